@@ -1,0 +1,61 @@
+"""Errors that are meant for the person at the keyboard.
+
+Everything a user can cause (a misspelt key, a missing mesh, a full disk) is raised as a
+:class:`BlinkGLError` whose ``str`` is one line: where it is (a config path, a file), the value, and what
+would be accepted. The command line prints that line and exits with status 2; ``--debug`` shows the
+traceback. Programming errors stay ordinary exceptions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+_MAX_VALUE_CHARS = 120
+
+
+def _short(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _MAX_VALUE_CHARS else text[: _MAX_VALUE_CHARS - 1] + "…"
+
+
+class BlinkGLError(Exception):
+    """One line for the user.
+
+    Parameters
+    ----------
+    problem : what is wrong, without a trailing full stop.
+    where : config path (``scene.objects.count``), file or frame the problem is at.
+    value : the offending value; shown shortened. Leave out when there is none.
+    accepted : what would be accepted, or the command that mends it.
+    """
+
+    exit_status = 2
+
+    def __init__(self, problem: str, *, where: str | None = None, value: Any = ..., accepted: str | None = None):
+        self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
+        line = f"{where}: {problem}" if where else problem
+        if value is not ...:
+            line += f" (got {_short(value)})"
+        if accepted:
+            line += f"; expected {accepted}" if not accepted.startswith(("run ", "try ", "use ", "see ")) else f"; {accepted}"
+        super().__init__(line)
+
+
+class ConfigError(BlinkGLError):
+    """A YAML file, ``--set`` option or Python config value that cannot be used."""
+
+
+class AssetError(BlinkGLError):
+    """A mesh, texture, video or other input file that is missing, corrupt or beyond a limit."""
+
+
+class GLError(BlinkGLError):
+    """No usable OpenGL, or a shader that does not compile."""
+
+
+class OutputError(BlinkGLError):
+    """Output that cannot be written: existing folder, full disk, no permission."""
+
+
+class EventDataError(BlinkGLError):
+    """Frames or events outside the emulator's or a format's contract (time order, range, shape)."""

@@ -1,0 +1,37 @@
+"""Where every random number comes from.
+
+One run has one integer seed (0 is a seed like any other). Each sequence and each role in it gets an
+independent child stream, so that adding a draw in one role moves nothing in another and sequence 17 is the
+same whether or not sequences 0-16 were made in this run, by this worker, or at all.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Role(IntEnum):
+    """Streams of one sequence. Append only: the numbers are part of every published data set."""
+
+    PARAMETERS = 0
+    SCENE = 1
+    TRAJECTORY = 2
+    TEXTURE = 3
+    EVENTS = 4
+
+
+def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:
+    """Child of ``seed`` keyed by (sequence, role); independent of any other child drawn before it."""
+    return np.random.SeedSequence(seed, spawn_key=(int(sequence), int(role)))
+
+
+def generator(seed: int, sequence: int, role: Role) -> np.random.Generator:
+    """PCG64 generator on :func:`seed_sequence`."""
+    return np.random.default_rng(seed_sequence(seed, sequence, role))
+
+
+def kernel_seed(seed: int, sequence: int, role: Role) -> int:
+    """64-bit key for the counter-based generators inside numba kernels."""
+    return int(seed_sequence(seed, sequence, role).generate_state(1, np.uint64)[0])

@@ -1,0 +1,163 @@
+"""A scene is data: meshes, materials, poses over time, one camera, one light. No OpenGL and no YAML here.
+
+Frames and units
+----------------
+World: right-handed, z up, units of the user's choice (metres in the shipped configs).
+Camera: OpenCV axes (x right, y down, z forward). ``T_world_cam`` maps camera to world coordinates.
+Pixels: (x, y) with (0, 0) the centre of the top-left pixel; a point at camera coordinates (X, Y, Z) is seen at
+``x = fx * X / Z + cx``, ``y = fy * Y / Z + cy``.
+Time: int64 nanoseconds. Poses: 4x4 float64, rigid (scale is baked into the vertices).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+
+@runtime_checkable
+class PosePath(Protocol):
+    """A rigid motion over [t0_ns, t1_ns]; outside it the end poses are held (and the derivative is zero)."""
+
+    t0_ns: int
+    t1_ns: int
+
+    @property
+    def is_static(self) -> bool:
+        """True when the pose is the same at all times (lets a renderer cache what it drew)."""
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        """(4, 4) float64 T_world_body at t_ns."""
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        """(4, 4) float64 dT/dt in 1/s, analytic; last row zero. With body rate w: dR/dt = R [w]x."""
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        """(N, 4, 4) float64 poses at (N,) int64 times; equals stacking :meth:`pose`."""
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        """Upper bounds over [ta, tb] of (|velocity of the body's origin| in units/s, |angular rate| in rad/s)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles in object-local coordinates.
+
+    vertices : (V, 3) float64.   faces : (F, 3) int32, counter-clockwise seen from outside.
+    normals  : (V, 3) float32, unit.
+    uvs      : (V, 2) float32; (0, 0) is the top-left corner of the texture image, v grows downwards; repeats.
+    closed   : watertight with consistent outward winding, so back faces can be culled.
+    name, source_hash : where it came from; ``source_hash`` is a stable hash of the content (train/test splits).
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+    uvs: np.ndarray
+    closed: bool = False
+    name: str = ""
+    source_hash: str = ""
+
+    @property
+    def radius(self) -> float:
+        """Radius of the bounding sphere around the local origin."""
+        return float(np.sqrt((self.vertices**2).sum(axis=1).max())) if len(self.vertices) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """image: (h, w, 3) uint8 sRGB-encoded, or (h, w, 3) float32 linear light. Row 0 is the top."""
+
+    image: np.ndarray
+    name: str = ""
+    source_hash: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Lambert (or unlit) surface: albedo(u, v) = texture(uv * uv_scale) * base_color, linear light.
+
+    texture      : None means white.
+    base_color   : (3,) linear factor.
+    unlit        : radiance = albedo, whatever the light (sky boxes, screens).
+    double_sided : draw back faces with the normal turned round; otherwise they are culled when the mesh is closed.
+    """
+
+    texture: Texture | None = None
+    base_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    uv_scale: tuple[float, float] = (1.0, 1.0)
+    unlit: bool = False
+    double_sided: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One mesh with one material; an object has one or several."""
+
+    mesh: Mesh
+    material: Material
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """A rigid body. ``instance_id`` >= 1 is what the id pass writes (0 is 'nothing hit')."""
+
+    name: str
+    instance_id: int
+    parts: tuple[Part, ...]
+    path: PosePath
+    category: Literal["object", "ground", "wall", "sky"] = "object"
+
+    @property
+    def radius(self) -> float:
+        return max((part.mesh.radius for part in self.parts), default=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Pin-hole camera. fx, fy, cx, cy in px by the pixel convention above; ``near`` in world units."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    path: PosePath
+    near: float = 0.05
+
+    @property
+    def K(self) -> np.ndarray:
+        """(3, 3) float64 intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Light:
+    """White sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E.
+
+    sun_direction : unit vector in the world, from the surface towards the sun (s).
+    """
+
+    sun_direction: tuple[float, float, float] = (0.37139068, 0.27854301, 0.88569817)
+    sun: float = 0.8
+    sky: float = 0.4
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Everything that is rendered over [t0_ns, t1_ns].
+
+    background : linear radiance where nothing is hit.
+    log        : one line per decision worth keeping (collisions cut, objects dropped), for the manifest.
+    """
+
+    objects: tuple[SceneObject, ...]
+    camera: Camera
+    t0_ns: int
+    t1_ns: int
+    light: Light = Light()
+    background: float = 0.0
+    log: tuple[str, ...] = field(default=())

@@ -1,0 +1,347 @@
+"""Rigid motions over time: the :class:`~blinkgl.scene.types.PosePath` implementations.
+
+All of them hold their end pose outside ``[t0_ns, t1_ns]`` and have a zero derivative there. Times are int64
+nanoseconds and are subtracted as integers before they become float seconds, so a path that starts at 10^6 s
+is as precise as (in fact: bit-identical to) the same path started at 0.
+
+    path = SplinePath([0, 500_000_000, 1_000_000_000], positions, rotations)
+    T_world_body = path.pose(250_000_000)
+
+A piecewise path is, between key frames i and i + 1 and with u the seconds since key frame i,
+
+    p(u) = sum_k cp[i, k] u^k,      R(u) = R_i exp([phi(u)]x),   phi(u) = sum_k cr[i, k] u^k,   k = 0..3,
+
+which is what scipy's ``CubicSpline`` and ``RotationSpline`` evaluate; straight lines and slerp are the same form
+with two terms. The coefficients come from scipy; evaluation is compiled here because a renderer asks for one time
+at a time and scipy's call overhead is ten times the work.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from blinkgl.errors import ConfigError
+from blinkgl.scene.types import PosePath
+
+# Rounding in the bounds' own arithmetic is of order 1e-15; this margin keeps them upper bounds.
+_BOUND_MARGIN = 1.0 + 1e-9
+
+
+class StaticPath:
+    """A body that does not move.
+
+    T : (4, 4) rigid T_world_body, or None for the identity. Raises ConfigError when it is not rigid and finite.
+    """
+
+    def __init__(self, T: ArrayLike | None = None, t0_ns: int = 0, t1_ns: int = 0):
+        self._T = np.eye(4) if T is None else rigid(T)
+        self.t0_ns, self.t1_ns = int(t0_ns), int(t1_ns)
+
+    is_static = True
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        return self._T.copy()
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        return np.zeros((4, 4))
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        return np.tile(self._T, (len(t_ns), 1, 1))
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        return 0.0, 0.0
+
+
+class KeyframePath:
+    """Motion through given poses.
+
+    times_ns      : (N,) int64, strictly increasing, N >= 1 (one key frame: a body that stays there).
+    positions     : (N, 3) world coordinates of the body's origin.
+    rotations     : scipy ``Rotation`` of length N, or (N, 4) quaternions (x, y, z, w).
+    interpolation : "spline": C2 (cubic, not-a-knot ends; two key frames give the straight line);
+                    "linear": straight lines and slerp, velocity jumps at the key frames (the derivative there is that
+                    of the following piece).
+    Raises ConfigError (prefixed by ``where``) on wrong shapes, non-finite values, zero quaternions or unordered times.
+    """
+
+    def __init__(self, times_ns: ArrayLike, positions: ArrayLike, rotations: Rotation | ArrayLike,
+                 interpolation: Literal["spline", "linear"] = "spline", where: str | None = None):
+        knots, positions, rotations = _checked_keys(times_ns, positions, rotations, where)
+        self.t0_ns, self.t1_ns = int(knots[0]), int(knots[-1])
+        if len(knots) == 1:
+            # One nanosecond of standing still, so that the evaluation below needs no special case.
+            knots = np.array([knots[0], knots[0] + 1])
+            positions, rotations = np.repeat(positions, 2, axis=0), Rotation.concatenate([rotations, rotations])
+        seconds = (knots - knots[0]) * 1e-9
+        if interpolation == "spline":
+            cp = CubicSpline(seconds, positions).c
+            cr = RotationSpline(seconds, rotations).interpolator.c
+        elif interpolation == "linear":
+            h = np.diff(seconds)[:, None]
+            cp = np.stack([np.diff(positions, axis=0) / h, positions[:-1]])
+            turn = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
+            cr = np.stack([turn / h, np.zeros_like(turn)])
+        else:
+            raise ConfigError("unknown interpolation", where=where, value=interpolation, accepted="spline or linear")
+        self._knots = knots
+        self._cp, self._cr = _ascending(cp), _ascending(cr)
+        self._rot = np.ascontiguousarray(rotations[:-1].as_matrix())
+        self.key_times_ns = knots[:1] if self.t0_ns == self.t1_ns else knots
+        self.is_static = not (self._cp[:, 1:].any() or self._cr[:, 1:].any())
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        T = np.empty((4, 4))
+        _pose(int(t_ns), self._knots, self._cp, self._cr, self._rot, T)
+        return T
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        D = np.zeros((4, 4))
+        t_ns = int(t_ns)
+        if self.t0_ns <= t_ns <= self.t1_ns:
+            _derivative(t_ns, self._knots, self._cp, self._cr, self._rot, D)
+        return D
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        t_ns = np.ascontiguousarray(t_ns, dtype=np.int64)
+        T = np.empty((len(t_ns), 4, 4))
+        _poses(t_ns, self._knots, self._cp, self._cr, self._rot, T)
+        return T
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        """See :class:`PosePath`. Rigorous: a quadratic stays in the convex hull of its Bezier points on the interval,
+        and |w| = |J_r(phi) phi'| <= |phi'| because the right Jacobian of SO(3) has singular values 1 and
+        |sin(|phi|/2)| / (|phi|/2) <= 1."""
+        v, w = _speed_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr)
+        return v * _BOUND_MARGIN, w * _BOUND_MARGIN
+
+
+class SplinePath(KeyframePath):
+    """C2 spline through way-points; arguments as in :class:`KeyframePath`."""
+
+    def __init__(self, times_ns: ArrayLike, positions: ArrayLike, rotations: Rotation | ArrayLike, where: str | None = None):
+        super().__init__(times_ns, positions, rotations, "spline", where)
+
+
+class CutPath:
+    """``path`` until ``t_cut_ns``, then standing still at the pose of that instant.
+
+    The derivative is zero from the cut on (the derivative to the right: what happens next).
+    """
+
+    def __init__(self, path: PosePath, t_cut_ns: int):
+        self.path, self.t_cut_ns = path, int(t_cut_ns)
+        self.t0_ns = min(path.t0_ns, self.t_cut_ns)
+        self.t1_ns = min(path.t1_ns, self.t_cut_ns)
+
+    @property
+    def is_static(self) -> bool:
+        return self.path.is_static or self.t_cut_ns <= self.path.t0_ns
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        return self.path.pose(min(int(t_ns), self.t_cut_ns))
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        return self.path.derivative(t_ns) if t_ns < self.t_cut_ns else np.zeros((4, 4))
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        return self.path.poses(np.minimum(np.asarray(t_ns, dtype=np.int64), self.t_cut_ns))
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        if ta_ns >= self.t_cut_ns:
+            return 0.0, 0.0
+        return self.path.speed_bound(ta_ns, min(tb_ns, self.t_cut_ns))
+
+
+class OffsetPath:
+    """A body fixed to another: T_world_offset(t) = T_world_body(t) @ T_body_offset (a stereo camera, a part)."""
+
+    def __init__(self, path: PosePath, T_body_offset: ArrayLike):
+        self.path, self.T_body_offset = path, rigid(T_body_offset)
+        self.t0_ns, self.t1_ns = path.t0_ns, path.t1_ns
+        self._arm = float(np.linalg.norm(self.T_body_offset[:3, 3]))
+
+    @property
+    def is_static(self) -> bool:
+        return self.path.is_static
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        return self.path.pose(t_ns) @ self.T_body_offset
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        return self.path.derivative(t_ns) @ self.T_body_offset
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        return self.path.poses(t_ns) @ self.T_body_offset
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        v, w = self.path.speed_bound(ta_ns, tb_ns)
+        return (v + w * self._arm) * _BOUND_MARGIN, w
+
+
+def rigid(T: ArrayLike, where: str | None = None) -> np.ndarray:
+    """(4, 4) float64 copy of ``T``; ConfigError unless it is finite and a rotation with a translation (to 1e-6)."""
+    T = np.array(T, dtype=np.float64)
+    ok = T.shape == (4, 4) and bool(np.isfinite(T).all())
+    if ok:
+        R = T[:3, :3]
+        ok = np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0 and np.array_equal(T[3], [0, 0, 0, 1])
+    if not ok:
+        raise ConfigError("pose is not rigid", where=where, value=T.tolist(),
+                          accepted="a 4x4 matrix of a rotation (determinant +1) and a finite translation")
+    return T
+
+
+def body_rate(T: np.ndarray, dT: np.ndarray) -> np.ndarray:
+    """(3,) body-frame angular rate in rad/s of a pose and its derivative: dR/dt = R [w]x."""
+    W = T[:3, :3].T @ dT[:3, :3]
+    return 0.5 * np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
+
+
+def _checked_keys(times_ns, positions, rotations, where):
+    try:
+        times = np.asarray(times_ns)
+        knots = times.astype(np.int64)
+        positions = np.array(positions, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise ConfigError("key frames are not numbers", where=where) from None
+    if knots.ndim != 1 or len(knots) == 0 or not np.array_equal(knots, times):
+        raise ConfigError("key-frame times have to be a list of whole nanoseconds, at least one", where=where)
+    if (np.diff(knots) <= 0).any():
+        at = int(np.argmax(np.diff(knots) <= 0)) + 1
+        raise ConfigError(f"key-frame times have to increase (key frame {at})", where=where, value=int(knots[at]),
+                          accepted=f"more than {int(knots[at - 1])} ns")
+    if positions.shape != (len(knots), 3) or not np.isfinite(positions).all():
+        raise ConfigError("key-frame positions have to be finite and three per time", where=where,
+                          value=f"shape {positions.shape}", accepted=f"shape ({len(knots)}, 3)")
+    if not isinstance(rotations, Rotation):
+        try:
+            quaternions = np.array(rotations, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ConfigError("key-frame rotations are not numbers", where=where) from None
+        if (quaternions.shape != (len(knots), 4) or not np.isfinite(quaternions).all()
+                or not (np.linalg.norm(quaternions, axis=1) > 1e-12).all()):
+            raise ConfigError("key-frame rotations have to be non-zero quaternions (x, y, z, w), one per time", where=where,
+                              value=f"shape {quaternions.shape}", accepted=f"shape ({len(knots)}, 4)")
+        rotations = Rotation.from_quat(quaternions)
+    elif rotations.single or len(rotations) != len(knots):
+        raise ConfigError("key-frame rotations have to be one per time", where=where,
+                          value=1 if rotations.single else len(rotations), accepted=str(len(knots)))
+    return knots, positions, rotations
+
+
+def _ascending(c: np.ndarray) -> np.ndarray:
+    """scipy's (k, pieces, 3) coefficients, highest power first, as contiguous (pieces, 4, 3), lowest first."""
+    out = np.zeros((c.shape[1], 4, 3))
+    out[:, : len(c)] = c[::-1].transpose(1, 0, 2)
+    return out
+
+
+@njit(cache=True)
+def _piece(t, knots):
+    i = np.searchsorted(knots, t, side="right") - 1
+    return min(max(i, 0), len(knots) - 2)
+
+
+@njit(cache=True)
+def _pose(t, knots, cp, cr, rot, T):
+    t = min(max(t, knots[0]), knots[-1])
+    i = _piece(t, knots)
+    u = (t - knots[i]) * 1e-9
+    x = ((cr[i, 3, 0] * u + cr[i, 2, 0]) * u + cr[i, 1, 0]) * u + cr[i, 0, 0]
+    y = ((cr[i, 3, 1] * u + cr[i, 2, 1]) * u + cr[i, 1, 1]) * u + cr[i, 0, 1]
+    z = ((cr[i, 3, 2] * u + cr[i, 2, 2]) * u + cr[i, 1, 2]) * u + cr[i, 0, 2]
+    q = x * x + y * y + z * z
+    # exp = c I + a [phi]x + b phi phi^T. sin(angle / 2) has no cancellation in 1 - cos at small angles.
+    if q > 1e-300:
+        angle = math.sqrt(q)
+        half = math.sin(0.5 * angle)
+        a = math.sin(angle) / angle
+        b = 2.0 * half * half / q
+        c = math.cos(angle)
+    else:
+        a, b, c = 1.0, 0.5, 1.0
+    E00, E01, E02 = c + b * x * x, b * x * y - a * z, b * x * z + a * y
+    E10, E11, E12 = b * x * y + a * z, c + b * y * y, b * y * z - a * x
+    E20, E21, E22 = b * x * z - a * y, b * y * z + a * x, c + b * z * z
+    for r in range(3):
+        r0, r1, r2 = rot[i, r, 0], rot[i, r, 1], rot[i, r, 2]
+        T[r, 0] = r0 * E00 + r1 * E10 + r2 * E20
+        T[r, 1] = r0 * E01 + r1 * E11 + r2 * E21
+        T[r, 2] = r0 * E02 + r1 * E12 + r2 * E22
+        T[r, 3] = ((cp[i, 3, r] * u + cp[i, 2, r]) * u + cp[i, 1, r]) * u + cp[i, 0, r]
+        T[3, r] = 0.0
+    T[3, 3] = 1.0
+
+
+@njit(cache=True)
+def _poses(times, knots, cp, cr, rot, T):
+    for k in range(len(times)):
+        _pose(times[k], knots, cp, cr, rot, T[k])
+
+
+@njit(cache=True)
+def _derivative(t, knots, cp, cr, rot, D):
+    """D = dT/dt. Body rate w = J_r(phi) phi' with the right Jacobian of SO(3),
+    J_r = I - (1 - cos a)/a^2 [phi]x + (a - sin a)/a^3 [phi]x^2, a = |phi|."""
+    T = np.empty((4, 4))
+    _pose(t, knots, cp, cr, rot, T)
+    i = _piece(t, knots)
+    u = (t - knots[i]) * 1e-9
+    p, d = np.empty(3), np.empty(3)
+    for k in range(3):
+        p[k] = ((cr[i, 3, k] * u + cr[i, 2, k]) * u + cr[i, 1, k]) * u + cr[i, 0, k]
+        d[k] = (3.0 * cr[i, 3, k] * u + 2.0 * cr[i, 2, k]) * u + cr[i, 1, k]
+        D[k, 3] = (3.0 * cp[i, 3, k] * u + 2.0 * cp[i, 2, k]) * u + cp[i, 1, k]
+    q = p[0] * p[0] + p[1] * p[1] + p[2] * p[2]
+    if q > 1e-4:
+        a = math.sqrt(q)
+        k1, k2 = (1.0 - math.cos(a)) / q, (a - math.sin(a)) / (q * a)
+    else:
+        # Both differences cancel at small angles; next terms are q^3/40320 and q^3/362880, below 1e-16.
+        k1 = 0.5 - q * (1.0 / 24.0 - q / 720.0)
+        k2 = 1.0 / 6.0 - q * (1.0 / 120.0 - q / 5040.0)
+    c0, c1, c2 = p[1] * d[2] - p[2] * d[1], p[2] * d[0] - p[0] * d[2], p[0] * d[1] - p[1] * d[0]
+    w0 = d[0] - k1 * c0 + k2 * (p[1] * c2 - p[2] * c1)
+    w1 = d[1] - k1 * c1 + k2 * (p[2] * c0 - p[0] * c2)
+    w2 = d[2] - k1 * c2 + k2 * (p[0] * c1 - p[1] * c0)
+    for r in range(3):
+        D[r, 0] = T[r, 1] * w2 - T[r, 2] * w1
+        D[r, 1] = T[r, 2] * w0 - T[r, 0] * w2
+        D[r, 2] = T[r, 0] * w1 - T[r, 1] * w0
+
+
+@njit(cache=True)
+def _quadratic_bound(c, ua, ub):
+    """Upper bound of |p'(u)| over [ua, ub] for the cubic p: the largest norm of the three Bezier points of p'."""
+    best = 0.0
+    for corner in range(3):
+        # Blossom of a quadratic: products u u -> v w, u -> (v + w) / 2.
+        v = ub if corner == 2 else ua
+        w = ua if corner == 0 else ub
+        q = 0.0
+        for k in range(3):
+            x = 3.0 * c[3, k] * v * w + c[2, k] * (v + w) + c[1, k]
+            q += x * x
+        best = max(best, q)
+    return math.sqrt(best)
+
+
+@njit(cache=True)
+def _speed_bound(ta, tb, knots, cp, cr):
+    if tb < knots[0] or ta > knots[-1] or tb < ta:
+        return 0.0, 0.0
+    ta, tb = max(ta, knots[0]), min(tb, knots[-1])
+    speed, rate = 0.0, 0.0
+    for i in range(_piece(ta, knots), _piece(tb, knots) + 1):
+        ua = (max(ta, knots[i]) - knots[i]) * 1e-9
+        ub = (min(tb, knots[i + 1]) - knots[i]) * 1e-9
+        speed = max(speed, _quadratic_bound(cp[i], ua, ub))
+        rate = max(rate, _quadratic_bound(cr[i], ua, ub))
+    return speed, rate

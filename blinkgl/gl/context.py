@@ -1,0 +1,224 @@
+"""Headless OpenGL: EGL on a chosen device, OSMesa as the software fallback, one error when there is neither.
+
+Every context made here has ``glClipControl(GL_LOWER_LEFT, GL_ZERO_TO_ONE)`` set, because reversed-Z keeps the
+precision of a 32F depth buffer only when clip-space depth runs from 0 to 1 (with -1 to 1 the hardware's
+``0.5 * z + 0.5`` rounds it away).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import moderngl
+
+from blinkgl.errors import GLError
+from blinkgl.gl.framebuffer import Target
+from blinkgl.gl.osmesa import OSMesaContext, OSMesaUnavailable
+from blinkgl.gl.shader import ShaderLoader
+
+REQUIRED_VERSION = 430
+APT_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6"
+REMEDY = f"run 'sudo apt-get install -y --no-install-recommends {APT_PACKAGES}', or install the GPU's driver with its EGL part"
+DEVICE_VARIABLE = "GLCONTEXT_DEVICE_INDEX"
+
+_LOWER_LEFT, _ZERO_TO_ONE, _CLIP_DEPTH_MODE = 0x8CA1, 0x935F, 0x935D
+_SOFTWARE = re.compile(r"llvmpipe|softpipe|swrast|lavapipe|swiftshader|software", re.IGNORECASE)
+_EGL_LIBRARIES = ("libEGL.so.1", "libEGL.so")
+_GL_LIBRARIES = ("libGL.so.1", "libOpenGL.so.0", *_EGL_LIBRARIES)
+
+
+class _EGLUnavailable(Exception):
+    """``no_such_device``: the user named a device that does not exist, which no fallback should hide."""
+
+    def __init__(self, message: str, no_such_device: bool = False):
+        super().__init__(message)
+        self.no_such_device = no_such_device
+
+
+class GLContext:
+    """A current OpenGL >= 4.3 core context with its programs and targets. Use it in ``with``, or call :meth:`release`.
+
+    ctx        : the ``moderngl.Context``.
+    backend    : "egl" or "osmesa".   device: EGL device number (0 for OSMesa).
+    vendor, renderer, version : GL's own strings; is_software : drawn by the CPU.
+    notes      : what was tried before and failed, one line each (empty when the first choice worked).
+    shaders    : the :class:`~blinkgl.gl.shader.ShaderLoader` behind :meth:`program`.
+
+    Not thread-safe, and not to be carried over ``fork()``: worker processes make their own.
+    """
+
+    def __init__(self, raw: Any, backend: str, device: int, notes: tuple[str, ...] = ()):
+        self._raw = raw
+        try:
+            self.ctx = moderngl.create_context(require=REQUIRED_VERSION, standalone=True, context=raw)
+        except Exception as error:  # moderngl raises bare Exception, ValueError and its own Error here
+            raw.release()
+            raise _EGLUnavailable(_one_line(error)) from None
+        self.backend, self.device, self.notes = backend, device, notes
+        info = self.ctx.info
+        self.vendor, self.renderer, self.version = info["GL_VENDOR"], info["GL_RENDERER"], info["GL_VERSION"]
+        self.is_software = bool(_SOFTWARE.search(f"{self.vendor} {self.renderer}"))
+        self.shaders = ShaderLoader(self.ctx)
+        self._set_clip_control()
+
+    def _set_clip_control(self) -> None:
+        if self.ctx.version_code < 450 and "GL_ARB_clip_control" not in self.ctx.extensions:
+            self.release()
+            raise _EGLUnavailable(f"{self.renderer}: neither OpenGL 4.5 nor GL_ARB_clip_control, needed for reversed-Z depth")
+        self.function("glClipControl", None, ctypes.c_uint, ctypes.c_uint)(_LOWER_LEFT, _ZERO_TO_ONE)
+        mode = ctypes.c_int(0)
+        self.function("glGetIntegerv", None, ctypes.c_uint, ctypes.c_void_p)(_CLIP_DEPTH_MODE, ctypes.byref(mode))
+        if mode.value != _ZERO_TO_ONE:
+            self.release()
+            raise _EGLUnavailable(f"{self.renderer}: glClipControl has no effect")
+
+    def function(self, name: str, restype: Any, *argtypes: Any) -> Any:
+        """ctypes function for the GL entry point ``name``; for the calls moderngl does not wrap."""
+        address = self._raw.load_opengl_function(name)
+        if not address:
+            raise GLError(f"the driver has no {name}", where=self.renderer)
+        return ctypes.CFUNCTYPE(restype, *argtypes)(address)
+
+    def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
+        """The program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
+        return self.shaders.program(name, defines)
+
+    def framebuffer(self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True) -> Target:
+        """A new render target; see :class:`~blinkgl.gl.framebuffer.Target`."""
+        return Target(self, width, height, colour, depth)
+
+    def make_current(self) -> None:
+        """Make this context the current one again, after another context was used in the same thread."""
+        self._raw.__enter__()
+
+    def release(self) -> None:
+        """Free the context and everything in it. Harmless when repeated."""
+        if self._raw is not None:
+            self.shaders.clear()
+            self.ctx.release()
+            self._raw.release()
+            self._raw = None
+
+    def __enter__(self) -> GLContext:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.release()
+
+    def __repr__(self) -> str:
+        return f"<GLContext {self.backend}:{self.device} {self.renderer}, OpenGL {self.version}>"
+
+
+def create_context(backend: str = "auto", device: int = 0) -> GLContext:
+    """Make a headless context and make it current.
+
+    backend : "egl"; "osmesa"; or "auto": EGL's ``device``, then (only for device 0) EGL's other devices, then OSMesa.
+    device  : index in the order of ``eglQueryDevicesEXT``; CUDA_VISIBLE_DEVICES has no say in it. The environment variable
+              GLCONTEXT_DEVICE_INDEX overrides it (glcontext's own rule, kept because job schedulers set it).
+
+    Raises GLError naming every attempt and the remedy.
+    """
+    if backend not in ("auto", "egl", "osmesa"):
+        raise GLError("unknown backend", where="gl.backend", value=backend, accepted="'auto', 'egl' or 'osmesa'")
+    device = _overridden(device)
+    attempts: list[str] = []
+    if backend in ("auto", "egl"):
+        others = range(1, len(egl_devices())) if backend == "auto" and device == 0 else ()
+        for index in (device, *others):
+            try:
+                return GLContext(_egl(index), "egl", index, tuple(attempts))
+            except _EGLUnavailable as error:
+                attempts.append(f"EGL device {index}: {error}")
+                if error.no_such_device:
+                    raise GLError("no such EGL device", where="gl.device", value=index,
+                                  accepted="one of those `blinkgl doctor` lists") from None
+    if backend in ("auto", "osmesa"):
+        try:
+            return GLContext(OSMesaContext(4, 3), "osmesa", 0, tuple(attempts))
+        except (OSMesaUnavailable, _EGLUnavailable) as error:
+            attempts.append(f"OSMesa: {error}")
+    raise GLError(f"no usable OpenGL ({'; '.join(attempts)})", where=f"gl.backend {backend}", accepted=REMEDY)
+
+
+def _overridden(device: int) -> int:
+    text = os.environ.get(DEVICE_VARIABLE)
+    if not text:
+        return device
+    if not text.isdigit():
+        raise GLError("not a device number", where=f"environment variable {DEVICE_VARIABLE}", value=text, accepted="an integer >= 0")
+    return int(text)
+
+
+def _egl(device: int) -> Any:
+    """glcontext's EGL object, current in this thread."""
+    from glcontext import egl
+
+    libegl = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
+    if libegl is None:
+        raise _EGLUnavailable("libEGL.so.1 not found")
+    # glcontext opens libGL beside libEGL, although EGL hands out every function: machines without X11 have no libGL.
+    libgl = os.environ.get("GLCONTEXT_LINUX_LIBGL") or _loadable(_GL_LIBRARIES)
+    try:
+        return egl.create_context(mode="standalone", libegl=libegl, libgl=libgl, glversion=REQUIRED_VERSION, device_index=device)
+    except Exception as error:  # glcontext raises bare Exception
+        message = _one_line(error)
+        if "but found 0 devices" in message:
+            raise _EGLUnavailable("no driver (Mesa's is in libegl-mesa0 and libgl1-mesa-dri)") from None
+        if "0x3001" in message:
+            message += ", i.e. no working DRI driver"
+        elif "eglCreateContext" in message:
+            message += f", i.e. no OpenGL {REQUIRED_VERSION / 100:.1f} core"
+        raise _EGLUnavailable(message, no_such_device="requested device index" in message) from None
+
+
+def _loadable(names: tuple[str, ...]) -> str | None:
+    for name in names:
+        try:
+            ctypes.CDLL(name)
+            return name
+        except OSError:
+            continue
+    return None
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def egl_devices() -> list[str]:
+    """One description per EGL device, in ``gl.device`` order; empty without EGL or its device extension. Makes no context."""
+    name = _loadable(_EGL_LIBRARIES)
+    if name is None:
+        return []
+    lib = ctypes.CDLL(name)
+    lib.eglGetProcAddress.restype = ctypes.c_void_p
+    lib.eglGetProcAddress.argtypes = [ctypes.c_char_p]
+    query_devices = lib.eglGetProcAddress(b"eglQueryDevicesEXT")
+    query_string = lib.eglGetProcAddress(b"eglQueryDeviceStringEXT")
+    if not (query_devices and query_string):
+        return []
+    query_devices = ctypes.CFUNCTYPE(ctypes.c_uint, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)(query_devices)
+    query_string = ctypes.CFUNCTYPE(ctypes.c_char_p, ctypes.c_void_p, ctypes.c_int)(query_string)
+    count, handles = ctypes.c_int(0), (ctypes.c_void_p * 32)()
+    if not query_devices(32, handles, ctypes.byref(count)):
+        return []
+    return [_device_text(query_string, handles[i]) for i in range(count.value)]
+
+
+def _device_text(query_string: Any, handle: int) -> str:
+    _EXTENSIONS, _RENDERER_EXT, _DRM_FILE = 0x3055, 0x335F, 0x3233
+    extensions = (query_string(handle, _EXTENSIONS) or b"").decode().split()
+    if "EGL_MESA_device_software" in extensions:
+        return "Mesa software rasteriser"
+    words = []
+    if "EGL_EXT_device_query_name" in extensions:
+        words.append((query_string(handle, _RENDERER_EXT) or b"").decode())
+    if "EGL_EXT_device_drm" in extensions:
+        words.append((query_string(handle, _DRM_FILE) or b"").decode())
+    if "EGL_NV_device_cuda" in extensions:
+        words.append("NVIDIA")
+    return " ".join(filter(None, words)) or "unnamed device"

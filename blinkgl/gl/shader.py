@@ -1,0 +1,246 @@
+"""GLSL programs from files: one file per program, ``#include``, ``#define`` variants, errors that name the user's line.
+
+A file in ``shaders/`` holds all stages of one program, told apart by ``#ifdef VERTEX_SHADER`` / ``#ifdef FRAGMENT_SHADER``;
+it is compiled once per stage. ``#include "camera.glsl"`` takes ``shaders/include/camera.glsl`` and has an include guard
+built in, so that two includes may share a third. What the compiler sees is one text with a table saying which file and line
+each of its lines came from: drivers disagree about ``#line`` with a file number, but all of them count lines.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import moderngl
+
+from blinkgl.errors import GLError
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable  # from 3.11 on; annotations only
+
+STAGES = ("vertex", "fragment")
+DEFAULT_VERSION = "#version 430 core"
+
+_VERSION = re.compile(r"\s*#\s*version\b")
+_INCLUDE = re.compile(r'\s*#\s*include\b\s*(?P<argument>.*?)\s*(//.*)?$')
+_QUOTED = re.compile(r'"([^"]+)"$')
+_NAME = re.compile(r"(?!gl_|GL_)[A-Za-z](?!\w*__)\w*$")
+# Where drivers put the line number: Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD/Intel/Apple "ERROR: 0:12: …".
+_MESSAGES = (
+    re.compile(r"\d+:(?P<line>\d+)\(\d+\): (?:preprocessor )?(?P<kind>error|warning): (?P<text>.*)"),
+    re.compile(r"\d+\((?P<line>\d+)\) : (?P<kind>error|warning) (?P<text>.*)"),
+    re.compile(r"(?P<kind>ERROR|WARNING): \d+:(?P<line>\d+): (?P<text>.*)"),
+)
+_STAGE_HEADER = re.compile(r"(vertex|fragment)_shader$")
+
+
+@dataclass(frozen=True)
+class ShaderSource:
+    """text : GLSL as the compiler sees it, one stage.
+    origin : (file, line) of each of its lines, 1-based, the file relative to the shader folder; ("", 0) for generated lines."""
+
+    name: str
+    stage: str
+    text: str
+    origin: tuple[tuple[str, int], ...]
+
+    def locate(self, line: int) -> tuple[str, int]:
+        """File and line that line ``line`` (1-based) of ``text`` came from."""
+        return self.origin[line - 1] if 1 <= line <= len(self.origin) else ("", 0)
+
+
+class ShaderError(GLError):
+    """A shader that does not load, compile or link. ``str``: one line; ``detail``: every message with the source around it."""
+
+    def __init__(self, problem: str, *, where: str | None = None, detail: str = "", log: str = "", **more: Any):
+        super().__init__(problem, where=where, **more)
+        self.detail, self.log = detail, log
+
+
+def shader_folder() -> Traversable:
+    """The shaders that ship with BlinkGL."""
+    return resources.files("blinkgl.shaders")
+
+
+def expand(name: str, stage: str, defines: Mapping[str, Any] | None = None, folder: Traversable | None = None) -> ShaderSource:
+    """Source of one stage with includes and defines written out.
+
+    name    : file in ``folder`` (default: the shipped shaders).   stage: "vertex" or "fragment".
+    defines : NAME -> number, True (1), text as it stands, or False/None (left undefined).
+
+    Raises ShaderError for a missing file, an include cycle, or a define that is no GLSL identifier.
+    """
+    if stage not in STAGES:
+        raise ValueError(f"stage must be one of {STAGES}, not {stage!r}")
+    folder = shader_folder() if folder is None else folder
+    body = _Expansion(folder)
+    body.file(name, folder / name, chain=())
+    head = [body.version or DEFAULT_VERSION, f"#define {stage.upper()}_SHADER 1"]
+    head += [f"#define {key} {value}" for key, value in normalised(defines)]
+    lines = [(line, ("", 0)) for line in head] + body.lines
+    return ShaderSource(name, stage, "\n".join(line for line, _ in lines) + "\n", tuple(origin for _, origin in lines))
+
+
+def normalised(defines: Mapping[str, Any] | None) -> tuple[tuple[str, str], ...]:
+    """Sorted (name, GLSL text) pairs: the key under which a variant is cached."""
+    pairs = []
+    for key, value in sorted((defines or {}).items()):
+        if not _NAME.match(key):
+            raise ShaderError("not a name GLSL can #define", value=key, accepted="letters, digits, single _; not starting with gl_")
+        if value is None or value is False:
+            continue
+        text = "1" if value is True else str(value)
+        if "\n" in text or (isinstance(value, float) and not math.isfinite(value)):
+            raise ShaderError(f"#define {key} needs a finite number or one line of text", value=value)
+        pairs.append((key, text))
+    return tuple(pairs)
+
+
+class _Expansion:
+    """Collects (line, origin) pairs of a file and what it includes."""
+
+    def __init__(self, folder: Traversable):
+        self.folder = folder
+        self.version: str | None = None
+        self.lines: list[tuple[str, tuple[str, int]]] = []
+
+    def file(self, shown: str, path: Traversable, chain: tuple[str, ...], included_at: str | None = None) -> None:
+        if shown in chain:
+            raise ShaderError("include cycle: " + " -> ".join([*chain[chain.index(shown):], shown]), where=included_at)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else "no such shader file"
+            raise ShaderError(reason, where=included_at or "shaders", value=shown, accepted=self._available(path)) from None
+        in_comment = False
+        for number, line in enumerate(text.splitlines(), 1):
+            origin = (shown, number)
+            include = None if in_comment else _INCLUDE.match(line)
+            if include:
+                self._include(include["argument"], (*chain, shown), f"{shown}:{number}")
+            elif not in_comment and _VERSION.match(line):
+                if chain:
+                    raise ShaderError("#version belongs into the program's own file, not into an include", where=f"{shown}:{number}")
+                self.version = line.strip()
+                self.lines.append(("", origin))
+            else:
+                self.lines.append((line, origin))
+            in_comment = _ends_in_comment(line, in_comment)
+
+    def _include(self, argument: str, chain: tuple[str, ...], at: str) -> None:
+        quoted = _QUOTED.match(argument)
+        if not quoted:
+            raise ShaderError("malformed #include", where=at, value=argument, accepted='#include "file.glsl"')
+        name = quoted[1]
+        if name.startswith("/") or ".." in name.split("/"):
+            raise ShaderError("include outside the shader folder", where=at, value=name, accepted="a file in shaders/include")
+        # A guard of the preprocessor, not of this loader: only it knows which #ifdef branches are alive.
+        guard = "INCLUDED_" + "".join(c if c.isalnum() else f"_{ord(c):x}x" for c in name)
+        self.lines += [(f"#ifndef {guard}", ("", 0)), (f"#define {guard}", ("", 0))]
+        self.file(f"include/{name}", self.folder / "include" / name, chain, at)
+        self.lines.append(("#endif", ("", 0)))
+
+    def _available(self, path: Traversable) -> str | None:
+        folder = self.folder / "include" if isinstance(path, Path) and path.parent.name == "include" else self.folder
+        try:
+            names = sorted(entry.name for entry in folder.iterdir() if entry.name.endswith(".glsl"))
+        except OSError:
+            return None
+        return "one of " + ", ".join(names) if names else None
+
+
+def _ends_in_comment(line: str, inside: bool) -> bool:
+    """Whether a /* comment is open after ``line``."""
+    position = 0
+    while True:
+        if inside:
+            end = line.find("*/", position)
+            if end < 0:
+                return True
+            inside, position = False, end + 2
+        start, slashes = line.find("/*", position), line.find("//", position)
+        if start < 0 or 0 <= slashes < start:
+            return False
+        inside, position = True, start + 2
+
+
+class ShaderLoader:
+    """Compiles and caches the programs of one context.
+
+    A cached program is shared by all who ask for it with the same defines, its uniforms included.
+    """
+
+    def __init__(self, ctx: moderngl.Context, folder: Traversable | None = None):
+        self.ctx = ctx
+        self.folder = shader_folder() if folder is None else folder
+        self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], moderngl.Program] = {}
+
+    def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
+        """The program of file ``name`` with ``defines``; compiled when first asked for. Raises ShaderError."""
+        key = (name, normalised(defines))
+        if key not in self._programs:
+            self._programs[key] = self._compile(name, defines)
+        return self._programs[key]
+
+    def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
+        sources = {stage: expand(name, stage, defines, self.folder) for stage in STAGES}
+        try:
+            return self.ctx.program(vertex_shader=sources["vertex"].text, fragment_shader=sources["fragment"].text)
+        except moderngl.Error as error:
+            raise translate(str(error), sources, self.folder) from None
+
+    def clear(self) -> None:
+        """Release every program; the next call of :meth:`program` reads its file again (live reload)."""
+        for program in self._programs.values():
+            program.release()
+        self._programs.clear()
+
+
+def translate(log: str, sources: Mapping[str, ShaderSource], folder: Traversable) -> ShaderError:
+    """moderngl's error text as a ShaderError that speaks of the files the user wrote."""
+    stage = next((m[1] for m in map(_STAGE_HEADER.match, log.splitlines()) if m), None)
+    source = sources.get(stage or "")
+    name = next(iter(sources.values())).name
+    first: ShaderError | None = None
+    blocks: list[str] = []
+    for message in filter(None, map(_parse, log.splitlines())):
+        line, kind, text = message
+        if source is None:
+            continue
+        file, number = source.locate(line)
+        where = f"{file}:{number}" if file else f"{name} (generated line {line}: {_line(source.text, line)})"
+        blocks.append(f"{where}: {kind}: {text}\n{_excerpt(folder, file, number)}")
+        if first is None and kind == "error":
+            first = ShaderError(f"{text} [{stage} stage]", where=where)
+    if first is None:
+        meaningful = [line.strip() for line in log.splitlines() if line.strip() and not set(line.strip()) <= {"="}]
+        meaningful = [line for line in meaningful if not _STAGE_HEADER.match(line)]
+        first = ShaderError(" ".join(meaningful) + (f" [{stage} stage]" if stage else ""), where=name)
+    first.detail, first.log = "\n".join(blocks), log
+    return first
+
+
+def _parse(line: str) -> tuple[int, str, str] | None:
+    for pattern in _MESSAGES:
+        match = pattern.match(line.strip())
+        if match:
+            return int(match["line"]), match["kind"].lower(), match["text"]
+    return None
+
+
+def _line(text: str, number: int) -> str:
+    lines = text.splitlines()
+    return lines[number - 1].strip() if 1 <= number <= len(lines) else ""
+
+
+def _excerpt(folder: Traversable, file: str, number: int, around: int = 2) -> str:
+    if not file:
+        return ""
+    lines = (folder / file).read_text(encoding="utf-8").splitlines()
+    shown = range(max(1, number - around), min(len(lines), number + around) + 1)
+    return "\n".join(f"{'>' if i == number else ' '} {i:4d} | {lines[i - 1]}" for i in shown) + "\n"

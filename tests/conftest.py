@@ -1,0 +1,36 @@
+"""Fixtures shared by all tests."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Under xdist there is one process per core already: more llvmpipe and numba threads would only fight over them.
+    if os.environ.get("PYTEST_XDIST_WORKER"):
+        os.environ.setdefault("LP_NUM_THREADS", "0")
+
+
+@pytest.fixture(scope="session")
+def _gl_session():
+    from blinkgl.gl import create_context
+
+    with create_context() as context:
+        yield context
+
+
+@pytest.fixture
+def gl(_gl_session):
+    """The session's GLContext, current and in moderngl's default state; no GL error before nor after the test."""
+    _gl_session.make_current()
+    ctx = _gl_session.ctx
+    ctx.enable_only(ctx.NOTHING)
+    ctx.depth_func = "<"
+    ctx.front_face = "ccw"
+    ctx.cull_face = "back"
+    assert ctx.error == "GL_NO_ERROR", "left over from before this test"
+    yield _gl_session
+    _gl_session.make_current()  # a test may have made other contexts
+    assert ctx.error == "GL_NO_ERROR", "caused by this test"

@@ -1,0 +1,428 @@
+"""The float64 reference renderer: what every buffer of every pass should hold, by casting rays on the CPU.
+
+It shares nothing with the rasteriser but :mod:`blinkgl.scene.types`: no GLSL, no clip space, no projection matrix.
+Tests and the shader debugger compare the GPU with it. One ray goes through each pixel centre (or any other image
+point); it hits the nearest triangle, and everything else follows from the object-local point of the hit.
+
+Flow and its rounding
+---------------------
+With ``M(t) = inv(T_world_cam(t)) @ T_world_obj(t)``, the point p is at ``M p`` in camera coordinates, and
+``X1 = X0 + (M1 - M0) p``. Because ``X0 = Z0 (rx, ry, 1)`` with ``rx = (x - cx) / fx`` exact,
+
+    flow_x = fx (dX - rx dZ) / Z1,    (dX, dY, dZ) = (M1 - M0) p,    Z1 = Z0 + dZ,
+
+without subtracting two projections. ``M1 - M0`` is formed from the differences of the poses, so a pose that does not
+change contributes exactly nothing. What is left is about 1e-15 of the flow, plus the resolution of the poses themselves:
+a translation of size 1e6 units is stored to 1e-10 units, i.e. fx * 1e-10 / Z px.
+
+Back faces: a closed mesh whose material is not double-sided is not hit from behind; any other is, with the shading
+normal turned round. Textures are sampled bilinearly at their full resolution, without mip maps: mip maps are the GPU's way
+to anti-alias, not a property of the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy import ndimage
+
+from blinkgl.render.raycast import Forest, build_tree, join_trees, nearest_exhaustive, nearest_tree
+from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject, Texture
+
+LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
+# A visibility ray ends this much (relative) before the point it aims at, so that the point does not hide itself:
+# far above the rounding of a hit (1e-15), far below any separation of two surfaces that a picture could show.
+VISIBILITY_SLACK = 1e-9
+
+_trees: WeakKeyDictionary = WeakKeyDictionary()
+_forests: WeakKeyDictionary = WeakKeyDictionary()
+
+
+# ------------------------------------------------------------------------------------------------- rays and hits
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The surface points seen at N image points at one time.
+
+    xy : (N, 2) px.   t_ns : the time.   hit : (N,) bool.
+    depth : (N,) Z along the optical axis in world units, inf where nothing is hit.
+    instance : (N,) int32 ``instance_id``, 0 where nothing is hit.
+    part : (N,) int32 index into :func:`scene_parts`, -1 where nothing is hit.   triangle : (N,) int32 index into
+    ``mesh.faces``.   front : (N,) bool seen from the front.   bary : (N, 3) weights of the triangle's corners.
+    local : (N, 3) object-local position (float64, nan where nothing is hit).
+    """
+
+    xy: np.ndarray
+    t_ns: int
+    hit: np.ndarray
+    depth: np.ndarray
+    instance: np.ndarray
+    part: np.ndarray
+    triangle: np.ndarray
+    front: np.ndarray
+    bary: np.ndarray
+    local: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """Where the points of some :class:`Hits` are at t_ns (t').
+
+    flow : (..., 2) px, +x right, +y down, t -> t'; nan where not valid.
+    valid : hit, and in front of the camera at t' (Z' > 0).
+    occluded : hit, but not visible at t': hidden, seen from a culled side, outside the image, in front of the near
+    plane or behind the camera.   outside : hit, and not inside the image at t'.
+    depth : (...) Z' at t'.   hidden_by : (..., 2) int32 (part, triangle) of the nearest thing in the way, or -1.
+    """
+
+    t_ns: int
+    flow: np.ndarray
+    valid: np.ndarray
+    occluded: np.ndarray
+    outside: np.ndarray
+    depth: np.ndarray
+    hidden_by: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What the surface looks like at some :class:`Hits`.
+
+    normal : (..., 3) unit shading normal in world coordinates, on the camera's side.   uv : (..., 2) before uv_scale.
+    albedo, colour : (..., 3) linear light.   luminance : (...) Rec. 709 luma of colour.
+    Where nothing is hit: normal and uv nan, albedo 0, colour and luminance the scene's background.
+    """
+
+    normal: np.ndarray
+    uv: np.ndarray
+    albedo: np.ndarray
+    colour: np.ndarray
+    luminance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class ReferenceFrame:
+    """All buffers of one image; (H, W, ...) float64 unless said otherwise. See :class:`Hits`, :class:`Surface`,
+    :class:`Flow` for the fields. velocity : (H, W, 2) px/s at t, nan where nothing is hit.
+    forward, backward : flow to the times that were asked for, else None."""
+
+    t_ns: int
+    hit: np.ndarray
+    depth: np.ndarray
+    instance: np.ndarray
+    part: np.ndarray
+    triangle: np.ndarray
+    bary: np.ndarray
+    local: np.ndarray
+    normal: np.ndarray
+    uv: np.ndarray
+    albedo: np.ndarray
+    colour: np.ndarray
+    luminance: np.ndarray
+    velocity: np.ndarray
+    forward: Flow | None
+    backward: Flow | None
+
+
+def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
+    """Every part with its object, in the order that part indices count."""
+    return [(thing, part) for thing in scene.objects for part in thing.parts]
+
+
+def pixel_grid(camera: Camera) -> np.ndarray:
+    """(H * W, 2) float64 pixel centres, row by row."""
+    y, x = np.mgrid[0 : camera.height, 0 : camera.width]
+    return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+
+
+def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: bool = False) -> Hits:
+    """The nearest hit behind each image point.
+
+    xy : (N, 2) image points in px, not necessarily inside the image; every pixel centre when left out.
+    exhaustive : test every triangle (the slow twin of the hierarchy; the same answer bit for bit).
+    """
+    xy = pixel_grid(scene.camera) if xy is None else np.atleast_2d(np.asarray(xy, np.float64))
+    hit, bary, depth = _nearest(scene, t_ns, _rays(scene.camera, xy), exhaustive=exhaustive)
+    parts = scene_parts(scene)
+    found = hit[:, 0] >= 0
+    ids = np.array([thing.instance_id for thing, _ in parts] + [0], np.int32)
+    local = np.full((len(xy), 3), np.nan)
+    for p, rows in _by_part(hit[:, 0]):
+        mesh = parts[p][1].mesh
+        corners = np.asarray(mesh.vertices, np.float64)[mesh.faces[hit[rows, 1]]]
+        local[rows] = np.einsum("nc,nck->nk", bary[rows], corners)
+    return Hits(xy, int(t_ns), found, depth, ids[hit[:, 0]], hit[:, 0], hit[:, 1], hit[:, 2] == 1, bary, local)
+
+
+def _rays(camera: Camera, xy: np.ndarray) -> np.ndarray:
+    return (xy - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+
+
+def _forest(scene: Scene) -> Forest:
+    if scene not in _forests:
+        parts = scene_parts(scene)
+        for _, part in parts:
+            if part.mesh not in _trees:
+                _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
+        cull = [part.mesh.closed and not part.material.double_sided for _, part in parts]
+        _forests[scene] = join_trees([_trees[part.mesh] for _, part in parts], cull)
+    return _forests[scene]
+
+
+def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
+    """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`."""
+    forest = _forest(scene)
+    camera_pose = scene.camera.path.pose(t_ns)
+    # relative to the camera by differences of positions, so that a common offset from the origin cancels first
+    relative = [_relative_pose(camera_pose, thing.path.pose(t_ns)) for thing, _ in scene_parts(scene)]
+    axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
+    origins = np.array([-m[:3, :3].T @ m[:3, 3] for m in relative]).reshape(-1, 3)
+    n = len(rays)
+    far = np.full(n, np.inf) if far is None else far
+    skip = np.full((n, 2), -1, np.int32) if skip is None else skip
+    hit, bary, depth = np.empty((n, 3), np.int32), np.zeros((n, 3)), np.empty(n)
+    kernel = nearest_exhaustive if exhaustive else nearest_tree
+    kernel(
+        forest.triangles, forest.face, forest.lower, forest.upper, forest.child, forest.count,
+        forest.root, forest.first, forest.size, forest.cull, forest.extent,
+        origins, np.ascontiguousarray(axes), np.ascontiguousarray(rays), float(scene.camera.near), far, skip, hit, bary, depth,
+    )  # fmt: skip
+    return hit, bary, depth
+
+
+def _by_part(part: np.ndarray):
+    """(p, indices of the points on part p) for every part that was hit."""
+    return [(int(p), np.flatnonzero(part == p)) for p in np.unique(part) if p >= 0]
+
+
+# ------------------------------------------------------------------------------------------------- motion
+
+
+def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """(4, 4) inv(camera) @ body for rigid poses."""
+    m = np.eye(4)
+    m[:3, :3] = camera[:3, :3].T @ body[:3, :3]
+    m[:3, 3] = camera[:3, :3].T @ (body[:3, 3] - camera[:3, 3])
+    return m
+
+
+def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
+    """(3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
+    c0, c1 = scene.camera.path.pose(t0_ns), scene.camera.path.pose(t1_ns)
+    b0, b1 = thing.path.pose(t0_ns), thing.path.pose(t1_ns)
+    turn = (c1[:3, :3] - c0[:3, :3]).T
+    shift = (b1[:3, 3] - b0[:3, 3]) - (c1[:3, 3] - c0[:3, 3])
+    change = np.empty((3, 4))
+    change[:, :3] = c1[:3, :3].T @ (b1[:3, :3] - b0[:3, :3]) + turn @ b0[:3, :3]
+    change[:, 3] = c1[:3, :3].T @ shift + turn @ (b0[:3, 3] - c0[:3, 3])
+    return change
+
+
+def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
+    """(3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
+    c, dc = scene.camera.path.pose(t_ns), scene.camera.path.derivative(t_ns)
+    b, db = thing.path.pose(t_ns), thing.path.derivative(t_ns)
+    rate = np.empty((3, 4))
+    rate[:, :3] = dc[:3, :3].T @ b[:3, :3] + c[:3, :3].T @ db[:3, :3]
+    rate[:, 3] = dc[:3, :3].T @ (b[:3, 3] - c[:3, 3]) + c[:3, :3].T @ (db[:3, 3] - dc[:3, 3])
+    return rate
+
+
+def _apply(scene: Scene, hits: Hits, matrix_of) -> np.ndarray:
+    """(N, 3) matrix_of(object) (3, 4) applied to every object-local point; nan where nothing is hit."""
+    parts, out = scene_parts(scene), np.full((len(hits.hit), 3), np.nan)
+    for p, rows in _by_part(hits.part):
+        m = matrix_of(parts[p][0])
+        out[rows] = hits.local[rows] @ m[:3, :3].T + m[:3, 3]
+    return out
+
+
+def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
+    """Displacement of every hit point from ``hits.t_ns`` to t_ns, and whether it is seen there."""
+    camera = scene.camera
+    f = np.array([camera.fx, camera.fy])
+    rays = _rays(camera, hits.xy)
+    change = _apply(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
+    depth = hits.depth + change[:, 2]
+    valid = hits.hit & (depth > 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        flow = np.where(valid[:, None], f * (change[:, :2] - rays * change[:, 2:]) / depth[:, None], np.nan)
+        there = hits.xy + flow
+        inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
+
+    candidate = inside & (depth >= camera.near)
+    facing = _faces_camera(scene, hits, t_ns, candidate)
+    candidate &= facing
+    hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
+    rows = np.flatnonzero(candidate)
+    # the ray aims at the moved point itself: through there = xy + flow it would carry that sum's rounding
+    moved = _apply(scene, hits, lambda thing: relative_pose_at(scene, thing, t_ns))[rows]
+    skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
+    far = moved[:, 2] * (1.0 - VISIBILITY_SLACK)
+    blocker, _, _ = _nearest(scene, t_ns, moved[:, :2] / moved[:, 2:], far=far, skip=skip)
+    hidden_by[rows] = blocker[:, :2]
+    occluded = hits.hit & ~(candidate & (hidden_by[:, 0] < 0))
+    return Flow(int(t_ns), flow, valid, occluded, hits.hit & ~inside, depth, hidden_by)
+
+
+def velocity(scene: Scene, hits: Hits) -> np.ndarray:
+    """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
+    f = np.array([scene.camera.fx, scene.camera.fy])
+    rate = _apply(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
+    with np.errstate(invalid="ignore"):
+        return f * (rate[:, :2] - _rays(scene.camera, hits.xy) * rate[:, 2:]) / hits.depth[:, None]
+
+
+def relative_pose_at(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
+    """(4, 4) T_cam_obj at t_ns."""
+    return _relative_pose(scene.camera.path.pose(t_ns), thing.path.pose(t_ns))
+
+
+def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:
+    """(N,) bool: the triangle of each hit is drawn from where the camera is at t_ns (False only for culled ones)."""
+    shown = np.ones(len(rows), bool)
+    for p, (thing, part) in enumerate(scene_parts(scene)):
+        on = np.flatnonzero(rows & (hits.part == p))
+        if len(on) and part.mesh.closed and not part.material.double_sided:
+            m = relative_pose_at(scene, thing, t_ns)
+            eye = -m[:3, :3].T @ m[:3, 3]
+            a, b, c = np.moveaxis(np.asarray(part.mesh.vertices, np.float64)[part.mesh.faces[hits.triangle[on]]], 1, 0)
+            shown[on] = (np.cross(b - a, c - a) * (eye - a)).sum(axis=1) > 0.0
+    return shown
+
+
+# ------------------------------------------------------------------------------------------------- appearance
+
+
+def surface(scene: Scene, hits: Hits) -> Surface:
+    """Normals, texture coordinates, albedo and radiance at every hit."""
+    n = len(hits.hit)
+    normal, uv = np.full((n, 3), np.nan), np.full((n, 2), np.nan)
+    albedo, colour = np.zeros((n, 3)), np.full((n, 3), float(scene.background))
+    parts = scene_parts(scene)
+    for p, rows in _by_part(hits.part):
+        thing, part = parts[p]
+        corners = part.mesh.faces[hits.triangle[rows]]
+        bary = hits.bary[rows]
+        blend = np.einsum("nc,nck->nk", bary, part.mesh.normals[corners].astype(np.float64))
+        length = np.linalg.norm(blend, axis=1, keepdims=True)
+        sign = np.where(hits.front[rows], 1.0, -1.0)[:, None]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T
+        uv[rows] = np.einsum("nc,nck->nk", bary, part.mesh.uvs[corners].astype(np.float64))
+        albedo[rows] = sample_albedo(part.material, uv[rows])
+        colour[rows] = albedo[rows] * (1.0 if part.material.unlit else irradiance(scene, normal[rows])[:, None])
+    return Surface(normal, uv, albedo, colour, colour @ LUMA)
+
+
+def irradiance(scene: Scene, normal: np.ndarray) -> np.ndarray:
+    """(...) E(n) of the scene's light for (..., 3) unit normals."""
+    light = scene.light
+    return light.sun * np.maximum(0.0, normal @ np.asarray(light.sun_direction)) + light.sky * (0.5 + 0.5 * normal[..., 2])
+
+
+def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:
+    """(N, 3) linear albedo at (N, 2) texture coordinates."""
+    base = np.asarray(material.base_color, np.float64)
+    if material.texture is None:
+        return np.broadcast_to(base, (len(uv), 3)).copy()
+    return sample_bilinear(material.texture, uv * np.asarray(material.uv_scale)) * base
+
+
+def sample_bilinear(texture: Texture, uv: np.ndarray) -> np.ndarray:
+    """(N, 3) linear light, bilinear over the four nearest texels, repeating; texel centres at (i + 0.5) / size."""
+    image = texture.image
+    size = np.array([image.shape[1], image.shape[0]])
+    at = uv * size - 0.5
+    low = np.floor(at)
+    frac = at - low
+    x0, y0 = np.mod(low, size).astype(np.int64).T
+    x1, y1 = (x0 + 1) % size[0], (y0 + 1) % size[1]
+    fx, fy = frac[:, :1], frac[:, 1:]
+
+    def texel(y, x):
+        values = image[y, x]
+        return _SRGB_TO_LINEAR[values] if values.dtype == np.uint8 else values.astype(np.float64)
+
+    top = texel(y0, x0) * (1.0 - fx) + texel(y0, x1) * fx
+    bottom = texel(y1, x0) * (1.0 - fx) + texel(y1, x1) * fx
+    return top * (1.0 - fy) + bottom * fy
+
+
+def srgb_to_linear(v: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1 decoding of values in [0, 1]."""
+    v = np.asarray(v, np.float64)
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+
+
+_SRGB_TO_LINEAR = srgb_to_linear(np.arange(256) / 255.0)
+
+
+# ------------------------------------------------------------------------------------------------- whole images
+
+
+def render(
+    scene: Scene,
+    t_ns: int,
+    *,
+    forward_ns: int | None = None,
+    backward_ns: int | None = None,
+    exhaustive: bool = False,
+) -> ReferenceFrame:
+    """Every buffer at t_ns, with the flow to forward_ns and to backward_ns where given."""
+    camera = scene.camera
+    hits = cast(scene, t_ns, exhaustive=exhaustive)
+    looks = surface(scene, hits)
+
+    def image(values):
+        return values.reshape(camera.height, camera.width, *values.shape[1:])
+
+    def flow(to_ns):
+        if to_ns is None:
+            return None
+        result = flow_to(scene, hits, to_ns)
+        return Flow(result.t_ns, *(image(getattr(result, name)) for name in _FLOW_IMAGES))
+
+    from_hits = {name: image(getattr(hits, name)) for name in _HIT_IMAGES}
+    from_looks = {name: image(getattr(looks, name)) for name in ("normal", "uv", "albedo", "colour", "luminance")}
+    return ReferenceFrame(
+        t_ns=int(t_ns),
+        **from_hits,
+        **from_looks,
+        velocity=image(velocity(scene, hits)),
+        forward=flow(forward_ns),
+        backward=flow(backward_ns),
+    )
+
+
+_HIT_IMAGES = ("hit", "depth", "instance", "part", "triangle", "bary", "local")
+_FLOW_IMAGES = ("flow", "valid", "occluded", "outside", "depth", "hidden_by")
+
+
+def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: float = 0.02) -> np.ndarray:
+    """(H, W) bool: pixels within ``width`` px (8-neighbourhood) of an id change or a jump in depth.
+
+    ids : (H, W) integers.   depth : (H, W), inf or nan where nothing is hit.   A jump is a second difference of 1 / Z
+    along x or y above ``jump`` of its largest value there: 1 / Z is affine in the image of a plane, however steep the plane
+    is seen, so that slanted ground is not taken for an edge.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.nan_to_num(1.0 / np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    band = np.zeros(ids.shape, bool)
+    for axis in (0, 1):
+        i, z, b = np.swapaxes(ids, 0, axis), np.swapaxes(inverse, 0, axis), np.swapaxes(band, 0, axis)
+        change = i[1:] != i[:-1]
+        b[1:] |= change
+        b[:-1] |= change
+        bend = np.abs(z[2:] - 2.0 * z[1:-1] + z[:-2]) > jump * np.maximum(np.maximum(z[2:], z[1:-1]), z[:-2])
+        b[1:-1] |= bend
+    diagonal = ids[1:, 1:] != ids[:-1, :-1]
+    other = ids[1:, :-1] != ids[:-1, 1:]
+    band[1:, 1:] |= diagonal
+    band[:-1, :-1] |= diagonal
+    band[1:, :-1] |= other
+    band[:-1, 1:] |= other
+    return ndimage.binary_dilation(band, np.ones((3, 3)), iterations=width - 1) if width > 1 else band

@@ -1,0 +1,273 @@
+"""``scene:`` of the YAML: a random world, an explicit scene, or a scene file.
+
+Relative paths are resolved against the YAML file's folder by :mod:`blinkgl.scene.build`, which also finds out
+whether they exist; the models here only know shapes, units and limits.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Union
+
+from pydantic import AfterValidator, Field, model_validator
+
+from blinkgl.config.base import Config
+
+PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
+TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
+
+PrimitiveKind = Literal["cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid"]
+TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
+
+
+def _ordered(value: tuple[float, float]) -> tuple[float, float]:
+    if value[0] > value[1]:
+        raise ValueError("the range must be [smallest, largest]")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0)]
+Unsigned = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
+UnsignedRange = Annotated[tuple[Unsigned, Unsigned], AfterValidator(_ordered)]
+Vector3 = tuple[float, float, float]
+Color = tuple[Fraction, Fraction, Fraction]
+
+
+class ObjectsConfig(Config):
+    """The random world's objects."""
+
+    count: int = Field(14, ge=0, le=1000, description="number of objects")
+    size: PositiveRange = Field((0.5, 2.5), description="diameter of an object's bounding sphere, m; log-uniform")
+    distance: PositiveRange = Field((2.0, 20.0), description="distance from the camera's first position, m; log-uniform")
+    flying: Fraction = Field(0.5, description="fraction that flies; the others rest on the ground")
+    moving: Fraction = Field(0.7, description="fraction that moves")
+    in_view: Fraction = Field(0.85, description="fraction placed in the camera's first field of view; the others anywhere around it")
+    tint: Fraction = Field(0.3, description="strength of the random colour factor on each object's texture")
+    texture_scale: PositiveRange = Field((0.7, 2.0), description="texture repeats over an object's texture coordinates; log-uniform")
+
+
+class PoolConfig(Config):
+    """Where the random world's objects come from."""
+
+    primitives: Literal["all"] | tuple[PrimitiveKind, ...] = Field("all", description="'all' or a list of kinds; [] for none")
+    variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
+    folders: tuple[str, ...] = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
+    urdfs: Literal["auto"] | bool = Field("auto", description="pybullet's random_urdfs: auto uses them when the wheel is installed")
+    max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
+    max_file_mb: float = Field(512.0, gt=0, description="a larger mesh file is refused unread")
+    test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
+    keep_materials: bool = Field(False, description="use the meshes' own colours and textures where they have any")
+    bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unusable mesh and draws another")
+
+
+class TexturesConfig(Config):
+    """Where the random world's textures come from."""
+
+    procedural: bool | tuple[TextureKind, ...] = Field(True, description="true, false or a list of kinds")
+    variants: int = Field(40, ge=1, le=100_000, description="textures of each procedural kind")
+    photographs: bool = Field(True, description="the photographs bundled with scikit-image")
+    folders: tuple[str, ...] = Field((), description="folders searched recursively for images (also .hdr)")
+    max_size: int = Field(512, ge=8, le=8192, description="longer image sides are reduced to this, px")
+    test_fraction: Fraction = Field(0.1, description="fraction of textures kept for split 'test', chosen by content hash")
+    bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unreadable image and draws another")
+
+
+class SkyConfig(Config):
+    """Textured box around everything, seen from inside, unlit."""
+
+    kind: Literal["box"] = "box"
+    size: float = Field(100.0, gt=0, le=1e6, description="edge length, m")
+    subdivisions: int = Field(16, ge=1, le=256, description="cells per edge; huge triangles cost flow precision")
+    repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
+    per_face: bool = Field(True, description="a texture of its own on each face, or one on all")
+    brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
+    panoramas: tuple[str, ...] = Field((), description="equirectangular images or folders of them (jpg, png, hdr) used instead of the texture pool")
+
+
+class GroundConfig(Config):
+    """Textured square at a constant height."""
+
+    size: float | None = Field(None, gt=0, le=1e6, description="edge length, m; null: as the sky box")
+    height: float = Field(0.0, description="z of the ground, m")
+    subdivisions: int = Field(32, ge=1, le=1024, description="cells per edge")
+    tile: PositiveRange = Field((2.0, 8.0), description="edge of one texture repeat, m; log-uniform")
+
+
+class WallsConfig(Config):
+    """Textured vertical slabs on the sides of the region."""
+
+    count: int = Field(0, ge=0, le=4, description="how many of the region's four sides have a wall")
+    height: PositiveRange = Field((1.5, 5.0), description="m; uniform")
+    thickness: float = Field(0.3, gt=0, description="m")
+    tile: PositiveRange = Field((2.0, 6.0), description="edge of one texture repeat, m; log-uniform")
+
+
+class RegionConfig(Config):
+    """Box in which the camera and the objects live, centred on the z axis, standing on the ground."""
+
+    width: float = Field(30.0, gt=0, le=1e6, description="edge in x and y, m")
+    height: float = Field(8.0, gt=0, le=1e6, description="m")
+    camera_height: PositiveRange = Field((1.0, 3.5), description="camera's first height above the ground, m; uniform")
+
+
+class LightConfig(Config):
+    """One white sun and a sky: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)."""
+
+    sun: float = Field(0.8, ge=0, description="strength of the sun, radiance of a white facing surface")
+    sky: float = Field(0.4, ge=0, description="strength of the sky")
+    sun_elevation: float | None = Field(None, ge=-90, le=90, description="degrees above the horizon; null: random in [25, 80] (60 where nothing is random)")
+    sun_azimuth: float | None = Field(None, ge=-360, le=360, description="degrees from +x towards +y; null: random (40 where nothing is random)")
+    unlit: bool = Field(False, description="radiance = albedo on every surface")
+
+
+class RandomSceneConfig(Config):
+    """A random world, as in the paper: objects from a pool between sky and ground."""
+
+    kind: Literal["random"] = "random"
+    objects: ObjectsConfig = ObjectsConfig()
+    pool: PoolConfig = PoolConfig()
+    textures: TexturesConfig = TexturesConfig()
+    region: RegionConfig = RegionConfig()
+    sky: SkyConfig | None = Field(SkyConfig(), description="null: none, the background is seen")
+    ground: GroundConfig | None = Field(GroundConfig(), description="null: none; then every object flies")
+    walls: WallsConfig | bool = Field(False, description="true: four walls")
+    light: LightConfig = LightConfig()
+    background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
+
+    @model_validator(mode="after")
+    def _fits(self):
+        if self.sky is not None and self.sky.size < 1.2 * self.region.width:
+            raise ValueError(f"sky.size {self.sky.size:g} must be at least 1.2 times region.width {self.region.width:g}")
+        if self.region.camera_height[0] >= self.region.height:
+            raise ValueError(f"region.camera_height must begin below region.height {self.region.height:g}")
+        if self.objects.size[0] >= self.region.height:
+            raise ValueError(f"objects.size must begin below region.height {self.region.height:g}")
+        return self
+
+
+class PoseConfig(Config):
+    """Position, and at most one way to say the orientation."""
+
+    position: Vector3 = Field((0.0, 0.0, 0.0), description="m")
+    quaternion: tuple[float, float, float, float] | None = Field(None, description="[w, x, y, z], need not be normalised")
+    euler: Vector3 | None = Field(None, description="degrees about the fixed x, y, z axes, applied in this order")
+    look_at: Vector3 | None = Field(None, description="point that the camera's z axis, or an object's x axis, is turned to")
+
+    @model_validator(mode="after")
+    def _one_orientation(self):
+        given = [k for k in ("quaternion", "euler", "look_at") if getattr(self, k) is not None]
+        if len(given) > 1:
+            raise ValueError("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
+        if self.quaternion is not None and sum(q * q for q in self.quaternion) < 1e-12:
+            raise ValueError("a quaternion must not be zero")
+        if self.look_at is not None and max(abs(a - b) for a, b in zip(self.look_at, self.position)) < 1e-9:
+            raise ValueError("look_at must differ from the position")
+        return self
+
+
+class KeyframeConfig(PoseConfig):
+    time: float = Field(description="s; 0 is the first label")
+
+
+class MotionConfig(PoseConfig):
+    """A fixed pose, or key frames joined by a C2 spline; before the first and after the last the pose is held."""
+
+    keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
+
+    @model_validator(mode="after")
+    def _keyframes(self):
+        times = [k.time for k in self.keyframes]
+        if len(times) == 1:
+            raise ValueError("one key frame is no motion; give two or more, or a fixed pose")
+        if any(b - a < 1e-6 for a, b in zip(times, times[1:])):
+            raise ValueError("the key frames' times must increase by at least 1e-6 s")
+        if times and (self.model_fields_set & {"position", "quaternion", "euler", "look_at"}):
+            raise ValueError("give a fixed pose or keyframes, not both")
+        return self
+
+
+class MeshConfig(Config):
+    """A primitive with its parameters, or a file."""
+
+    primitive: Literal[PrimitiveKind, "grid"] | None = Field(None, description="kind of primitive")
+    parameters: dict[str, float | int | Vector3] = Field({}, description="the primitive's keyword arguments, see blinkgl.scene.primitives")
+    file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
+    project_uvs: bool = Field(False, description="replace the file's texture coordinates by a box projection")
+    uv_size: float = Field(1.0, gt=0, description="edge of one repeat of projected texture coordinates, in the mesh's units")
+
+    @model_validator(mode="after")
+    def _one(self):
+        if (self.primitive is None) == (self.file is None):
+            raise ValueError("give exactly one of primitive and file")
+        if self.file is not None and self.parameters:
+            raise ValueError("parameters belong to a primitive, not to a file")
+        return self
+
+
+class MaterialConfig(Config):
+    """A colour, times at most one texture."""
+
+    texture: str | None = Field(None, description="image file, sRGB, or .hdr, linear")
+    procedural: TextureKind | None = Field(None, description="kind of procedural texture")
+    seed: int = Field(0, ge=0, description="which procedural texture of that kind")
+    photograph: str | None = Field(None, description="name of a photograph bundled with scikit-image, such as astronaut")
+    max_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
+    color: tuple[Unsigned, Unsigned, Unsigned] = Field((1.0, 1.0, 1.0), description="linear factor")
+    uv_scale: tuple[float, float] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
+    unlit: bool = Field(False, description="radiance = albedo, whatever the light")
+    double_sided: bool = Field(False, description="draw back faces, with the normal turned round")
+
+    @model_validator(mode="after")
+    def _one(self):
+        given = [k for k in ("texture", "procedural", "photograph") if getattr(self, k) is not None]
+        if len(given) > 1:
+            raise ValueError("only one of texture, procedural, photograph may be given, not " + " and ".join(given))
+        return self
+
+
+class ObjectConfig(MotionConfig):
+    """One object of an explicit scene."""
+
+    name: str | None = Field(None, description="null: the mesh's name")
+    mesh: str = Field(description="a name under scene.meshes")
+    material: str | None = Field(None, description="a name under scene.materials; null: the file's own materials")
+    scale: float | Annotated[tuple[Positive, Positive, Positive], Field()] = Field(1.0, description="factor on the mesh, one or per axis")
+    category: Literal["object", "ground", "wall", "sky"] = "object"
+
+    @model_validator(mode="after")
+    def _scale(self):
+        if isinstance(self.scale, float) and self.scale <= 0:
+            raise ValueError("scale must be greater than 0")
+        return self
+
+
+class ExplicitSceneConfig(Config):
+    """A custom scene: named meshes and materials, objects with poses or key frames, the camera likewise."""
+
+    kind: Literal["explicit"]
+    meshes: dict[str, MeshConfig] = Field({}, description="by name")
+    materials: dict[str, MaterialConfig] = Field({}, description="by name")
+    objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="at least one")
+    camera: MotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
+    light: LightConfig = LightConfig()
+    background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
+    max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
+
+
+class FileSceneConfig(Config):
+    """A finished glTF/GLB scene with its cameras, materials and node animations."""
+
+    kind: Literal["file"]
+    path: str = Field(description="gltf or glb file")
+    camera: str | int | None = Field(None, description="name or index of the file's camera; null: the first")
+    pose: MotionConfig | None = Field(None, description="camera motion used instead of the file's camera (z-up world)")
+    intrinsics: Literal["config", "file"] = Field("config", description="focal length from the YAML's camera or from the file's (yfov)")
+    animation: str | int | None = Field(0, description="name or index of the animation played; null: none")
+    light: LightConfig = LightConfig()
+    background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
+    max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")
+    max_texture_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
+
+
+SceneConfig = Annotated[Union[RandomSceneConfig, ExplicitSceneConfig, FileSceneConfig], Field(discriminator="kind")]

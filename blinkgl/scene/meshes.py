@@ -1,0 +1,298 @@
+"""From any triangles to a valid :class:`~blinkgl.scene.types.Mesh`: checked, cleaned, with normals and texture
+coordinates, and known to be closed or not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.types import Mesh
+
+CREASE_DEGREES = 40.0
+WELD_RELATIVE = 1e-6        # vertices nearer than this times the extent are one point when topology is asked for
+_MAX_COORDINATE = 1e15      # squares of larger coordinates lose all meaning in float32 and overflow soon after
+
+
+def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | None = None, uvs: np.ndarray | None = None,
+              name: str = "", source_hash: str = "", where: str | None = None, max_faces: int | None = None,
+              crease_degrees: float = CREASE_DEGREES, uv_size: float | None = None, project_degenerate: bool = False,
+              log: list[str] | None = None) -> Mesh:
+    """A valid mesh from raw triangles.
+
+    Parameters
+    ----------
+    vertices : (V, 3) any float, object-local.   faces : (F, 3) any int, counter-clockwise seen from outside.
+    normals : (V, 3) or None: made from the faces, angle-weighted, split where faces meet at more than
+        ``crease_degrees`` (so a cuboid stays flat and a sphere smooth).
+    uvs : (V, 2), v down, or None: box projection (:func:`box_project`).
+    uv_size : edge of one repeat of projected texture coordinates, in the mesh's units; None: the largest side of the
+        bounding box, so that the texture covers the mesh once.
+    project_degenerate : also project when the given coordinates cannot carry a texture (:func:`uvs_degenerate`). They
+        are kept otherwise, because palette textures use exactly such coordinates.
+    log : gets a line for each repair.
+
+    Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is turned round.
+    Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, too many
+    or no faces.
+    """
+    where = where or name or "mesh"
+    log = [] if log is None else log
+    vertices = np.array(vertices, dtype=np.float64)
+    faces = np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or (faces.size and (faces.ndim != 2 or faces.shape[1] != 3)):
+        raise AssetError(f"vertices {vertices.shape} and faces {faces.shape} are no triangle mesh", where=where)
+    if faces.size == 0:
+        raise AssetError("the mesh has no faces", where=where, accepted="a mesh with triangles")
+    if max_faces is not None and len(faces) > max_faces:
+        raise AssetError("the mesh has too many faces", where=where, value=len(faces), accepted=f"at most {max_faces}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise AssetError(f"a face refers to a vertex outside 0..{len(vertices) - 1}", where=where)
+    faces = faces.astype(np.int64)
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    bad = used & ~(np.abs(vertices) < _MAX_COORDINATE).all(axis=1)   # NaN compares false
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        raise AssetError(f"{int(bad.sum())} vertices are NaN, infinite or beyond {_MAX_COORDINATE:g}, the first is {first}",
+                         where=where, value=vertices[first].tolist(), accepted="finite coordinates")
+
+    vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
+    normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
+    uvs_given = uvs is not None
+    uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
+
+    kept = _faces_with_area(vertices, faces)
+    if not kept.any():
+        raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
+    if not kept.all():
+        log.append(f"{where}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
+        faces = faces[kept]
+
+    if normals is not None and not _usable_normals(normals, vertices, faces):
+        log.append(f"{where}: the normals are unusable, made new ones")
+        normals = None
+    if uvs_given:
+        broken = uvs is None or not np.isfinite(uvs[faces]).all()
+        if broken or (project_degenerate and uvs_degenerate(vertices, faces, uvs)):
+            log.append(f"{where}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones")
+            uvs = None
+
+    # From here on corner attributes: (F, 3, …), welded to vertices at the end.
+    points, welded = weld(vertices, faces)
+    closed, inside_out = closedness(points, welded)
+    corner_normals = crease_normals(vertices, faces, welded, crease_degrees) if normals is None else np.asarray(normals, np.float64)[faces]
+    corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
+    if inside_out:
+        log.append(f"{where}: the mesh was inside out, turned round")
+        faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
+        if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
+            corner_normals = -corner_normals
+    return _from_corners(vertices[faces], corner_normals, corner_uvs, closed=closed, name=name, source_hash=source_hash)
+
+
+def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F,) bool. A sliver is judged against its own longest edge, so that small meshes are not dropped."""
+    corners = vertices[faces]
+    edges = corners - np.roll(corners, 1, axis=1)
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    scale = np.where(longest > 0, longest, 1.0)[:, None, None]
+    edges = edges / scale
+    twice_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    floor = 1e-14 * max(float(np.abs(corners).max()), 1e-300)
+    return (twice_area > 1e-10) & (longest > floor)
+
+
+def _face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(F, 3) outward vectors of twice the area."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def _usable_normals(normals: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> bool:
+    normals = np.asarray(normals, np.float64)
+    if normals.shape != vertices.shape:
+        return False
+    length = np.linalg.norm(normals[faces], axis=2)
+    return bool(np.isfinite(length).all() and (length > 1e-6).all())
+
+
+def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((P, 3) float64 points, (F, 3) int64 faces over them): coinciding vertices are one point, because files split
+    vertices at seams and between materials."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    step = max(float((high - low).max()) * WELD_RELATIVE, 1e-300)
+    cells = np.round((vertices - low) / step).astype(np.int64)      # below 2**20 each: one int64 holds all three
+    _, first, index = np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True, return_inverse=True)
+    return vertices[first], index.reshape(-1)[faces]
+
+
+def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
+    """(closed, inside_out) of a welded mesh.
+
+    Closed: every directed edge is met as often as its reverse (an oriented surface without a boundary, which also
+    admits solids that touch along an edge), and every shell has a positive volume or lies inside the bounding box of one
+    that has.
+    """
+    alive = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
+    welded = welded[alive]
+    if not len(welded):
+        return False, False
+    count = len(points)
+    start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
+    if not np.array_equal(np.sort(start * count + end), np.sort(end * count + start)):
+        return False, False
+    _, shell = connected_components(coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count)), directed=False)
+    a, b, c = ((points - points.mean(axis=0))[welded[:, i]] for i in range(3))
+    volumes = np.bincount(shell[welded[:, 0]], weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
+    inside_out = bool(volumes.sum() < 0)
+    volumes = -volumes if inside_out else volumes
+    shells = np.unique(shell[welded[:, 0]])
+    hollow = [s for s in shells if volumes[s] <= 0]
+    if len(hollow) == len(shells) or len(hollow) > 64:
+        return False, False
+    boxes = {s: (points[shell == s].min(axis=0), points[shell == s].max(axis=0)) for s in shells} if hollow else {}
+    for s in hollow:
+        low, high = boxes[s]
+        if not any(volumes[o] > 0 and (boxes[o][0] <= low).all() and (boxes[o][1] >= high).all() for o in shells):
+            return False, False
+    return True, inside_out
+
+
+def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
+    """(F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point that are
+    joined by edges bent less than ``crease_degrees``."""
+    cross = _face_cross(vertices, faces)
+    unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
+    corners = vertices[faces]
+    to_next = np.roll(corners, -1, axis=1) - corners
+    to_previous = np.roll(corners, 1, axis=1) - corners
+    angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))   # (F, 3)
+
+    # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
+    count = len(faces)
+    a, b = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    order = np.lexsort((high, low))
+    same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
+    first, second = order[:-1][same], order[1:][same]             # edge numbers 3*face + k
+    smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > np.cos(np.radians(crease_degrees))
+    first, second = first[smooth], second[smooth]
+    f_next, s_next = first - first % 3 + (first % 3 + 1) % 3, second - second % 3 + (second % 3 + 1) % 3
+    # The edge's two ends: joined corners are those at the same welded point (faces may be wound either way).
+    direct = a[first] == a[second]
+    left = np.concatenate([first, f_next])
+    right = np.concatenate([np.where(direct, second, s_next), np.where(direct, s_next, second)])
+    _, fan = connected_components(coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(3 * count, 3 * count)), directed=False)
+    weighted = (unit[:, None, :] * angle[:, :, None]).reshape(-1, 3)
+    total = np.stack([np.bincount(fan, weights=weighted[:, i], minlength=fan.max() + 1) for i in range(3)], axis=1)[fan]
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    flat = np.repeat(unit, 3, axis=0)
+    return np.where(length > 1e-9, total / np.maximum(length, 1e-300), flat).reshape(count, 3, 3)
+
+
+# Seen from outside, with z (for ±z: y) up: (axis, sign) -> the axis and sign that point right, the axis that points up.
+_BOX_SIDES = {(0, 1): (1, 1, 2), (0, -1): (1, -1, 2), (1, 1): (0, -1, 2), (1, -1): (0, 1, 2), (2, 1): (0, 1, 1), (2, -1): (0, -1, 1)}
+
+
+def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None = None) -> np.ndarray:
+    """(F, 3, 2) float64 corner texture coordinates: each face is projected along the axis nearest to its normal, never
+    mirrored, upright (z up). One repeat measures ``uv_size``; by default the largest side of the bounding box, then the
+    coordinates lie in [0, 1]."""
+    low, high = vertices[faces].min(axis=(0, 1)), vertices[faces].max(axis=(0, 1))
+    size = float((high - low).max()) if uv_size is None else float(uv_size)
+    centred = (vertices[faces] - (low + high) / 2) / max(size, 1e-300)
+    normal = _face_cross(vertices, faces)
+    axis = np.abs(normal).argmax(axis=1)
+    sign = np.where(np.take_along_axis(normal, axis[:, None], 1)[:, 0] < 0, -1, 1)
+    uvs = np.empty((len(faces), 3, 2))
+    for (side_axis, side_sign), (right, right_sign, up) in _BOX_SIDES.items():
+        here = (axis == side_axis) & (sign == side_sign)
+        uvs[here, :, 0] = 0.5 + right_sign * centred[here][:, :, right]
+        uvs[here, :, 1] = 0.5 - centred[here][:, :, up]
+    return uvs
+
+
+def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> bool:
+    """True when more than half of the surface has (next to) no area in the texture."""
+    a, b, c = (uvs[faces[:, i]] for i in range(3))
+    uv_area = np.abs((b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0]))
+    area = np.linalg.norm(_face_cross(vertices, faces), axis=1)
+    return bool(area[uv_area < 1e-10].sum() > 0.5 * area.sum())
+
+
+def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, **fields) -> Mesh:
+    """Corners with equal position, normal and coordinates become one vertex."""
+    positions = positions.reshape(-1, 3)
+    normals = normals.reshape(-1, 3)
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    uvs = uvs.reshape(-1, 2).astype(np.float32)
+    # Adding 0.0 turns -0.0 into 0.0, which would otherwise split vertices. Normals are compared to 1e-5: float noise.
+    rows = np.concatenate([(positions + 0.0).view(np.int64), np.round(normals * 1e5).astype(np.int64), (uvs + 0.0).view(np.int32).astype(np.int64)], axis=1)
+    _, first, index = np.unique(np.ascontiguousarray(rows).view([("", np.int64)] * 8).ravel(), return_index=True, return_inverse=True)
+    # Vertices in order of first use: good for the vertex cache, and independent of how np.unique sorts.
+    order = np.argsort(first, kind="stable")
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    first = first[order]
+    return Mesh(vertices=positions[first], faces=rank[index.reshape(-1)].reshape(-1, 3).astype(np.int32),
+                normals=normals[first], uvs=uvs[first], **fields)
+
+
+def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+    """Mesh under an affine (4, 4) or linear (3, 3) map; a mirroring one turns the faces round so that they keep facing out."""
+    matrix = np.asarray(matrix, np.float64)
+    linear = matrix[:3, :3]
+    vertices = mesh.vertices @ linear.T + (matrix[:3, 3] if matrix.shape[0] == 4 else 0.0)
+    determinant = float(np.linalg.det(linear))
+    if not np.isfinite(determinant) or determinant == 0.0:
+        raise AssetError("a transform flattens the mesh (determinant 0)", where=mesh.name or "mesh")
+    normals = mesh.normals @ np.linalg.inv(linear)
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    faces = mesh.faces if determinant > 0 else np.ascontiguousarray(mesh.faces[:, ::-1])
+    return replace(mesh, vertices=vertices, faces=faces, normals=normals)
+
+
+def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
+    return replace(mesh, vertices=mesh.vertices * scale)
+
+
+def bounds(meshes) -> tuple[np.ndarray, np.ndarray]:
+    """((3,), (3,)) corners of the common bounding box."""
+    return (np.min([m.vertices.min(axis=0) for m in meshes], axis=0), np.max([m.vertices.max(axis=0) for m in meshes], axis=0))
+
+
+def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]:
+    """The meshes of one object together, moved so that the bounding box is centred on the origin and scaled to bounding
+    radius 1."""
+    low, high = bounds(meshes)
+    centre = (low + high) / 2
+    radius = max(float(np.sqrt(((m.vertices - centre) ** 2).sum(axis=1).max())) for m in meshes)
+    if not radius > 0:
+        raise AssetError("the mesh has no extent", where=where)
+    return tuple(replace(m, vertices=(m.vertices - centre) / radius) for m in meshes)
+
+
+def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:
+    """One mesh of several; closed when they are closed together (see :func:`closed_together`)."""
+    if len(meshes) == 1:
+        return replace(meshes[0], name=name or meshes[0].name, source_hash=source_hash or meshes[0].source_hash)
+    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    return Mesh(vertices=np.concatenate([m.vertices for m in meshes]),
+                faces=np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.int32),
+                normals=np.concatenate([m.normals for m in meshes]), uvs=np.concatenate([m.uvs for m in meshes]),
+                closed=closed_together(meshes), name=name, source_hash=source_hash)
+
+
+def closed_together(meshes: tuple[Mesh, ...]) -> bool:
+    """Whether the union of the meshes is closed: files often split one solid by material."""
+    if all(m.closed for m in meshes):
+        return True
+    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    vertices = np.concatenate([m.vertices for m in meshes])
+    faces = np.concatenate([m.faces.astype(np.int64) + o for m, o in zip(meshes, offsets)])
+    closed, inside_out = closedness(*weld(vertices, faces))
+    return closed and not inside_out

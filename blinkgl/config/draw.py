@@ -1,0 +1,123 @@
+"""Parameters that differ from sequence to sequence.
+
+Anywhere a plain value may stand, the YAML may hold a distribution instead; it is drawn once per sequence and
+the drawn value is what the sequence's own ``config.yaml`` records:
+
+    contrast_threshold: {uniform: [0.18, 0.25]}     # float in [a, b)
+    log_eps: {log_uniform: [1.0e-4, 1.0e-2]}        # float, uniform in log
+    count: {integer: [8, 16]}                       # integer, both ends included
+    emulator: {choice: [esim, v2e]}                 # one of the list, equal chances
+    emulator: {weighted: {esim: 3, v2e: 1}}         # one of the keys, chances in proportion
+
+Each path draws from its own stream (seed, sequence, path), so adding one distribution changes no other draw.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import Any
+
+import numpy as np
+
+from blinkgl.errors import ConfigError
+from blinkgl.rng import Role
+
+_KINDS = ("uniform", "log_uniform", "integer", "choice", "weighted")
+
+
+def is_distribution(node: Any) -> bool:
+    return isinstance(node, dict) and len(node) == 1 and next(iter(node)) in _KINDS
+
+
+def draw(tree: Any, seed: int, sequence: int) -> Any:
+    """``tree`` (plain YAML data) with every distribution replaced by the value drawn for ``sequence``.
+
+    Raises ConfigError (with the path) for a malformed distribution."""
+    return _walk(tree, (), lambda path, kind, spec: _draw_one(path, kind, spec, seed, sequence))
+
+
+def extremes(tree: Any) -> list[Any]:
+    """Plain trees that pin all distributions to their lower, then upper ends, and each option of every choice in
+    turn, so that a range whose end is not accepted is refused before any work starts."""
+    most = [1]
+
+    def pick(index: int):
+        def one(path, kind, spec):
+            _check(path, kind, spec)
+            options = list(spec)
+            most[0] = max(most[0], len(options))
+            return options[min(index, len(options) - 1)]
+        return one
+
+    trees, index = [], 0
+    while index < most[0]:
+        trees.append(_walk(tree, (), pick(index)))
+        index += 1
+    return trees
+
+
+def _walk(node: Any, path: tuple[str, ...], replace) -> Any:
+    if is_distribution(node):
+        kind, spec = next(iter(node.items()))
+        value = replace(path, kind, spec)
+        return _walk(value, path, replace)  # a choice may hold further distributions
+    if isinstance(node, dict):
+        return {key: _walk(value, (*path, str(key)), replace) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_walk(value, (*path, str(i)), replace) for i, value in enumerate(node)]
+    return node
+
+
+def _number(x: Any) -> float:
+    if isinstance(x, bool) or not isinstance(x, (int, float, str)):
+        raise ValueError
+    value = float(x)
+    if not math.isfinite(value):
+        raise ValueError
+    return value
+
+
+def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
+    where = ".".join((*path, kind))
+    if kind == "choice":
+        if not isinstance(spec, list) or not spec:
+            raise ConfigError("not a list of choices", where=where, value=spec, accepted="a non-empty list")
+        return
+    if kind == "weighted":
+        try:
+            ok = isinstance(spec, dict) and spec and all(_number(w) >= 0 for w in spec.values())
+            ok = ok and sum(_number(w) for w in spec.values()) > 0
+        except ValueError:
+            ok = False
+        if not ok:
+            raise ConfigError("not a table of weights", where=where, value=spec,
+                              accepted="{value: weight, …} with weights >= 0 and a positive sum")
+        return
+    try:
+        low, high = (_number(x) for x in spec)
+    except (TypeError, ValueError):
+        raise ConfigError("not a range", where=where, value=spec, accepted="[low, high], two finite numbers") from None
+    if low > high:
+        raise ConfigError("the range is empty", where=where, value=spec, accepted="low <= high")
+    if kind == "log_uniform" and low <= 0:
+        raise ConfigError("a logarithmic range needs positive ends", where=where, value=spec, accepted="0 < low <= high")
+    if kind == "integer" and not (low.is_integer() and high.is_integer()):
+        raise ConfigError("not whole numbers", where=where, value=spec, accepted="[low, high], two integers")
+
+
+def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> Any:
+    _check(path, kind, spec)
+    key = int.from_bytes(hashlib.sha256("/".join(path).encode()).digest()[:8], "little")
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(sequence), int(Role.PARAMETERS), key)))
+    if kind == "choice":
+        return spec[int(rng.integers(len(spec)))]
+    if kind == "weighted":
+        weights = np.array([_number(w) for w in spec.values()])
+        return list(spec)[int(rng.choice(len(weights), p=weights / weights.sum()))]
+    low, high = (_number(x) for x in spec)
+    if kind == "integer":
+        return int(rng.integers(int(low), int(high), endpoint=True))
+    if kind == "log_uniform":
+        return float(math.exp(rng.uniform(math.log(low), math.log(high))))
+    return float(rng.uniform(low, high))

@@ -1,0 +1,70 @@
+"""The only place where poses become clip-space matrices: float64, camera-relative, cast to float32 once.
+
+Clip space: x right, y DOWN, w = Z along the optical axis, reversed-Z with the far plane at infinity
+(depth = near / Z in [0, 1], 1 at the near plane). Because y points down in clip space already, row 0 of every
+image is the top row and ``gl_FragCoord.xy - 0.5`` is the user's pixel: no image is ever flipped.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.scene.types import Camera
+
+
+def projection(camera: Camera) -> np.ndarray:
+    """(4, 4) float64 clip_from_cam for OpenCV camera axes.
+
+    A point (X, Y, Z) lands on pixel x = fx X/Z + cx, i.e. window coordinate x + 0.5, i.e.
+    ndc 2 (x + 0.5) / W - 1."""
+    w, h = camera.width, camera.height
+    return np.array([
+        [2 * camera.fx / w, 0.0, 2 * (camera.cx + 0.5) / w - 1, 0.0],
+        [0.0, 2 * camera.fy / h, 2 * (camera.cy + 0.5) / h - 1, 0.0],
+        [0.0, 0.0, 0.0, camera.near],
+        [0.0, 0.0, 1.0, 0.0],
+    ])
+
+
+def invert_rigid(T: np.ndarray) -> np.ndarray:
+    """Inverse of (..., 4, 4) rigid transforms, exact transpose for the rotation."""
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    inverse = np.zeros_like(T)
+    inverse[..., :3, :3] = R_t
+    inverse[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
+
+
+def cam_from_obj(T_world_cam: np.ndarray, T_world_obj: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) float64 T_cam_obj. The translations are subtracted before they are rotated, so that a scene
+    far from the origin loses no more than the rounding of its own coordinates."""
+    R_t = np.swapaxes(T_world_cam[..., :3, :3], -1, -2)
+    out = np.zeros(np.broadcast_shapes(T_world_cam.shape, T_world_obj.shape))
+    out[..., :3, :3] = R_t @ T_world_obj[..., :3, :3]
+    out[..., :3, 3] = (R_t @ (T_world_obj[..., :3, 3:] - T_world_cam[..., :3, 3:]))[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def cam_from_obj_rate(T_world_cam: np.ndarray, dT_world_cam: np.ndarray,
+                      T_world_obj: np.ndarray, dT_world_obj: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) float64 d(T_cam_obj)/dt, 1/s, by the product rule on :func:`cam_from_obj`."""
+    R_t = np.swapaxes(T_world_cam[..., :3, :3], -1, -2)
+    dR_t = np.swapaxes(dT_world_cam[..., :3, :3], -1, -2)
+    offset = T_world_obj[..., :3, 3:] - T_world_cam[..., :3, 3:]
+    d_offset = dT_world_obj[..., :3, 3:] - dT_world_cam[..., :3, 3:]
+    out = np.zeros(np.broadcast_shapes(T_world_cam.shape, T_world_obj.shape))
+    out[..., :3, :3] = dR_t @ T_world_obj[..., :3, :3] + R_t @ dT_world_obj[..., :3, :3]
+    out[..., :3, 3] = (dR_t @ offset + R_t @ d_offset)[..., 0]
+    return out
+
+
+def mat4_bytes(matrices: np.ndarray) -> bytes:
+    """GLSL mat4 (column-major float32) of one (4, 4) float64 matrix."""
+    return np.ascontiguousarray(matrices.T, dtype=np.float32).tobytes()
+
+
+def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
+    """GLSL mat4x3 (4 columns of 3) with the x, y, w rows of a (4, 4) clip-space matrix."""
+    return np.ascontiguousarray(matrix[[0, 1, 3]].T, dtype=np.float32).tobytes()

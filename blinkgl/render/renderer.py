@@ -1,0 +1,368 @@
+"""Frames of a scene by rasterisation: the event pass, the velocity pass and the label pass.
+
+    with create_context() as gl, Renderer(gl, scene, RenderConfig()) as renderer:
+        frame = renderer.luminance(t_ns)                       # (H, W) float32, linear light
+        labels = renderer.labels(t_ns, LabelRequest(flow_forward=True, depth=True), t_forward_ns=t1_ns)
+
+Poses are composed in float64 relative to the camera (``matrices.py``); vertices stay object-local. Programs and
+targets are made the first time something asks for them, and only in the variants the scene's materials need.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+
+from blinkgl.render.matrices import (cam_from_obj, cam_from_obj_rate, mat4_bytes, projection, rows_xyw_bytes)
+from blinkgl.render.occlusion import occlusion_mask
+from blinkgl.render.resources import DrawItem, SceneResources
+from blinkgl.scene.types import PosePath, Scene
+
+
+@dataclass(frozen=True)
+class LabelRequest:
+    """Which buffers :meth:`Renderer.labels` returns; what is not asked for is not computed."""
+
+    colour: bool = False
+    depth: bool = False
+    ids: bool = False
+    normals: bool = False
+    velocity: bool = False
+    flow_forward: bool = False
+    flow_backward: bool = False
+    occlusion: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """flow : (H, W, 2) float32 px, +x right, +y down, from t to t' at reference t; 0 where not valid.
+    valid : (H, W) bool, something is hit and it is in front of the camera at t'.
+    occluded : (H, W) bool or None, valid but not visible at t' (hidden by a surface, or outside the image)."""
+
+    flow: np.ndarray
+    valid: np.ndarray
+    occluded: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class LabelFrame:
+    """Ground truth at t_ns. Buffers that were not requested are None.
+
+    colour : (H, W, 3) float32 linear radiance.     depth : (H, W) float32 Z along the optical axis; inf: nothing hit.
+    ids : (H, W) uint32; 0: nothing hit.            normals : (H, W, 3) float32, world frame, towards the camera.
+    velocity : (H, W, 2) float32 px/s at t."""
+
+    t_ns: int
+    colour: np.ndarray | None = None
+    depth: np.ndarray | None = None
+    ids: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    velocity: np.ndarray | None = None
+    forward: Flow | None = None
+    backward: Flow | None = None
+
+
+@dataclass
+class RenderStats:
+    """Wall seconds since the renderer was made; triangles counts what was submitted after culling."""
+
+    frames: int = 0
+    triangles: int = 0
+    render_s: float = 0.0
+    readback_s: float = 0.0
+
+
+@dataclass(eq=False)
+class _Moment:
+    """All objects at one time: T_cam_obj and clip matrices, (n, 4, 4) float64."""
+
+    T_world_cam: np.ndarray
+    T_world_obj: np.ndarray
+    T_cam_obj: np.ndarray
+    mvp: np.ndarray
+
+
+class Renderer:
+    """Draws one scene. Holds GL resources: use it as a context manager or call :meth:`release`.
+
+    gl : blinkgl.gl.GLContext.   config : blinkgl.config.sequence.RenderConfig (anti-aliasing, anisotropy).
+    """
+
+    def __init__(self, gl, scene: Scene, config):
+        self.gl, self.scene, self.config = gl, scene, config
+        self.width, self.height = scene.camera.width, scene.camera.height
+        self.stats = RenderStats()
+        self._projection = projection(scene.camera)
+        self._paths: list[PosePath] = [o.path for o in scene.objects]
+        self._moving = [i for i, p in enumerate(self._paths) if not p.is_static]
+        self._T_world_obj = np.stack([p.pose(scene.t0_ns) for p in self._paths]) if self._paths else np.zeros((0, 4, 4))
+        self._targets: dict = {}
+        self._uniforms: dict = {}
+        self._resources = SceneResources(gl.ctx, scene, config.anisotropy)
+        items = self._resources.items
+        self._item_object = np.array([i.object_index for i in items], np.intp)
+        self._item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
+        self._item_radius = np.array([i.radius for i in items])
+        self._item_layer = np.array([i.layer for i in items])
+        self._frustum = _frustum_planes(scene.camera)
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.release()
+
+    def release(self) -> None:
+        for target in self._targets.values():
+            target.release()
+        self._targets = {}
+        self._resources.release()
+
+    @property
+    def triangles(self) -> int:
+        """Of the whole scene, before culling."""
+        return self._resources.triangles
+
+    # ---- passes ------------------------------------------------------------------------------------------------
+
+    def luminance(self, t_ns: int, out: np.ndarray | None = None) -> np.ndarray:
+        """Linear luminance at t_ns, (H, W) float32, into ``out`` when given (C-contiguous)."""
+        started = time.perf_counter()
+        factor = self.config.supersample
+        target = self._target("luminance", factor, ("R32F",))
+        moment = self._moment(t_ns)
+        self._begin(target, moment, self.scene.background)
+        for item in self._visible(moment):
+            uniforms = self._bind("luminance.glsl", item, moment, {})
+            if item.textured:
+                self._resources.luminance_texture(item.material).use(0)
+            else:
+                uniforms["albedo"].value = self._resources.albedo_luminance(item.material)
+            self._draw(uniforms, item)
+        if factor > 1:
+            target = self._downsample(target, "luminance", "R32F", factor)
+        return self._read(target, 0, started, out)
+
+    def velocity(self, t_ns: int, reduce: int = 1) -> np.ndarray:
+        """Image velocity at t_ns in px/s (of the full-size image), (H // reduce, W // reduce, 2) float32, 0 where
+        nothing is hit. ``reduce`` samples every n-th pixel: enough to find the largest motion, at 1/n² the cost."""
+        started = time.perf_counter()
+        target = self._target("velocity", 1 / reduce, ("RG32F",))
+        moment = self._moment(t_ns)
+        rate = self._rates(t_ns, moment)
+        self._begin(target, moment, 0.0)
+        for item in self._visible(moment):
+            uniforms = self._bind("label.glsl", item, moment, {"OUT_VELOCITY": 0})
+            self._set_motion(uniforms, "rate", rate, item, target)
+            self._draw(uniforms, item)
+        velocity = self._read(target, 0, started, None)
+        scale = np.array([self.width / target.fbo.width, self.height / target.fbo.height], np.float32)
+        return velocity * scale if reduce != 1 else velocity
+
+    def labels(self, t_ns: int, request: LabelRequest, t_forward_ns: int | None = None,
+               t_backward_ns: int | None = None) -> LabelFrame:
+        """Ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns."""
+        result: dict = {}
+        if request.colour:
+            result["colour"] = self._colour(t_ns)
+        outputs = []
+        needs_occlusion = request.occlusion and (request.flow_forward or request.flow_backward)
+        for name, wanted, fmt in (
+            ("DEPTH", request.depth, "R32F"),
+            ("ID", request.ids or needs_occlusion, "R32UI"),
+            ("NORMAL", request.normals, "RGBA32F"),
+            ("VELOCITY", request.velocity, "RG32F"),
+            ("FLOW_FORWARD", request.flow_forward, "RGBA32F"),
+            ("FLOW_BACKWARD", request.flow_backward, "RGBA32F"),
+        ):
+            if wanted:
+                outputs.append((name, fmt))
+        if outputs:
+            buffers = self._geometry(t_ns, outputs, t_forward_ns, t_backward_ns)
+            if request.depth:
+                result["depth"] = np.where(buffers["DEPTH"] > 0, buffers["DEPTH"], np.float32(np.inf))
+            if request.ids:
+                result["ids"] = buffers["ID"]
+            if request.normals:
+                result["normals"] = np.ascontiguousarray(buffers["NORMAL"][..., :3])
+            if request.velocity:
+                result["velocity"] = buffers["VELOCITY"]
+            for name, key, t_other in (("FLOW_FORWARD", "forward", t_forward_ns), ("FLOW_BACKWARD", "backward", t_backward_ns)):
+                if name in buffers:
+                    result[key] = self._flow(buffers[name], buffers.get("ID"), t_other, needs_occlusion)
+        return LabelFrame(t_ns, **result)
+
+    # ---- parts of the label pass -------------------------------------------------------------------------------
+
+    def _colour(self, t_ns: int) -> np.ndarray:
+        started = time.perf_counter()
+        factor = self.config.image_supersample
+        target = self._target("colour", factor, ("RGBA32F",))
+        moment = self._moment(t_ns)
+        self._begin(target, moment, self.scene.background)
+        for item in self._visible(moment):
+            uniforms = self._bind("label.glsl", item, moment, {"OUT_COLOUR": 0})
+            uniforms["base_color"].value = tuple(item.material.base_color)
+            if item.textured:
+                self._resources.colour_texture(item.material).use(0)
+            self._draw(uniforms, item)
+        if factor > 1:
+            target = self._downsample(target, "colour", "RGBA32F", factor)
+        return np.ascontiguousarray(self._read(target, 0, started, None)[..., :3])
+
+    def _geometry(self, t_ns: int, outputs: list[tuple[str, str]], t_forward_ns: int | None,
+                  t_backward_ns: int | None) -> dict[str, np.ndarray]:
+        started = time.perf_counter()
+        defines = {f"OUT_{name}": i for i, (name, _) in enumerate(outputs)}
+        target = self._target("geometry:" + ",".join(defines), 1, tuple(fmt for _, fmt in outputs))
+        moment = self._moment(t_ns)
+        motions = []
+        if "OUT_VELOCITY" in defines:
+            motions.append(("rate", self._rates(t_ns, moment)))
+        for name, t_other in (("forward", t_forward_ns), ("backward", t_backward_ns)):
+            if f"OUT_FLOW_{name.upper()}" in defines:
+                motions.append((f"difference_{name}", self._moment(t_other).mvp - moment.mvp))
+        self._begin(target, moment, 0.0)
+        for item in self._visible(moment):
+            uniforms = self._bind("label.glsl", item, moment, defines)
+            for name, matrices in motions:
+                self._set_motion(uniforms, name, matrices, item, target)
+            if "OUT_ID" in defines:
+                uniforms["instance_id"].value = self.scene.objects[item.object_index].instance_id
+            if "OUT_NORMAL" in defines:
+                rotation = moment.T_world_obj[item.object_index, :3, :3]
+                uniforms["world_from_local"].write(np.ascontiguousarray(rotation.T, np.float32).tobytes())
+            self._draw(uniforms, item)
+        return {name: self._read(target, i, started if i == 0 else time.perf_counter(), None)
+                for i, (name, _) in enumerate(outputs)}
+
+    def _flow(self, buffer: np.ndarray, ids: np.ndarray | None, t_other_ns: int, occlusion: bool) -> Flow:
+        w_next = buffer[..., 2]
+        hit = buffer[..., 3] > 0
+        valid = hit & (w_next > 0) & np.isfinite(buffer[..., :2]).all(axis=-1)
+        flow = np.where(valid[..., None], buffer[..., :2], np.float32(0))
+        occluded = None
+        if occlusion:
+            other = self._geometry(t_other_ns, [("DEPTH", "R32F"), ("ID", "R32UI")], None, None)
+            occluded = occlusion_mask(flow, w_next, valid, ids, other["DEPTH"], other["ID"])
+        return Flow(flow, valid, occluded)
+
+    # ---- matrices ----------------------------------------------------------------------------------------------
+
+    def _moment(self, t_ns: int) -> _Moment:
+        for i in self._moving:
+            self._T_world_obj[i] = self._paths[i].pose(t_ns)
+        T_world_cam = self.scene.camera.path.pose(t_ns)
+        T_cam_obj = cam_from_obj(T_world_cam, self._T_world_obj)
+        return _Moment(T_world_cam, self._T_world_obj.copy(), T_cam_obj, self._projection @ T_cam_obj)
+
+    def _rates(self, t_ns: int, moment: _Moment) -> np.ndarray:
+        """(n, 4, 4) float64 d(MVP)/dt, 1/s, from the analytic derivatives of the paths."""
+        dT_world_obj = np.zeros_like(moment.T_world_obj)
+        for i in self._moving:
+            dT_world_obj[i] = self._paths[i].derivative(t_ns)
+        return self._projection @ cam_from_obj_rate(moment.T_world_cam, self.scene.camera.path.derivative(t_ns),
+                                                    moment.T_world_obj, dT_world_obj)
+
+    def _visible(self, moment: _Moment) -> list[DrawItem]:
+        """Items whose bounding sphere meets the view frustum: objects front to back, then ground, then sky."""
+        if not len(self._item_object):
+            return []
+        T = moment.T_cam_obj[self._item_object]
+        centre = (T[:, :3, :3] @ self._item_centre[..., None])[..., 0] + T[:, :3, 3]
+        inside = (centre @ self._frustum.T >= -self._item_radius[:, None]).all(axis=1)
+        nearest = centre[:, 2] - self._item_radius
+        order = np.lexsort((nearest, self._item_layer))
+        items = self._resources.items
+        return [items[i] for i in order if inside[i]]
+
+    # ---- GL state ----------------------------------------------------------------------------------------------
+
+    def _target(self, name: str, scale: float, formats: tuple[str, ...]):
+        key = (name, scale)
+        if key not in self._targets:
+            width, height = max(1, int(self.width * scale)), max(1, int(self.height * scale))
+            self._targets[key] = self.gl.framebuffer(width, height, colour=formats, depth=True)
+        return self._targets[key]
+
+    def _begin(self, target, moment: _Moment, background: float) -> None:
+        ctx = self.gl.ctx
+        target.fbo.use()
+        ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
+        ctx.enable_only(moderngl.DEPTH_TEST)
+        ctx.depth_func = ">"  # reversed-Z
+        ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down
+        ctx.cull_face = "back"
+        target.clear((background, background, background, 0.0)[: target.formats[0].components], depth=0.0)
+        self._culling = False
+        self.stats.frames += 1
+
+    def _bind(self, name: str, item: DrawItem, moment: _Moment, defines: dict) -> dict:
+        """Uniforms of the program variant for ``item``, with the matrices and the light set."""
+        key = (name, tuple(defines.items()), item.textured, item.lit, item.two_sided)
+        if key not in self._uniforms:
+            variant = dict(defines)
+            for define, on in (("TEXTURED", item.textured), ("LIT", item.lit), ("TWO_SIDED", item.two_sided)):
+                if on:
+                    variant[define] = 1
+            program = self.gl.program(name, variant)
+            uniforms = {n: program[n] for n in program if isinstance(program[n], moderngl.Uniform)}
+            uniforms[""] = program
+            if "light_strength" in uniforms:
+                uniforms["light_strength"].value = (self.scene.light.sun, self.scene.light.sky)
+            self._uniforms[key] = uniforms
+        uniforms = self._uniforms[key]
+        index = item.object_index
+        uniforms["mvp"].write(mat4_bytes(moment.mvp[index]))
+        if "sun_direction" in uniforms:
+            R = moment.T_world_obj[index, :3, :3]
+            uniforms["sun_direction"].value = tuple(self.scene.light.sun_direction @ R)
+            uniforms["up_direction"].value = tuple(R[2])
+        return uniforms
+
+    def _set_motion(self, uniforms: dict, name: str, matrices: np.ndarray, item: DrawItem, target) -> None:
+        uniforms[name].write(rows_xyw_bytes(matrices[item.object_index]))
+        uniforms["image_size"].value = (target.fbo.width, target.fbo.height)
+
+    def _draw(self, uniforms: dict, item: DrawItem) -> None:
+        cull = not item.two_sided
+        if cull != self._culling:
+            (self.gl.ctx.enable if cull else self.gl.ctx.disable)(moderngl.CULL_FACE)
+            self._culling = cull
+        self._resources.vertex_array(uniforms[""], item).render(moderngl.TRIANGLES)
+        self.stats.triangles += len(item.mesh.faces)
+
+    def _downsample(self, fine, name: str, fmt: str, factor: int):
+        key = (name, "mean")
+        if key not in self._targets:
+            self._targets[key] = self.gl.framebuffer(self.width, self.height, colour=(fmt,), depth=False)
+        target = self._targets[key]
+        program = self.gl.program("downsample.glsl", {"FACTOR": factor})
+        vao_key = ("downsample", factor)
+        if vao_key not in self._uniforms:
+            self._uniforms[vao_key] = self.gl.ctx.vertex_array(program, [])
+        target.fbo.use()
+        self.gl.ctx.viewport = (0, 0, self.width, self.height)
+        self.gl.ctx.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        fine.colour[0].use(0)
+        self._uniforms[vao_key].render(moderngl.TRIANGLES, vertices=3)
+        return target
+
+    def _read(self, target, index: int, started: float, out: np.ndarray | None) -> np.ndarray:
+        self.gl.ctx.finish()
+        drawn = time.perf_counter()
+        image = target.read(index, out=out)
+        self.stats.render_s += drawn - started
+        self.stats.readback_s += time.perf_counter() - drawn
+        return image
+
+
+def _frustum_planes(camera) -> np.ndarray:
+    """(5, 3) inward unit normals, camera axes, of left, right, top, bottom and the plane through the centre."""
+    left, right = (-0.5 - camera.cx) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
+    top, bottom = (-0.5 - camera.cy) / camera.fy, (camera.height - 0.5 - camera.cy) / camera.fy
+    planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
+    return planes / np.linalg.norm(planes, axis=1, keepdims=True)

@@ -1,0 +1,138 @@
+"""What a scene occupies in OpenGL: buffers, textures and vertex arrays, each made when first needed, shared by
+content, and released together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.render.colour import LUMA, decode_image, luminance_image
+from blinkgl.scene.types import Material, Mesh, Scene
+
+_ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f", 8))
+
+
+@dataclass(eq=False)
+class DrawItem:
+    """One part of one object, ready to draw.
+
+    object_index : row of the frame's matrices.   centre, radius : bounding sphere, object frame.
+    layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
+    two_sided : no culling, and the normal is turned towards the camera.
+    """
+
+    object_index: int
+    mesh: Mesh
+    material: Material
+    centre: np.ndarray
+    radius: float
+    layer: int
+    two_sided: bool
+    lit: bool
+
+    @property
+    def textured(self) -> bool:
+        return self.material.texture is not None
+
+
+_LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
+
+
+class SceneResources:
+    """GL side of one Scene. Release it before the context."""
+
+    def __init__(self, ctx: moderngl.Context, scene: Scene, anisotropy: float = 1.0):
+        self.ctx, self.scene, self.anisotropy = ctx, scene, anisotropy
+        self._buffers: dict[tuple, tuple[moderngl.Buffer, moderngl.Buffer]] = {}
+        self._textures: dict[tuple, moderngl.Texture] = {}
+        self._vaos: dict[tuple, moderngl.VertexArray] = {}
+        self.items = [
+            _draw_item(index, part.mesh, part.material, obj.category)
+            for index, obj in enumerate(scene.objects) for part in obj.parts
+        ]
+        self.items.sort(key=lambda item: item.layer)
+
+    @property
+    def triangles(self) -> int:
+        return sum(len(item.mesh.faces) for item in self.items)
+
+    def vertex_array(self, program: moderngl.Program, item: DrawItem) -> moderngl.VertexArray:
+        """VAO of the attributes ``program`` uses; the rest of the interleaved vertex is skipped."""
+        key = (id(program), id(item.mesh), item.material.uv_scale)
+        if key not in self._vaos:
+            vertices, indices = self._mesh_buffers(item.mesh, item.material.uv_scale)
+            formats, names = [], []
+            for name, fmt, size in _ATTRIBUTES:
+                used = name in program
+                formats.append(fmt if used else f"{size}x")
+                if used:
+                    names.append(name)
+            self._vaos[key] = self.ctx.vertex_array(program, [(vertices, " ".join(formats), *names)], indices, 4)
+        return self._vaos[key]
+
+    def luminance_texture(self, material: Material) -> moderngl.Texture:
+        """R32F: luminance of texture * base_color (mip-mapped in linear light)."""
+        key = ("luminance", id(material.texture), material.base_color)
+        if key not in self._textures:
+            image = luminance_image(material.texture.image, material.base_color)
+            self._textures[key] = self._upload(image[..., None], material.texture.name)
+        return self._textures[key]
+
+    def colour_texture(self, material: Material) -> moderngl.Texture:
+        """Linear rgb of the texture alone: sRGB8 when the image is 8-bit, else RGB32F."""
+        key = ("colour", id(material.texture))
+        if key not in self._textures:
+            image = material.texture.image
+            srgb8 = image.dtype == np.uint8
+            self._textures[key] = self._upload(image if srgb8 else decode_image(image), material.texture.name,
+                                               internal_format=0x8C41 if srgb8 else None)  # GL_SRGB8
+        return self._textures[key]
+
+    def albedo_luminance(self, material: Material) -> float:
+        """Of a material without texture."""
+        return float(LUMA @ np.asarray(material.base_color, np.float64))
+
+    def release(self) -> None:
+        for vao in self._vaos.values():
+            vao.release()
+        for pair in self._buffers.values():
+            for buffer in pair:
+                buffer.release()
+        for texture in self._textures.values():
+            texture.release()
+        self._vaos, self._buffers, self._textures = {}, {}, {}
+
+    def _mesh_buffers(self, mesh: Mesh, uv_scale: tuple[float, float]) -> tuple[moderngl.Buffer, moderngl.Buffer]:
+        key = (id(mesh), uv_scale)
+        if key not in self._buffers:
+            data = np.empty((len(mesh.vertices), 8), np.float32)
+            data[:, :3], data[:, 3:6] = mesh.vertices, mesh.normals
+            data[:, 6:] = mesh.uvs * np.asarray(uv_scale, np.float64)
+            self._buffers[key] = (self.ctx.buffer(data.tobytes()),
+                                  self.ctx.buffer(np.ascontiguousarray(mesh.faces, np.int32).tobytes()))
+        return self._buffers[key]
+
+    def _upload(self, image: np.ndarray, name: str, internal_format: int | None = None) -> moderngl.Texture:
+        height, width, components = image.shape
+        limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
+        if max(height, width) > limit:
+            raise AssetError("texture is larger than this OpenGL takes", where=name, value=(width, height),
+                             accepted=f"at most {limit} px on a side")
+        dtype = "f1" if image.dtype == np.uint8 else "f4"
+        texture = self.ctx.texture((width, height), components, np.ascontiguousarray(image).tobytes(), alignment=1,
+                                   dtype=dtype, internal_format=internal_format)
+        texture.build_mipmaps()
+        texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+        texture.anisotropy = self.anisotropy
+        return texture
+
+
+def _draw_item(index: int, mesh: Mesh, material: Material, category: str) -> DrawItem:
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    centre = (low + high) / 2
+    radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
+    two_sided = material.double_sided or not mesh.closed
+    return DrawItem(index, mesh, material, centre, radius, _LAYER[category], two_sided, lit=not material.unlit)

@@ -1,0 +1,13 @@
+// Irradiance factor of the white sun-and-sky light (blinkgl/scene/types.py: Light):
+//   E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_up)
+// n, s and up in the object's own frame, so that normals need no matrix.
+uniform vec3 sun_direction;  // s, object frame, unit
+uniform vec3 up_direction;   // world z, object frame, unit
+uniform vec2 light_strength; // (sun, sky)
+
+float irradiance(vec3 normal)
+{
+    vec3 n = normalize(normal);
+    return light_strength.x * max(0.0, dot(n, sun_direction))
+         + light_strength.y * (0.5 + 0.5 * dot(n, up_direction));
+}

@@ -1,0 +1,27 @@
+// Image motion of a surface point from its object-local position, free of cancellation.
+//
+// With P the clip position now, D = (MVP' - MVP) composed in float64 and cast once, d = D * p and w' = w + d.w:
+//   ndc' - ndc = (d.xy - ndc.xy * d.w) / w'
+// Subtracting two projected positions instead (c1/w1 - c0/w0) leaves float32 rounding of the positions, 1e-4 px,
+// in the result however small the motion is. ndc comes from gl_FragCoord, which is exact.
+
+vec2 ndc_of_fragment(vec2 image_size)
+{
+    return gl_FragCoord.xy / image_size * 2.0 - 1.0;
+}
+
+// difference: rows x, y, w of D.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera.
+vec3 displacement(mat4x3 difference, vec3 local, vec2 image_size)
+{
+    vec3 d = difference * vec4(local, 1.0);
+    float w_next = 1.0 / gl_FragCoord.w + d.z;
+    vec2 flow_ndc = (d.xy - ndc_of_fragment(image_size) * d.z) / w_next;
+    return vec3(flow_ndc * 0.5 * image_size, w_next);
+}
+
+// rate: rows x, y, w of d(MVP)/dt.  Returns px/s.
+vec2 velocity(mat4x3 rate, vec3 local, vec2 image_size)
+{
+    vec3 d = rate * vec4(local, 1.0);
+    return (d.xy - ndc_of_fragment(image_size) * d.z) * gl_FragCoord.w * 0.5 * image_size;
+}

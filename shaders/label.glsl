@@ -1,0 +1,135 @@
+#version 430 core
+// Label pass: any subset of the ground-truth buffers in one go. The renderer defines OUT_<NAME> as the attachment
+// number for each buffer that somebody consumes; the others do not exist.
+//
+//   OUT_COLOUR    rgb linear radiance            OUT_DEPTH     Z along the optical axis, world units
+//   OUT_ID        instance id (0: nothing hit)   OUT_NORMAL    world-frame unit normal towards the camera
+//   OUT_VELOCITY  px/s                           OUT_FLOW_FORWARD, OUT_FLOW_BACKWARD
+//                                                (u, v in px, Z at the other time; 0 in .w of unwritten pixels)
+// Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED.
+
+#if defined(OUT_COLOUR) && defined(LIT) || defined(OUT_NORMAL)
+#define NEEDS_NORMAL
+#endif
+#if defined(OUT_VELOCITY) || defined(OUT_FLOW_FORWARD) || defined(OUT_FLOW_BACKWARD)
+#define NEEDS_LOCAL
+#endif
+#if defined(OUT_COLOUR) && defined(TEXTURED)
+#define NEEDS_UV
+#endif
+
+#ifdef VERTEX_SHADER
+in vec3 in_position;
+uniform mat4 mvp;
+invariant gl_Position;
+#ifdef NEEDS_UV
+in vec2 in_uv;
+out vec2 uv;
+#endif
+#ifdef NEEDS_NORMAL
+in vec3 in_normal;
+out vec3 normal;
+#endif
+#ifdef NEEDS_LOCAL
+out vec3 local;
+#endif
+
+void main()
+{
+    gl_Position = mvp * vec4(in_position, 1.0);
+#ifdef NEEDS_UV
+    uv = in_uv;
+#endif
+#ifdef NEEDS_NORMAL
+    normal = in_normal;
+#endif
+#ifdef NEEDS_LOCAL
+    local = in_position;
+#endif
+}
+#endif
+
+#ifdef FRAGMENT_SHADER
+#ifdef NEEDS_NORMAL
+in vec3 normal;
+#endif
+#ifdef NEEDS_LOCAL
+in vec3 local;
+uniform vec2 image_size;
+#include "motion.glsl"
+#endif
+
+#ifdef OUT_COLOUR
+layout(location = OUT_COLOUR) out vec4 colour;
+uniform vec3 base_color;
+#ifdef TEXTURED
+in vec2 uv;
+uniform sampler2D albedo;
+#endif
+#ifdef LIT
+#include "light.glsl"
+#endif
+#endif
+#ifdef OUT_DEPTH
+layout(location = OUT_DEPTH) out float depth;
+#endif
+#ifdef OUT_ID
+layout(location = OUT_ID) out uint id;
+uniform uint instance_id;
+#endif
+#ifdef OUT_NORMAL
+layout(location = OUT_NORMAL) out vec4 world_normal;
+uniform mat3 world_from_local;
+#endif
+#ifdef OUT_VELOCITY
+layout(location = OUT_VELOCITY) out vec2 image_velocity;
+uniform mat4x3 rate;
+#endif
+#ifdef OUT_FLOW_FORWARD
+layout(location = OUT_FLOW_FORWARD) out vec4 flow_forward;
+uniform mat4x3 difference_forward;
+#endif
+#ifdef OUT_FLOW_BACKWARD
+layout(location = OUT_FLOW_BACKWARD) out vec4 flow_backward;
+uniform mat4x3 difference_backward;
+#endif
+
+void main()
+{
+#ifdef NEEDS_NORMAL
+#ifdef TWO_SIDED
+    vec3 facing = gl_FrontFacing ? normal : -normal;
+#else
+    vec3 facing = normal;
+#endif
+#endif
+#ifdef OUT_COLOUR
+    vec3 radiance = base_color;
+#ifdef TEXTURED
+    radiance *= texture(albedo, uv).rgb;
+#endif
+#ifdef LIT
+    radiance *= irradiance(facing);
+#endif
+    colour = vec4(radiance, 1.0);
+#endif
+#ifdef OUT_DEPTH
+    depth = 1.0 / gl_FragCoord.w;
+#endif
+#ifdef OUT_ID
+    id = instance_id;
+#endif
+#ifdef OUT_NORMAL
+    world_normal = vec4(normalize(world_from_local * facing), 0.0);
+#endif
+#ifdef OUT_VELOCITY
+    image_velocity = velocity(rate, local, image_size);
+#endif
+#ifdef OUT_FLOW_FORWARD
+    flow_forward = vec4(displacement(difference_forward, local, image_size), 1.0);
+#endif
+#ifdef OUT_FLOW_BACKWARD
+    flow_backward = vec4(displacement(difference_backward, local, image_size), 1.0);
+#endif
+}
+#endif

@@ -1,0 +1,126 @@
+"""Output appears whole or not at all: written under a hidden name beside the final one, synced, then renamed.
+
+A temporary's name holds a hash of this machine's boot, its PID namespace, and the writer's pid, so that a later run can
+recognise leftovers of its own dead predecessors (kill -9, power loss) without ever touching those of a live
+process, another container, or another machine on a shared disk.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import itertools
+import os
+import re
+import shutil
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+from blinkgl.errors import OutputError
+
+_serial = itertools.count()
+_PATTERN = re.compile(r"^\..+\.blinkgl-tmp-([0-9a-f]{12})-(\d+)-\d+(\..*)?$")
+
+
+@contextlib.contextmanager
+def output_errors(where: str | os.PathLike) -> Iterator[None]:
+    """Turns an ``OSError`` of writing ``where`` (also HDF5's, which hide the errno in their text) into an
+    :class:`OutputError` of one line."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot write: {_reason(error)}", where=str(where)) from error
+
+
+def _reason(error: OSError) -> str:
+    code = error.errno
+    if code is None and (found := re.search(r"errno = (\d+)", str(error))):
+        code = int(found.group(1))
+    if code == errno.ENOSPC:
+        return "no space left on the device"
+    return os.strerror(code).lower() if code else " ".join(str(error).split())
+
+
+def machine_token() -> str:
+    """12 hex digits naming this boot of this machine and this PID namespace: where a pid is meaningful."""
+    parts = [socket.gethostname()]
+    for read in (lambda: Path("/proc/sys/kernel/random/boot_id").read_text(), lambda: os.readlink("/proc/self/ns/pid")):
+        with contextlib.suppress(OSError):
+            parts.append(read())
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:12]
+
+
+def temporary_beside(final: Path) -> Path:
+    """A fresh hidden name in ``final``'s folder (hence on its file system) with its suffix, because writers
+    such as ffmpeg go by the ending."""
+    return final.with_name(f".{final.name}.blinkgl-tmp-{machine_token()}-{os.getpid()}-{next(_serial)}{final.suffix}")
+
+
+def remove_stale(folder: Path) -> list[Path]:
+    """Deletes temporaries in ``folder`` whose writer ran on this boot of this machine and is dead. Anything
+    else, even when it looks like ours, is left alone."""
+    removed = []
+    token = machine_token()
+    for path in folder.iterdir() if folder.is_dir() else ():
+        match = _PATTERN.match(path.name)
+        if not match or match.group(1) != token or _alive(int(match.group(2))) or path.is_symlink():
+            continue
+        shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+        removed.append(path)
+    return removed
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def fsync(path: Path) -> None:
+    """Flushes a file or a directory entry to the disk."""
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    except OSError as error:
+        # Some network and FUSE file systems cannot sync a directory; the rename is still atomic there.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP) or not path.is_dir():
+            raise
+    finally:
+        os.close(fd)
+
+
+@contextlib.contextmanager
+def atomic_file(final: str | os.PathLike, *, overwrite: bool = True) -> Iterator[Path]:
+    """``with atomic_file("out.h5") as path:`` write to ``path``; renamed to ``out.h5`` on success, deleted on
+    any exception. The parent folder is made.
+
+    Raises
+    ------
+    OutputError : the file exists and ``overwrite`` is False, it is a folder, or it cannot be written.
+    """
+    final = Path(final)
+    if final.is_dir():
+        raise OutputError("is a folder", where=str(final), accepted="a file name")
+    if final.exists() and not overwrite:
+        raise OutputError("output file exists", where=str(final), accepted="a new name, or --overwrite")
+    with output_errors(final):
+        final.parent.mkdir(parents=True, exist_ok=True)
+        remove_stale(final.parent)
+    temporary = temporary_beside(final)
+    try:
+        yield temporary  # the format's own writer translates its errors; what the body reads is not our business
+        with output_errors(final):
+            fsync(temporary)
+            os.replace(temporary, final)
+            fsync(final.parent)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OutputError) and error.where == str(temporary):
+            raise OutputError(error.problem, where=str(final), accepted=error.accepted) from error
+        raise

@@ -1,0 +1,314 @@
+"""DSEC's event file: streaming writer, slicing reader (Gehrig et al., "DSEC", RA-L 2021; data format page).
+
+Layout: ``events/{x,y}`` u2, ``events/p`` u1, ``events/t`` u4 µs relative to the scalar ``t_offset`` (i8 µs on the
+image clock), ``ms_to_idx`` u8 with ``ms_to_idx[ms]`` = smallest index whose t >= 1000·ms. Blosc-zstd with bit
+shuffle, as the published files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import h5py
+import hdf5plugin
+import numpy as np
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.atomic import output_errors
+
+BLOCK = 1 << 17
+"""Events per HDF5 chunk and per write."""
+
+_COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
+_MAX_RELATIVE_US = np.iinfo(np.uint32).max
+
+
+class DsecEventWriter:
+    """Writes events of one sensor, chunk by chunk, in memory that does not grow with the sequence.
+
+    Compression runs in a background thread (Blosc releases the GIL) behind a queue of a few blocks; an error
+    there is raised by the next :meth:`append` or by :meth:`close`. The same events give the same bytes however they
+    were chunked. Use as a context manager: it closes on success and aborts on an exception (the file is then not
+    usable; the caller owns the name, see :mod:`blinkgl.io.atomic`).
+
+    Parameters
+    ----------
+    path : file to create (overwritten).
+    height, width : sensor size in px; events outside are refused. Also stored as root attributes, which DSEC's
+        own readers ignore.
+    t_offset_us : image-clock time of relative time 0. Events before it, or 2^32 µs (71.6 minutes) or more after it, are
+        refused: the format's u4 cannot hold them.
+    background : False compresses in the caller's thread.
+    """
+
+    def __init__(self, path: str | os.PathLike, height: int, width: int, t_offset_us: int = 0, *, background: bool = True):
+        if not (0 < height <= 65536 and 0 < width <= 65536):
+            raise EventDataError("sensor size does not fit uint16 coordinates", where=str(path), value=(height, width),
+                                 accepted="1 to 65536 px a side")
+        self.path, self.height, self.width, self.t_offset_us = Path(path), int(height), int(width), int(t_offset_us)
+        self.count = 0
+        self._last_t = self.t_offset_us
+        self._next_ms = 0
+        self._written = 0
+        self._fill = 0
+        self._block = _new_block()
+        self._error: BaseException | None = None
+        self._closed = False
+        # Blosc's threads store blocks in the order they finish: with more than one the bytes differ from run to run.
+        os.environ["BLOSC_NTHREADS"] = "1"
+        with output_errors(path):
+            self._file = h5py.File(self.path, "w", rdcc_nbytes=0)  # whole chunks only: no cache, a full disk shows at once
+            codec = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
+            make = lambda name, dtype, chunk: self._file.create_dataset(  # noqa: E731
+                name, (0,), dtype, maxshape=(None,), chunks=(chunk,), track_times=False, compression=codec)
+            self._columns = {k: make(f"events/{k}", dtype, BLOCK) for k, dtype in _COLUMNS.items()}
+            self._ms_to_idx = make("ms_to_idx", np.uint64, 1 << 13)
+            self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
+            self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
+        self._queue: queue.Queue | None = None
+        if background:
+            self._queue = queue.Queue(maxsize=4)
+            self._thread = threading.Thread(target=self._run, name="dsec-writer", daemon=True)
+            self._thread.start()
+
+    def append(self, events: Events) -> None:
+        """Adds events (copied: the caller may reuse its arrays).
+
+        Raises
+        ------
+        EventDataError : times not in order or outside the file's range, coordinates outside the sensor, polarity
+            not 0 or 1. OutputError : the disk refused an earlier block.
+        """
+        self._check(events)
+        self.count += len(events)
+        start = 0
+        while start < len(events):
+            stop = min(len(events), start + BLOCK - self._fill)
+            into = slice(self._fill, self._fill + stop - start)
+            for name in "xyp":
+                self._block[name][into] = getattr(events, name)[start:stop]
+            np.subtract(events.t[start:stop], self.t_offset_us, out=self._block["t"][into], casting="unsafe")
+            self._fill += stop - start
+            start = stop
+            if self._fill == BLOCK:
+                self._submit(self._block)
+                self._block, self._fill = _new_block(), 0
+        self._raise_pending()
+
+    def close(self, t_end_us: int | None = None) -> None:
+        """Finishes the file. ``t_end_us`` (image clock, exclusive) is the recording's end where it is later than the
+        last event's, so that ``ms_to_idx`` covers windows up to it."""
+        if self._closed:
+            return
+        end = max(self._last_t + 1 if self.count else self.t_offset_us, self.t_offset_us if t_end_us is None else int(t_end_us))
+        try:
+            self._submit({k: v[: self._fill] for k, v in self._block.items()})
+            self._submit(None)
+            if self._queue is not None:
+                self._thread.join()
+            self._raise_pending()
+            with output_errors(self.path):
+                # One entry past the last millisecond: a slicer asks for ceil(end).
+                last_ms = -(-(end - self.t_offset_us) // 1000)
+                self._store_ms(np.full(last_ms + 1 - self._next_ms, self._written, np.uint64))
+                self._file.close()
+            self._closed = True
+        except BaseException:
+            self.abort()
+            raise
+
+    def abort(self) -> None:
+        """Stops without finishing; never raises."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._queue is not None and self._thread.is_alive():
+            self._error = self._error or RuntimeError("aborted")  # the thread drops what is queued
+            self._queue.put(None)
+            self._thread.join()
+        with contextlib.suppress(Exception):
+            self._file.close()
+
+    def __enter__(self) -> "DsecEventWriter":
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        self.close() if kind is None else self.abort()
+
+    def _check(self, events: Events) -> None:
+        if self._closed:
+            raise ValueError("append after close")
+        if not len(events):
+            return
+        where, t = str(self.path), events.t
+        if t[0] < self._last_t:
+            raise EventDataError("event time runs backwards or precedes the recording's start", where=where,
+                                 value=int(t[0]), accepted=f">= {self._last_t} µs")
+        if np.any(t[1:] < t[:-1]):
+            i = int(np.argmax(t[1:] < t[:-1]))
+            raise EventDataError(f"event times not in order at event {self.count + i + 1}", where=where,
+                                 value=(int(t[i]), int(t[i + 1])))
+        if t[-1] - self.t_offset_us > _MAX_RELATIVE_US:
+            raise EventDataError("event time beyond what DSEC's 32-bit µs can hold", where=where, value=int(t[-1]),
+                                 accepted=f"at most {self.t_offset_us + _MAX_RELATIVE_US} µs (71.6 minutes per file)")
+        if events.x.max() >= self.width or events.y.max() >= self.height:
+            i = int(np.argmax((events.x >= self.width) | (events.y >= self.height)))
+            raise EventDataError("event outside the sensor", where=where, value=(int(events.x[i]), int(events.y[i])),
+                                 accepted=f"x < {self.width}, y < {self.height}")
+        if events.p.max() > 1:
+            raise EventDataError("polarity", where=where, value=int(events.p.max()), accepted="0 or 1")
+        self._last_t = int(t[-1])
+
+    def _submit(self, block: dict[str, np.ndarray] | None) -> None:
+        if self._queue is not None:
+            self._queue.put(block)
+        elif block is not None:
+            with output_errors(self.path):
+                self._store(block)
+
+    def _run(self) -> None:
+        while (block := self._queue.get()) is not None:
+            if self._error is not None:
+                continue  # keep draining, so that a blocked producer wakes up and sees the error
+            try:
+                with output_errors(self.path):
+                    self._store(block)
+            except BaseException as error:  # noqa: BLE001 - handed to the caller's thread
+                self._error = error
+
+    def _raise_pending(self) -> None:
+        if self._error is not None:
+            error = self._error
+            self.abort()
+            raise error
+
+    def _store(self, block: dict[str, np.ndarray]) -> None:
+        start, stop = self._written, self._written + len(block["t"])
+        for name, dataset in self._columns.items():
+            dataset.resize((stop,))
+            dataset[start:stop] = block[name]
+        if stop > start:
+            # Entries up to the last event's own millisecond are settled now; later ones wait for their event.
+            last_ms = int(block["t"][-1]) // 1000
+            bounds = np.arange(self._next_ms, last_ms + 1, dtype=np.int64) * 1000
+            self._store_ms(start + np.searchsorted(block["t"], bounds, side="left"))
+        self._written = stop
+
+    def _store_ms(self, entries: np.ndarray) -> None:
+        if len(entries):
+            self._ms_to_idx.resize((self._next_ms + len(entries),))
+            self._ms_to_idx[self._next_ms :] = entries
+            self._next_ms += len(entries)
+
+
+def _new_block() -> dict[str, np.ndarray]:
+    return {name: np.empty(BLOCK, dtype) for name, dtype in _COLUMNS.items()}
+
+
+class DsecEventReader:
+    """Events of a DSEC file by time; times come out as int64 µs on the image clock (t + t_offset).
+
+    Also reads BlinkFlow's files, which lack ``t_offset`` (taken as 0), hold t as u8 and whose ``ms_to_idx`` stops
+    short of the last millisecond.
+
+    Raises
+    ------
+    AssetError : not a readable HDF5 file (truncated, wrong type) or without the DSEC datasets.
+    """
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        self._file = open_hdf5(self.path)
+        try:
+            missing = [k for k in ("events/x", "events/y", "events/t", "events/p") if k not in self._file]
+            if missing:
+                raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
+            self._columns = {k: self._file["events"][k] for k in "xytp"}
+            lengths = {len(c) for c in self._columns.values()}
+            if len(lengths) != 1:
+                raise AssetError("event columns differ in length", where=str(path), value=sorted(lengths))
+            self.count = lengths.pop()
+            self.t_offset_us = int(self._file["t_offset"][()]) if "t_offset" in self._file else 0
+            self._ms_to_idx = self._file["ms_to_idx"][()].astype(np.int64) if "ms_to_idx" in self._file else None
+        except BaseException:
+            self._file.close()
+            raise
+        attrs = self._file.attrs
+        self.height = int(attrs["height"]) if "height" in attrs else None
+        self.width = int(attrs["width"]) if "width" in attrs else None
+
+    def slice(self, t0_us: int, t1_us: int) -> Events:
+        """Events of [t0_us, t1_us), image clock, by DSEC's rule: ``ms_to_idx`` gives the conservative range
+        floor(t0)…ceil(t1) in ms, the exact bounds are searched inside it."""
+        r0, r1 = int(t0_us) - self.t_offset_us, int(t1_us) - self.t_offset_us
+        start, stop = self._index(r0 // 1000, 0), self._index(-(-r1 // 1000), self.count)
+        t = self._columns["t"][start:stop].astype(np.int64)
+        i, j = np.searchsorted(t, (r0, r1), side="left")
+        return self._read(start + int(i), start + int(j))
+
+    def _index(self, ms: int, otherwise: int) -> int:
+        if self._ms_to_idx is None:
+            return otherwise
+        if ms < 0:
+            return 0
+        if ms < len(self._ms_to_idx):
+            return int(self._ms_to_idx[ms])
+        # Past the table: the end for an upper bound; for a lower one the last entry is still a safe start.
+        return self.count if otherwise else (int(self._ms_to_idx[-1]) if len(self._ms_to_idx) else 0)
+
+    def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
+        """All events in pieces of ``size``."""
+        for start in range(0, self.count, size):
+            yield self._read(start, min(self.count, start + size))
+
+    def _read(self, start: int, stop: int) -> Events:
+        try:
+            x, y, t, p = (self._columns[k][start:stop] for k in "xytp")
+        except OSError as error:
+            raise AssetError(f"events {start} to {stop} cannot be read: {' '.join(str(error).split())}",
+                             where=str(self.path)) from error
+        return Events(x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False),
+                      t.astype(np.int64) + self.t_offset_us, p.astype(np.uint8, copy=False))
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> "DsecEventReader":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+
+def open_hdf5(path: Path) -> h5py.File:
+    """Opens for reading; AssetError with the likely cause when that fails."""
+    if not path.is_file():
+        raise AssetError("no such file", where=str(path))
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        text = " ".join(str(error).split())
+        problem = "truncated HDF5 file" if "truncated" in text else "not an HDF5 file" if "signature" in text else f"cannot be opened: {text}"
+        raise AssetError(problem, where=str(path)) from error
+
+
+def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:
+    """``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A simulated pin-hole camera's is the identity;
+    loaders such as E-RAFT's insist on the file."""
+    with output_errors(path), h5py.File(path, "w") as file:
+        file.create_dataset("rectify_map", data=np.asarray(rectify_map, np.float32), track_times=False,
+                            compression=hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE))
+
+
+def identity_rectify_map(height: int, width: int) -> np.ndarray:
+    """(H, W, 2) float32 identity for :func:`write_rectify_map`."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    return np.stack([x, y], axis=-1)
+
+

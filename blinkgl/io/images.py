@@ -1,0 +1,80 @@
+"""Images, masks, ids, depth and normals of a sequence, and the sRGB transfer curve (IEC 61966-2-1)."""
+
+from __future__ import annotations
+
+import io
+import os
+
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.io.flow_png import encode_png, read_png
+
+
+def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    """sRGB OETF. linear: any shape, float; clipped to [0, 1] (NaN becomes 0). Returns float32 in [0, 1]."""
+    x = np.clip(np.nan_to_num(np.asarray(linear, np.float32), nan=0.0), 0, 1)
+    return np.where(x <= np.float32(0.0031308), x * np.float32(12.92),
+                    np.float32(1.055) * np.power(x, np.float32(1 / 2.4)) - np.float32(0.055))
+
+
+def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
+    """Inverse of :func:`srgb_from_linear`; encoded in [0, 1], float32 out."""
+    x = np.asarray(encoded, np.float32)
+    return np.where(x <= np.float32(0.04045), x / np.float32(12.92),
+                    np.power((np.maximum(x, 0) + np.float32(0.055)) / np.float32(1.055), np.float32(2.4)))
+
+
+def to_srgb8(linear: np.ndarray) -> np.ndarray:
+    """8-bit sRGB codes, rounded to nearest, of linear light in [0, 1]."""
+    return (srgb_from_linear(linear) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+
+
+def encode_image(image: np.ndarray) -> bytes:
+    """sRGB PNG. (H, W) or (H, W, 3) RGB; float is linear light, uint8 and uint16 are stored as they are."""
+    image = np.asarray(image)
+    if image.dtype.kind == "f":
+        image = to_srgb8(image)
+    return encode_png(image[..., ::-1] if image.ndim == 3 else image)
+
+
+def read_image(path: str | os.PathLike) -> np.ndarray:
+    """(H, W) or (H, W, 3) RGB as stored (uint8, uint16)."""
+    image = read_png(path)
+    return np.ascontiguousarray(image[..., 2::-1]) if image.ndim == 3 else image
+
+
+def encode_mask(mask: np.ndarray) -> bytes:
+    """8-bit PNG, 0 or 255, of a (H, W) bool."""
+    return encode_png(np.asarray(mask, bool).astype(np.uint8) * np.uint8(255))
+
+
+def read_mask(path: str | os.PathLike) -> np.ndarray:
+    """(H, W) bool."""
+    image = read_png(path)
+    if image.ndim != 2:
+        raise AssetError("not a mask", where=str(path), value=image.shape, accepted="one channel")
+    return image > 0
+
+
+def encode_ids(ids: np.ndarray) -> bytes:
+    """16-bit PNG of (H, W) instance ids; ValueError when one does not fit."""
+    ids = np.asarray(ids)
+    if ids.size and (ids.min() < 0 or ids.max() > 65535):
+        raise ValueError(f"instance ids must fit uint16, got {ids.min()}..{ids.max()}")
+    return encode_png(ids.astype(np.uint16))
+
+
+def encode_npy(array: np.ndarray) -> bytes:
+    """.npy bytes; object arrays are refused (they would be pickled)."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def read_npy(path: str | os.PathLike) -> np.ndarray:
+    """An array; AssetError when missing, truncated or pickled."""
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise AssetError(f"cannot read .npy: {' '.join(str(error).split())}", where=str(path)) from error

@@ -1,0 +1,368 @@
+"""One generated sequence on disk: written aside, checksummed, synced, renamed; and its verification.
+
+    <sequence>/
+      events.h5                      DSEC layout (blinkgl.io.dsec)
+      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line
+      flow/forward/%06d.png          DSEC 16-bit flow;                  flow/forward_timestamps.txt   from_us,to_us
+      flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
+      flow/forward_flo/%06d.flo, flow/forward.h5                        (on request)
+      flow/backward…                 the same, from > to
+      occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
+      depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
+      poses.npz  config.yaml  manifest.json  preview.mp4
+
+Float flow stands in folders of its own because DSEC loaders take every file of ``flow/forward`` for a PNG.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import h5py
+import hdf5plugin
+import numpy as np
+
+from blinkgl.errors import AssetError, BlinkGLError, OutputError
+from blinkgl.events.types import Events
+from blinkgl.io import images
+from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from blinkgl.io.dsec import DsecEventWriter
+from blinkgl.io.flo import encode_flo
+from blinkgl.io.flow_png import encode_flow_png
+
+MANIFEST = "manifest.json"
+_IN_FLIGHT = 8
+"""Labels waiting for the encoder thread: bounds memory at a few tens of MB."""
+
+
+class SequenceWriter:
+    """Context manager around one sequence directory. On success everything appears under ``final`` at once; on any exception
+    (Ctrl-C and a full disk included) nothing does and the temporary is removed.
+
+    Encoding and hashing run in one background thread, event compression in another; their errors surface in the next
+    call or on exit. Arrays are copied, so callers may reuse read-back buffers.
+
+    Parameters
+    ----------
+    final : the directory to make. An existing non-empty one is refused.
+    height, width : sensor size, px.
+    config_yaml : resolved configuration, stored as ``config.yaml``.
+    t_offset_us : time of the sequence's start, µs; events before it are refused by the DSEC format.
+    float_flow : additional float32 flow: any of "npy", "flo", "h5".
+    events : False makes no ``events.h5``.
+
+    Attributes
+    ----------
+    info : dict written into the manifest beside the checksums (seed, versions, GL renderer, counts). Keep wall-clock times
+        out of it: the same seed shall give the same manifest.
+    t_end_us : set it to the sequence's end, so that ``ms_to_idx`` covers an eventless tail.
+
+    Raises
+    ------
+    OutputError : the directory exists, or cannot be written.
+    """
+
+    def __init__(self, final: str | os.PathLike, height: int, width: int, *, config_yaml: str, t_offset_us: int = 0,
+                 float_flow: tuple[str, ...] = (), events: bool = True):
+        self.final = Path(final)
+        self.height, self.width, self.config_yaml, self.t_offset_us = int(height), int(width), config_yaml, int(t_offset_us)
+        if unknown := set(float_flow) - {"npy", "flo", "h5"}:
+            raise ValueError(f"unknown float flow format {sorted(unknown)}")
+        self.float_flow = tuple(float_flow)
+        self.info: dict[str, Any] = {}
+        self.t_end_us: int | None = None
+        self.flow_lost: dict[str, int] = {}
+        self._with_events = events
+        self._files: dict[str, dict[str, Any]] = {}
+        self._timestamps: dict[str, list[str]] = {}
+        self._flow_h5: dict[str, h5py.File] = {}
+        self._failure: list[BaseException] = []
+
+    def __enter__(self) -> "SequenceWriter":
+        refuse_existing(self.final)
+        with output_errors(self.final):
+            self.final.parent.mkdir(parents=True, exist_ok=True)
+            remove_stale(self.final.parent)
+            self._tmp = temporary_beside(self.final)
+            self._tmp.mkdir()
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="sequence-writer")
+        self._slots = threading.BoundedSemaphore(_IN_FLIGHT)
+        try:
+            self._events = (DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us)
+                            if self._with_events else None)
+        except BaseException:
+            self._discard()
+            raise
+        return self
+
+    def __exit__(self, kind, error, _) -> None:
+        if kind is None:
+            try:
+                self._finish()
+                return
+            except BaseException as failure:  # noqa: BLE001 - Ctrl-C during the last flush must not leave anything either
+                error = failure
+        self._discard()
+        if isinstance(error, OutputError) and str(self._tmp) in (error.where or ""):
+            # The user knows the final name, not the temporary's.
+            where = error.where.replace(str(self._tmp), str(self.final))
+            raise OutputError(error.problem, where=where, accepted=error.accepted) from error
+        if kind is None:
+            raise error
+
+    # ---- what a sequence consists of -------------------------------------------------------------------------
+
+    def append_events(self, events: Events) -> None:
+        """The next events, in time order (µs on the sequence's clock)."""
+        self._check()
+        self._events.append(events)
+
+    def image(self, index: int, t_us: int, image: np.ndarray) -> None:
+        """Frame: (H, W[, 3]) float linear light in [0, 1], or uint8 sRGB."""
+        image = self._owned(image)
+        self._stamp("images/timestamps.txt", str(int(t_us)))
+        self._write(f"images/{index:06d}.png", lambda: images.encode_image(image))
+
+    def flow(self, direction: str, index: int, flow: np.ndarray, valid: np.ndarray, from_us: int, to_us: int) -> None:
+        """direction "forward" | "backward"; flow (H, W, 2) float32 px from ``from_us`` to ``to_us``; valid (H, W) bool.
+        Valid pixels beyond DSEC's ±256 px become invalid in the PNG (not in the float forms) and are counted in
+        ``flow_lost`` and the manifest."""
+        if direction not in ("forward", "backward"):
+            raise ValueError(f"flow direction {direction!r}")
+        flow, valid = self._owned(flow, 2), self._owned(valid).astype(bool)
+        self._stamp(f"flow/{direction}_timestamps.txt", f"{int(from_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
+
+        def png() -> bytes:
+            data, lost = encode_flow_png(flow, valid)
+            self.flow_lost[direction] = self.flow_lost.get(direction, 0) + lost
+            return data
+
+        self._write(f"flow/{direction}/{index:06d}.png", png)
+        if "npy" in self.float_flow:
+            self._write(f"flow/{direction}_npy/{index:06d}.npy",
+                        lambda: images.encode_npy(np.dstack([np.where(valid[..., None], flow, 0), valid]).astype(np.float32)))
+        if "flo" in self.float_flow:
+            self._write(f"flow/{direction}_flo/{index:06d}.flo", lambda: encode_flo(flow, valid))
+        if "h5" in self.float_flow:
+            self._submit(lambda: self._append_flow_h5(direction, flow, valid))
+
+    def occlusion(self, direction: str, index: int, occluded: np.ndarray) -> None:
+        """(H, W) bool: the point seen here is hidden at the other end of ``direction``'s flow."""
+        occluded = self._owned(occluded)
+        self._write(f"occlusion/{direction}/{index:06d}.png", lambda: images.encode_mask(occluded))
+
+    def depth(self, index: int, depth: np.ndarray) -> None:
+        """(H, W) float32 scene units along +z of the camera, inf where nothing is hit."""
+        self._array("depth", index, self._owned(depth))
+
+    def velocity(self, index: int, velocity: np.ndarray) -> None:
+        """(H, W, 2) float32 px/s at the label's time."""
+        self._array("velocity", index, self._owned(velocity, 2))
+
+    def normals(self, index: int, normals: np.ndarray) -> None:
+        """(H, W, 3) float32 unit normals, camera axes (OpenCV)."""
+        self._array("normals", index, self._owned(normals, 3))
+
+    def ids(self, index: int, ids: np.ndarray) -> None:
+        """(H, W) integer instance ids, 0…65535."""
+        ids = self._owned(ids)
+        self._write(f"ids/{index:06d}.png", lambda: images.encode_ids(ids))
+
+    def poses(self, **arrays: np.ndarray) -> None:
+        """``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
+        arrays = {k: np.array(v) for k, v in arrays.items()}
+        if bad := [k for k, v in arrays.items() if v.dtype.hasobject]:
+            raise TypeError(f"poses: object arrays would be pickled: {bad}")
+
+        def save(path: Path) -> None:
+            with open(path, "wb") as file:  # NumPy stamps zip members 1980-01-01: the bytes do not depend on the clock
+                np.savez(file, **arrays)
+
+        self.external("poses.npz", save)
+
+    def text(self, name: str, content: str) -> None:
+        """A UTF-8 text file at ``name`` inside the sequence."""
+        self._write(name, content.encode)
+
+    def path(self, name: str) -> Path:
+        """Where another writer (the preview's) may put ``name`` before exit; it is checksummed on exit."""
+        path = self._tmp / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def external(self, name: str, save: Callable[[Path], None]) -> None:
+        """Runs ``save(path)`` in the background thread."""
+        def task() -> None:
+            path = self.path(name)
+            with output_errors(path):
+                save(path)
+        self._submit(task)
+
+    # ---- machinery -------------------------------------------------------------------------------------------
+
+    def _owned(self, array: np.ndarray, channels: int | None = None) -> np.ndarray:
+        array = np.array(array)
+        expected = (self.height, self.width) + ((channels,) if channels else ())
+        if array.shape[: len(expected)] != expected:
+            raise ValueError(f"label of shape {array.shape}, expected {expected}")
+        return array
+
+    def _array(self, folder: str, index: int, array: np.ndarray) -> None:
+        self._write(f"{folder}/{index:06d}.npy", lambda: images.encode_npy(array.astype(np.float32, copy=False)))
+
+    def _stamp(self, name: str, line: str, header: str | None = None) -> None:
+        self._timestamps.setdefault(name, [header] if header else []).append(line)
+
+    def _write(self, name: str, encode: Callable[[], bytes]) -> None:
+        def task() -> None:
+            data = encode()
+            path = self.path(name)
+            with output_errors(path), open(path, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            self._files[name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        self._submit(task)
+
+    def _submit(self, task: Callable[[], None]) -> None:
+        self._check()
+        self._slots.acquire()
+        self._pool.submit(task).add_done_callback(self._done)
+
+    def _done(self, future: Future) -> None:
+        self._slots.release()
+        if not future.cancelled() and (error := future.exception()) is not None:
+            self._failure.append(error)
+
+    def _check(self) -> None:
+        if self._failure:
+            raise self._failure[0]
+
+    def _append_flow_h5(self, direction: str, flow: np.ndarray, valid: np.ndarray) -> None:
+        path = self.path(f"flow/{direction}.h5")
+        with output_errors(path):
+            if direction not in self._flow_h5:
+                file = self._flow_h5[direction] = h5py.File(path, "w", rdcc_nbytes=0)
+                codec = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
+                for name, array in (("flow", flow), ("valid", valid)):
+                    file.create_dataset(name, (0, *array.shape), np.float32 if name == "flow" else np.uint8,
+                                        maxshape=(None, *array.shape), chunks=(1, *array.shape), track_times=False, compression=codec)
+            file = self._flow_h5[direction]
+            for name, array in (("flow", np.where(valid[..., None], flow, np.float32(0))), ("valid", valid)):
+                n = len(file[name])
+                file[name].resize(n + 1, axis=0)
+                file[name][n] = array
+
+    def _finish(self) -> None:
+        self._check()
+        for name, lines in self._timestamps.items():
+            self.text(name, "\n".join(lines) + "\n")
+        self.text("config.yaml", self.config_yaml)
+        if self._events is not None:
+            self._events.close(self.t_end_us)
+        self._pool.shutdown(wait=True)
+        self._check()
+        with output_errors(self.final):
+            for file in self._flow_h5.values():
+                file.close()
+            for path in sorted(self._tmp.rglob("*")):
+                name = path.relative_to(self._tmp).as_posix()
+                if path.is_file() and name not in self._files:
+                    fsync(path)
+                    self._files[name] = _digest(path)
+            manifest = {"format": "blinkgl-sequence", "format_version": 1, "height": self.height, "width": self.width,
+                        "t_offset_us": self.t_offset_us, "events": self._events.count if self._events is not None else 0,
+                        "flow_pixels_out_of_range": self.flow_lost, **self.info, "files": self._files}
+            path = self._tmp / MANIFEST
+            path.write_text(json.dumps(manifest, indent=1, sort_keys=True, default=_plain) + "\n", encoding="utf-8")
+            fsync(path)
+            for folder in sorted({p.parent for p in self._tmp.rglob("*")}, reverse=True):
+                fsync(folder)
+            refuse_existing(self.final)
+            os.rename(self._tmp, self.final)
+            fsync(self.final.parent)
+
+    def _discard(self) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        if getattr(self, "_events", None) is not None:
+            self._events.abort()
+        for file in self._flow_h5.values():
+            try:
+                file.close()
+            except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway
+                pass
+        shutil.rmtree(self._tmp, ignore_errors=True)
+
+
+def refuse_existing(final: str | os.PathLike) -> None:
+    """OutputError unless ``final`` is free (absent, or an empty folder)."""
+    final = Path(final)
+    if final.is_dir() and not any(final.iterdir()):
+        return
+    if final.exists() or final.is_symlink():
+        raise OutputError("output folder exists" if final.is_dir() else "output path is a file", where=str(final),
+                          accepted="a new folder name")
+
+
+def verify_sequence(folder: str | os.PathLike) -> list[str]:
+    """Problems of a sequence directory against its manifest, one line each; empty when whole.
+
+    Finds missing, foreign, truncated and altered files; an unreadable manifest is one problem."""
+    folder = Path(folder)
+    try:
+        files = read_manifest(folder)["files"]
+    except BlinkGLError as error:
+        return [str(error)]
+    problems = []
+    for name, expected in sorted(files.items()):
+        path = folder / name
+        if not path.resolve().is_relative_to(folder.resolve()):
+            problems.append(f"{name}: path leaves the sequence")
+        elif not path.is_file():
+            problems.append(f"{name}: missing")
+        elif path.stat().st_size != expected["bytes"]:
+            problems.append(f"{name}: {path.stat().st_size} bytes, manifest says {expected['bytes']}")
+        elif _digest(path)["sha256"] != expected["sha256"]:
+            problems.append(f"{name}: checksum differs")
+    present = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
+    problems += [f"{name}: not in the manifest" for name in sorted(present - set(files) - {MANIFEST})]
+    return problems
+
+
+def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
+    """The manifest; AssetError when there is none or it is damaged."""
+    path = Path(folder) / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+        files = manifest["files"]
+        if not all(isinstance(f["bytes"], int) and isinstance(f["sha256"], str) for f in files.values()):
+            raise ValueError
+    except OSError as error:
+        raise AssetError(f"no manifest: {error.strerror}", where=str(path)) from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise AssetError("damaged manifest", where=str(path)) from error
+    return manifest
+
+
+def _digest(path: Path) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return {"bytes": path.stat().st_size, "sha256": digest.hexdigest()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    raise TypeError(f"manifest: {type(value).__name__} is not plain data")

@@ -1,0 +1,260 @@
+"""A sequence directory appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+from blinkgl.errors import BlinkGLError, OutputError
+from blinkgl.events.types import Events
+from blinkgl.io import flo, images
+from blinkgl.io.atomic import atomic_file, machine_token, remove_stale
+from blinkgl.io.sequence_dir import SequenceWriter, read_manifest, verify_sequence
+
+H, W = 24, 32
+
+
+def events_between(t0, t1, n, seed=0) -> Events:
+    rng = np.random.default_rng(seed)
+    return Events(rng.integers(0, W, n).astype(np.uint16), rng.integers(0, H, n).astype(np.uint16),
+                  np.sort(rng.integers(t0, t1, n)), rng.integers(0, 2, n).astype(np.uint8))
+
+
+def fill(writer: SequenceWriter, labels: int = 3, reuse: bool = True) -> None:
+    buffer = np.empty((H, W, 3), np.float32)  # as a renderer reuses its read-back buffer
+    for i in range(labels):
+        rng = np.random.default_rng(i)
+        t = 100_000 * i
+        writer.append_events(events_between(t, t + 100_000, 5000, i))
+        buffer[:] = rng.random((H, W, 3))
+        writer.image(i, t, buffer)
+        flow = rng.normal(size=(H, W, 2)).astype(np.float32)
+        flow[0, 0] = 300
+        valid = np.ones((H, W), bool)
+        writer.flow("forward", i, flow, valid, t, t + 100_000)
+        writer.flow("backward", i, -flow, valid, t + 100_000, t)
+        writer.occlusion("forward", i, flow[..., 0] > 0)
+        writer.depth(i, np.full((H, W), i + 1.0, np.float32))
+        writer.velocity(i, flow * 10)
+        writer.normals(i, buffer)
+        writer.ids(i, np.full((H, W), i))
+    writer.poses(T_world_cam=np.eye(4)[None], times_ns=np.arange(3))
+    writer.info["seed"] = np.int64(0)
+    writer.t_end_us = 100_000 * labels
+
+
+def make(final, **kw) -> None:
+    with SequenceWriter(final, H, W, config_yaml="seed: 0\n", **kw) as writer:
+        fill(writer)
+
+
+def tree(folder) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_contents_read_back_independently(tmp_path):
+    make(tmp_path / "a" / "b", float_flow=("npy", "flo", "h5"))
+    seq = tmp_path / "a" / "b"
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["b"]
+    assert (seq / "images/timestamps.txt").read_text() == "0\n100000\n200000\n"
+    stamps = np.loadtxt(seq / "flow/forward_timestamps.txt", delimiter=",", comments="#", dtype=np.int64)
+    assert stamps.tolist() == [[0, 100000], [100000, 200000], [200000, 300000]]
+    assert (seq / "flow/backward_timestamps.txt").read_text().startswith("# from_timestamp_us, to_timestamp_us\n100000, 0\n")
+    rng = np.random.default_rng(1)
+    image, flow = rng.random((H, W, 3)).astype(np.float32), rng.normal(size=(H, W, 2)).astype(np.float32)
+    assert np.array_equal(cv2.imread(str(seq / "images/000001.png"))[..., ::-1], images.to_srgb8(image))
+    rgb = cv2.imread(str(seq / "flow/forward/000001.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(float)
+    assert not rgb[0, 0, 2] and rgb[1:, :, 2].all()
+    assert np.abs((rgb[1:, :, :2] - 2**15) / 128 - flow[1:]).max() <= 0.5 / 128
+    full = np.load(seq / "flow/forward_npy/000001.npy")
+    assert full.shape == (H, W, 3) and full[0, 0].tolist() == [300, 300, 1] and np.array_equal(full[1:, :, :2], flow[1:])
+    assert np.array_equal(flo.read_flo(seq / "flow/forward_flo/000001.flo")[0][1:], flow[1:])
+    with h5py.File(seq / "flow/forward.h5") as file:
+        assert np.array_equal(file["flow"][1, 1:], flow[1:]) and file["valid"].shape == (3, H, W)
+    with h5py.File(seq / "events.h5") as file:
+        assert len(file["events/t"]) == 15_000 and len(file["ms_to_idx"]) == 301
+    with np.load(seq / "poses.npz", allow_pickle=False) as poses:
+        assert poses["T_world_cam"].shape == (1, 4, 4)
+    manifest = read_manifest(seq)
+    assert manifest["events"] == 15_000 and manifest["seed"] == 0
+    assert manifest["flow_pixels_out_of_range"] == {"forward": 3, "backward": 3}
+    assert verify_sequence(seq) == []
+
+
+def test_same_input_same_bytes(tmp_path):
+    make(tmp_path / "a", float_flow=("h5",))
+    time.sleep(1.1)  # a time stamp of seconds would show
+    make(tmp_path / "b", float_flow=("h5",))
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+
+
+@pytest.mark.parametrize("damage, problem", [
+    ("flip", "events.h5: checksum differs"), ("cut", "ids/000000.png: .* bytes, manifest says"), ("remove", "poses.npz: missing"),
+    ("add", "images/x.png: not in the manifest"), ("manifest", "damaged manifest"), ("none", "no manifest"),
+])
+def test_verify_finds_damage(tmp_path, damage, problem):
+    seq = tmp_path / "a"
+    make(seq)
+    if damage == "flip":
+        data = bytearray((seq / "events.h5").read_bytes())
+        data[len(data) // 2] ^= 1
+        (seq / "events.h5").write_bytes(data)
+    elif damage == "cut":
+        (seq / "ids/000000.png").write_bytes((seq / "ids/000000.png").read_bytes()[:-1])
+    elif damage == "remove":
+        (seq / "poses.npz").unlink()
+    elif damage == "add":
+        (seq / "images/x.png").write_bytes(b"")
+    elif damage == "manifest":
+        (seq / "manifest.json").write_text("{")
+    else:
+        (seq / "manifest.json").unlink()
+    problems = verify_sequence(seq)
+    import re
+    assert len(problems) == 1 and re.search(problem, problems[0])
+
+
+@pytest.mark.parametrize("error", [ValueError("bug"), KeyboardInterrupt(), SystemExit(1)])
+def test_nothing_is_left_after_an_exception(tmp_path, error):
+    with pytest.raises(type(error)):
+        with SequenceWriter(tmp_path / "a", H, W, config_yaml="") as writer:
+            fill(writer)
+            raise error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_output_is_refused_and_untouched(tmp_path):
+    make(tmp_path / "a")
+    before = tree(tmp_path / "a")
+    with pytest.raises(OutputError, match=r"a: output folder exists; expected a new folder name"):
+        make(tmp_path / "a")
+    assert tree(tmp_path / "a") == before
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(OutputError, match="is a file"):
+        make(tmp_path / "file")
+    (tmp_path / "empty").mkdir()
+    make(tmp_path / "empty")
+    assert verify_sequence(tmp_path / "empty") == []
+
+
+def test_errors_of_the_background_threads_surface(tmp_path, monkeypatch):
+    def full(image):
+        raise OSError(28, "No space left on device")
+    monkeypatch.setattr(images, "encode_image", full)
+    with pytest.raises((OutputError, OSError), match="[Nn]o space left"):
+        make(tmp_path / "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A 3 MB tmpfs: a disk that really runs full."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    if os.geteuid() != 0 or not shutil.which("mount"):
+        pytest.skip("needs root and mount(8) for a size-limited tmpfs")
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3m", "tmpfs", folder], capture_output=True).returncode:
+        pytest.skip("this container does not allow mounting a tmpfs")
+    yield folder
+    subprocess.run(["umount", "-l", folder], check=True)
+
+
+@pytest.mark.parametrize("what", ["events", "labels", "both"])
+def test_full_disk_is_one_clear_error_and_leaves_nothing(small_disk, what):
+    with pytest.raises(OutputError, match=r"small/seq.*cannot write: no space left on the device") as caught:
+        with SequenceWriter(small_disk / "seq", 240, 320, config_yaml="") as writer:
+            rng = np.random.default_rng(0)
+            for i in range(40):
+                if what != "labels":
+                    n = 100_000
+                    writer.append_events(Events(rng.integers(0, 320, n).astype(np.uint16), rng.integers(0, 240, n).astype(np.uint16),
+                                                np.sort(rng.integers(i * 10**6, (i + 1) * 10**6, n)), rng.integers(0, 2, n).astype(np.uint8)))
+                if what != "events":
+                    writer.depth(i, rng.random((240, 320), dtype=np.float32))
+    assert "blinkgl-tmp" not in str(caught.value) and "\n" not in str(caught.value)
+    assert list(small_disk.iterdir()) == []
+
+
+def test_full_disk_does_not_upset_interpreter_exit(small_disk):
+    """HDF5 keeps a file it could not flush open: the process must still end quietly with our own status."""
+    code = f"""
+import numpy as np
+from blinkgl.io.dsec import DsecEventWriter
+from blinkgl.events.types import Events
+from blinkgl.errors import OutputError
+rng = np.random.default_rng(0)
+try:
+    with DsecEventWriter({str(small_disk / 'e.h5')!r}, 480, 640) as w:
+        for i in range(40):
+            n = 100_000
+            w.append(Events(rng.integers(0, 640, n).astype('u2'), rng.integers(0, 480, n).astype('u2'),
+                            np.sort(rng.integers(i * 10**6, (i + 1) * 10**6, n)), rng.integers(0, 2, n).astype('u1')))
+except OutputError as error:
+    print(error)
+    raise SystemExit(2)
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert result.returncode == 2 and "no space left" in result.stdout and result.stderr == ""
+
+
+def test_kill_leaves_no_final_name_and_the_next_run_cleans_up(tmp_path):
+    code = f"""
+import time, numpy as np
+from blinkgl.io.sequence_dir import SequenceWriter
+with SequenceWriter({str(tmp_path / 'a')!r}, 24, 32, config_yaml='') as w:
+    w.depth(0, np.zeros((24, 32)))
+    print('ready', flush=True)
+    time.sleep(60)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    leftovers = list(tmp_path.iterdir())
+    assert len(leftovers) == 1 and leftovers[0].name.startswith(".a.blinkgl-tmp-")
+    assert remove_stale(tmp_path) == []  # its writer lives
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    assert list(tmp_path.iterdir()) == leftovers
+    make(tmp_path / "b")
+    assert [p.name for p in tmp_path.iterdir()] == ["b"]
+
+
+def test_only_own_dead_temporaries_are_removed(tmp_path):
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    token = machine_token()
+    keep = [f".x.blinkgl-tmp-{'0' * 12}-{dead.pid}-0", f".x.blinkgl-tmp-{token}-{os.getpid()}-0", "x", f"x.blinkgl-tmp-{token}-{dead.pid}-0"]
+    for name in [*keep, f".x.blinkgl-tmp-{token}-{dead.pid}-0"]:
+        (tmp_path / name).mkdir()
+    outside = tmp_path / "x" / "data"
+    outside.write_text("keep me")
+    (tmp_path / f".y.blinkgl-tmp-{token}-{dead.pid}-0").symlink_to(tmp_path / "x")
+    assert [p.name for p in remove_stale(tmp_path)] == [f".x.blinkgl-tmp-{token}-{dead.pid}-0"]
+    assert outside.read_text() == "keep me" and all((tmp_path / k).exists() for k in keep)
+
+
+def test_atomic_file(tmp_path):
+    with atomic_file(tmp_path / "d" / "a.txt") as path:
+        assert path.suffix == ".txt"
+        path.write_text("one")
+        assert not (tmp_path / "d" / "a.txt").exists()
+    with pytest.raises(ZeroDivisionError):
+        with atomic_file(tmp_path / "d" / "a.txt") as path:
+            path.write_text("two")
+            1 / 0
+    assert (tmp_path / "d" / "a.txt").read_text() == "one" and len(list((tmp_path / "d").iterdir())) == 1
+    with pytest.raises(OutputError, match="output file exists"):
+        with atomic_file(tmp_path / "d" / "a.txt", overwrite=False):
+            pass
+    with pytest.raises(BlinkGLError, match="is a folder"):
+        with atomic_file(tmp_path / "d"):
+            pass

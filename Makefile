@@ -1,0 +1,64 @@
+# make demo    install into .venv, check OpenGL, generate the demo sequence into out/demo
+# make test    install into .venv, check OpenGL, run the tests
+# make slow    the tests that take long       make bench   the benchmarks
+# make clean   remove what was built (not .venv, not out/)
+#
+# PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
+
+JOBS ?= auto
+PIP = .venv/bin/python -m pip --disable-pip-version-check
+INSTALL = $(PIP) install --quiet --no-build-isolation -c constraints.txt
+INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
+
+.PHONY: demo test slow bench doctor setup clean
+.DELETE_ON_ERROR:
+
+demo: .venv/.installed-core .venv/.checked-opengl
+	@rm -rf out/demo
+	.venv/bin/blinkgl generate configs/demo.yaml --out out/demo
+	@echo
+	@echo "Look at:"
+	@find out/demo -name preview.mp4 | sort | sed 's/^/  /'
+	@echo "and beside it events.h5, flow/, images/ in DSEC's layout. Next: README.md."
+
+test: .venv/.installed-dev .venv/.checked-opengl
+	.venv/bin/python -m pytest -q -n $(JOBS) --maxprocesses 4 --dist worksteal
+
+slow: .venv/.installed-dev .venv/.checked-opengl
+	.venv/bin/python -m pytest -q -m slow
+
+bench: .venv/.installed-dev .venv/.checked-opengl
+	@for program in tools/bench_*.py; do echo "== $$program"; .venv/bin/python $$program || exit 1; done
+
+doctor: .venv/.installed-core
+	.venv/bin/blinkgl doctor
+
+setup: .venv/.installed-dev .venv/.checked-opengl
+
+# Stamps: a step runs again only when what it depends on has changed.
+
+.venv/.made: tools/setup.sh
+	@tools/setup.sh venv
+	@$(PIP) install --quiet -c constraints.txt --upgrade pip setuptools wheel
+	@touch $@
+
+.venv/.installed-core: .venv/.made $(INPUTS)
+	@echo "installing BlinkGL into .venv (minutes the first time)"
+	@$(INSTALL) -e .
+	@touch $@
+
+# pyrender, the independent renderer some tests compare with, builds an old PyOpenGL from source. Where that fails those tests
+# are skipped and say so.
+.venv/.installed-dev: .venv/.installed-core
+	@echo "installing the test tools into .venv"
+	@$(INSTALL) -e '.[dev]'
+	@$(INSTALL) -e '.[check]' || echo "pyrender could not be installed: the comparisons with it will be skipped"
+	@touch $@
+
+.venv/.checked-opengl: .venv/.installed-core
+	@tools/setup.sh opengl
+	@touch $@
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .hypothesis
+	find blinkgl eflow shaders configs tools tests -name __pycache__ -type d -prune -exec rm -rf {} +

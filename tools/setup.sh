@@ -43,10 +43,8 @@ find_python() {
 }
 
 make_venv() {
-    # A virtual environment that was copied, or whose Python is gone, does not run: make it anew.
-    if "$python" -c 'import pip' 2>/dev/null && [ "$("$python" -c 'import os, sys; print(os.path.realpath(sys.prefix))')" = "$(pwd -P)/$venv" ]; then
-        return
-    fi
+    # One whose Python is gone, or that was made without pip, is made anew.
+    if "$python" -c 'import pip' 2>/dev/null; then return; fi
     base=$(find_python) || {
         need "python3 python3-venv" "there is no Python 3.10 or newer"
         base=$(find_python) || { echo "still no Python 3.10 or newer; set PYTHON=/path/to/python3" >&2; exit 1; }

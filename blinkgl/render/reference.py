@@ -73,8 +73,8 @@ class Flow:
 
     flow : (..., 2) px, +x right, +y down, t -> t'; nan where not valid.
     valid : hit, and in front of the camera at t' (Z' > 0).
-    occluded : hit, but not visible at t': hidden, seen from a culled side, outside the image, in front of the near
-    plane or behind the camera.   outside : hit, and not inside the image at t'.
+    occluded : valid, but not visible at t': hidden by a surface, seen from its own culled side, outside the image or in
+    front of the near plane.   outside : valid, and not inside the image at t'.
     depth : (...) Z' at t'.   hidden_by : (..., 2) int32 (part, triangle) of the nearest thing in the way, or -1.
     """
 
@@ -264,8 +264,8 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     far = moved[:, 2] * (1.0 - VISIBILITY_SLACK)
     blocker, _, _ = _nearest(scene, t_ns, moved[:, :2] / moved[:, 2:], far=far, skip=skip)
     hidden_by[rows] = blocker[:, :2]
-    occluded = hits.hit & ~(candidate & (hidden_by[:, 0] < 0))
-    return Flow(int(t_ns), flow, valid, occluded, hits.hit & ~inside, depth, hidden_by)
+    occluded = valid & ~(candidate & (hidden_by[:, 0] < 0))
+    return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
 
 
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:

@@ -10,7 +10,7 @@ import errno
 import os
 import sys
 import traceback
-from typing import Annotated
+from typing import Annotated, Optional
 
 import typer
 
@@ -53,6 +53,21 @@ def doctor(
         examination.show(report)
     if not report.ok:
         raise typer.Exit(BlinkGLError.exit_status)
+
+
+@app.command()
+def generate(
+    config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")],
+    num: Annotated[Optional[int], typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")] = None,
+    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+) -> None:
+    """Generate event + optical-flow sequences from one YAML file."""
+    from blinkgl.dataset.show import generate_with_progress
+
+    generate_with_progress(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet)
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------

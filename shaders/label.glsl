@@ -3,7 +3,7 @@
 // number for each buffer that somebody consumes; the others do not exist.
 //
 //   OUT_COLOUR    rgb linear radiance            OUT_DEPTH     Z along the optical axis, world units
-//   OUT_ID        instance id (0: nothing hit)   OUT_NORMAL    world-frame unit normal towards the camera
+//   OUT_ID        instance id (0: nothing hit)   OUT_NORMAL    unit normal, camera axes, facing it
 //   OUT_VELOCITY  px/s                           OUT_FLOW_FORWARD, OUT_FLOW_BACKWARD
 //                                                (u, v in px, Z at the other time; 0 in .w of unwritten pixels)
 // Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED.
@@ -78,8 +78,8 @@ layout(location = OUT_ID) out uint id;
 uniform uint instance_id;
 #endif
 #ifdef OUT_NORMAL
-layout(location = OUT_NORMAL) out vec4 world_normal;
-uniform mat3 world_from_local;
+layout(location = OUT_NORMAL) out vec4 camera_normal;
+uniform mat3 camera_from_local;
 #endif
 #ifdef OUT_VELOCITY
 layout(location = OUT_VELOCITY) out vec2 image_velocity;
@@ -120,7 +120,7 @@ void main()
     id = instance_id;
 #endif
 #ifdef OUT_NORMAL
-    world_normal = vec4(normalize(world_from_local * facing), 0.0);
+    camera_normal = vec4(normalize(camera_from_local * facing), 0.0);
 #endif
 #ifdef OUT_VELOCITY
     image_velocity = velocity(rate, local, image_size);

@@ -137,12 +137,12 @@ class LabelsConfig(Config):
     """What is written at label times. A pass that nobody asks for is not compiled, allocated or run."""
 
     images: bool = Field(True, description="sRGB PNG of the colour pass")
-    flow: list[Literal["forward", "backward"]] = Field(["forward"], description="directions of optical flow")
-    flow_formats: list[Literal["png", "npy", "flo"]] = Field(["png"], description="png: DSEC 16-bit; npy, flo: float32")
+    flow: tuple[Literal["forward", "backward"], ...] = Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG")
+    float_flow: tuple[Literal["npy", "flo", "h5"], ...] = Field((), description="float32 flow besides the PNG")
     occlusion: bool = Field(True, description="masks of pixels that are not visible at the flow's other end")
     depth: bool = Field(False, description="float32 .npy, world units along the optical axis")
     ids: bool = Field(False, description="instance ids, 16-bit PNG")
-    normals: bool = Field(False, description="world-frame unit normals, float32 .npy")
+    normals: bool = Field(False, description="unit normals in camera axes, float32 .npy")
     velocity: bool = Field(False, description="instantaneous image velocity, px/s, float32 .npy")
 
 
@@ -150,7 +150,7 @@ class PreviewConfig(Config):
     """preview.mp4: frames, events and flow side by side."""
 
     enabled: bool = True
-    fps: float = Field(30.0, gt=0, le=240, description="pictures per second of simulated time")
+    rate: float = Field(60.0, gt=0, le=1e4, description="pictures per second of simulated time, Hz")
     slowdown: float = Field(3.0, gt=0, le=1000, description="play-back this many times slower than the simulation")
 
 
@@ -160,6 +160,7 @@ class OutputConfig(Config):
     name: str = Field("sequence", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$", description="name of the sequences")
     split: Literal["train", "test"] = "train"
     sequences: int = Field(1, ge=1, le=10_000_000, description="how many (--num overrides)")
+    first_index: int = Field(0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone")
 
 
 class SequenceConfig(Config):

@@ -52,7 +52,7 @@ class LabelFrame:
     """Ground truth at t_ns. Buffers that were not requested are None.
 
     colour : (H, W, 3) float32 linear radiance.     depth : (H, W) float32 Z along the optical axis; inf: nothing hit.
-    ids : (H, W) uint32; 0: nothing hit.            normals : (H, W, 3) float32, world frame, towards the camera.
+    ids : (H, W) uint32; 0: nothing hit.            normals : (H, W, 3) float32 unit, camera axes (OpenCV), facing the camera.
     velocity : (H, W, 2) float32 px/s at t."""
 
     t_ns: int
@@ -101,6 +101,7 @@ class Renderer:
         self._T_world_obj = np.stack([p.pose(scene.t0_ns) for p in self._paths]) if self._paths else np.zeros((0, 4, 4))
         self._targets: dict = {}
         self._uniforms: dict = {}
+        self._last_moment: tuple[int, _Moment] | None = None
         self._resources = SceneResources(gl.ctx, scene, config.anisotropy)
         items = self._resources.items
         self._item_object = np.array([i.object_index for i in items], np.intp)
@@ -167,7 +168,7 @@ class Renderer:
         """Ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns."""
         result: dict = {}
         if request.colour:
-            result["colour"] = self._colour(t_ns)
+            result["colour"] = self.colour(t_ns)
         outputs = []
         needs_occlusion = request.occlusion and (request.flow_forward or request.flow_backward)
         for name, wanted, fmt in (
@@ -195,11 +196,10 @@ class Renderer:
                     result[key] = self._flow(buffers[name], buffers.get("ID"), t_other, needs_occlusion)
         return LabelFrame(t_ns, **result)
 
-    # ---- parts of the label pass -------------------------------------------------------------------------------
-
-    def _colour(self, t_ns: int) -> np.ndarray:
+    def colour(self, t_ns: int, supersample: int | None = None) -> np.ndarray:
+        """Linear radiance at t_ns, (H, W, 3) float32; ``supersample`` overrides the configuration's."""
         started = time.perf_counter()
-        factor = self.config.image_supersample
+        factor = self.config.image_supersample if supersample is None else supersample
         target = self._target("colour", factor, ("RGBA32F",))
         moment = self._moment(t_ns)
         self._begin(target, moment, self.scene.background)
@@ -212,6 +212,8 @@ class Renderer:
         if factor > 1:
             target = self._downsample(target, "colour", "RGBA32F", factor)
         return np.ascontiguousarray(self._read(target, 0, started, None)[..., :3])
+
+    # ---- parts of the label pass -------------------------------------------------------------------------------
 
     def _geometry(self, t_ns: int, outputs: list[tuple[str, str]], t_forward_ns: int | None,
                   t_backward_ns: int | None) -> dict[str, np.ndarray]:
@@ -233,8 +235,8 @@ class Renderer:
             if "OUT_ID" in defines:
                 uniforms["instance_id"].value = self.scene.objects[item.object_index].instance_id
             if "OUT_NORMAL" in defines:
-                rotation = moment.T_world_obj[item.object_index, :3, :3]
-                uniforms["world_from_local"].write(np.ascontiguousarray(rotation.T, np.float32).tobytes())
+                rotation = moment.T_cam_obj[item.object_index, :3, :3]
+                uniforms["camera_from_local"].write(np.ascontiguousarray(rotation.T, np.float32).tobytes())
             self._draw(uniforms, item)
         return {name: self._read(target, i, started if i == 0 else time.perf_counter(), None)
                 for i, (name, _) in enumerate(outputs)}
@@ -253,11 +255,16 @@ class Renderer:
     # ---- matrices ----------------------------------------------------------------------------------------------
 
     def _moment(self, t_ns: int) -> _Moment:
+        if self._last_moment is not None and self._last_moment[0] == t_ns:  # several passes of one frame share it
+            return self._last_moment[1]
+        T_world_obj = self._T_world_obj.copy()
         for i in self._moving:
-            self._T_world_obj[i] = self._paths[i].pose(t_ns)
+            T_world_obj[i] = self._paths[i].pose(t_ns)
         T_world_cam = self.scene.camera.path.pose(t_ns)
-        T_cam_obj = cam_from_obj(T_world_cam, self._T_world_obj)
-        return _Moment(T_world_cam, self._T_world_obj.copy(), T_cam_obj, self._projection @ T_cam_obj)
+        T_cam_obj = cam_from_obj(T_world_cam, T_world_obj)
+        moment = _Moment(T_world_cam, T_world_obj, T_cam_obj, self._projection @ T_cam_obj)
+        self._last_moment = (t_ns, moment)
+        return moment
 
     def _rates(self, t_ns: int, moment: _Moment) -> np.ndarray:
         """(n, 4, 4) float64 d(MVP)/dt, 1/s, from the analytic derivatives of the paths."""

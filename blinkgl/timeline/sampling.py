@@ -50,11 +50,11 @@ def displacement_times(max_px: float, min_step_ns: int, max_step_ns: int, t0_ns:
     yield t0_ns
     t, v = t0_ns, speed(t0_ns)
     while t < t1_ns:
-        step = _step(max_px, v, min_step_ns, max_step_ns)
+        step = min(_step(max_px, v, min_step_ns, max_step_ns), t1_ns - t)
         while True:
-            end = min(t + step, t1_ns)
+            end = t + step
             v_end = speed(end)
-            if max(v, v_end) * (end - t) <= max_px * NS_PER_S * (1 + 1e-9) or step <= min_step_ns:
+            if max(v, v_end) * step <= max_px * NS_PER_S * (1 + 1e-9) or step <= min_step_ns:
                 break
             # 0.9: a step cut to exactly what the end's speed asks for is often rejected again.
             step = max(min_step_ns, min(int(0.9 * step), _step(0.95 * max_px, max(v, v_end), min_step_ns, max_step_ns)))

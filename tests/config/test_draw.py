@@ -1,0 +1,79 @@
+"""Per-sequence parameter distributions."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from blinkgl.config.draw import draw, extremes, is_distribution
+from blinkgl.errors import ConfigError
+
+TREE = {"a": {"uniform": [0.18, 0.25]}, "b": {"c": [{"integer": [1, 6]}, 5]}, "d": {"choice": ["x", "y"]}, "e": 3}
+
+
+def test_plain_values_stay_and_distributions_become_plain():
+    drawn = draw(TREE, seed=0, sequence=0)
+    assert drawn["e"] == 3 and drawn["b"]["c"][1] == 5
+    assert 0.18 <= drawn["a"] < 0.25 and drawn["b"]["c"][0] in range(1, 7) and drawn["d"] in ("x", "y")
+
+
+def test_same_seed_and_sequence_same_draw_and_others_differ():
+    assert draw(TREE, 0, 3) == draw(TREE, 0, 3)
+    assert draw(TREE, 0, 3)["a"] != draw(TREE, 0, 4)["a"] != draw(TREE, 1, 4)["a"]
+
+
+def test_a_new_distribution_moves_no_other_draw():
+    more = {"new": {"uniform": [0, 1]}, **TREE}
+    assert draw(more, 5, 2)["a"] == draw(TREE, 5, 2)["a"]
+
+
+def test_uniform_over_sequences_is_uniform():
+    values = [draw({"a": {"uniform": [2, 4]}}, 0, i)["a"] for i in range(2000)]
+    assert stats.kstest(values, "uniform", args=(2, 2)).pvalue > 1e-3
+
+
+def test_log_uniform_is_uniform_in_log():
+    values = np.log10([draw({"a": {"log_uniform": ["1e-4", 1e-2]}}, 0, i)["a"] for i in range(2000)])
+    assert stats.kstest(values, "uniform", args=(-4, 2)).pvalue > 1e-3
+
+
+def test_weighted_choice_follows_its_weights():
+    values = [draw({"a": {"weighted": {"esim": 3, "v2e": 1}}}, 0, i)["a"] for i in range(2000)]
+    share = values.count("esim")
+    assert stats.binomtest(share, 2000, 0.75).pvalue > 1e-3 and set(values) == {"esim", "v2e"}
+
+
+def test_integer_includes_both_ends_and_is_flat():
+    values = [draw({"a": {"integer": [1, 4]}}, 0, i)["a"] for i in range(2000)]
+    assert set(values) == {1, 2, 3, 4}
+    assert stats.chisquare([values.count(k) for k in range(1, 5)]).pvalue > 1e-3
+
+
+def test_a_choice_may_hold_distributions():
+    tree = {"events": {"choice": [{"emulator": "esim", "contrast_threshold": {"uniform": [1, 2]}}]}}
+    assert 1 <= draw(tree, 0, 0)["events"]["contrast_threshold"] < 2
+
+
+def test_extremes_visit_both_ends_and_every_choice():
+    trees = extremes({"a": {"uniform": [1, 2]}, "b": {"choice": [7, 8, 9]}})
+    assert {t["a"] for t in trees} == {1, 2} and {t["b"] for t in trees} == {7, 8, 9}
+
+
+@pytest.mark.parametrize("node, message", [
+    ({"uniform": [2, 1]}, "p.q.uniform: the range is empty"),
+    ({"uniform": [1]}, "p.q.uniform: not a range"),
+    ({"uniform": "ab"}, "p.q.uniform: not a range"),
+    ({"uniform": [0, "nan"]}, "p.q.uniform: not a range"),
+    ({"log_uniform": [0, 1]}, "p.q.log_uniform: a logarithmic range needs positive ends"),
+    ({"integer": [1, 2.5]}, "p.q.integer: not whole numbers"),
+    ({"choice": []}, "p.q.choice: not a list of choices"),
+    ({"weighted": {"a": 0}}, "p.q.weighted: not a table of weights"),
+    ({"weighted": {"a": -1, "b": 3}}, "p.q.weighted: not a table of weights"),
+])
+def test_malformed_distributions_name_the_path(node, message):
+    for function in (lambda t: draw(t, 0, 0), extremes):
+        with pytest.raises(ConfigError, match="^" + message):
+            function({"p": {"q": node}})
+
+
+def test_ordinary_tables_are_not_distributions():
+    assert not is_distribution({"kind": "uniform"}) and not is_distribution({"uniform": [1, 2], "fps": 3})

@@ -1,0 +1,130 @@
+"""The YAML as a user writes it, and what a user reads when it is wrong."""
+
+import math
+from importlib import resources
+
+import pytest
+
+from blinkgl.config.sequence import CameraConfig, SequenceConfig, TimeConfig, load_run
+from blinkgl.errors import ConfigError
+
+
+def write(tmp_path, text):
+    path = tmp_path / "run.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_an_empty_file_is_a_valid_run(tmp_path):
+    assert load_run(write(tmp_path, "")).sequence(0) == SequenceConfig()
+
+
+def test_shipped_configurations_are_valid():
+    shipped = [p for p in resources.files("blinkgl.configs").iterdir() if p.name.endswith(".yaml")]
+    assert {p.name for p in shipped} >= {"demo.yaml", "flying_objects.yaml"}
+    for path in shipped:
+        load_run(path).sequence(0)
+
+
+def test_ranges_are_drawn_per_sequence_and_recorded(tmp_path):
+    run = load_run(write(tmp_path, "events: {emulator: esim, contrast_threshold: {uniform: [0.18, 0.25]}}"))
+    values = {run.sequence(i).events.contrast_threshold for i in range(5)}
+    assert len(values) == 5 and all(0.18 <= v < 0.25 for v in values)
+
+
+def test_resolved_yaml_makes_the_same_sequence(tmp_path):
+    from blinkgl.dataset.generate import config_yaml
+
+    run = load_run(write(tmp_path, "seed: 3\nevents: {emulator: esim, contrast_threshold: {uniform: [0.18, 0.25]}}"))
+    third = run.sequence(3)
+    again = load_run(write(tmp_path, config_yaml(third, 3)))
+    copy = again.sequence(3)
+    assert copy.output.first_index == 3 and copy.output.sequences == 1
+    assert copy.model_copy(update={"output": third.output}) == third
+
+
+def test_overrides_reach_nested_keys_lists_and_absent_tables(tmp_path):
+    path = write(tmp_path, "camera: {width: 64, height: 48}")
+    run = load_run(path, ["camera.width=32", "time.duration=0.5", "labels.flow=[forward, backward]", "labels.flow.1=forward",
+                          "timeline={kind: uniform, fps: 1e2}"], seed=9)
+    config = run.sequence(0)
+    assert (config.camera.width, config.time.duration, config.labels.flow, config.seed) == (32, 0.5, ("forward", "forward"), 9)
+    assert config.timeline.kind == "uniform" and config.timeline.fps == 100.0
+
+
+def test_times_of_the_paper():
+    time = TimeConfig(duration=1.0, label_rate=10, start=5)
+    assert time.label_count == 10 and time.t0_ns == 5_000_000_000
+    assert time.label_times_ns[0] - time.t0_ns == 100_000_000, "a label interval of events before the first label"
+    assert time.t1_ns - time.t0_ns == 1_100_000_000
+
+
+def test_field_of_view_is_horizontal_and_the_principal_point_the_centre():
+    camera = CameraConfig(width=640, height=480, fov=90)
+    assert math.isclose(camera.fx, 320) and camera.fx == camera.fy and camera.principal_point == (319.5, 239.5)
+
+
+@pytest.mark.parametrize("text, message", [
+    ("camra: {width: 3}", "camra: unknown key; expected 'camera' (nearest)"),
+    ("camera: {widht: 3}", "camera.widht: unknown key; expected 'width' (nearest)"),
+    ("scene: {kind: random, objects: {cuont: 3}}", "scene.objects.cuont: unknown key; expected 'count' (nearest)"),
+    ("events: {emulator: esim, contrast_treshold: 0.2}", "events.contrast_treshold: unknown key; expected 'contrast_threshold' (nearest)"),
+    ("camera: {width: many}", "camera.width: input should be a valid integer, unable to parse string as an integer (got 'many')"),
+    ("camera: {width: 0}", "camera.width: input should be greater than or equal to 1 (got 0)"),
+    ("camera: 7", "camera: input should be a valid dictionary or instance of CameraConfig (got 7)"),
+    ("camera: {fov: 60, focal: 200}", "camera: give fov or focal, not both"),
+    ("camera: {fov: .nan}", "camera.fov: input should be a finite number (got nan)"),
+    ("time: {duration: -1}", "time.duration: input should be greater than 0 (got -1)"),
+    ("time: {duration: 0.01}", "time: duration * label_rate must be at least 1 label"),
+    ("timeline: {kind: regular}", "timeline.kind: unknown or missing choice (got 'regular'); expected one of 'uniform', 'displacement'"),
+    ("timeline: {kind: displacement, min_step_us: 5, max_step_us: 4}", "timeline: min_step_us must not exceed max_step_us = 4.0"),
+    ("events: {emulator: easim}", "events.emulator: unknown or missing choice (got 'easim')"),
+    ("labels: {flow: [sideways]}", "labels.flow.0: input should be 'forward' or 'backward' (got 'sideways')"),
+    ("output: {name: ../escape}", "output.name: string should match pattern"),
+    ("seed: -1", "seed: input should be greater than or equal to 0 (got -1)"),
+    ("events: {emulator: esim, contrast_threshold: {uniform: [0.1, 11]}}", "events.contrast_threshold: input should be less than or equal to 10 (got 11)"),
+])
+def test_bad_values_name_path_value_and_what_is_accepted(tmp_path, text, message):
+    with pytest.raises(ConfigError) as caught:
+        load_run(write(tmp_path, text))
+    assert str(caught.value).startswith(message)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text, message", [
+    ("a: [1, 2", ":1:9: not valid YAML"),
+    ("camera: {width: 3}\ncamera: {width: 4}", ":2:1: not valid YAML: key 'camera' is given twice"),
+    ("- 1\n- 2", ": not a table of keys"),
+    ("a: !!python/object/apply:os.system [echo]", ":1:4: not valid YAML: could not determine a constructor"),
+])
+def test_files_that_are_no_configuration(tmp_path, text, message):
+    path = write(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_run(path)
+    assert str(caught.value).startswith(str(path) + message)
+
+
+def test_missing_binary_and_huge_files(tmp_path):
+    with pytest.raises(ConfigError, match="no such file"):
+        load_run(tmp_path / "absent.yaml")
+    path = tmp_path / "binary.yaml"
+    path.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_run(path)
+    path.write_bytes(b" " * (5 << 20))
+    with pytest.raises(ConfigError, match="too large"):
+        load_run(path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_run(tmp_path)
+
+
+@pytest.mark.parametrize("option, message", [
+    ("camera.width", "--set: not an override"), ("=3", "--set: not an override"),
+    ("camera.width.x=3", "--set camera.width: is a plain value and has no keys"),
+    ("labels.flow.5=forward", "--set labels.flow.5: no such list entry"),
+    ("camera.width=[", "--set camera.width:1:2: not valid YAML"),
+])
+def test_bad_overrides(tmp_path, option, message):
+    with pytest.raises(ConfigError) as caught:
+        load_run(write(tmp_path, "camera: {width: 3}\nlabels: {flow: [forward]}"), [option])
+    assert str(caught.value).startswith(message)

@@ -1,0 +1,17 @@
+"""Event emulators: frames and times in, events out. They know nothing of scenes or OpenGL."""
+
+from __future__ import annotations
+
+from blinkgl.config.events import EsimConfig
+from blinkgl.events.emulator import Emulator
+from blinkgl.events.esim import Esim
+from blinkgl.events.types import Events
+
+__all__ = ["Emulator", "Esim", "Events", "make_emulator"]
+
+
+def make_emulator(config, height: int, width: int, seed: int = 0) -> Emulator:
+    """The emulator a config asks for: ``EsimConfig``, ``V2eConfig`` or ``VoltmeterConfig``."""
+    if isinstance(config, EsimConfig):
+        return Esim(height, width, config, seed)
+    raise TypeError(f"no emulator for {type(config).__name__}")

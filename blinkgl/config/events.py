@@ -1,0 +1,123 @@
+"""Event emulators: parameters, units, defaults and where each comes from.
+
+``emulator: esim | v2e | voltmeter`` picks the model; ``preset`` fills in published parameter sets, and any key
+given beside it wins over the preset.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, Union
+
+from pydantic import Field, model_validator
+
+from blinkgl.config.base import Config
+
+_MAX_EVENTS = Field(2**25, ge=1_000, le=2**31 - 1, description="Most events one step may emit. If more could fire, every "
+                    "pixel is cut to the same number per interval; levels still move, the cut events are counted in "
+                    "`emulator.saturated`. 2^25 events need about 1 GB while they are sorted.")
+_THRESHOLD = dict(ge=0.001, le=10.0)
+
+
+def _fill_preset(data: Any, presets: dict[str, dict[str, float]]) -> Any:
+    if isinstance(data, dict):
+        return {**presets.get(data.get("preset"), {}), **data}
+    return data
+
+
+class EsimConfig(Config):
+    """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
+
+    emulator: Literal["esim"] = "esim"
+    contrast_threshold: float = Field(0.2, **_THRESHOLD, description="C+, change of ln(intensity) per ON event. "
+                                      "BlinkSim draws 0.18-0.25 per sequence.")
+    contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="C-, for OFF events; default: equal to "
+                                                 "contrast_threshold.")
+    threshold_sigma: float = Field(0.021, ge=0, le=5, description="Standard deviation of C+ and C- over the pixels, in ln "
+                                   "units (rpg_esim's default 0.021), drawn once per pixel; each threshold stays >= 0.01 "
+                                   "(or >= half of a smaller nominal one).")
+    threshold_jitter: float = Field(0.0, ge=0, le=5, description="Standard deviation of the threshold from event to event, "
+                                    "in ln units, drawn once per event.")
+    log_eps: float = Field(1e-3, ge=1e-12, le=1e6, description="Added to the intensity before the logarithm, in the units "
+                           "of the intensity (rpg_esim's default 1e-3 for intensities in [0, 1]).")
+    refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time of a pixel after an event, microseconds; a level "
+                                 "passed in it is lost, as in rpg_esim.")
+    max_events_per_step: int = _MAX_EVENTS
+
+
+V2E_PRESETS = {
+    # v2e's `--dvs_params clean` and `noisy` (emulator.py, set_dvs_params).
+    "clean": dict(threshold_sigma=0.02, cutoff_hz=0.0, leak_rate_hz=0.0, leak_jitter=0.0, leak_cov_decades=0.0,
+                  shot_noise_rate_hz=0.0, refractory_us=0.0),
+    "noisy": dict(threshold_sigma=0.05, cutoff_hz=30.0, leak_rate_hz=0.1, leak_jitter=0.1, leak_cov_decades=0.1,
+                  shot_noise_rate_hz=5.0, refractory_us=500.0),
+}
+
+
+class V2eConfig(Config):
+    """V2E (Hu, Liu, Delbruck, CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period."""
+
+    emulator: Literal["v2e"] = "v2e"
+    preset: Literal["default", "clean", "noisy"] = Field("default", description="v2e's command-line defaults, or its `clean` "
+                                                         "and `noisy` parameter sets.")
+    contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units (v2e: 0.2).")
+    contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="OFF threshold; default: equal.")
+    threshold_sigma: float = Field(0.03, ge=0, le=5, description="Spread of the thresholds over the pixels, ln units (v2e: "
+                                   "0.03); each threshold stays >= 0.01.")
+    full_scale: float = Field(255.0, gt=0, le=1e9, description="Digital number of luminance 1.0: v2e's lin-log joint (20) "
+                              "and its 275 are on the 8-bit scale.")
+    cutoff_hz: float = Field(300.0, ge=0, le=1e7, description="Photoreceptor cut-off at full scale, Hz (v2e: 300), scaled by "
+                             "(I + 20)/275; 0: infinite bandwidth.")
+    leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON (v2e: 0.01).")
+    leak_jitter: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the interval between two leak "
+                               "events of a pixel (v2e: leak_jitter_fraction 0.1).")
+    leak_cov_decades: float = Field(0.1, ge=0, le=3, description="Spread of the leak rate over the pixels, decades (v2e: "
+                                    "noise_rate_cov_decades 0.1).")
+    shot_noise_rate_hz: float = Field(0.001, ge=0, le=1e5, description="Noise events per second and pixel in the dark, ON and "
+                                      "OFF together (v2e: 0.001); at full scale a quarter of it.")
+    photoreceptor_noise: bool = Field(False, description="Make the noise events by low-passed noise before the comparator, "
+                                      "at the rate shot_noise_rate_hz, instead of drawing events.")
+    refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
+    hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
+    hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
+    max_events_per_step: int = _MAX_EVENTS
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, data: Any) -> Any:
+        return _fill_preset(data, V2E_PRESETS)
+
+
+VOLTMETER_PRESETS = {
+    # Lin, Ma, Guo, Wen, "DVS-Voltmeter", ECCV 2022, calibrated k1..k6 of the two cameras.
+    "DVS346": dict(k1=5.265, k2=20.0, k3=1e-4, k4=1e-7, k5=5e-9, k6=1e-5),
+    "DVS240": dict(k1=4.424, k2=23.0, k3=2e-4, k4=1e-7, k5=5e-8, k6=1e-5),
+}
+
+
+class VoltmeterConfig(Config):
+    """DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion with drift between two absorbing thresholds."""
+
+    emulator: Literal["voltmeter"] = "voltmeter"
+    preset: Literal["DVS346", "DVS240"] = Field("DVS346", description="Camera whose calibrated k1...k6 are the defaults.")
+    k1: float = Field(5.265, gt=0, le=100, description="Gain: thresholds per unit of d ln(L + k2); the contrast threshold is "
+                      "about 1/k1.")
+    k2: float = Field(20.0, gt=0, le=1e4, description="Dark-current offset, digital numbers.")
+    k3: float = Field(1e-4, ge=0, le=1, description="Photon shot noise, sqrt(DN) per sqrt(us).")
+    k4: float = Field(1e-7, ge=-1, le=1, description="Leak by temperature (junction leakage), thresholds per us.")
+    k5: float = Field(5e-9, ge=-1, le=1, description="Leak by parasitic photocurrent, thresholds per us and DN.")
+    k6: float = Field(1e-5, ge=0, le=1, description="Noise of the circuit, thresholds per sqrt(us).")
+    full_scale: float = Field(255.0, gt=0, le=1e9, description="Digital number of luminance 1.0 (the constants are on the "
+                              "8-bit scale).")
+    refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time after an event, microseconds (the paper has none).")
+    max_events_per_step: int = _MAX_EVENTS
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            return _fill_preset({"preset": "DVS346", **data}, VOLTMETER_PRESETS)
+        return data
+
+
+EmulatorConfig = Annotated[Union[EsimConfig, V2eConfig, VoltmeterConfig], Field(discriminator="emulator")]
+"""The union as a field annotation; a model holds ``events: EmulatorConfig = EsimConfig()``."""

@@ -1,0 +1,91 @@
+"""Counter-based random numbers: every draw is a pure function of (seed, pixel, stream, index).
+
+Philox4x32-10 (Salmon, Moraes, Dror, Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011). There is no
+state to share, so results do not depend on the number of threads, the chunk length, or which pixels were busy.
+The counter is (pixel, stream, index low, index high), the key the 64-bit seed. One block is 128 bits: two
+uniforms, or two normals.
+
+Called from Python with arrays (uint64) the functions are the NumPy twin; compiled into a kernel they work on
+scalars (see :mod:`blinkgl.events.arith`).
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numba.extending import register_jitable
+
+from blinkgl.events.arith import cos_sin_turn, log_f64
+
+_U, _D = np.uint64, np.float64
+_MASK32, _S32, _S11 = _U(0xFFFFFFFF), _U(32), _U(11)
+_M0, _M1 = _U(0xD2511F53), _U(0xCD9E8D57)
+_W0, _W1 = _U(0x9E3779B9), _U(0xBB67AE85)
+_HALF, _ULP53, _MINUS2 = _D(0.5), _D(2.0**-53), _D(-2.0)
+
+
+class Stream(IntEnum):
+    """What a draw is for. Append only: the numbers are part of every published data set."""
+
+    THRESHOLD = 0  # (ON, OFF) spread of the thresholds, frozen per pixel
+    JITTER = 1  # (ON, OFF) threshold jitter, index = the pixel's event count
+    LEAK = 2  # (leak rate, hot pixel) frozen per pixel
+    LEAK_JITTER = 3
+    SHOT = 4  # shot noise; "pixel" is the image row
+    NOISE = 5  # photoreceptor noise, index = step
+    HOT = 6
+    DIFFUSION = 7  # Voltmeter, index = step * 2^20 + draw within the step
+    START = 8  # initial state
+
+
+@register_jitable
+def _round(c0, c1, c2, c3, k0, k1):
+    p0 = c0 * _M0
+    p1 = c2 * _M1
+    return (p1 >> _S32) ^ c1 ^ k0, p1 & _MASK32, (p0 >> _S32) ^ c3 ^ k1, p0 & _MASK32
+
+
+@register_jitable
+def philox4x32(c0, c1, c2, c3, k0, k1):
+    """Four 32-bit words (held in uint64) of the block at counter (c0, c1, c2, c3) under key (k0, k1)."""
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+    k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
+    return _round(c0, c1, c2, c3, k0, k1)
+
+
+@register_jitable
+def uniform2(seed, pixel, stream, index):
+    """Two independent uniforms in the open interval (0, 1), 53 bits each. All arguments uint64 (or arrays of it)."""
+    w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
+    return (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53, (_D(((w3 << _S32) | w2) >> _S11) + _HALF) * _ULP53
+
+
+@register_jitable
+def normal2(seed, pixel, stream, index):
+    """Two independent standard normals (Box-Muller), float64."""
+    u, v = uniform2(seed, pixel, stream, index)
+    radius = np.sqrt(_MINUS2 * log_f64(u))
+    c, s = cos_sin_turn(v)
+    return radius * c, radius * s
+
+
+def pixel_counters(height: int, width: int) -> np.ndarray:
+    """(H*W,) uint64 pixel numbers in raster order, the ``pixel`` argument of the draws."""
+    return np.arange(height * width, dtype=np.uint64)

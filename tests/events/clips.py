@@ -1,0 +1,34 @@
+"""Small clips for the emulator tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.events.types import Events
+
+
+def random_clip(seed: int, frames: int = 8, height: int = 37, width: int = 45, contrast: float = 0.5, dtype=np.float32):
+    """Random-walk luminance with still pixels, exact returns and irregular frame times.
+
+    Returns ((N, H, W) frames, (N,) int64 ns). The size is odd so that bands and blocks end raggedly.
+    """
+    rng = np.random.default_rng(seed)
+    steps = rng.normal(0, contrast, (frames, height, width)) * (rng.random((frames, height, width)) < 0.5)
+    log = np.cumsum(steps, axis=0) - 2.0
+    log[2] = log[0]  # an exact return
+    clip = np.exp(np.clip(log, -9, 3))
+    clip[:, 3, :5] = 0.0
+    times = 7_123 + np.cumsum(rng.integers(1_000, 40_000_000, frames))
+    if dtype == np.uint8:
+        return np.clip(clip * 255, 0, 255).astype(np.uint8), times
+    return clip.astype(np.float32), times
+
+
+def run(emulator, clip, times) -> Events:
+    return Events.concatenate([emulator.step(f, int(t)) for f, t in zip(clip, times)])
+
+
+def assert_same(a: Events, b: Events) -> None:
+    assert len(a) == len(b)
+    for name in "tyxp":
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)

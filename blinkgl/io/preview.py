@@ -1,0 +1,144 @@
+"""preview.mp4: frames, events and flow colours side by side, with the time; made while the sequence is being generated."""
+
+from __future__ import annotations
+
+import os
+
+import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from blinkgl.events.types import Events
+from blinkgl.io import images
+from blinkgl.io.colour import count_events, event_colour, flow_colour, flow_wheel
+from blinkgl.io.video import VideoWriter
+
+_BAR = 30
+_GAP = 4
+_BACK, _TEXT, _DIM = (22, 24, 28), (235, 238, 242), (150, 156, 166)
+_MAX_PANEL_HEIGHT = 360
+_LEGEND = 27
+
+
+class PreviewWriter:
+    """Streams a side-by-side video. Frames are taken at ``rate_hz`` of simulated time and played at ``fps``, i.e. slowed by
+    ``rate_hz / fps``; memory does not grow with the sequence.
+
+        preview.add_events(events)              every chunk
+        preview.set_flow(flow, valid)           whenever a label exists; shown until the next
+        if preview.due(t_us):                   ask first: making the picture may cost something
+            preview.frame(t_us, image)
+
+    Parameters
+    ----------
+    path : ending decides the container, .mp4 usually. height, width : sensor size, px.
+    t0_us : start. flow : False leaves the flow panel out. rate_hz, fps : see above.
+
+    Raises OutputError when the video cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike, height: int, width: int, *, t0_us: int = 0, flow: bool = True,
+                 rate_hz: float = 40, fps: float = 20, label: str = "frame"):
+        self._counts = np.zeros((2, height, width), np.uint16)
+        self._pending = 0
+        factor = min(1.0, _MAX_PANEL_HEIGHT / height)
+        if height < 200:
+            factor = 2.0
+        self._panel = (max(2, round(width * factor / 2) * 2), max(2, round(height * factor / 2) * 2))  # (w, h), even
+        self._period_us, self._next_us, self._t0_us = 1e6 / rate_hz, float(t0_us), t0_us
+        self._slow = rate_hz / fps
+        self._names = [label, "events", "optical flow"][: 3 if flow else 2]
+        w, h = self._panel
+        self._canvas = np.empty((h + _BAR, len(self._names) * (w + _GAP) - _GAP, 3), np.uint8)
+        self._canvas[:] = _BACK
+        self._flow_max = 0.0
+        self._has_flow = flow
+        self._font, self._small = ImageFont.load_default(14), ImageFont.load_default(11)
+        if flow:
+            self._panel_view(2)[:] = (32, 34, 38)
+            self._caption(2, "")
+        self._video = VideoWriter(path, *self._canvas.shape[:2], fps, preset="superfast", crf=22)
+
+    def add_events(self, events: Events) -> None:
+        """Collected until the next frame."""
+        count_events(events.x, events.y, events.p, self._counts)
+        self._pending += len(events)
+
+    def set_flow(self, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
+        """(H, W, 2) px and its valid mask. Full saturation is the largest 99th percentile of speed so far."""
+        if not self._has_flow:
+            return
+        speed = np.hypot(flow[::4, ::4, 0], flow[::4, ::4, 1])
+        speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
+        if speed.size:
+            self._flow_max = max(self._flow_max, float(np.percentile(speed, 99)))
+        nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # noqa: E731 - edges stay true
+        shown = None if valid is None else nearest(np.asarray(valid, np.uint8)) > 0
+        self._panel_view(2)[:] = flow_colour(nearest(np.asarray(flow, np.float32)), self._flow_max or None, shown)
+        self._legend()
+        self._caption(2, f"full colour = {self._flow_max:.3g} px")
+
+    def due(self, t_us: int) -> bool:
+        """Whether :meth:`frame` at this time would be shown."""
+        return t_us >= self._next_us
+
+    def frame(self, t_us: int, image: np.ndarray) -> None:
+        """Composes and encodes one picture (several times when more than one period has passed). image: (H, W[, 3]) float
+        linear light in [0, 1], or uint8 sRGB."""
+        if not self.due(t_us):
+            return
+        small = self._fit(image)  # first: cheaper, and averages linear light where it is given
+        small = images.to_srgb8(small) if small.dtype.kind == "f" else small
+        self._panel_view(0)[:] = small[..., None] if small.ndim == 2 else small
+        self._panel_view(1)[:] = self._fit(event_colour(self._counts))
+        self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms   slowed {self._slow:g}x")
+        self._caption(1, f"ON blue, OFF red   {self._pending:,}")
+        self._counts[:] = 0
+        self._pending = 0
+        while self.due(t_us):
+            self._video.write(self._canvas)
+            self._next_us += self._period_us
+
+    def close(self) -> None:
+        self._video.close()
+
+    def abort(self) -> None:
+        self._video.abort()
+
+    def __enter__(self) -> "PreviewWriter":
+        return self
+
+    def __exit__(self, kind, *_) -> None:
+        self.close() if kind is None else self.abort()
+
+    def _panel_view(self, panel: int) -> np.ndarray:
+        w, h = self._panel
+        left = panel * (w + _GAP)
+        return self._canvas[_BAR:_BAR + h, left:left + w]
+
+    def _fit(self, image: np.ndarray) -> np.ndarray:
+        larger = self._panel[1] > image.shape[0]
+        return cv2.resize(image, self._panel, interpolation=cv2.INTER_NEAREST if larger else cv2.INTER_AREA)
+
+    def _caption(self, panel: int, detail: str) -> None:
+        w = self._panel[0]
+        strip = Image.new("RGB", (w, _BAR), _BACK)
+        draw = ImageDraw.Draw(strip)
+        draw.text((8, _BAR / 2), self._names[panel], fill=_TEXT, font=self._font, anchor="lm")
+        draw.text((w - 8, _BAR / 2), detail, fill=_DIM, font=self._small, anchor="rm")
+        left = panel * (w + _GAP)
+        self._canvas[:_BAR, left:left + w] = np.asarray(strip)
+
+    def _legend(self) -> None:
+        """The colour wheel in the flow panel's lower right corner."""
+        view = self._panel_view(2)
+        size = 2 * _LEGEND + 1
+        if min(view.shape[:2]) < 3 * size:
+            return
+        y, x = np.mgrid[-_LEGEND:_LEGEND + 1, -_LEGEND:_LEGEND + 1]
+        inside = np.clip(_LEGEND + 0.5 - np.hypot(x, y), 0, 1)[..., None]  # one pixel of anti-aliasing
+        wheel = cv2.resize(flow_wheel(), (size, size), interpolation=cv2.INTER_AREA)
+        corner = view[-size - 6:-6, -size - 6:-6]
+        ring = np.clip(1.5 - np.abs(np.hypot(x, y) - _LEGEND), 0, 1)[..., None]
+        mixed = corner * (1 - inside) + wheel * inside
+        corner[:] = mixed * (1 - ring) + 60 * ring

@@ -1,0 +1,123 @@
+"""Videos, the preview, and colours."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError, OutputError
+from blinkgl.events.types import Events
+from blinkgl.io.colour import INVALID, event_colour, flow_colour
+from blinkgl.io.preview import PreviewWriter
+from blinkgl.io.video import VideoReader, VideoWriter
+
+
+def write_video(path, count=12, height=48, width=64):
+    y, x = np.mgrid[:height, :width]
+    frames = [np.dstack([x * 3, y * 4, np.full_like(x, 20 * i)]).astype(np.uint8) for i in range(count)]
+    with VideoWriter(path, height, width, 25) as video:
+        for frame in frames:
+            video.write(frame)
+    return frames
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv", "avi"])
+def test_video_round_trip_and_independent_decoder(tmp_path, ending):
+    frames = write_video(tmp_path / f"v.{ending}")
+    reader = VideoReader(tmp_path / f"v.{ending}")
+    assert (reader.height, reader.width, reader.fps) == (48, 64, 25)
+    decoded = list(reader)
+    assert len(decoded) == 12
+    assert max(np.abs(a.astype(int) - b).mean() for a, b in zip(frames, decoded)) < 6  # lossy, subsampled chroma
+    capture = cv2.VideoCapture(str(tmp_path / f"v.{ending}"))
+    assert np.abs(capture.read()[1][..., ::-1].astype(int) - frames[0]).mean() < 6
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv", "avi"])
+def test_truncated_video_is_an_error_that_names_the_frame(tmp_path, ending):
+    path = tmp_path / f"v.{ending}"
+    rng = np.random.default_rng(0)
+    with VideoWriter(path, 96, 128, 25) as video:
+        for _ in range(30):
+            video.write(rng.integers(0, 255, (96, 128, 3), dtype=np.uint8))
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    count = 0
+    with pytest.raises(AssetError, match=f"v.{ending}: video truncated or corrupt after frame [0-9]+") as caught:
+        for _ in VideoReader(path):
+            count += 1
+    assert f"after frame {count}" in str(caught.value) and 5 < count < 25
+
+
+@pytest.mark.parametrize("content, message", [(b"", "cannot read video"), (b"not a video at all" * 100, "cannot read video: .*[Ii]nvalid data"),
+                                              (None, "no such file")])
+def test_unreadable_video(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "v.mp4").write_bytes(content)
+    with pytest.raises(AssetError, match=message) as caught:
+        VideoReader(tmp_path / "v.mp4")
+    assert "\n" not in str(caught.value)
+
+
+def test_video_without_pictures(tmp_path):
+    with pytest.raises(OutputError, match="cannot write video"):
+        write_video(tmp_path / "none" / "v.mp4")
+    with pytest.raises(OutputError, match="cannot write video"):
+        write_video(tmp_path / "v.unknown_ending")
+    with pytest.raises(ValueError, match="even sizes"):
+        VideoWriter(tmp_path / "v.mp4", 47, 64, 25)
+
+
+def test_no_ffmpeg(tmp_path, monkeypatch):
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: (_ for _ in ()).throw(RuntimeError("No ffmpeg exe")))
+    with pytest.raises(OutputError, match="no ffmpeg binary.*use pip install imageio-ffmpeg"):
+        VideoWriter(tmp_path / "v.mp4", 48, 64, 25)
+
+
+@pytest.mark.parametrize("height, width", [(48, 65), (261, 347)])
+@pytest.mark.parametrize("flow", [True, False])
+def test_preview(tmp_path, height, width, flow):
+    rng = np.random.default_rng(0)
+    with PreviewWriter(tmp_path / "p.mp4", height, width, t0_us=5000, flow=flow, rate_hz=100, fps=20) as preview:
+        for i in range(11):
+            t = 5000 + i * 5000  # twice the preview's rate: every second frame is due
+            n = 100
+            preview.add_events(Events(rng.integers(0, width, n).astype(np.uint16), rng.integers(0, height, n).astype(np.uint16),
+                                      np.full(n, t, np.int64), rng.integers(0, 2, n).astype(np.uint8)))
+            assert preview.due(t) == (i % 2 == 0)
+            if i % 4 == 0:
+                preview.set_flow(rng.normal(size=(height, width, 2)).astype(np.float32))
+            preview.frame(t, rng.random((height, width) if i % 4 else (height, width, 3), dtype=np.float32))
+    reader = VideoReader(tmp_path / "p.mp4")
+    assert len(list(reader)) == 6 and reader.fps == 20
+    assert reader.width > (2.5 if flow else 1.5) * width
+
+
+def test_preview_keeps_pace_when_frames_are_late(tmp_path):
+    with PreviewWriter(tmp_path / "p.mp4", 48, 64, rate_hz=100) as preview:
+        preview.frame(0, np.zeros((48, 64), np.uint8))
+        preview.frame(95_000, np.zeros((48, 64), np.uint8))
+    assert len(list(VideoReader(tmp_path / "p.mp4"))) == 10
+
+
+def test_flow_colour():
+    flow = np.array([[[0, 0], [10, 0], [-10, 0], [0, 10], [0, -10], [20, 0], [np.nan, 0], [5, 0]]], np.float32)
+    valid = np.ones((1, 8), bool)
+    valid[0, 7] = False
+    rgb = flow_colour(flow, 10, valid)[0]
+    assert rgb[0].tolist() == [255, 255, 255] and rgb[1].tolist() == [255, 0, 0] and rgb[5].tolist() == [255, 0, 0]
+    assert rgb[2][0] == 0 and rgb[2][2] == 255, "left is cyan-blue"
+    assert rgb[3][2] == 0 and rgb[3][0] > 200 and rgb[3][1] > 200, "down is yellow"
+    assert rgb[4][2] == 255 and rgb[4][1] < 60, "up is violet"
+    assert rgb[6].tolist() == rgb[7].tolist() == INVALID.tolist()
+    angle = np.linspace(0, 2 * np.pi, 2000)
+    ring = flow_colour(np.stack([np.cos(angle), np.sin(angle)], -1)[None], 1)[0].astype(int)
+    assert np.abs(np.diff(ring, axis=0)).max() <= 25, "the wheel is closed and continuous"
+
+
+def test_event_colour():
+    counts = np.zeros((2, 1, 4), np.uint16)
+    counts[1, 0, 1], counts[0, 0, 2], counts[:, 0, 3] = 1, 65535, 65535
+    rgb = event_colour(counts)[0].astype(int)
+    assert rgb[0].tolist() == [255, 255, 255]
+    assert rgb[1][2] == 255 and rgb[1][0] < 120 and rgb[2].tolist() == [255, 0, 0] and rgb[3].tolist() == [0, 0, 0]

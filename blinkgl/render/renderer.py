@@ -249,7 +249,8 @@ class Renderer:
         occluded = None
         if occlusion:
             other = self._geometry(t_other_ns, [("DEPTH", "R32F"), ("ID", "R32UI")], None, None)
-            occluded = occlusion_mask(flow, w_next, valid, ids, other["DEPTH"], other["ID"])
+            occluded = occlusion_mask(flow, w_next, valid, ids, other["DEPTH"], other["ID"],
+                                      self.scene.camera.near)
         return Flow(flow, valid, occluded)
 
     # ---- matrices ----------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Union
 from pydantic import AfterValidator, Field, model_validator
 
 from blinkgl.config.base import Config
+from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
 PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
 TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
@@ -41,7 +42,6 @@ class ObjectsConfig(Config):
     size: PositiveRange = Field((0.5, 2.5), description="diameter of an object's bounding sphere, m; log-uniform")
     distance: PositiveRange = Field((2.0, 20.0), description="distance from the camera's first position, m; log-uniform")
     flying: Fraction = Field(0.5, description="fraction that flies; the others rest on the ground")
-    moving: Fraction = Field(0.7, description="fraction that moves")
     in_view: Fraction = Field(0.85, description="fraction placed in the camera's first field of view; the others anywhere around it")
     tint: Fraction = Field(0.3, description="strength of the random colour factor on each object's texture")
     texture_scale: PositiveRange = Field((0.7, 2.0), description="texture repeats over an object's texture coordinates; log-uniform")
@@ -133,12 +133,16 @@ class RandomSceneConfig(Config):
     ground: GroundConfig | None = Field(GroundConfig(), description="null: none; then every object flies")
     walls: WallsConfig | bool = Field(False, description="true: four walls")
     light: LightConfig = LightConfig()
+    object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
+    camera_motion: CameraMotion = CameraMotion()
+    camera_clearance: float = Field(0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m")
     background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
 
     @model_validator(mode="after")
     def _fits(self):
-        if self.sky is not None and self.sky.size < 1.2 * self.region.width:
-            raise ValueError(f"sky.size {self.sky.size:g} must be at least 1.2 times region.width {self.region.width:g}")
+        least = max(1.2 * self.region.width, self.region.width + 2 * self.objects.size[1], 2.2 * self.region.height)
+        if self.sky is not None and self.sky.size < least:
+            raise ValueError(f"sky.size {self.sky.size:g} must be at least {least:g} to hold the region and its objects")
         if self.region.camera_height[0] >= self.region.height:
             raise ValueError(f"region.camera_height must begin below region.height {self.region.height:g}")
         if self.objects.size[0] >= self.region.height:
@@ -167,13 +171,14 @@ class PoseConfig(Config):
 
 
 class KeyframeConfig(PoseConfig):
-    time: float = Field(description="s; 0 is the first label")
+    time: float = Field(ge=-1e7, le=1e7, description="s on the sequence's clock (the first label is at time.start + 1 / label_rate)")
 
 
-class MotionConfig(PoseConfig):
-    """A fixed pose, or key frames joined by a C2 spline; before the first and after the last the pose is held."""
+class KeyedMotionConfig(PoseConfig):
+    """A fixed pose, or key frames; before the first and after the last the pose is held."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
+    interpolation: Literal["spline", "linear"] = Field("spline", description="between key frames: C2 spline, or straight lines and slerp")
 
     @model_validator(mode="after")
     def _keyframes(self):
@@ -226,7 +231,7 @@ class MaterialConfig(Config):
         return self
 
 
-class ObjectConfig(MotionConfig):
+class ObjectConfig(KeyedMotionConfig):
     """One object of an explicit scene."""
 
     name: str | None = Field(None, description="null: the mesh's name")
@@ -249,7 +254,7 @@ class ExplicitSceneConfig(Config):
     meshes: dict[str, MeshConfig] = Field({}, description="by name")
     materials: dict[str, MaterialConfig] = Field({}, description="by name")
     objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="at least one")
-    camera: MotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
+    camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
@@ -261,7 +266,7 @@ class FileSceneConfig(Config):
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")
     camera: str | int | None = Field(None, description="name or index of the file's camera; null: the first")
-    pose: MotionConfig | None = Field(None, description="camera motion used instead of the file's camera (z-up world)")
+    pose: KeyedMotionConfig | None = Field(None, description="camera motion used instead of the file's camera (z-up world)")
     intrinsics: Literal["config", "file"] = Field("config", description="focal length from the YAML's camera or from the file's (yfov)")
     animation: str | int | None = Field(0, description="name or index of the animation played; null: none")
     light: LightConfig = LightConfig()

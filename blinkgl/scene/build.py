@@ -1,0 +1,58 @@
+"""From a scene's configuration to a :class:`~blinkgl.scene.types.Scene`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
+from blinkgl.errors import ConfigError
+from blinkgl.scene.explicit import explicit_scene
+from blinkgl.scene.importers import scene_from_file
+from blinkgl.scene.pool import SPLITS, resolve
+from blinkgl.scene.types import Scene
+from blinkgl.scene.world import pools, random_world
+
+
+def build_scene(config: SceneConfig, camera, t0_ns: int, t1_ns: int, *, split: str = "train", seed: int = 0, sequence: int = 0,
+                base: Path | str = ".") -> Scene:
+    """The scene over [t0_ns, t1_ns].
+
+    camera : anything with width, height, fx, fy, near and principal_point (or cx, cy): a CameraConfig.
+    split : 'train' or 'test', which side of the pools random scenes draw from.
+    seed, sequence : random scenes are a function of these and the configuration; the same twice gives identical arrays.
+    base : folder that the configuration's relative paths start from.
+    Raises ConfigError and AssetError.
+    """
+    if split not in SPLITS:
+        raise ConfigError("unknown split", where="output.split", value=split, accepted="train or test")
+    if not t0_ns < t1_ns:
+        raise ValueError("build_scene: t0_ns must be before t1_ns")
+    base = Path(base)
+    if isinstance(config, RandomSceneConfig):
+        return random_world(config, camera, t0_ns, t1_ns, split, seed, sequence, base)
+    if isinstance(config, ExplicitSceneConfig):
+        return explicit_scene(config, camera, t0_ns, t1_ns, base)
+    return scene_from_file(config, camera, t0_ns, t1_ns, base)
+
+
+def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "train") -> None:
+    """Finds missing folders, empty pools and missing files before any work starts. Raises ConfigError or AssetError."""
+    base = Path(base)
+    if isinstance(config, RandomSceneConfig):
+        objects, textures = pools(config, base)
+        if config.objects.count:
+            objects.split(split)
+        textures.split(split)
+    elif isinstance(config, ExplicitSceneConfig):
+        for name, mesh in config.meshes.items():
+            _exists(mesh.file, base, f"scene.meshes.{name}.file", "a mesh file")
+        for name, material in config.materials.items():
+            _exists(material.texture, base, f"scene.materials.{name}.texture", "an image file")
+    else:
+        assert isinstance(config, FileSceneConfig)
+        _exists(config.path, base, "scene.path", "a gltf or glb file")
+
+
+def _exists(path: str | None, base: Path, where: str, what: str) -> None:
+    if path is not None and not resolve(path, base).is_file():
+        raise ConfigError("no such file", where=where, value=path, accepted=what)

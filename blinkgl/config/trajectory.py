@@ -18,7 +18,8 @@ from blinkgl.config.base import Config
 
 
 def _as_pair(value: Any) -> Any:
-    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+    # Text too: YAML 1.1 reads 1e-1 as text, and pydantic turns it into a number afterwards.
+    return (value, value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else value
 
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:

@@ -319,13 +319,13 @@ class Renderer:
             program = self.gl.program(name, variant)
             uniforms = {n: program[n] for n in program if isinstance(program[n], moderngl.Uniform)}
             uniforms[""] = program
-            if "light_strength" in uniforms:
-                uniforms["light_strength"].value = (self.scene.light.sun, self.scene.light.sky)
             self._uniforms[key] = uniforms
         uniforms = self._uniforms[key]
         index = item.object_index
         uniforms["mvp"].write(mat4_bytes(moment.mvp[index]))
         if "sun_direction" in uniforms:
+            # Every time: the context's programs are shared with other renderers, their uniforms included.
+            uniforms["light_strength"].value = (self.scene.light.sun, self.scene.light.sky)
             R = moment.T_world_obj[index, :3, :3]
             uniforms["sun_direction"].value = tuple(self.scene.light.sun_direction @ R)
             uniforms["up_direction"].value = tuple(R[2])

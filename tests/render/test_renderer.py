@@ -1,0 +1,210 @@
+"""The renderer's own promises: culling changes nothing, super-sampling is the mean, nothing unasked is made."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blinkgl.render import renderer as module
+from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid, projection
+from blinkgl.render.occlusion import occlusion_mask
+from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.statistics import largest_speed
+from blinkgl.scene import primitives
+from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObject, Texture
+
+from render_scenes import LEVEL, SECOND, curve, still
+
+PLAIN = SimpleNamespace(supersample=1, image_supersample=1, anisotropy=1.0)
+
+
+def world(width=96, height=72, objects=12, light=Light()):
+    rng = np.random.default_rng(5)
+    image = rng.integers(0, 256, (32, 32, 3), dtype=np.uint8)
+    made = []
+    for i in range(objects):
+        mesh = [primitives.cuboid(), primitives.sphere(), primitives.torus()][i % 3]
+        material = Material(Texture(image), base_color=(1.0, 0.8, 0.5), unlit=i % 4 == 0) if i % 2 else Material(base_color=(0.2, 0.5, 0.9))
+        centre = rng.uniform((-6, -2, -3), (6, 9, 3))  # some behind the camera, some outside the view
+        made.append(SceneObject(f"object {i}", i + 1, (Part(mesh, material),), curve(i, centre, 0.5, 1.0)))
+    f = 0.8 * width
+    camera = Camera(width, height, f, f, (width - 1) / 2, (height - 1) / 2, curve(99, (0, -4, 0), 0.1, 0.1, LEVEL))
+    return Scene(tuple(made), camera, 0, SECOND, light, background=0.25)
+
+
+ALL = LabelRequest(True, True, True, True, True, True, True, True)
+
+
+def buffers(frame):
+    named = {k: getattr(frame, k) for k in ("colour", "depth", "ids", "normals", "velocity")}
+    for k in ("forward", "backward"):
+        named.update({f"{k}.{n}": getattr(getattr(frame, k), n) for n in ("flow", "valid", "occluded")})
+    return named
+
+
+def test_frustum_culling_changes_no_pixel(gl, monkeypatch):
+    with Renderer(gl, world(), PLAIN) as renderer:
+        culled = [renderer.luminance(t) for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
+        drawn = renderer.stats.triangles
+        monkeypatch.setattr(module.Renderer, "_visible", lambda self, moment: self._resources.items)
+        renderer.stats.triangles = 0
+        full = [renderer.luminance(t) for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
+        assert drawn < renderer.stats.triangles, "the scene has something to cull"
+    for a, b in zip(culled[0], full[0]):
+        np.testing.assert_array_equal(a, b)
+    for name in culled[1]:
+        np.testing.assert_array_equal(culled[1][name], full[1][name], err_msg=name)
+
+
+def test_back_face_culling_of_closed_meshes_changes_no_pixel(gl):
+    scene = world()
+    with Renderer(gl, scene, PLAIN) as renderer:
+        assert any(not item.two_sided for item in renderer._resources.items)
+        culled = renderer.luminance(0)
+        for item in renderer._resources.items:
+            item.two_sided = True
+        np.testing.assert_array_equal(culled, renderer.luminance(0))
+
+
+def test_the_same_frame_twice_is_the_same_frame(gl):
+    for _ in range(2):
+        with Renderer(gl, world(), PLAIN) as renderer:
+            first = renderer.luminance(SECOND // 3), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
+        with Renderer(gl, world(), PLAIN) as renderer:
+            renderer.luminance(0)
+            again = renderer.luminance(SECOND // 3), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
+        np.testing.assert_array_equal(first[0], again[0])
+        for name in first[1]:
+            np.testing.assert_array_equal(first[1][name], again[1][name], err_msg=name)
+
+
+def test_two_renderers_in_one_context_do_not_disturb_each_other(gl):
+    """Programs, and with them uniforms such as the light, belong to the context."""
+    dim, bright = world(light=Light(sun=0.1, sky=0.1)), world(light=Light(sun=1.0, sky=0.8))
+    with Renderer(gl, dim, PLAIN) as a, Renderer(gl, bright, PLAIN) as b:
+        alone = a.luminance(0)
+        b.luminance(0)
+        np.testing.assert_array_equal(alone, a.luminance(0))
+        assert b.luminance(0).mean() > alone.mean()
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_supersampling_is_the_mean_of_a_finer_image(gl, factor):
+    """Slow twin: the same camera with n times the pixels, averaged by NumPy."""
+    scene = world()
+    c = scene.camera
+    fine = Camera(c.width * factor, c.height * factor, c.fx * factor, c.fy * factor,
+                  (c.cx + 0.5) * factor - 0.5, (c.cy + 0.5) * factor - 0.5, c.path, c.near)
+    with Renderer(gl, scene, SimpleNamespace(supersample=factor, image_supersample=factor, anisotropy=1.0)) as renderer:
+        luminance, colour = renderer.luminance(0), renderer.colour(0)
+    with Renderer(gl, Scene(scene.objects, fine, 0, SECOND, scene.light, scene.background), PLAIN) as renderer:
+        h, w = c.height, c.width
+        expected = renderer.luminance(0).reshape(h, factor, w, factor).mean(axis=(1, 3), dtype=np.float64)
+        expected_colour = renderer.colour(0).reshape(h, factor, w, factor, 3).mean(axis=(1, 3), dtype=np.float64)
+    np.testing.assert_allclose(luminance, expected, rtol=1e-5)
+    np.testing.assert_allclose(colour, expected_colour, rtol=1e-5)
+
+
+def test_only_what_is_asked_for_is_made(gl):
+    gl.shaders.clear()
+    with Renderer(gl, world(), PLAIN) as renderer:
+        renderer.luminance(0)
+        assert {name for name, _ in gl.shaders._programs} == {"luminance.glsl"}
+        assert len(renderer._targets) == 1
+        assert all(key[0] == "luminance" for key in renderer._resources._textures), "no colour texture without a colour pass"
+        renderer.labels(0, LabelRequest(depth=True))
+        defines = [dict(d) for name, d in gl.shaders._programs if name == "label.glsl"]
+        assert defines and all(not any(k.startswith("OUT_") and k != "OUT_DEPTH" for k in d) for d in defines)
+        frame = renderer.labels(0, LabelRequest(depth=True))
+        assert frame.ids is None and frame.forward is None and frame.colour is None
+
+
+def test_nothing_hit_is_background(gl):
+    scene = world(objects=0)
+    with Renderer(gl, scene, PLAIN) as renderer:
+        assert (renderer.luminance(0) == np.float32(0.25)).all()
+        frame = renderer.labels(0, ALL, SECOND, 0)
+    assert (frame.ids == 0).all() and np.isinf(frame.depth).all()
+    assert not frame.forward.valid.any() and (frame.forward.flow == 0).all() and not frame.forward.occluded.any()
+
+
+def test_luminance_writes_into_the_given_array(gl):
+    with Renderer(gl, world(), PLAIN) as renderer:
+        out = np.empty((72, 96), np.float32)
+        assert renderer.luminance(0, out=out) is out
+        np.testing.assert_array_equal(out, renderer.luminance(0))
+
+
+def test_reduced_velocity_samples_the_full_one(gl):
+    """A quarter of the pixels in each direction: the largest speed of a smooth field changes little."""
+    with Renderer(gl, world(width=192, height=144), PLAIN) as renderer:
+        full, reduced = largest_speed(renderer.velocity(0)), largest_speed(renderer.velocity(0, reduce=4))
+    assert 0.7 * full < reduced <= 1.05 * full
+
+
+# ---- matrices ----------------------------------------------------------------------------------------------------
+
+
+def test_projection_puts_points_on_the_documented_pixel():
+    camera = Camera(640, 480, 500.0, 510.0, 300.0, 250.0, still(), near=0.1)
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-1, -1, 0.2), (1, 1, 9), (50, 3))
+    clip = np.column_stack([points, np.ones(50)]) @ projection(camera).T
+    ndc = clip[:, :3] / clip[:, 3:]
+    window = (ndc[:, :2] + 1) / 2 * (640, 480) - 0.5
+    np.testing.assert_allclose(window, points[:, :2] / points[:, 2:] * (500, 510) + (300, 250), atol=1e-10)
+    np.testing.assert_allclose(ndc[:, 2], 0.1 / points[:, 2], rtol=1e-14)
+
+
+def test_relative_poses_keep_their_precision_far_from_the_origin():
+    near, far = curve(1, (0, 0, 0), 1, 1), curve(1, (0, 0, 0), 1, 1)
+    shift = np.zeros((4, 4))
+    shift[:3, 3] = 1e6
+    a, b = near.pose(SECOND // 2), curve(2, (1, 2, 3), 1, 1).pose(SECOND // 2)
+    moved = cam_from_obj(far.pose(SECOND // 2) + shift, b + shift)
+    np.testing.assert_allclose(moved, cam_from_obj(a, b), atol=1e-9)
+    np.testing.assert_allclose(cam_from_obj(a, b), np.linalg.inv(a) @ b, atol=1e-12)
+    np.testing.assert_allclose(invert_rigid(a), np.linalg.inv(a), atol=1e-14)
+
+
+def test_rate_of_relative_pose_is_its_derivative_to_second_order():
+    camera, body = curve(3, (0, 0, 0), 1, 1), curve(4, (1, 5, 2), 1, 1)
+    t = 430_000_000
+    rate = cam_from_obj_rate(camera.pose(t), camera.derivative(t), body.pose(t), body.derivative(t))
+    errors = []
+    steps = [4_000_000, 2_000_000, 1_000_000]
+    for h in steps:
+        central = (cam_from_obj(camera.pose(t + h), body.pose(t + h)) - cam_from_obj(camera.pose(t - h), body.pose(t - h))) / (2e-9 * h)
+        errors.append(np.abs(central - rate).max())
+    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert abs(order - 2) < 0.3
+
+
+# ---- per-pixel helpers -------------------------------------------------------------------------------------------
+
+
+def test_largest_speed_and_percentile():
+    velocity = np.zeros((3, 4, 2), np.float32)
+    velocity[1, 2] = (3, 4)
+    velocity[0, 0] = (np.inf, 0)
+    velocity[0, 1] = (np.nan, 0)
+    assert largest_speed(velocity) == 5.0
+    assert largest_speed(velocity, 50) == 0.0
+    assert largest_speed(np.zeros((2, 2, 2), np.float32)) == 0.0
+
+
+def test_occlusion_by_hand():
+    """A near strip (id 2, Z = 1) moves over a far plane (id 1, Z = 4); everything shifts by one pixel."""
+    ids = np.ones((1, 6), np.uint32)
+    ids[0, 1] = 2
+    depth = np.where(ids == 2, 1.0, 4.0).astype(np.float32)
+    ids_next, depth_next = np.roll(ids, 2), np.roll(depth, 2)  # the strip goes from x = 1 to x = 3
+    flow = np.zeros((1, 6, 2), np.float32)
+    flow[0, 1, 0] = 2.0
+    valid = np.ones((1, 6), bool)
+    hidden = occlusion_mask(flow, depth, valid, ids, depth_next, ids_next)
+    np.testing.assert_array_equal(hidden[0], [False, False, False, True, False, False])
+    flow[..., 0] = 3.0
+    gone = occlusion_mask(flow, depth, valid, ids, np.full_like(depth, 4), np.ones_like(ids))
+    np.testing.assert_array_equal(gone[0], [False, False, False, True, True, True]), "outside the image is not visible"
+    assert not occlusion_mask(flow, depth, ~valid, ids, depth_next, ids_next).any()

@@ -63,6 +63,7 @@ class GLContext:
         self.vendor, self.renderer, self.version = info["GL_VENDOR"], info["GL_RENDERER"], info["GL_VERSION"]
         self.is_software = bool(_SOFTWARE.search(f"{self.vendor} {self.renderer}"))
         self.shaders = ShaderLoader(self.ctx)
+        self.idle = self.ctx.framebuffer(self.ctx.renderbuffer((1, 1)))  # bound when a target in use is released
         self._set_clip_control()
 
     def _set_clip_control(self) -> None:
@@ -93,6 +94,9 @@ class GLContext:
 
     def make_current(self) -> None:
         """Make this context the current one again, after another context was used in the same thread."""
+        if self.backend == "egl":
+            # EGL does not see what OSMesa does behind its back: it takes a context it bound for still bound, and does nothing.
+            _unbind_egl()
         self._raw.__enter__()
 
     def release(self) -> None:
@@ -173,6 +177,16 @@ def _egl(device: int) -> Any:
         elif "eglCreateContext" in message:
             message += f", i.e. no OpenGL {REQUIRED_VERSION / 100:.1f} core"
         raise _EGLUnavailable(message, no_such_device="requested device index" in message) from None
+
+
+def _unbind_egl() -> None:
+    name = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
+    lib = ctypes.CDLL(name)
+    lib.eglGetCurrentDisplay.restype = ctypes.c_void_p
+    lib.eglMakeCurrent.argtypes = [ctypes.c_void_p] * 4
+    display = lib.eglGetCurrentDisplay()
+    if display:
+        lib.eglMakeCurrent(display, None, None, None)
 
 
 def _loadable(names: tuple[str, ...]) -> str | None:

@@ -155,6 +155,8 @@ class Target:
 
     def release(self) -> None:
         """Free the framebuffer and its textures. Harmless when repeated."""
+        if self.gl.ctx.fbo is self.fbo:
+            self.gl.idle.use()  # moderngl binds its current framebuffer again later, an error once that is deleted
         for resource in (self.fbo, *self.colour, self.depth):
             if resource is not None:
                 resource.release()

@@ -14,6 +14,8 @@ _DEPTH_BITS, _STENCIL_BITS, _PROFILE, _CORE_PROFILE = 0x30, 0x31, 0x33, 0x34
 _MAJOR, _MINOR = 0x36, 0x37
 _UNSIGNED_BYTE = 0x1401
 
+LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
+
 
 class OSMesaUnavailable(Exception):
     """libOSMesa is missing, too old, or refused a context."""
@@ -61,7 +63,7 @@ class OSMesaContext:
 
 
 def _load_library() -> ctypes.CDLL:
-    for name in ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"):
+    for name in LIBRARIES:
         try:
             lib = ctypes.CDLL(name)
             break

@@ -1,0 +1,253 @@
+"""Contexts: both backends draw the same, are released cleanly, and fail with one line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from blinkgl.config.base import validate
+from blinkgl.config.gl import GLConfig
+from blinkgl.errors import ConfigError, GLError
+from blinkgl.gl import context as context_module
+from blinkgl.gl import create_context, egl_devices, osmesa
+
+VERTEX = """#version 430 core
+in vec3 position;
+void main() { gl_Position = vec4(position, 1.0); }"""
+FRAGMENT = """#version 430 core
+out vec4 colour;
+void main() { colour = vec4(gl_FragCoord.xy * 0.1, sin(gl_FragCoord.x), gl_FragCoord.z); }"""
+
+
+def backends() -> list[str]:
+    try:
+        osmesa._load_library()
+        return ["egl", "osmesa"]
+    except osmesa.OSMesaUnavailable:
+        return ["egl"]
+
+
+def needs_osmesa() -> None:
+    if "osmesa" not in backends():
+        pytest.skip("libosmesa6 is not installed")
+
+
+def draw(gl) -> tuple[np.ndarray, np.ndarray]:
+    """A skewed triangle into RGBA32F and 32F depth."""
+    program = gl.ctx.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
+    corners = np.array([[-0.9, -0.8, 0.1], [0.95, -0.3, 1e-7], [0.1, 0.9, 0.7]], np.float32)
+    vertices = gl.ctx.vertex_array(program, [(gl.ctx.buffer(corners), "3f", "position")])
+    gl.ctx.enable_only(gl.ctx.DEPTH_TEST)
+    gl.ctx.depth_func = ">"
+    with gl.framebuffer(61, 47, ("RGBA32F",)) as target:
+        target.clear((9, 8, 7, 6), depth=0.0)
+        vertices.render()
+        assert gl.ctx.error == "GL_NO_ERROR"
+        return target.read(), target.read_depth()
+
+
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_backend_draws_and_is_released(backend):
+    if backend == "osmesa":
+        needs_osmesa()
+    with create_context(backend) as gl:
+        assert gl.backend == backend and gl.renderer and gl.vendor and gl.version and gl.notes == ()
+        assert gl.ctx.version_code >= 430
+        colour, depth = draw(gl)
+    covered = depth > 0
+    assert 0.3 < covered.mean() < 0.6
+    assert np.all(colour[~covered] == [9, 8, 7, 6])
+    y, x = np.nonzero(covered)
+    np.testing.assert_allclose(colour[y, x, :2], np.stack([x + 0.5, y + 0.5], 1) * 0.1, rtol=1e-6)  # row 0 is GL's row 0
+    np.testing.assert_allclose(colour[y, x, 3], depth[y, x], rtol=1e-6)  # zero-to-one: no 0.5 * z + 0.5 anywhere
+    gl.release()  # twice is harmless
+
+
+def test_osmesa_equals_egl_software():
+    needs_osmesa()
+    with create_context("egl") as gl:
+        if not gl.is_software:
+            pytest.skip("EGL draws on a GPU: equal bits are not promised")
+        egl = draw(gl)
+    with create_context("osmesa") as gl:
+        assert gl.is_software
+        other = draw(gl)
+    for a, b in zip(egl, other):
+        assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("pair", [("egl", "egl"), ("egl", "osmesa"), ("osmesa", "egl")])
+def test_two_contexts_side_by_side(pair):
+    if "osmesa" in pair:
+        needs_osmesa()
+    with create_context(pair[0]) as first:
+        expected = draw(first)
+        with create_context(pair[1]) as second:
+            draw(second)
+            first.make_current()
+            again = draw(first)
+            second.make_current()
+            draw(second)
+        first.make_current()  # releasing the second left none current
+        last = draw(first)
+    for a, b, c in zip(expected, again, last):
+        assert a.tobytes() == b.tobytes() == c.tobytes()
+
+
+def test_many_contexts_in_a_row_leave_nothing_behind():
+    """Handles and memory are given back (a leaked llvmpipe context holds some MB)."""
+    for _ in range(3):
+        with create_context() as gl:
+            draw(gl)
+    before = _resident_mib()
+    for _ in range(15):
+        with create_context() as gl:
+            draw(gl)
+    assert _resident_mib() - before < 60
+
+
+def _resident_mib() -> float:
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096 / 2**20
+
+
+WORKER = """
+import hashlib, sys
+sys.path.insert(0, sys.argv[1])
+from test_context import create_context, draw
+with create_context() as gl:
+    colour, depth = draw(gl)
+print(hashlib.sha256(colour.tobytes() + depth.tobytes()).hexdigest())
+"""
+
+
+def test_two_processes_at_once_draw_the_same():
+    import os
+
+    folder = os.path.dirname(__file__)
+    workers = [subprocess.Popen([sys.executable, "-c", WORKER, folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    outputs = [worker.communicate(timeout=120) for worker in workers]
+    assert [worker.returncode for worker in workers] == [0, 0], outputs
+    assert all(stderr == "" for _, stderr in outputs)
+    assert outputs[0][0] == outputs[1][0] != ""
+
+
+# --- failures ---------------------------------------------------------------------------------------------------------
+
+
+def test_device_out_of_range():
+    count = len(egl_devices())
+    if not count:
+        pytest.skip("no EGL devices here")
+    for backend in ("egl", "auto"):  # auto must not hide that the chosen device does not exist
+        with pytest.raises(GLError, match=r"^gl.device: no such EGL device \(got 99\); expected one of those `blinkgl doctor` lists$"):
+            create_context(backend, device=99)
+
+
+def test_environment_overrides_the_device(monkeypatch):
+    monkeypatch.setenv("GLCONTEXT_DEVICE_INDEX", "98")
+    with pytest.raises(GLError, match="got 98"):
+        create_context("egl", device=0)
+    monkeypatch.setenv("GLCONTEXT_DEVICE_INDEX", "first")
+    with pytest.raises(GLError, match="GLCONTEXT_DEVICE_INDEX: not a device number"):
+        create_context("egl", device=0)
+
+
+def test_auto_falls_back_to_osmesa_and_says_so(monkeypatch):
+    needs_osmesa()
+    monkeypatch.setenv("GLCONTEXT_LINUX_LIBEGL", "libmissing.so")
+    with create_context("auto") as gl:
+        assert gl.backend == "osmesa"
+        assert "libmissing.so not loaded" in gl.notes[0]
+        draw(gl)
+
+
+def test_neither_is_one_line_with_the_remedy(monkeypatch):
+    monkeypatch.setattr(context_module, "_EGL_LIBRARIES", ("libmissing.so",))
+    monkeypatch.setattr(osmesa, "LIBRARIES", ("libmissing.so",))
+    with pytest.raises(GLError) as caught:
+        create_context()
+    line = str(caught.value)
+    assert "\n" not in line
+    assert "EGL device 0: libEGL.so.1 not found" in line and "OSMesa: libOSMesa.so not found" in line
+    assert "run 'sudo apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri libosmesa6'" in line
+    for backend in ("egl", "osmesa"):
+        with pytest.raises(GLError, match="apt-get"):
+            create_context(backend)
+
+
+@pytest.mark.parametrize("raw, translated", [
+    ("eglInitialize failed (0x3001)", "no working DRI driver"),
+    ("requested device index 0, but found 0 devices", "no driver"),
+    ("libGL.so not loaded", "libGL.so not loaded"),
+    ("eglCreateContext failed (0x3009)", "no OpenGL 4.3 core"),
+])
+def test_glcontext_errors_are_translated(monkeypatch, raw, translated):
+    from glcontext import egl
+
+    def fail(**_):
+        raise Exception(raw)  # what glcontext raises
+
+    monkeypatch.setattr(egl, "create_context", fail)
+    with pytest.raises(GLError, match=translated):
+        create_context("egl")
+
+
+def test_too_old_opengl_is_refused(monkeypatch):
+    needs_osmesa()
+    monkeypatch.setattr(context_module, "REQUIRED_VERSION", 990)
+    with pytest.raises(GLError, match="Requested OpenGL version 990"):
+        create_context("osmesa")
+
+
+def test_unknown_backend():
+    with pytest.raises(GLError, match="gl.backend: unknown backend \\(got 'glx'\\)"):
+        create_context("glx")
+
+
+def test_missing_gl_function(gl):
+    address = gl._raw.load_opengl_function
+    assert address("glClipControl")
+
+    class Empty:
+        def load_opengl_function(self, name):
+            return 0
+
+    raw, gl._raw = gl._raw, Empty()
+    try:
+        with pytest.raises(GLError, match="the driver has no glNope"):
+            gl.function("glNope", None)
+    finally:
+        gl._raw = raw
+
+
+def test_software_is_recognised():
+    recognised = context_module._SOFTWARE.search
+    for text in ("llvmpipe (LLVM 15.0.6, 256 bits)", "softpipe", "Google SwiftShader", "zink (llvmpipe)"):
+        assert recognised(text)
+    for text in ("NVIDIA H100 80GB HBM3/PCIe/SSE2", "AMD Radeon RX 7900 (radeonsi)", "Mesa Intel(R) UHD Graphics 620"):
+        assert not recognised(text)
+
+
+# --- config -----------------------------------------------------------------------------------------------------------
+
+
+def test_config():
+    assert validate(GLConfig, {}) == GLConfig(backend="auto", device=0)
+    assert validate(GLConfig, {"backend": "osmesa", "device": 2}, where="gl").device == 2
+    with pytest.raises(ConfigError, match="gl.backend"):
+        validate(GLConfig, {"backend": "glx"}, where="gl")
+    with pytest.raises(ConfigError, match="gl.device"):
+        validate(GLConfig, {"device": -1}, where="gl")
+    with pytest.raises(ConfigError, match="gl.backnd: unknown key; expected 'backend'"):
+        validate(GLConfig, {"backnd": "egl"}, where="gl")
+
+
+def test_devices_are_listed_without_a_context():
+    done = subprocess.run([sys.executable, "-c", "import json; from blinkgl.gl import egl_devices; print(json.dumps(egl_devices()))"],
+                          capture_output=True, text=True, timeout=60)
+    assert all(isinstance(text, str) and text for text in json.loads(done.stdout))

@@ -129,7 +129,8 @@ class _Expansion:
                 self.version = line.strip()
                 self.lines.append(("", origin))
             else:
-                self.lines.append((line, origin))
+                # Left over: includes in comments, which moderngl's own resolver would try to follow.
+                self.lines.append((line.replace("#include", "# include"), origin))
             in_comment = _ends_in_comment(line, in_comment)
 
     def _include(self, argument: str, chain: tuple[str, ...], at: str) -> None:

@@ -252,7 +252,7 @@ def test_backward_undoes_forward(gl):
     forward = drawn(gl, world, t=T0, forward=T1)[0].forward
     backward = drawn(gl, world, t=T1, backward=T0)[0].backward
     residual = length(forward.flow + sample(backward.flow, moved))[clear]
-    assert clear.mean() > 0.4 and np.median(length(forward.flow)[clear]) > 3
+    assert clear.mean() > 0.35 and np.median(length(forward.flow)[clear]) > 3
     # what is left is the interpolation of the curved backward field between pixels
     assert np.median(residual) < 1e-5 and np.quantile(residual, 0.99) < 1e-2
 

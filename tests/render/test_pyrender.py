@@ -1,0 +1,116 @@
+"""An independent rasteriser, pyrender, draws the same scenes: depth, ids and unlit colour agree.
+
+It runs in a process of its own (two OpenGL bindings do not share one). Needs the extra [check]; skipped without it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from render_scenes import camera, mixed_scene, quad, scene, still, thing
+
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.render import reference
+from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.scene.types import Material, Texture
+from blinkgl.tools import peer_pyrender
+
+if peer_pyrender.available():
+    pytest.skip(peer_pyrender.available(), allow_module_level=True)
+
+TIMES = [300_000_000, 650_000_000]
+NEAR = 1.5  # in front of everything: pyrender's 24-bit depth is then good to 2^-24 Z / near
+
+
+def byte_textures(world):
+    """The same scene with linear textures of whole 255ths, which pyrender can hold exactly."""
+
+    def whole(part):
+        texture = part.material.texture
+        if texture is None:
+            return part
+        image = (np.rint(texture.image * 255) / 255).astype(np.float32)
+        return replace(part, material=replace(part.material, texture=replace(texture, image=image)))
+
+    return replace(world, objects=tuple(replace(o, parts=tuple(map(whole, o.parts))) for o in world.objects))
+
+
+@pytest.fixture(scope="module")
+def world():
+    return byte_textures(mixed_scene(unlit=True))
+
+
+@pytest.fixture(scope="module")
+def peer(world):
+    return peer_pyrender.render(world, TIMES, near=NEAR)
+
+
+@pytest.mark.parametrize("moment", [0, 1])
+def test_depth_ids_and_colour_agree(gl, world, peer, moment):
+    t = TIMES[moment]
+    true = reference.render(world, t)
+    with Renderer(gl, world, RenderConfig(image_supersample=1)) as renderer:
+        ours = renderer.labels(t, LabelRequest(colour=True, depth=True, ids=True))
+    assert true.depth.min() > NEAR
+    band = reference.silhouette_band(true.instance, true.depth)
+    assert band.mean() < 0.15 and len(np.unique(true.instance)) == 5
+
+    ids = peer["ids"][moment]
+    np.testing.assert_array_equal(ids[~band], ours.ids[~band])
+    assert (ids != ours.ids).sum() <= 0.02 * band.sum()  # silhouettes, pixel by pixel
+    for depth in (ours.depth, true.depth):
+        relative = np.abs(peer["depth"][moment].astype(np.float64) / depth - 1)[~band]
+        assert np.median(relative) < 1e-6 and relative.max() < 1e-5
+
+    # pyrender filters 8-bit texels and 8-bit mip levels in 8-bit arithmetic: a few units in the last place, no bias
+    error = (peer["colour"][moment] - 255.0 * ours.colour)[~band]
+    assert np.abs(error).max() < 4.0 and np.quantile(np.abs(error), 0.99) < 2.0
+    assert np.abs(error.mean(axis=0)).max() < 0.3
+
+
+def test_flat_colours_are_equal_to_8_bit_rounding(gl):
+    """No texture, no filter: what is left is the rounding to 8 bits, half a unit."""
+    base = mixed_scene(unlit=True, textured=False)
+    sky = base.objects[0]
+    plain = replace(sky.parts[0], material=Material(base_color=(0.2, 0.4, 0.6), unlit=True))
+    base = replace(base, objects=(replace(sky, parts=(plain,)), *base.objects[1:]))
+    theirs = peer_pyrender.render(base, TIMES[:1])["colour"][0]
+    true = reference.render(base, TIMES[0])
+    with Renderer(gl, base, RenderConfig(image_supersample=1)) as renderer:
+        ours = renderer.colour(TIMES[0])
+    band = reference.silhouette_band(true.instance, true.depth)
+    for colour in (ours, true.colour):
+        assert np.abs(theirs - 255.0 * colour)[~band].max() <= 0.501
+
+
+def test_picture_is_the_same_way_up(gl):
+    """A magnified random texture, so that mirror images and half-texel shifts cannot hide."""
+    rng = np.random.default_rng(3)
+    texels = Texture((rng.integers(0, 256, (12, 16, 3)) / 255).astype(np.float32))
+    paint = Material(texture=texels, uv_scale=(0.75, 1.25), unlit=True, double_sided=True)
+    eye = camera(path=still((0.1, 0.2, -2.5)))
+    picture = scene([thing("picture", 300, quad(3, 2.5), still(), paint)], eye)
+    theirs = peer_pyrender.render(picture, [0])
+    with Renderer(gl, picture, RenderConfig(image_supersample=1)) as renderer:
+        ours = renderer.colour(0)
+    true = reference.render(picture, 0)
+    assert true.hit.all() and (theirs["ids"] == 300).all()
+    assert np.abs(theirs["colour"][0] - 255.0 * ours).max() < 2.5  # 8-bit weights of its filter
+    assert np.abs(theirs["colour"][0] - 255.0 * true.colour).max() < 2.5
+    assert np.abs(theirs["colour"][0] - 255.0 * true.colour).mean() < 0.6
+
+
+def test_measure_reports_seconds_per_frame(world):
+    result = peer_pyrender.measure(world, TIMES, repeat=1)
+    assert result["seconds_per_frame"] > 0 and result["frames"] == 2
+    assert (result["width"], result["height"]) == (160, 120) and result["triangles"] > 5000
+
+
+def test_failure_is_one_line(world, monkeypatch):
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "egl")
+    monkeypatch.setenv("EGL_DEVICE_ID", "999")
+    with pytest.raises(RuntimeError, match="pyrender failed: .*[Dd]evice") as error:
+        peer_pyrender.render(world, [0])
+    assert "\n" not in str(error.value)

@@ -29,6 +29,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "urdf": (("pybullet",), "its random meshes as an object pool"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
 }
+_PINNED = {"torch": "torch==2.13.0"}
 
 
 @dataclass(frozen=True)
@@ -298,7 +299,7 @@ def _extras() -> Iterator[Check]:
             except metadata.PackageNotFoundError:
                 lacking.append(name)
         value = ", ".join(found + [f"no {name}" for name in lacking]) + f" ({purpose})"
-        remedy = f"{_python()} -m pip install 'blinkgl[{extra}]'" if lacking else ""
+        remedy = f"{_python()} -m pip install {' '.join(_PINNED.get(name, name) for name in lacking)}" if lacking else ""
         yield Check("Optional extras", f"[{extra}]", "absent" if lacking else "ok", value, remedy)
 
 

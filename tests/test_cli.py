@@ -1,0 +1,118 @@
+"""The command's frame: one line per error, its exit status, a traceback only when asked for."""
+
+from __future__ import annotations
+
+import errno
+import subprocess
+import sys
+
+import pytest
+import typer
+
+from blinkgl import __version__, cli
+from blinkgl.errors import ConfigError
+from blinkgl.gl import ShaderError
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """``failing(error)`` makes ``blinkgl fail`` raise it."""
+    app = typer.Typer(callback=cli._global_options)
+    error: list[BaseException] = []
+
+    @app.command()
+    def fail() -> None:
+        raise error[0]
+
+    @app.command()
+    def other() -> None:
+        """So that typer keeps 'fail' a sub-command."""
+
+    monkeypatch.setattr(cli, "app", app)
+
+    def make(e: BaseException) -> None:
+        error[:] = [e]
+
+    return make
+
+
+def outcome(capsys, *arguments: str) -> tuple[int, str, str]:
+    status = cli.run(list(arguments))
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_user_error_is_one_line_and_2(failing, capsys):
+    failing(ConfigError("must be positive", where="camera.width", value=-3, accepted="1 to 16384 px"))
+    status, out, err = outcome(capsys, "fail")
+    assert (status, out) == (2, "")
+    assert err == "error: camera.width: must be positive (got -3); expected 1 to 16384 px\n"
+
+
+@pytest.mark.parametrize("arguments", [("--debug", "fail"), ("fail", "--debug")])
+def test_debug_adds_the_traceback(failing, capsys, arguments):
+    failing(ConfigError("must be positive", where="camera.width"))
+    status, _, err = outcome(capsys, *arguments)
+    assert status == 2 and "Traceback" in err and "in fail" in err
+    assert err.endswith("error: camera.width: must be positive\n")
+
+
+def test_shader_error_shows_its_source(failing, capsys):
+    failing(ShaderError("bad", where="a.glsl:3", detail="> 3 | x"))
+    assert outcome(capsys, "fail") == (2, "", "error: a.glsl:3: bad\n\n> 3 | x\n")
+
+
+@pytest.mark.parametrize("error, line", [
+    (OSError(errno.ENOSPC, "No space left on device", "out/events.h5"), "out/events.h5: no space left on device"),
+    (OSError(errno.ENOSPC, "No space left on device"), "no space left on device"),
+    (OSError("Can't write data (file write failed: errno = 28, error message = 'No space left on device')"), "no space left on device"),
+    (PermissionError(errno.EACCES, "Permission denied", "/data"), "/data: permission denied"),
+    (OSError(errno.EROFS, "Read-only file system", "/data"), "/data: read-only file system"),
+])
+def test_the_machines_errors_are_one_line_and_2(failing, capsys, error, line):
+    failing(error)
+    assert outcome(capsys, "fail") == (2, "", f"error: {line}\n")
+
+
+def test_interrupt_is_130(failing, capsys):
+    failing(KeyboardInterrupt())
+    status, _, err = outcome(capsys, "fail")
+    assert status == 130 and "Traceback" not in err
+
+
+def test_a_bug_keeps_its_traceback(failing, capsys):
+    failing(ZeroDivisionError("division by zero"))
+    status, _, err = outcome(capsys, "fail")
+    assert status == 1 and "ZeroDivisionError" in err and "bug in BlinkGL" in err
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (("--nope",), ["--nope", "see 'blinkgl --help'"]),
+    (("doctr",), ["doctr", "see 'blinkgl --help'"]),
+    (("doctor", "--device", "-1"), ["--device", "see 'blinkgl doctor --help'"]),
+    (("doctor", "extra"), ["extra", "see 'blinkgl doctor --help'"]),
+])
+def test_usage_errors_are_one_line_and_2(capsys, arguments, words):
+    status, out, err = outcome(capsys, *arguments)
+    assert (status, out) == (2, "")
+    assert err.startswith("error: ") and err.count("\n") == 1 and all(word in err for word in words)
+
+
+def test_version_and_help(capsys):
+    assert outcome(capsys, "--version") == (0, f"blinkgl {__version__}\n", "")
+    for arguments in ((), ("--help",)):
+        status, out, err = outcome(capsys, *arguments)
+        assert status == 0 and "doctor" in out and err == ""
+
+
+def test_help_imports_nothing_heavy():
+    code = ("import sys; from blinkgl import cli; cli.run(['--help']);"
+            "heavy = {'numpy', 'numba', 'moderngl', 'trimesh', 'scipy', 'cv2', 'h5py', 'torch', 'matplotlib', 'pydantic'} & set(sys.modules);"
+            "sys.exit(f'imported: {sorted(heavy)}' if heavy else 0)")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_reader_that_leaves_early_is_no_error():
+    done = subprocess.run(f"{sys.executable} -m blinkgl.cli --help | true", shell=True, capture_output=True, text=True, timeout=60)
+    assert "Traceback" not in done.stderr

@@ -7,7 +7,8 @@
 
 JOBS ?= auto
 PIP = .venv/bin/python -m pip --disable-pip-version-check
-INSTALL = $(PIP) install --quiet --no-build-isolation -c constraints.txt
+# setuptools warns about every editable install beside a folder of the same name; that is the layout wanted here.
+INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
 INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 
 .PHONY: demo test slow bench doctor setup clean

@@ -1,0 +1,141 @@
+"""The wheel and the editable install are complete: command, shaders, configs, tools, outside the repository too.
+
+Both go into fresh virtual environments that see this one's packages (through a .pth, which does not activate this one's
+editable install), so nothing is fetched.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+PACKAGES = {"blinkgl": "blinkgl", "eflow": "eflow", "shaders": "blinkgl/shaders", "configs": "blinkgl/configs", "tools": "blinkgl/tools"}
+
+PROBE = """
+import json, sys
+from importlib import metadata, resources
+import blinkgl, blinkgl.tools, eflow
+from blinkgl.gl import create_context
+shaders, configs = resources.files("blinkgl.shaders"), resources.files("blinkgl.configs")
+names = sorted(entry.name for entry in shaders.iterdir() if entry.name.endswith(".glsl"))
+yamls = sorted(entry.name for entry in configs.iterdir() if entry.name.endswith(".yaml"))
+print(json.dumps({
+    "file": blinkgl.__file__, "version": metadata.version("blinkgl"),
+    "shaders": {name: (shaders / name).read_text() for name in names},
+    "configs": {name: (configs / name).read_text() for name in yamls},
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    """A copy of what a build reads: building in the repository would leave files there, and two test processes collide."""
+    copy = tmp_path_factory.mktemp("source")
+    for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, copy)
+    for name in PACKAGES:
+        shutil.copytree(REPOSITORY / name, copy / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
+    return copy
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
+    done = subprocess.run([str(c) for c in command], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def fresh_environment(folder: Path) -> Path:
+    """A virtual environment without pip that can import this one's dependencies but not its blinkgl; returns its bin/."""
+    run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder.parent)
+    site = next(folder.glob("lib/python*/site-packages"))
+    seen = [path for path in sys.path if path.endswith("site-packages") and Path(path).is_dir()]
+    (site / "dependencies.pth").write_text("\n".join(seen) + "\n")
+    return folder / "bin"
+
+
+def expected_files() -> set[str]:
+    """Where every Python file, shader and config of the repository has to be in a wheel."""
+    found = set()
+    for here, there in PACKAGES.items():
+        for path in (REPOSITORY / here).rglob("*"):
+            if path.suffix in (".py", ".glsl", ".yaml") and "__pycache__" not in path.parts:
+                found.add(f"{there}/{path.relative_to(REPOSITORY / here).as_posix()}")
+    return found
+
+
+def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
+    """The installed command and resources, used from a folder that has nothing to do with the repository."""
+    python = bin_ / "python"
+    probe = json.loads(run(python, "-c", PROBE, cwd=elsewhere))
+    assert Path(probe["file"]).is_relative_to(root)
+    for folder in ("shaders", "configs"):
+        suffix = {"shaders": "*.glsl", "configs": "*.yaml"}[folder]
+        assert probe[folder] == {path.name: path.read_text() for path in (REPOSITORY / folder).glob(suffix)}
+    assert probe["shaders"]
+    assert run(bin_ / "blinkgl", "--version", cwd=elsewhere) == f"blinkgl {probe['version']}\n"
+    assert json.loads(run(bin_ / "blinkgl", "doctor", "--json", cwd=elsewhere))["ok"]
+    # a shader that includes another, compiled from where it was installed
+    name = next(name for name, text in sorted(probe["shaders"].items()) if "#include" in text)
+    run(python, "-c", f"from blinkgl.gl import expand\nassert '#include' not in expand({name!r}, 'vertex').text", cwd=elsewhere)
+
+
+def test_wheel(source, tmp_path):
+    pytest.importorskip("build")
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
+    wheel = next((tmp_path / "dist").glob("blinkgl-*.whl"))
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    missing = expected_files() - names
+    assert not missing, f"not in the wheel (packages and package_data in setup.cfg): {sorted(missing)}"
+    assert not [name for name in names if name.startswith(("tests/", "docs/"))]
+    assert any(name.endswith("LICENSE") for name in names)
+    bin_ = fresh_environment(tmp_path / "venv")
+    run(sys.executable, "-m", "pip", "--python", bin_ / "python", "install", "--no-deps", "--no-index", wheel, cwd=tmp_path)
+    check_installation(bin_, tmp_path / "venv", tmp_path)
+
+
+def test_editable(source, tmp_path):
+    bin_ = fresh_environment(tmp_path / "venv")
+    run(sys.executable, "-m", "pip", "--python", bin_ / "python", "install", "--no-deps", "--no-index", "--no-build-isolation", "-e", source, cwd=tmp_path)
+    check_installation(bin_, source, tmp_path)
+    changed = source / "shaders" / "include" / "only_here.glsl"
+    changed.write_text("// new\n")  # an editable install sees new files at once
+    run(bin_ / "python", "-c", "from importlib import resources\nassert resources.files('blinkgl.shaders').joinpath('include/only_here.glsl').is_file()",
+        cwd=tmp_path)
+
+
+def test_constraints_pin_what_setup_cfg_asks_for():
+    """Every direct dependency has a pin, and the pin satisfies the lower bound."""
+    import configparser
+    import re
+
+    from packaging.requirements import Requirement
+
+    def key(name: str) -> str:
+        return re.sub(r"[-_.]+", "-", name).lower()
+
+    pins = {}
+    for line in (REPOSITORY / "constraints.txt").read_text().splitlines():
+        if line.strip() and not line.startswith("#"):
+            requirement = Requirement(line)
+            pins[key(requirement.name)] = next(iter(requirement.specifier)).version
+            assert [s.operator for s in requirement.specifier] == ["=="], line
+            assert requirement.url is None
+    parser = configparser.ConfigParser()
+    parser.read(REPOSITORY / "setup.cfg")
+    wanted = parser["options"]["install_requires"].split("\n")
+    for extra in ("dev", "check", "learn"):
+        wanted += parser["options.extras_require"][extra].split("\n")
+    for line in filter(None, wanted):
+        requirement = Requirement(line)
+        assert key(requirement.name) in pins, f"{line} has no pin"
+        assert requirement.specifier.contains(pins[key(requirement.name)]), line

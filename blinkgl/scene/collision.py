@@ -257,49 +257,45 @@ class _Search:
         """(next time up to which the pair is known to be apart, None), or (t, separation) for a collision at t."""
         a, b = self.bodies[i], self.bodies[j]
         Ta, Tb = a.path.pose(t), b.path.pose(t)
-        room, balls = self._room(i, j, a, b, Ta, Tb)
+        room, nearer = self._room(i, j, a, b, Ta, Tb)
         separation = room
         if room <= 0.0:
             tol = self._tol(a, b)
             separation = self._distance(a, b, Ta, Tb)
             if separation <= tol:
                 return t, max(separation, 0.0)
-            room = separation - 0.5 * tol
-        later = self._later(a, b, t, room, balls)
+            room, nearer = separation - 0.5 * tol, _body_speed
+        later = self._later(a, b, t, room, nearer)
         # A body that crosses the room left within a nanosecond has no later time to be looked at.
         return (later, None) if later > t else (t, separation)
 
-    def _room(self, i: int, j: int, a: _Body, b: _Body, Ta, Tb) -> tuple[float, bool]:
-        """How much the two may approach before they have to be looked at again, without an exact distance, and
-        whether that is the approach of their bounding balls. 0 when only the exact distance can tell."""
+    def _room(self, i: int, j: int, a: _Body, b: _Body, Ta, Tb):
+        """How much the two may approach before they have to be looked at again, without an exact distance, and the
+        bound on a body's share in the approach. Room 0 when only the exact distance can tell."""
         if (i, j) in self.resting:
             plane, lowest = self.resting[i, j]
             body, T = (b, Tb) if a.category in _SUPPORTS else (a, Ta)
             margin = self.rest_margin * body.radius
             room = float(_heights(plane, body, T)[0]) - lowest + 0.975 * margin
-            return (room if room > 0.025 * margin else 0.0), False
+            return (room if room > 0.025 * margin else 0.0), _speed_along(plane[0, :3])
         tol = self._tol(a, b)
         gap = self._ball_gap(a, b, Ta, Tb)
         # Far apart the balls are as good as the triangles; close by an exact distance gains much larger steps.
         if gap > max(tol, 0.3 * min(a.radius, b.radius)):
-            return gap - 0.5 * tol, True
+            return gap - 0.5 * tol, _centre_speed
         for solid, body, T in ((a, b, Tb), (b, a, Ta)):
             if solid.planes is not None:
-                height = float(_heights(solid.planes, body, T).max())
-                if height > tol:
-                    return height - 0.5 * tol, False
-        return 0.0, False
+                heights = _heights(solid.planes, body, T)
+                k = int(np.argmax(heights))
+                if heights[k] > tol:
+                    return float(heights[k]) - 0.5 * tol, _speed_along(solid.planes[k, :3])
+        return 0.0, None
 
-    def _later(self, a: _Body, b: _Body, t: int, room: float, balls: bool) -> int:
-        """Latest time for which the speed bounds allow no more than ``room`` of approach since t. ``balls``: only
-        the bounding balls count, and turning moves their centres only."""
+    def _later(self, a: _Body, b: _Body, t: int, room: float, speed_bound) -> int:
+        """Latest time for which ``speed_bound`` allows no more than ``room`` of approach since t."""
         window = self.t1 - t
         for _ in range(4):
-            speed = 0.0
-            for body in (a, b):
-                if not body.is_static:
-                    v, w = body.path.speed_bound(t, t + window)
-                    speed += v + w * (body.arm if balls else body.reach)
+            speed = sum(speed_bound(body, t, t + window) for body in (a, b) if not body.is_static)
             if speed * window * 1e-9 <= room:
                 return t + window
             step = int(room / speed * 1e9)
@@ -327,6 +323,28 @@ class _Search:
             shape.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
             shapes.append(shape)
         return max(fcl.distance(*shapes, _REQUEST, fcl.DistanceResult()), 0.0) - a.pad - b.pad
+
+
+def _body_speed(body: _Body, ta: int, tb: int) -> float:
+    """Upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round: turning moves it nowhere.)"""
+    v, w = body.path.speed_bound(ta, tb)
+    return v + w * body.reach
+
+
+def _centre_speed(body: _Body, ta: int, tb: int) -> float:
+    v, w = body.path.speed_bound(ta, tb)
+    return v + w * body.arm
+
+
+def _speed_along(normal: np.ndarray):
+    """As :func:`_body_speed`, along one direction only, for paths that can tell."""
+    normal = np.ascontiguousarray(normal)
+
+    def speed(body: _Body, ta: int, tb: int) -> float:
+        bound = getattr(body.path, "approach_bound", None)
+        return _body_speed(body, ta, tb) if bound is None else bound(normal, body.reach, ta, tb)
+
+    return speed
 
 
 def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:

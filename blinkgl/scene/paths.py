@@ -121,6 +121,12 @@ class KeyframePath:
         v, w = _speed_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr)
         return v * _BOUND_MARGIN, w * _BOUND_MARGIN
 
+    def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
+        """Upper bound over [ta, tb] of |n . velocity| in units/s of the body's points within ``reach`` of its origin,
+        for the world direction ``normal`` (unit). Zero (to rounding) for a body that slides and turns on a plane,
+        where :meth:`speed_bound` says nothing useful."""
+        return _BOUND_MARGIN * _approach_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr, self._rot, normal, reach)
+
 
 class SplinePath(KeyframePath):
     """C2 spline through way-points; arguments as in :class:`KeyframePath`."""
@@ -331,6 +337,50 @@ def _quadratic_bound(c, ua, ub):
             q += x * x
         best = max(best, q)
     return math.sqrt(best)
+
+
+@njit(cache=True)
+def _cubic_bound(c, ua, ub):
+    """Upper bound of |p(u)| over [ua, ub]: the largest norm of the four Bezier points of p."""
+    best = 0.0
+    for corner in range(4):
+        v = ub if corner > 0 else ua
+        w = ub if corner > 1 else ua
+        x = ub if corner > 2 else ua
+        q = 0.0
+        for k in range(3):
+            y = c[3, k] * v * w * x + (c[2, k] * (v * w + v * x + w * x) + c[1, k] * (v + w + x)) / 3.0 + c[0, k]
+            q += y * y
+        best = max(best, q)
+    return math.sqrt(best)
+
+
+@njit(cache=True)
+def _approach_bound(ta, tb, knots, cp, cr, rot, normal, reach):
+    """n . (velocity of the point x) = n . p' + x . (n x w), all in key frame i's axes, where w = J_l(phi) phi' with
+    J_l = I + a [phi]x + b [phi]x^2, 0 <= a <= 1/2, 0 <= b <= 1/6. With the parts across n, phi_n and phi'_n:
+    |n x w| <= |phi'_n| + X / 2 + |phi| X / 6,  X = |phi x phi'| <= |phi| |phi'_n| + |phi_n| |phi'|;  also <= |phi'|."""
+    if tb < knots[0] or ta > knots[-1] or tb < ta:
+        return 0.0
+    ta, tb = max(ta, knots[0]), min(tb, knots[-1])
+    best = 0.0
+    along, across, local = np.zeros((4, 3)), np.empty((4, 3)), np.empty(3)
+    for i in range(_piece(ta, knots), _piece(tb, knots) + 1):
+        ua = (max(ta, knots[i]) - knots[i]) * 1e-9
+        ub = (min(tb, knots[i + 1]) - knots[i]) * 1e-9
+        for r in range(3):
+            local[r] = rot[i, 0, r] * normal[0] + rot[i, 1, r] * normal[1] + rot[i, 2, r] * normal[2]
+        for k in range(4):
+            along[k, 0] = cp[i, k, 0] * normal[0] + cp[i, k, 1] * normal[1] + cp[i, k, 2] * normal[2]
+            dot = cr[i, k, 0] * local[0] + cr[i, k, 1] * local[1] + cr[i, k, 2] * local[2]
+            for r in range(3):
+                across[k, r] = cr[i, k, r] - dot * local[r]
+        phi, rate = _cubic_bound(cr[i], ua, ub), _quadratic_bound(cr[i], ua, ub)
+        rate_n = _quadratic_bound(across, ua, ub)
+        x = phi * rate_n + _cubic_bound(across, ua, ub) * rate
+        tilt = min(rate_n + 0.5 * x + phi * x / 6.0, rate)
+        best = max(best, _quadratic_bound(along, ua, ub) + reach * tilt)
+    return best
 
 
 @njit(cache=True)

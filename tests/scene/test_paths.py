@@ -145,6 +145,32 @@ def test_speed_bound_is_never_exceeded(seed, a, b, kind):
         assert np.linalg.norm(body_rate(path.pose(t), D)) <= w_bound * (1 + 1e-9) + 1e-12
 
 
+@given(st.integers(0, 10**6), st.floats(0, 1), st.floats(0, 1), st.floats(0.05, 2))
+@settings(max_examples=60, deadline=None)
+def test_approach_bound_is_never_exceeded(seed, a, b, turn):
+    rng = np.random.default_rng(seed)
+    path = SplinePath(*random_keys(seed, 5, turn=turn))
+    ta, tb = (int(x * (path.t1_ns - path.t0_ns)) for x in sorted((a, b)))
+    normal = rng.normal(size=3)
+    normal /= np.linalg.norm(normal)
+    points = rng.normal(size=(40, 3))
+    points *= 0.7 / np.linalg.norm(points, axis=1, keepdims=True)
+    bound = path.approach_bound(normal, 0.7, ta, tb)
+    v, w = path.speed_bound(ta, tb)
+    assert bound <= (v + 0.7 * w) * (1 + 1e-9)
+    for t in np.linspace(ta, tb, 40).astype(np.int64):
+        D = path.derivative(t)
+        assert np.abs((points @ D[:3, :3].T + D[:3, 3]) @ normal).max() <= bound * (1 + 1e-9) + 1e-12
+
+
+def test_approach_bound_of_what_slides_and_turns_on_a_plane_is_zero():
+    turned = Rotation.from_rotvec([0.4, -0.2, 0.9])
+    yaw = Rotation.from_rotvec([[0, 0, 0], [0, 0, 1], [0, 0, 3], [0, 0, 2]]) * turned
+    path = SplinePath(np.arange(4) * SECOND, [[0, 0, 1], [1, 0, 1], [2, 3, 1], [0, 1, 1]], yaw)
+    assert path.approach_bound(np.array([0.0, 0, 1]), 2.0, 0, 3 * SECOND) < 1e-8
+    assert path.approach_bound(np.array([1.0, 0, 0]), 2.0, 0, 3 * SECOND) > 1
+
+
 def test_speed_bound_is_tight_on_short_intervals():
     path = SplinePath(*random_keys(8, turn=0.4))
     for t in np.linspace(path.t0_ns, path.t1_ns - 10_000_000, 40).astype(np.int64):

@@ -26,7 +26,7 @@ from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import build_scene, check_assets
 from blinkgl.scene.types import Scene
 from blinkgl.timeline import frame_times
 
@@ -62,6 +62,7 @@ def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
     indices = range(first.output.first_index, first.output.first_index + count)
     for index in indices:
         refuse_existing(sequence_folder(first.output, out, index))
+    check_assets(first.scene, template.base, first.output.split)
     with create_context(first.gl.backend, first.gl.device) as gl:
         for index in indices:
             yield generate_sequence(template.sequence(index), index, out, gl, base=template.base, progress=progress)
@@ -82,7 +83,8 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
     report = SequenceReport(index, sequence_folder(config.output, out, index))
     t0_ns, t1_ns = config.time.t0_ns, config.time.t1_ns
     with clock("scene"):
-        scene = build_scene(config.scene, config.camera, t0_ns, t1_ns, config.output.split, config.seed, index, base)
+        scene = build_scene(config.scene, config.camera, t0_ns, t1_ns, split=config.output.split, seed=config.seed,
+                            sequence=index, base=base)
     with (
         Renderer(gl, scene, config.render) as renderer,
         SequenceWriter(report.path, scene.camera.height, scene.camera.width, config_yaml=config_yaml(config, index),

@@ -1,0 +1,285 @@
+"""One YAML in, a DSEC-layout sequence out: read back by independent readers, reproducible, whole or not at all."""
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import h5py
+import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
+import numba
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset import generate as generate_module
+from blinkgl.dataset.generate import generate_run
+from blinkgl.io.sequence_dir import verify_sequence
+from shared_data import shared
+
+SMALL = {
+    "seed": 4,
+    "output": {"name": "tiny"},
+    "camera": {"width": 64, "height": 48},
+    "time": {"duration": 0.2, "label_rate": 20, "start": 3.0},
+    "timeline": {"kind": "uniform", "fps": 200},
+    "scene": {"kind": "random", "objects": {"count": 3}, "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+              "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64}},
+    "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True, "ids": True, "normals": True, "velocity": True},
+    "preview": {"enabled": False},
+}
+
+
+def config_file(tmp_path, **changes) -> Path:
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump({**SMALL, **changes}))
+    return path
+
+
+def generate(tmp_path, out="out", num=None, **changes) -> list[Path]:
+    return [r.path for r in generate_run(load_run(config_file(tmp_path, **changes)), tmp_path / out, num)]
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+            for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory) -> Path:
+    return generate(tmp_path_factory.mktemp("sequence"))[0]
+
+
+# ---- the sequence, by readers that are not ours ------------------------------------------------------------------
+
+
+def dsec_slice(file: h5py.File, t0_us: int, t1_us: int) -> dict[str, np.ndarray]:
+    """The rule of DSEC's event slicer, written from the format's description: ms_to_idx brackets the window in whole
+    milliseconds, the exact window is found inside, times are int64 and relative to t_offset."""
+    offset = int(file["t_offset"][()])
+    start, stop = t0_us - offset, t1_us - offset
+    ms = file["ms_to_idx"]
+    a, b = int(ms[start // 1000]), int(ms[-(-stop // 1000)])
+    t = file["events/t"][a:b].astype(np.int64)
+    inside = (t >= start) & (t < stop)
+    return {"t": t[inside] + offset, **{k: file[f"events/{k}"][a:b][inside] for k in "xyp"}}
+
+
+def test_events_by_the_dsec_slicer(sequence):
+    with h5py.File(sequence / "events.h5") as file:
+        assert int(file["t_offset"][()]) == 3_000_000
+        assert [file[f"events/{k}"].dtype for k in "xypt"] == [np.uint16, np.uint16, np.uint8, np.uint32]
+        everything = dsec_slice(file, 3_000_000, 3_250_000)
+        assert len(everything["t"]) == len(file["events/t"]) > 500, "every event is inside [start, end)"
+        assert (np.diff(everything["t"]) >= 0).all()
+        assert everything["x"].max() < 64 and everything["y"].max() < 48 and set(everything["p"]) == {0, 1}
+        windows = [dsec_slice(file, a, a + 50_000) for a in range(3_000_000, 3_250_000, 50_000)]
+        assert sum(len(w["t"]) for w in windows) == len(everything["t"])
+        assert all(len(w["t"]) for w in windows), "each label has events before and after it"
+
+
+def test_flow_png_equals_the_float_flow_to_half_a_quantum(sequence):
+    for direction in ("forward", "backward"):
+        lines = (sequence / f"flow/{direction}_timestamps.txt").read_text().splitlines()
+        assert lines[0].startswith("#") and len(lines) == 1 + 4
+        for k in range(4):
+            raw = cv2.imread(str(sequence / f"flow/{direction}/{k:06d}.png"), cv2.IMREAD_UNCHANGED)
+            assert raw.dtype == np.uint16 and raw.shape == (48, 64, 3)
+            png = (raw[..., :0:-1].astype(np.float64) - 2**15) / 128
+            exact = np.load(sequence / f"flow/{direction}_npy/{k:06d}.npy")
+            valid = raw[..., 0] == 1
+            assert valid.mean() > 0.9
+            assert np.abs(png - exact[..., :2])[valid].max() <= 0.5 / 128 + 1e-6
+            start, end = (int(x) for x in lines[1 + k].split(","))
+            assert start == 3_050_000 + 50_000 * k and end == start + (50_000 if direction == "forward" else -50_000)
+
+
+def test_images_labels_and_poses_fit_together(sequence):
+    stamps = [int(x) for x in (sequence / "images/timestamps.txt").read_text().split()]
+    assert stamps == [3_050_000 + 50_000 * k for k in range(5)]
+    poses = np.load(sequence / "poses.npz", allow_pickle=False)
+    assert list(poses["t_ns"] // 1000) == [3_000_000, *stamps]
+    for k in range(4):
+        image = cv2.imread(str(sequence / f"images/{k:06d}.png"))
+        assert image.shape == (48, 64, 3) and 5 < image.mean() < 250
+        depth, ids = np.load(sequence / f"depth/{k:06d}.npy"), cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert np.isfinite(depth[ids > 0]).all() and set(np.unique(ids)) <= {0, *poses["object_ids"]}
+
+
+def test_flow_follows_from_depth_ids_and_poses(sequence):
+    """The flow is recomputed in float64 from the other files: lift each pixel by its depth, move it with its object,
+    project it into the next camera."""
+    poses = np.load(sequence / "poses.npz", allow_pickle=False)
+    K = poses["K"]
+    index = {int(i): n for n, i in enumerate(poses["object_ids"])}
+    y, x = np.mgrid[0:48, 0:64].astype(np.float64)
+    for k in range(4):
+        depth, ids = np.load(sequence / f"depth/{k:06d}.npy"), cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED)
+        flow = np.load(sequence / f"flow/forward_npy/{k:06d}.npy")
+        now, then = k + 1, k + 2
+        errors = []
+        for i in np.unique(ids[ids > 0]):
+            at = (ids == i) & (flow[..., 2] > 0)
+            rays = np.stack([(x[at] - K[0, 2]) / K[0, 0], (y[at] - K[1, 2]) / K[1, 1], np.ones(at.sum())])
+            local = np.linalg.inv(poses["T_world_obj"][index[i], now]) @ poses["T_world_cam"][now] @ np.vstack([rays * depth[at], np.ones(at.sum())])
+            moved = np.linalg.inv(poses["T_world_cam"][then]) @ poses["T_world_obj"][index[i], then] @ local
+            pixel = K @ (moved[:3] / moved[2])
+            errors.append(np.hypot(pixel[0] - x[at] - flow[at, 0], pixel[1] - y[at] - flow[at, 1]))
+        errors = np.concatenate(errors)
+        assert np.median(errors) < 1e-4 and errors.max() < 1e-2
+
+
+def test_manifest_is_complete(sequence):
+    assert verify_sequence(sequence) == []
+    manifest = json.loads((sequence / "manifest.json").read_text())
+    assert manifest["seed"] == 4 and manifest["opengl"]["renderer"] and manifest["versions"]["numba"]
+    with h5py.File(sequence / "events.h5") as file:
+        assert manifest["events"] == len(file["events/t"])
+
+
+# ---- reproducible ------------------------------------------------------------------------------------------------
+
+
+def test_same_seed_same_bytes_whatever_the_threads(sequence, tmp_path):
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        again = generate(tmp_path)[0]
+    finally:
+        numba.set_num_threads(before)
+    assert digests(again) == digests(sequence)
+
+
+def test_same_bytes_with_another_number_of_opengl_threads(sequence, tmp_path):
+    """Software OpenGL reads LP_NUM_THREADS when it is loaded, hence the fresh process."""
+    for threads in ("0", "2"):
+        command = [sys.executable, "-m", "blinkgl.cli", "generate", str(config_file(tmp_path)), "--out", str(tmp_path / threads), "--quiet"]
+        subprocess.run(command, check=True, env={**os.environ, "LP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": "2"})
+        assert digests(tmp_path / threads / "train/tiny_000000") == digests(sequence)
+
+
+def test_another_seed_or_index_is_another_sequence_and_order_does_not_matter(sequence, tmp_path):
+    first, second = generate(tmp_path, num=2)
+    assert digests(first) == digests(sequence)
+    assert digests(second)["events.h5"] != digests(first)["events.h5"]
+    alone = generate(tmp_path, out="alone", output={"name": "tiny", "first_index": 1}, num=1)[0]
+    assert digests(alone)["events.h5"] == digests(second)["events.h5"]
+    other = generate(tmp_path, out="other", seed=5)[0]
+    assert digests(other)["events.h5"] != digests(first)["events.h5"]
+
+
+def test_resolved_configuration_reproduces_the_sequence(tmp_path):
+    second = generate(tmp_path, num=2, events={"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.5]}})[1]
+    again = list(generate_run(load_run(second / "config.yaml"), tmp_path / "again"))[0].path
+    assert again.name == second.name
+    assert digests(again)["events.h5"] == digests(second)["events.h5"]
+
+
+# ---- whole or not at all -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_a_failure_in_the_middle_leaves_nothing(tmp_path, monkeypatch, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(generate_module, "_write_labels", fail)
+    with pytest.raises(error):
+        generate(tmp_path)
+    assert [p for p in (tmp_path / "out").rglob("*") if p.is_file()] == []
+
+
+def test_existing_output_is_refused_before_any_work(tmp_path, capsys, monkeypatch):
+    folder = generate(tmp_path)[0]
+    before = digests(folder)
+    monkeypatch.setattr(generate_module, "create_context", lambda *_: pytest.fail("work was started"))
+    assert run(["generate", str(config_file(tmp_path)), "--out", str(tmp_path / "out"), "--num", "3"]) == 2
+    assert "output folder exists" in capsys.readouterr().err
+    assert digests(folder) == before
+
+
+def test_only_requested_labels_are_written(tmp_path):
+    folder = generate(tmp_path, labels={"images": False, "flow": [], "occlusion": False})[0]
+    assert {p.name for p in folder.iterdir()} == {"events.h5", "poses.npz", "config.yaml", "manifest.json"}
+
+
+def test_preview_shows_the_sequence(tmp_path):
+    import imageio.v3 as iio
+
+    folder = generate(tmp_path, preview={"enabled": True, "rate": 40, "slowdown": 4})[0]
+    video = iio.imread(folder / "preview.mp4")
+    assert len(video) == 11 and video.shape[2] > 3 * 64 and video.std() > 10
+
+
+# ---- the command line --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("option, message", [
+    ("camera.widht=3", "camera.widht: unknown key; expected 'width' (nearest)"),
+    ("scene.pool.folders=[nowhere]", "scene.pool.folders.0: "),
+    ("scene.pool={primitives: [], urdfs: false}", "scene.pool: "),
+    ("gl.device=99", "gl.device"),
+    ("events.emulator=blender", "events.emulator: unknown or missing choice"),
+])
+def test_bad_input_is_one_line_and_status_2(tmp_path, capsys, option, message):
+    out = tmp_path / "out"
+    assert run(["generate", str(config_file(tmp_path)), "--out", str(out), "--set", option]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and "Traceback" not in error
+    assert not out.exists() or not any(p.is_file() for p in out.rglob("*"))
+
+
+def test_output_that_is_a_file(tmp_path, capsys):
+    (tmp_path / "out").write_text("")
+    assert run(["generate", str(config_file(tmp_path)), "--out", str(tmp_path / "out")]) == 2
+    assert "is a file" in capsys.readouterr().err
+
+
+def test_table_names_every_stage(tmp_path, capsys):
+    assert run(["generate", str(config_file(tmp_path)), "--out", str(tmp_path / "out"), "--num", "2"]) == 0
+    shown = capsys.readouterr().out
+    for word in ("2 sequences", "event frames", "events", "render", "read-back", "write", "per simulated second", "tiny_000001"):
+        assert word in shown
+
+
+# ---- real input, long input --------------------------------------------------------------------------------------
+
+
+def test_flying_objects_from_real_meshes_and_photographs(tmp_path):
+    meshes, textures = shared("data/assets/models_cc0"), shared("data/assets/textures_cc0")
+    shipped = Path(__file__).parents[2] / "configs/flying_objects.yaml"
+    template = load_run(shipped, [
+        f"scene.pool.folders=[{json.dumps(str(meshes))}]", f"scene.textures.folders=[{json.dumps(str(textures))}]",
+        "scene.pool.primitives=[]", "scene.textures.procedural=false", "camera.width=160", "camera.height=120",
+        "time.duration=0.2", "preview.enabled=false", "timeline={kind: uniform, fps: 100}"])
+    folder = list(generate_run(template, tmp_path / "out"))[0].path
+    assert verify_sequence(folder) == []
+    names = [o["name"] for o in json.loads((folder / "manifest.json").read_text())["objects"] if o["category"] == "object"]
+    assert len(names) >= 8
+    with h5py.File(folder / "events.h5") as file:
+        assert len(dsec_slice(file, 100_000, 300_000)["t"]) > 1000
+
+
+_PEAK = """
+import resource, sys
+from blinkgl.cli import run
+assert run(sys.argv[1:]) == 0
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def test_peak_memory_does_not_grow_with_the_sequence(tmp_path):
+    """1 s against 20 s (2,000 frames, 20x the events), each in a process of its own."""
+    peaks = {}
+    for seconds in (1, 20):
+        path = config_file(tmp_path, time={"duration": seconds, "label_rate": 5}, timeline={"kind": "uniform", "fps": 100},
+                           labels={"flow": ["forward"]})
+        done = subprocess.run([sys.executable, "-c", _PEAK, "generate", str(path), "--out", str(tmp_path / str(seconds)), "--quiet"],
+                              check=True, capture_output=True, text=True)
+        peaks[seconds] = int(done.stdout.split()[-1])
+    assert peaks[20] < 1.05 * peaks[1] + 8_000, f"peak resident memory, KiB: {peaks}"

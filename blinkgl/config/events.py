@@ -37,7 +37,7 @@ class EsimConfig(Config):
                                    "(or >= half of a smaller nominal one).")
     threshold_jitter: float = Field(0.0, ge=0, le=5, description="Standard deviation of the threshold from event to event, "
                                     "in ln units, drawn once per event.")
-    log_eps: float = Field(1e-3, ge=1e-12, le=1e6, description="Added to the intensity before the logarithm, in the units "
+    log_eps: float = Field(1e-3, ge=1e-9, le=1e6, description="Added to the intensity before the logarithm, in the units "
                            "of the intensity (rpg_esim's default 1e-3 for intensities in [0, 1]).")
     refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time of a pixel after an event, microseconds; a level "
                                  "passed in it is lost, as in rpg_esim.")

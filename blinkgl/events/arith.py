@@ -20,8 +20,8 @@ _F, _I, _D, _L = np.float32, np.int32, np.float64, np.int64
 Q = 25
 """Fraction bits of fixed-point log intensity: resolution 2^-25 = 3.0e-8, range +-64."""
 Q_ONE = 1 << Q
-LOG_MAX_INPUT = float(2.0**44)
-"""Largest intensity :func:`log_q25` takes (and 2^-44 the smallest), so that any difference of two logs fits."""
+LOG_MAX_INPUT = float(2.0**30)
+"""Largest intensity :func:`log_q25` takes (and 2^-30 the smallest): a log, a threshold and their difference fit."""
 _Q_LN2 = _I(round(np.log(2.0) * Q_ONE))
 _Q_SCALE = _F(Q_ONE)
 _F1, _SQRT_HALF_BITS, _EXP23 = _F(1.0), _I(0x3F3504F3), _I(23)
@@ -46,7 +46,7 @@ def _log1p_reduced(f):
 
 @register_jitable
 def log_q25(v):
-    """ln(v) as int32 in units of 2^-25; v float32 in [2^-44, 2^44]. Absolute error < 1.3e-7.
+    """ln(v) as int32 in units of 2^-25; v float32 in [2^-30, 2^30]. Absolute error < 1.3e-7.
 
     Fixed point because sums of thresholds are then exact: a brightness that returns to its old value returns
     to its old level, a reference never drifts, and ties are decided by numbers rather than by rounding. In

@@ -20,12 +20,13 @@ INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 are all larger, so one running maximum per frame checks everything at once."""
 MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
+NO_CAP = 2**62
 
 
 class Emulator(ABC):
     """Frames in, events out.
 
-    ``step(luminance, t_ns)`` takes one frame: float32 (H, W), linear, finite, >= 0, at most 2^44; or uint8 (H, W),
+    ``step(luminance, t_ns)`` takes one frame: float32 (H, W), linear, finite, >= 0, at most 2^30; or uint8 (H, W),
     looked up in the table of :meth:`set_decode`. The first call sets the reference and returns no events; call k
     returns the events of the interval (t_{k-1}, t_k]. Times are int64 ns, strictly increasing, at most 17 minutes
     apart. Event times are floored to the microsecond and never decrease, within a step or from step to step; an
@@ -120,10 +121,6 @@ class Emulator(ABC):
         blocks = -(-pixels // BLOCK)
         bands = min(numba.get_num_threads(), blocks)
         return np.minimum(BLOCK * (blocks * np.arange(bands + 1, dtype=np.int64) // bands), pixels)
-
-    def _per_pixel_cap(self, bound: int, active: int, limit: int) -> int:
-        """Events one pixel may emit in this step: without limit unless the step could exceed ``limit``."""
-        return 2**62 if bound <= limit else max(1, limit // max(active, 1))
 
     # -- state ----------------------------------------------------------------------------------------------
     def state_dict(self) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ redrawn at every frame lose events, the more the higher the frame rate.) Everyth
 returns exactly passes exactly the same levels.
 
 How it is fast: the logarithm and the comparison with both levels are branch-free loops over blocks that stay in
-the first-level cache; the pixels that fire are then picked out of the block's flags eight at a time.
+the first-level cache; the pixels that fire are then picked out of the block's flags, eight at a time, without branches on the data.
 :mod:`blinkgl.events.reference` is the slow twin.
 """
 
@@ -19,29 +19,20 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic, register_jitable
+from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.emulator import BLOCK, NEVER_NS, Emulator
-from blinkgl.events.packing import JIT, JIT_PARALLEL
+from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CAP, Emulator
+from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
 from blinkgl.events.philox import Stream, normal2, pixel_counters
 from blinkgl.events.types import Events
 
-_ZERO = np.float32(0.0)
+_ZERO, _I0, _FAR_BELOW = np.float32(0.0), np.int32(0), np.int32(-(2**31))
+_U1000 = np.uint64(1000)
 _JITTER = np.uint64(Stream.JITTER)
 _LONG_NS = 2**31
 MIN_THRESHOLD = 0.01
-
-
-@intrinsic
-def trailing_zeros(typing_context, word):
-    """Number of trailing zero bits of a non-zero uint64."""
-    def generate(context, builder, signature, args):
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-    return types.uint64(types.uint64), generate
 
 
 @numba.njit(**JIT)
@@ -63,8 +54,13 @@ def lookup_block(codes, table, out):
 
 @numba.njit(**JIT)
 def _flag_block(level, upper, lower, flags):
+    """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
+    farthest = _FAR_BELOW
     for i in range(level.size):
-        flags[i] = np.uint8((level[i] >= upper[i]) | (level[i] <= lower[i]))
+        beyond = max(np.int32(level[i] - upper[i]), np.int32(lower[i] - level[i]))
+        flags[i] = np.uint8(beyond >= _I0)
+        farthest = max(farthest, beyond)
+    return farthest
 
 
 @numba.njit(**JIT)
@@ -73,8 +69,7 @@ def _sense_band(frame, codes, table, eps, start, stop, now, upper, lower, invers
 
     Returns (firing pixels, upper bound of their events, largest bit pattern of the intensities)."""
     count, bound, worst = 0, 0, np.uint32(0)
-    flags = np.zeros(BLOCK, np.uint8)
-    words = flags.view(np.uint64)
+    flags, words_set = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64)
     for s in range(start, stop, BLOCK):
         e = min(s + BLOCK, stop)
         if e - s < BLOCK:
@@ -83,19 +78,23 @@ def _sense_band(frame, codes, table, eps, start, stop, now, upper, lower, invers
             lookup_block(codes[s:e], table, now[s:e])
         else:
             worst = max(worst, log_block(frame[s:e], eps, now[s:e]))
-        _flag_block(now[s:e], upper[s:e], lower[s:e], flags)
-        first = count
-        for k in range(words.size):
-            word = words[k]
-            while word:
-                active[start + count] = s + 8 * k + np.int64(trailing_zeros(word) >> np.uint64(3))
-                count += 1
-                word &= word - np.uint64(1)
-        for j in range(start + first, start + count):
-            i = active[j]
-            beyond = max(np.int64(now[i]) - upper[i], np.int64(lower[i]) - now[i])
-            bound += min(np.int64(beyond * inverse_threshold) + 2, refractory_bound)
+        farthest = _flag_block(now[s:e], upper[s:e], lower[s:e], flags)
+        if farthest >= 0:
+            found = compact_flags(flags, words_set, s, active[start + count:])
+            count += found
+            bound += found * min(np.int64(farthest * inverse_threshold) + 2, refractory_bound)
     return count, bound, worst
+
+
+@numba.njit(**JIT)
+def _fine_bound(active, start, count, now, upper, lower, inverse_threshold, refractory_bound):
+    """The bound of :func:`_sense_band`, pixel by pixel."""
+    bound = 0
+    for j in range(start, start + count):
+        i = active[j]
+        beyond = max(np.int64(now[i]) - upper[i], np.int64(lower[i]) - now[i])
+        bound += min(np.int64(beyond * inverse_threshold) + 2, refractory_bound)
+    return bound
 
 
 @register_jitable
@@ -116,41 +115,45 @@ def _emit_band(active, first, count, before, now, upper, lower, on, off, on_all,
     Returns (events emitted, events cut by ``cap``)."""
     out, cut = begin, 0
     y, row_end = np.int64(0), np.int64(0)
+    start_ns = t0_ns - 1000 * base_us  # start of the interval after the microsecond base, 0 to 999
     for j in range(first, first + count):
         i = np.int64(active[j])
         if i >= row_end:
             y = i // width
             row_end = (y + 1) * width
-        pixel = (y << 17) | ((i - row_end + width) << 1)
-        level_now, level_before = np.int64(now[i]), np.int64(before[i])
+        level, above, below = np.int64(now[i]), np.int64(upper[i]), np.int64(lower[i])
+        whole = abs(level - before[i])
+        polarity = np.int64(level >= above)
+        gap = max(level - above, below - level)  # how far the signal ends beyond the level being passed
+        pixel = (y << 17) | ((i - row_end + width) << 1) | polarity
         step_on, step_off = on_all, off_all
         if on.size:
             step_on, step_off = np.int64(on[i]), np.int64(off[i])
-        polarity = np.int64(level_now >= upper[i])
-        if polarity:
-            whole, gap, sign = level_now - level_before, level_now - upper[i], 1
-        else:
-            whole, gap, sign = level_before - level_now, lower[i] - level_now, -1
         up, down = step_on, step_off
+        step = down + polarity * (up - down)
         emitted = 0
-        while gap >= 0:  # gap: how far the signal ends beyond the level being passed
-            t_ns = t0_ns + crossing_ns(whole - gap, whole, dt_ns)
-            if last_ns.size == 0 or t_ns - last_ns[i] >= refractory_ns:
+        while gap >= 0:
+            after_ns = start_ns + crossing_ns(whole - gap, whole, dt_ns)
+            alive = True
+            if last_ns.size:
+                alive = base_us * 1000 + after_ns - last_ns[i] >= refractory_ns
+                if alive:
+                    last_ns[i] = base_us * 1000 + after_ns
+            if alive:
                 if emitted < cap:
-                    packed[out] = ((t_ns // 1000 - base_us) << 33) | pixel | polarity
+                    packed[out] = (np.int64(np.uint64(after_ns) // _U1000) << T_SHIFT) | pixel
                     out += 1
                     emitted += 1
                 else:
                     cut += 1
-                if last_ns.size:
-                    last_ns[i] = t_ns
             if fired.size:
                 fired[i] += 1
                 a, b = normal2(seed, np.uint64(i), _JITTER, np.uint64(fired[i]))
                 up = max(floor_on, step_on + np.int64(np.floor(jitter * a + 0.5)))
                 down = max(floor_off, step_off + np.int64(np.floor(jitter * b + 0.5)))
-            gap -= up if polarity else down
-        passed = level_now - sign * (gap + (up if polarity else down))  # the last level passed: the new reference
+                step = down + polarity * (up - down)
+            gap -= step
+        passed = level - (2 * polarity - 1) * (gap + step)  # the last level passed: the new reference
         upper[i] = np.int32(passed + up)
         lower[i] = np.int32(passed - down)
     return out - begin, cut
@@ -180,12 +183,12 @@ def to_q25(value: float | np.ndarray) -> np.ndarray:
 
 
 def draw_thresholds(height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64) -> tuple[np.ndarray, np.ndarray]:
-    """Per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 20.
+    """Per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 10.
 
     For nominal thresholds under 0.02 the floor is half the nominal one.
     """
     a, b = normal2(seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
-    clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 20.0)
+    clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 10.0)
     return clip(on, a), clip(off, b)
 
 
@@ -256,9 +259,12 @@ class Esim(Emulator):
             self._refuse_bad_intensity(frame, int(report[:, 2].max()))
 
         active, bound = int(counts.sum()), int(bounds.sum())
-        cap = self._per_pixel_cap(bound, active, self.config.max_events_per_step)
-        if bound > self.config.max_events_per_step:
-            bounds = counts * cap
+        limit, cap = self.config.max_events_per_step, NO_CAP
+        if bound > limit:  # the blocks' bound is generous: look again, pixel by pixel, before cutting anything
+            bounds = np.array([_fine_bound(self._active, edge, count, *levels[:-1]) for edge, count in zip(edges, counts)])
+            if bounds.sum() > limit:
+                cap = max(1, limit // active)
+                bounds = counts * cap
         begins = np.cumsum(bounds) - bounds
         packed = self._buffer.reserve(int(bounds.sum()))
         base_us = self.t_ns // 1000

@@ -39,7 +39,7 @@ class ReferenceEsim:
         floor = [min(0.01, c / 2) for c in nominal]
         pixels = pixel_counters(height, width)
         spread = normal2(self.seed, pixels, np.uint64(Stream.THRESHOLD), np.uint64(0))
-        self.threshold = [[q(min(max(c + config.threshold_sigma * n, f), 20.0)) for n in normals]
+        self.threshold = [[q(min(max(c + config.threshold_sigma * n, f), 10.0)) for n in normals]
                           for c, f, normals in zip(nominal, floor, spread)]
         if config.threshold_sigma == 0:
             self.threshold = [[q(c)] * (height * width) for c in nominal]

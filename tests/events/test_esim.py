@@ -61,7 +61,7 @@ def test_resumes_bit_identically(variant):
 def test_ramp_closed_form():
     """exp(a t) with no epsilon to speak of: an event every C/a seconds, to the microsecond."""
     rate, c, dt = 40.0, 0.2, 1_000_000
-    esim = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-12))
+    esim = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-9))
     events = run(esim, [np.full((1, 1), 1e-3 * np.exp(rate * k * dt * 1e-9), np.float32) for k in range(101)],
                  range(0, 101 * dt, dt))
     expected = np.arange(1, 20) * c / rate * 1e6
@@ -71,7 +71,7 @@ def test_ramp_closed_form():
 
 def test_step_is_spread_over_its_interval():
     """A jump of 10.5 thresholds fires ten events, evenly spaced in the interval."""
-    esim = Esim(1, 1, EsimConfig(contrast_threshold=0.1, threshold_sigma=0, log_eps=1e-12))
+    esim = Esim(1, 1, EsimConfig(contrast_threshold=0.1, threshold_sigma=0, log_eps=1e-9))
     esim.step(np.ones((1, 1), np.float32), 5_000_000)
     events = esim.step(np.full((1, 1), np.exp(-1.05), np.float32), 6_000_000)
     assert len(events) == 10 and (events.p == 0).all()
@@ -81,7 +81,7 @@ def test_step_is_spread_over_its_interval():
 def test_slow_ramp_fires():
     """3e-7 per frame: each step is far below what a float32 reference could follow."""
     frames, rate = 4000, 3e-7
-    esim = Esim(1, 4, EsimConfig(contrast_threshold=0.001, threshold_sigma=0, log_eps=1e-12))
+    esim = Esim(1, 4, EsimConfig(contrast_threshold=0.001, threshold_sigma=0, log_eps=1e-9))
     events = run(esim, (np.full((1, 4), np.exp(rate * k), np.float32) for k in range(frames)), range(0, frames * 10**6, 10**6))
     assert len(events) == 4 and (events.p == 1).all()
     assert np.abs(events.t - 0.001 / rate * 1000).max() < 1e-3 * events.t.max() + 1000
@@ -130,7 +130,7 @@ def test_event_times_converge_with_order_two(scene):
         truth = truth[truth <= 1]
     spacings, errors = [], []
     for n in (64, 128, 256, 512):
-        esim = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-12))
+        esim = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-9))
         events = run(esim, [np.full((1, 1), intensity(k / n), np.float32) for k in range(n + 1)],
                      [round(k / n * period * 1e9) for k in range(n + 1)])
         assert len(events) == len(truth)
@@ -164,7 +164,7 @@ def test_event_count_does_not_depend_on_frame_rate_with_spread():
     """The same ramp in 10 or 1000 frames: thresholds are not redrawn per frame, so no event is lost."""
     counts = []
     for n in (10, 1000):
-        esim = Esim(20, 20, EsimConfig(threshold_sigma=0.05, log_eps=1e-12))
+        esim = Esim(20, 20, EsimConfig(threshold_sigma=0.05, log_eps=1e-9))
         counts.append(len(run(esim, [np.full((20, 20), np.exp(3 * k / n), np.float32) for k in range(n + 1)],
                               [round(k / n * 1e9) for k in range(n + 1)])))
     assert abs(counts[0] - counts[1]) <= 4
@@ -172,7 +172,7 @@ def test_event_count_does_not_depend_on_frame_rate_with_spread():
 
 def test_burst_saturates_honestly(threads):
     """10^4 events per pixel wanted in one interval: bounded memory, every pixel cut alike, the rest counted."""
-    config = EsimConfig(contrast_threshold=0.001, threshold_sigma=0, log_eps=1e-12, max_events_per_step=20_000)
+    config = EsimConfig(contrast_threshold=0.001, threshold_sigma=0, log_eps=1e-9, max_events_per_step=20_000)
     esim = Esim(40, 50, config)
     esim.step(np.full((40, 50), 1e-5, np.float32), 0)
     events = esim.step(np.full((40, 50), np.exp(-1.5), np.float32), 10**6)
@@ -184,8 +184,8 @@ def test_burst_saturates_honestly(threads):
 
 
 def test_long_intervals():
-    esim = Esim(1, 1, EsimConfig(threshold_sigma=0, log_eps=1e-12))
-    slow = ReferenceEsim(1, 1, EsimConfig(threshold_sigma=0, log_eps=1e-12))
+    esim = Esim(1, 1, EsimConfig(threshold_sigma=0, log_eps=1e-9))
+    slow = ReferenceEsim(1, 1, EsimConfig(threshold_sigma=0, log_eps=1e-9))
     frames, times = [np.full((1, 1), v, np.float32) for v in (0.1, 5.0, 0.2)], [0, 17 * 60 * 10**9, 34 * 60 * 10**9 - 1]
     assert_same(run(esim, frames, times), run(slow, frames, times))
     with pytest.raises(EventDataError, match="17 minutes"):

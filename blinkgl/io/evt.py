@@ -1,0 +1,238 @@
+"""Prophesee's EVT2 (32-bit words) and EVT3 (16-bit words), decoded and encoded by numba kernels.
+
+EVT2: type in bits 31..28 (0 OFF, 1 ON, 8 TIME_HIGH = t >> 6); t low 27..22, x 21..11, y 10..0.
+EVT3: type in bits 15..12: 0 ADDR_Y, 2 ADDR_X (polarity bit 11), 3 VECT_BASE_X, 4 VECT_12, 5 VECT_8, 6 TIME_LOW (t & 0xfff),
+8 TIME_HIGH (t >> 12 & 0xfff): 24 bits of µs, wrapping every 16.8 s. (Prophesee, "EVT 2.0 / 3.0 format" pages.)
+
+Like other encoders of a ready event list we write EVT3's single events only, no vectors; the reader knows both.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.atomic import output_errors
+
+_WORD = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
+_MAX_SIDE = 2048
+_MAX_TIME = 1 << 34
+"""µs, 4.8 hours: EVT2's field; also the limit of what we fill with TIME_HIGH words in EVT3."""
+
+
+class EvtWriter:
+    """Streams events into an EVT2 or EVT3 file with a header that names format and geometry.
+
+    Raises EventDataError for times outside [0, 2^34) µs or out of order, and coordinates outside the sensor or the formats' 11 bits.
+    """
+
+    def __init__(self, path: str | os.PathLike, height: int, width: int, version: str = "evt3"):
+        if height > _MAX_SIDE or width > _MAX_SIDE:
+            raise EventDataError(f"{version.upper()} has 11-bit coordinates", where=str(path), value=(height, width),
+                                 accepted="at most 2048 px a side")
+        self.path, self.height, self.width, self.version = Path(path), height, width, version
+        # time written so far, EVT3's row; -1: none yet
+        self._state = np.array([0, -1], np.int64)
+        self._started = False
+        header = (f"% evt {version[-1]}.0\n% format {version.upper()};height={height};width={width}\n"
+                  f"% geometry {width}x{height}\n% integrator_name BlinkGL\n% end\n")
+        with output_errors(path):
+            self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
+            self._file.write(header.encode())
+
+    def append(self, events: Events) -> None:
+        if not len(events):
+            return
+        t = events.t
+        if t[0] < self._state[0] or np.any(t[1:] < t[:-1]):
+            raise EventDataError("event times not in order (or negative)", where=str(self.path))
+        if t[-1] >= _MAX_TIME:
+            raise EventDataError(f"{self.version.upper()} times count from the recording's start", where=str(self.path),
+                                 value=int(t[-1]), accepted="less than 2^34 µs; use --zero-time to shift")
+        if events.x.max() >= self.width or events.y.max() >= self.height:
+            raise EventDataError("event outside the sensor", where=str(self.path), accepted=f"x < {self.width}, y < {self.height}")
+        if self.version == "evt2":
+            words = np.empty(2 * len(t) + 1, np.uint32)
+            n = _encode_evt2(events.x, events.y, t, events.p, self._state, not self._started, words)
+        else:
+            words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
+            n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._started, words)
+        self._started = True
+        with output_errors(self.path):
+            self._file.write(words[:n].astype(_WORD[self.version], copy=False).data)
+
+    def close(self, t_end_us: int | None = None) -> None:
+        with output_errors(self.path):
+            self._file.close()
+
+    def abort(self) -> None:
+        try:
+            self._file.close()
+        except OSError:
+            pass
+
+
+class EvtReader:
+    """Header and events of an EVT2/EVT3 file. ``height`` and ``width`` are None when the header does not say.
+
+    Raises AssetError: no ``% evt`` header, another version, stray bytes at the end (truncated)."""
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        header, self._start = _read_header(self.path)
+        version = re.search(r"^% evt (\d+\.?\d*)", header, re.M) or re.search(r"^% format EVT(\d+)", header, re.M)
+        if not version:
+            raise AssetError("not an EVT file: header without '% evt'", where=str(path))
+        self.version = "evt" + version.group(1).removesuffix(".0")  # 2.1 has 64-bit words: another format
+        if self.version not in _WORD:
+            raise AssetError("unsupported EVT version", where=str(path), value=version.group(1), accepted="2 or 3")
+        geometry = re.search(r"^% geometry (\d+)x(\d+)", header, re.M)
+        sizes = {k: re.search(rf"{k}=(\d+)", header) for k in ("height", "width")}
+        self.height = int(geometry.group(2)) if geometry else int(sizes["height"].group(1)) if sizes["height"] else None
+        self.width = int(geometry.group(1)) if geometry else int(sizes["width"].group(1)) if sizes["width"] else None
+
+    def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
+        """All events, as decoded from ``words`` words at a time."""
+        dtype = _WORD[self.version]
+        # EVT2: time high, wraps.  EVT3: y, high, low, vector base x, polarity, wraps.  -1: no time yet.
+        state = np.array([-1, 0], np.int64) if self.version == "evt2" else np.array([0, -1, 0, 0, 0, 0], np.int64)
+        decode, most = (_decode_evt2, 1) if self.version == "evt2" else (_decode_evt3, 12)
+        with open(self.path, "rb") as file:
+            file.seek(self._start)
+            while data := file.read(words * dtype.itemsize):
+                whole = len(data) // dtype.itemsize * dtype.itemsize
+                raw = np.frombuffer(data[:whole], dtype)
+                x, y, p = np.empty(most * len(raw), np.uint16), np.empty(most * len(raw), np.uint16), np.empty(most * len(raw), np.uint8)
+                t = np.empty(most * len(raw), np.int64)
+                n = decode(raw, state, x, y, t, p)
+                if n:
+                    yield Events(x[:n].copy(), y[:n].copy(), t[:n].copy(), p[:n].copy())
+                if whole < len(data):
+                    raise AssetError(f"truncated: {len(data) - whole} stray bytes after the last {self.version.upper()} word",
+                                     where=str(self.path))
+
+
+def _read_header(path: Path) -> tuple[str, int]:
+    lines = []
+    try:
+        with open(path, "rb") as file:
+            while True:
+                start = file.tell()
+                if file.read(1) != b"%":
+                    break
+                line = file.readline(4096)
+                if not line.startswith(b" ") or not line.endswith(b"\n"):
+                    break  # a word that happens to begin with '%'
+                lines.append("%" + line.decode("latin-1").rstrip())
+                if lines[-1] == "% end":
+                    start = file.tell()
+                    break
+    except OSError as error:
+        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    return "\n".join(lines), start
+
+
+@numba.njit(cache=True, nogil=True)
+def _encode_evt2(x, y, t, p, state, first, words):
+    n = 0
+    high = -1 if first else state[0] >> 6
+    for i in range(len(t)):
+        if t[i] >> 6 != high:
+            high = t[i] >> 6
+            words[n] = np.uint32((8 << 28) | high)
+            n += 1
+        words[n] = np.uint32((np.int64(p[i]) << 28) | ((t[i] & 63) << 22) | (np.int64(x[i]) << 11) | np.int64(y[i]))
+        n += 1
+    state[0] = t[-1]
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _decode_evt2(words, state, x, y, t, p):
+    n = 0
+    high, wraps = state
+    for i in range(len(words)):
+        word = np.int64(words[i])
+        kind = word >> 28
+        if kind == 8:
+            new = word & 0xFFFFFFF
+            if high - new > 1 << 27:
+                wraps += 1
+            high = new
+        elif kind <= 1 and high >= 0:  # before the first TIME_HIGH the time is unknown
+            x[n], y[n], p[n] = (word >> 11) & 0x7FF, word & 0x7FF, kind
+            t[n] = (((wraps << 28) | high) << 6) | ((word >> 22) & 63)
+            n += 1
+    state[0], state[1] = high, wraps
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _encode_evt3(x, y, t, p, state, first, words):
+    n = 0
+    time, row = state
+    if first:
+        words[0] = 0x8000
+        n, time = 1, -1
+    for i in range(len(t)):
+        if t[i] != time:
+            # Every 4096 µs step is written: a reader counts the 24-bit counter's wraps by seeing it fall.
+            high = max(time, 0) >> 12
+            while high < t[i] >> 12:
+                high += 1
+                words[n] = 0x8000 | (high & 0xFFF)
+                n += 1
+            words[n] = 0x6000 | (t[i] & 0xFFF)
+            n += 1
+            time = t[i]
+        if y[i] != row:
+            row = y[i]
+            words[n] = row
+            n += 1
+        words[n] = 0x2000 | (np.int64(p[i]) << 11) | np.int64(x[i])
+        n += 1
+    state[0], state[1] = time, row
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _decode_evt3(words, state, x, y, t, p):
+    n = 0
+    row, high, low, base, polarity, wraps = state
+    for i in range(len(words)):
+        word = np.int64(words[i])
+        kind = word >> 12
+        if kind == 0:
+            row = word & 0x7FF
+        elif kind == 2:
+            if high >= 0:
+                x[n], y[n], p[n] = word & 0x7FF, row, (word >> 11) & 1
+                t[n] = (((wraps << 12) | high) << 12) | low
+                n += 1
+        elif kind == 3:
+            base, polarity = word & 0x7FF, (word >> 11) & 1
+        elif kind == 4 or kind == 5:
+            width = 12 if kind == 4 else 8
+            if high >= 0:
+                for k in range(width):
+                    if (word >> k) & 1:
+                        x[n], y[n], p[n] = base + k, row, polarity
+                        t[n] = (((wraps << 12) | high) << 12) | low
+                        n += 1
+            base += width
+        elif kind == 6:
+            low = word & 0xFFF
+        elif kind == 8:
+            new = word & 0xFFF
+            if high - new > 1 << 11:
+                wraps += 1
+            high = new
+    state[0], state[1], state[2], state[3], state[4], state[5] = row, high, low, base, polarity, wraps
+    return n

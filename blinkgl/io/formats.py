@@ -1,0 +1,195 @@
+"""Every event format by one door: :func:`open_events`, :func:`event_writer`, :func:`write_events`, :func:`convert`.
+
+| format | ending | read | write |
+|---|---|---|---|
+| dsec (also BlinkFlow's h5) | .h5 .hdf5 | x | x |
+| mvsec | .hdf5 .h5 | x | |
+| evt3, evt2 | .raw | x | x (.raw is EVT3; EVT2 by name) |
+| aedat4 (extra [formats]) | .aedat4 | x | x |
+| text, csv | .txt .csv | x | x |
+| npz, npy | .npz .npy | x | x |
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.events.types import Events
+from blinkgl.io.atomic import atomic_file
+
+ENDINGS = {".h5": "dsec", ".hdf5": "dsec", ".raw": "evt3", ".aedat4": "aedat4", ".txt": "text", ".csv": "csv", ".npz": "npz", ".npy": "npy"}
+WRITABLE = ("dsec", "evt3", "evt2", "aedat4", "text", "csv", "npz", "npy")
+SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
+"""(height, width) of event cameras, smallest first: the guess for files that do not say."""
+
+
+class EventWriter(Protocol):
+    """What every format's writer offers; ``abort`` never raises."""
+
+    def append(self, events: Events) -> None: ...
+    def close(self, t_end_us: int | None = None) -> None: ...
+    def abort(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class EventFile:
+    """An event file opened for reading, in any format.
+
+    height, width : px, None when the file does not say. t_offset_us : DSEC's, else 0 (already added to the times)."""
+
+    path: Path
+    format: str
+    height: int | None
+    width: int | None
+    t_offset_us: int = 0
+    _reader: Any = field(default=None, repr=False)
+
+    def chunks(self) -> Iterator[Events]:
+        """All events from the beginning, in pieces, memory flat (npz, npy: held whole).
+
+        Raises EventDataError when times run backwards; AssetError when the file is damaged."""
+        last, count = None, 0
+        for events in self._reader.chunks():
+            t = events.t
+            if last is not None and len(t) and t[0] < last:
+                raise EventDataError(f"event times run backwards at event {count}", where=str(self.path), value=(last, int(t[0])))
+            if (back := np.flatnonzero(t[1:] < t[:-1])).size:
+                i = int(back[0])
+                raise EventDataError(f"event times run backwards at event {count + i + 1}", where=str(self.path),
+                                     value=(int(t[i]), int(t[i + 1])))
+            if len(t):
+                last, count = int(t[-1]), count + len(t)
+                yield events
+
+    def read(self) -> Events:
+        """All events at once."""
+        return Events.concatenate(list(self.chunks()))
+
+    def sized(self) -> "EventFile":
+        """Self with height and width known: where the file does not say, the smallest known sensor that holds all its
+        events (one pass over the file)."""
+        if self.height is not None and self.width is not None:
+            return self
+        largest = np.zeros(2, int)
+        for events in self.chunks():
+            largest = np.maximum(largest, (int(events.y.max()), int(events.x.max())))
+        fits = (s for s in SENSORS if s[0] > largest[0] and s[1] > largest[1])
+        height, width = next(fits, tuple(int(v) + 1 for v in largest))
+        return replace(self, height=height, width=width)
+
+
+def open_events(path: str | os.PathLike) -> EventFile:
+    """Opens an event file; the content decides where the ending leaves a choice.
+
+    Raises AssetError: missing, unknown ending, or not what the ending says."""
+    path = Path(path)
+    kind = ENDINGS.get(path.suffix.lower())
+    if kind is None:
+        raise AssetError("unknown event file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
+    if not path.is_file():
+        raise AssetError("no such file", where=str(path))
+    if kind == "dsec":
+        from blinkgl.io.dsec import DsecEventReader, open_hdf5
+        from blinkgl.io.mvsec import DATASET, MvsecReader
+        with open_hdf5(path) as file:
+            kind = "mvsec" if DATASET in file else "dsec"
+        reader = MvsecReader(path) if kind == "mvsec" else DsecEventReader(path)
+    elif kind == "evt3":
+        from blinkgl.io.evt import EvtReader
+        reader = EvtReader(path)
+        kind = reader.version
+    elif kind == "aedat4":
+        from blinkgl.io.aedat4 import Aedat4Reader
+        reader = Aedat4Reader(path)
+    elif kind in ("text", "csv"):
+        from blinkgl.io.text import TextReader
+        reader = TextReader(path)
+    else:
+        from blinkgl.io.arrays import ArrayReader
+        reader = ArrayReader(path)
+    return EventFile(path, kind, reader.height, reader.width, getattr(reader, "t_offset_us", 0), reader)
+
+
+def output_format(path: str | os.PathLike, format: str | None = None) -> str:
+    """The format to write ``path`` in; OutputError when neither its ending nor ``format`` names one."""
+    kind = format or ENDINGS.get(Path(path).suffix.lower())
+    if kind not in WRITABLE:
+        raise OutputError("unknown event format" if format else "unknown event file ending", where=str(path),
+                          value=format or Path(path).suffix, accepted=", ".join(WRITABLE if format else ENDINGS))
+    return kind
+
+
+def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int) -> EventWriter:
+    if kind == "dsec":
+        from blinkgl.io.dsec import DsecEventWriter
+        return DsecEventWriter(path, height, width, t_offset_us)
+    if kind in ("evt2", "evt3"):
+        from blinkgl.io.evt import EvtWriter
+        return EvtWriter(path, height, width, kind)
+    if kind == "aedat4":
+        from blinkgl.io.aedat4 import Aedat4Writer
+        return Aedat4Writer(path, height, width)
+    if kind in ("text", "csv"):
+        from blinkgl.io.text import TextWriter
+        return TextWriter(path, "," if kind == "csv" else " ")
+    from blinkgl.io.arrays import ArrayWriter
+    return ArrayWriter(path, height, width)
+
+
+@contextlib.contextmanager
+def event_writer(path: str | os.PathLike, height: int, width: int, *, format: str | None = None, t_offset_us: int = 0,
+                 overwrite: bool = True) -> Iterator[EventWriter]:
+    """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the block ends
+    without an exception, and not at all otherwise.
+
+    t_offset_us : DSEC only, the time of the recording's start. Raises OutputError, EventDataError.
+    """
+    kind = output_format(path, format)
+    with atomic_file(path, overwrite=overwrite) as temporary:
+        writer = _writer(temporary, kind, height, width, t_offset_us)
+        try:
+            yield writer
+            writer.close()
+        except BaseException:
+            writer.abort()
+            raise
+
+
+def write_events(path: str | os.PathLike, chunks: Events | Iterable[Events], height: int, width: int, **options) -> int:
+    """Writes events or an iterable of chunks; options as :func:`event_writer`. Returns the number of events."""
+    count = 0
+    with event_writer(path, height, width, **options) as writer:
+        for events in [chunks] if isinstance(chunks, Events) else chunks:
+            writer.append(events)
+            count += len(events)
+    return count
+
+
+def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str | None = None, size: tuple[int, int] | None = None,
+            zero_time: bool = False, overwrite: bool = True) -> tuple[EventFile, int]:
+    """Copies events from one format to another, streaming.
+
+    size : (height, width) for sources that do not say (default: guessed, see :meth:`EventFile.sized`).
+    zero_time : shift times so that the first event is at 0, for formats that count from the start (EVT2, EVT3).
+    Returns the source with its size, and the number of events written.
+    """
+    output_format(target, format)
+    file = open_events(source)
+    if size is not None:
+        file = replace(file, height=size[0], width=size[1])
+    file = file.sized()
+    first = next((int(e.t[0]) for e in file.chunks()), 0)
+    shift = first if zero_time else 0
+    # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
+    offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
+    shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
+    count = write_events(target, shifted, file.height, file.width, format=format, t_offset_us=offset, overwrite=overwrite)
+    return file, count

@@ -1,0 +1,286 @@
+"""Event formats: write → read, independent libraries, real recordings, bad input."""
+
+from __future__ import annotations
+
+import contextlib
+
+import h5py
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.events.types import Events
+from blinkgl.io.evt import EvtReader, EvtWriter
+from blinkgl.io.formats import convert, event_writer, open_events, write_events
+from tests.shared_data import shared
+
+H, W = 480, 640
+FILES = {"dsec": "e.h5", "evt3": "e.raw", "evt2": "e.raw", "text": "e.txt", "csv": "e.csv", "npz": "e.npz", "npy": "e.npy", "aedat4": "e.aedat4"}
+
+
+def random_events(n=20_000, duration_us=40_000_000, t0=0, seed=0, height=H, width=W) -> Events:
+    """Bursts, equal times and gaps longer than EVT3's 16.8 s counter."""
+    rng = np.random.default_rng(seed)
+    t = np.sort(np.concatenate([rng.integers(0, 50_000, n // 2), rng.integers(0, 2_000_000, n - n // 2 - 3), [duration_us - 2] * 3]))
+    return Events(rng.integers(0, width, n).astype(np.uint16), rng.integers(0, height, n).astype(np.uint16), t + t0,
+                  rng.integers(0, 2, n).astype(np.uint8))
+
+
+def pieces(events: Events, seed=0):
+    rng, i = np.random.default_rng(seed), 0
+    while i < len(events):
+        n = int(rng.choice([1, 10, 5000]))
+        yield Events(*(getattr(events, k)[i:i + n] for k in "xytp"))
+        i += n
+
+
+def same(a: Events, b: Events) -> bool:
+    return all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")
+
+
+def need(kind):
+    if kind == "aedat4":
+        pytest.importorskip("dv_processing", reason="optional extra [formats]")
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_write_then_read_is_exact(tmp_path, kind):
+    need(kind)
+    events = random_events()
+    path = tmp_path / FILES[kind]
+    assert write_events(path, pieces(events), H, W, format=kind) == len(events)
+    file = open_events(path)
+    assert file.format == ("text" if kind == "text" else kind)
+    assert (file.height, file.width) == ((None, None) if kind in ("text", "csv", "npy") else (H, W))
+    assert same(file.read(), events)
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_no_events_at_all(tmp_path, kind):
+    need(kind)
+    write_events(tmp_path / FILES[kind], Events.empty(), H, W, format=kind)
+    assert len(open_events(tmp_path / FILES[kind]).read()) == 0
+
+
+@pytest.mark.parametrize("kind", ["evt2", "evt3", "text", "csv"])
+def test_bytes_do_not_depend_on_chunking(tmp_path, kind):
+    events = random_events(3000)
+    for i in range(2):
+        write_events(tmp_path / f"{i}.x", pieces(events, i), H, W, format=kind)
+    assert (tmp_path / "0.x").read_bytes() == (tmp_path / "1.x").read_bytes()
+
+
+@pytest.mark.parametrize("kind", ["evt2", "evt3", "aedat4"])
+def test_faery_reads_what_we_write(tmp_path, kind):
+    faery = pytest.importorskip("faery", reason="optional extra [formats]")
+    need(kind)
+    events = random_events()
+    write_events(tmp_path / FILES[kind], pieces(events), H, W, format=kind)
+    stream = faery.events_stream_from_file(tmp_path / FILES[kind])
+    assert stream.dimensions() == (W, H)
+    a = stream.to_array()
+    assert same(Events(a["x"], a["y"], a["t"].astype(np.int64), a["on"].astype(np.uint8)), events)
+
+
+@pytest.mark.parametrize("version", ["evt2", "evt3"])
+def test_we_read_what_faery_writes(tmp_path, version):
+    faery = pytest.importorskip("faery", reason="optional extra [formats]")
+    events = random_events(duration_us=15_000_000)  # within one turn of EVT3's counter, which faery does not fill
+    a = np.empty(len(events), faery.EVENTS_DTYPE)
+    a["t"], a["x"], a["y"], a["on"] = events.t, events.x, events.y, events.p
+    faery.events_stream_from_array(a, (W, H)).to_file(tmp_path / "e.raw", zero_t0=False, version=version)
+    file = open_events(tmp_path / "e.raw")
+    assert file.format == version and same(file.read(), events)
+
+
+@pytest.mark.parametrize("name, kind, size, count", [
+    ("prophesee/faery_evt2_gen3vga.raw", "evt2", (480, 640), 521_252),
+    ("prophesee/expelliarmus_evt3_gen41hd.raw", "evt3", (720, 1280), 219_596),
+    ("aedat4/davis346_events_frames_imu.aedat4", "aedat4", (260, 346), 6_676),
+    ("slider_depth/events_chunk.txt", "text", (180, 240), 50_000),
+    ("ecd_rotation/boxes_rotation/events.txt", "text", (180, 240), 30_000),
+])
+def test_real_recordings(tmp_path, name, kind, size, count):
+    path = shared(f"data/events/{name}")
+    need(kind)
+    file = open_events(path).sized()
+    assert (file.format, file.height, file.width) == (kind, *size)
+    events = file.read()
+    assert len(events) == count
+    if kind == "text":
+        table = np.loadtxt(path)
+        assert np.array_equal(events.t, np.rint(table[:, 0] * 1e6)) and np.array_equal(events.p, table[:, 3])
+    else:
+        faery = pytest.importorskip("faery", reason="optional extra [formats]")
+        a = faery.events_stream_from_file(path).to_array()
+        assert all(np.array_equal(a[k], getattr(events, ours)) for k, ours in (("x", "x"), ("y", "y"), ("on", "p")))
+        # The EVT3 recording has TIME_LOW words up to 11 µs ahead that the next word takes back before any event; faery keeps them.
+        assert np.abs(a["t"].astype(np.int64) - events.t).max() <= (11 if kind == "evt3" else 0)
+    source, written = convert(path, tmp_path / "e.h5")
+    assert written == count and (source.height, source.width) == size
+    assert same(open_events(tmp_path / "e.h5").read(), events)
+
+
+def test_evt3_vectors_and_counter_wrap(tmp_path):
+    words = [0x2005, 0x8000 | 0xFFE, 0x6123, 0x0007, 0x3803 + 0, 0x4000 | 0b100000000001, 0x5000 | 0b10000001, 0x2805, 0x8FFF, 0x6001, 0x2001,
+             0x8000, 0x6002, 0x0800 | 3, 0x2002, 0xA000, 0x7123, 0xE000, 0xF001]
+    (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% end\n" + np.array(words, "<u2").tobytes())
+    for block in (1, 3, 1 << 17):
+        e = Events.concatenate(list(EvtReader(tmp_path / "e.raw").chunks(block)))
+        # the first word precedes any TIME_HIGH and is dropped; vectors advance the base by 12, then 8
+        assert e.x.tolist() == [3, 14, 15, 22, 5, 1, 2] and e.y.tolist() == [7] * 6 + [3] and e.p.tolist() == [1, 1, 1, 1, 1, 0, 0]
+        high = 0xFFE << 12
+        assert e.t.tolist() == [high + 0x123] * 5 + [(0xFFF << 12) + 1, (1 << 24) + 2]
+
+
+def test_evt2_word_layout(tmp_path):
+    with contextlib.closing(EvtWriter(tmp_path / "e.raw", H, W, "evt2")) as writer:
+        writer.append(Events(np.array([600], np.uint16), np.array([400], np.uint16), np.array([1_000_003]), np.array([1], np.uint8)))
+    words = np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u4")
+    assert words.tolist() == [(8 << 28) | (1_000_003 >> 6), (1 << 28) | ((1_000_003 & 63) << 22) | (600 << 11) | 400]
+
+
+def test_blinkflow_and_mvsec(tmp_path):
+    events = random_events(5000, duration_us=3_000_000)
+    with h5py.File(tmp_path / "blinkflow.h5", "w") as file:  # u8 times, no t_offset, table without the final ms
+        for k, dtype in (("x", "u2"), ("y", "u2"), ("t", "u8"), ("p", "u1")):
+            file.create_dataset(f"events/{k}", data=getattr(events, k).astype(dtype), compression="gzip")
+        file["ms_to_idx"] = np.searchsorted(events.t, np.arange(0, events.t[-1] // 1000) * 1000).astype(np.uint64)
+    assert same(open_events(tmp_path / "blinkflow.h5").read(), events)
+    from blinkgl.io.dsec import DsecEventReader
+    with DsecEventReader(tmp_path / "blinkflow.h5") as reader:
+        assert same(reader.slice(1_000_000, 3_000_000), events.window(1_000_000, 3_000_000))
+        assert same(reader.slice(2_999_500, 3_000_000), events.window(2_999_500, 3_000_000))
+    events = random_events(5000, 3_000_000, t0=1_506_117_887_000_000, height=260, width=346)
+    with h5py.File(tmp_path / "mvsec.hdf5", "w") as file:
+        file["davis/left/events"] = np.stack([events.x, events.y, events.t / 1e6, events.p * 2.0 - 1], axis=1)
+    file = open_events(tmp_path / "mvsec.hdf5")
+    assert (file.format, file.height, file.width) == ("mvsec", 260, 346) and same(file.read(), events)
+    convert(tmp_path / "mvsec.hdf5", tmp_path / "dsec.h5")
+    with h5py.File(tmp_path / "dsec.h5") as dsec:
+        assert dsec["t_offset"][()] == events.t[0] // 10**6 * 10**6
+    assert same(open_events(tmp_path / "dsec.h5").read(), events)
+
+
+def test_convert_chain_returns_the_same_events(tmp_path):
+    events = random_events(4000, t0=77_000_000)
+    write_events(tmp_path / "0.npz", events, H, W)
+    names = ["0.npz", "1.h5", "2.raw", "3.csv", "4.h5", "5.txt", "6.npy"]
+    for a, b in zip(names, names[1:]):
+        convert(tmp_path / a, tmp_path / b, size=(H, W))
+    assert same(open_events(tmp_path / "6.npy").read(), events)
+
+
+def test_zero_time(tmp_path):
+    events = random_events(1000, t0=1_506_117_887_000_000)
+    write_events(tmp_path / "a.npz", events, H, W)
+    with pytest.raises(EventDataError, match=r"EVT3 times count from the recording's start.*use --zero-time"):
+        convert(tmp_path / "a.npz", tmp_path / "b.raw")
+    assert not (tmp_path / "b.raw").exists()
+    convert(tmp_path / "a.npz", tmp_path / "b.raw", zero_time=True)
+    assert np.array_equal(open_events(tmp_path / "b.raw").read().t, events.t - events.t[0])
+
+
+@pytest.mark.parametrize("text, expected", [
+    ("0.000001 1 2 0\n0.0000025 3 4 1\n", [(1, 1, 2, 0), (3, 3, 4, 1)]),
+    ("# comment\n\n5 1 2 -1\n6\t3\t4\t1", [(5, 1, 2, 0), (6, 3, 4, 1)]),
+    ("t,x,y,p\r\n1.5,1,2,0\r\n", [(1_500_000, 1, 2, 0)]),
+    ("640 480\n1e-3 1 2 1\n1.25E-3 1.0 2.000 1.0\n", [(1000, 1, 2, 1), (1250, 1, 2, 1)]),
+    ("1506117887.123456789 7 8 1\n", [(1506117887123457, 7, 8, 1)]),
+    ("1.000000000000000000e+00 1.000000000000000000e+00 2.0 1.0\n", [(10**6, 1, 2, 1)]),
+])
+def test_text_dialects(tmp_path, text, expected):
+    (tmp_path / "e.txt").write_bytes(text.encode())
+    file = open_events(tmp_path / "e.txt")
+    e = file.read()
+    assert list(zip(e.t.tolist(), e.x.tolist(), e.y.tolist(), e.p.tolist())) == expected
+    assert (file.height, file.width) == ((480, 640) if text.startswith("640") else (None, None))
+
+
+def test_text_blocks_of_any_size(tmp_path):
+    events = random_events(500)
+    write_events(tmp_path / "e.txt", events, H, W)
+    from blinkgl.io.text import TextReader
+    for size in (50, 97, 4096):
+        assert same(Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(size))), events)
+
+
+@pytest.mark.parametrize("line", ["0.1 1 2", "0.1 1 2 3 4", "0.1 1 2 7", "0.1 a 2 1", "0.1 -1 2 1", "0.1 1.5 2 1", "nan 1 2 1", "0.1 70000 2 1",
+                                  "99999999999999999999 1 2 1", "1e30 1 2 1", "0.1 1 2 1x"])
+def test_bad_text_lines_are_named(tmp_path, line):
+    (tmp_path / "e.txt").write_text(f"0.1 1 2 1\n0.1 1 2 1\n{line}\n0.2 1 2 1\n")
+    with pytest.raises(AssetError, match=r"e.txt: line 3 is not an event .*expected t x y p"):
+        open_events(tmp_path / "e.txt").read()
+
+
+def test_backwards_time_is_named(tmp_path):
+    (tmp_path / "e.txt").write_text("3 1 1 1\n4 1 1 1\n2 1 1 1\n")
+    with pytest.raises(EventDataError, match=r"run backwards at event 2 \(got \(4, 2\)\)"):
+        open_events(tmp_path / "e.txt").read()
+
+
+def _bad(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    return tmp_path / name
+
+
+@pytest.mark.parametrize("name, data, message", [
+    ("e.raw", b"\x00\x01" * 100, "without '% evt'"), ("e.raw", b"% evt 2.1\n% end\n", "unsupported EVT version"),
+    ("e.raw", b"% format EVT21;width=1\n% end\n", "unsupported EVT version"), ("e.raw", b"% evt 4.0\n% end\n", "unsupported EVT version"), ("e.raw", b"% evt 2.0\n% end\n" + b"\0" * 7, "truncated: 3 stray bytes"),
+    ("e.aedat4", b"#!AER-DAT3.1\r\n", "wrong magic"), ("e.aedat4", b"", "wrong magic"), ("e.h5", b"\x89HDF", "not an HDF5"),
+    ("e.npz", b"PK\x03\x04garbage", "damaged .npz"), ("e.npy", b"\x93NUMPY", "cannot read"), ("e.xyz", b"", "unknown event file ending"),
+])
+def test_damaged_files(tmp_path, name, data, message):
+    with pytest.raises(AssetError, match=message) as caught:
+        open_events(_bad(tmp_path, name, data)).read()
+    assert "\n" not in str(caught.value)
+
+
+def test_truncated_recordings(tmp_path):
+    source = shared("data/events/aedat4/davis346_events_frames_imu.aedat4")
+    need("aedat4")
+    for keep in (200, 100_000):
+        with pytest.raises(AssetError, match="AEDAT4"):
+            open_events(_bad(tmp_path, "e.aedat4", source.read_bytes()[:keep])).read()
+
+
+@pytest.mark.parametrize("array, message", [
+    (np.zeros((5, 4)), "no column 't'.*plain array"), (np.zeros(3, [("t", "f8"), ("x", "i4"), ("y", "i4")]), "no column 'p'"),
+    (np.array([(np.nan, 1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), "NaN"),
+    (np.array([(1, -1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), "column 'x' outside"),
+])
+def test_arrays_that_are_not_events(tmp_path, array, message):
+    np.save(tmp_path / "e.npy", array)
+    with pytest.raises(AssetError, match=message):
+        open_events(tmp_path / "e.npy")
+
+
+def test_foreign_array_names(tmp_path):
+    np.savez(tmp_path / "e.npz", timestamps=[0.5, 1.0], x=[1, 2], y=[3, 4], polarity=[-1, 1])
+    e = open_events(tmp_path / "e.npz").read()
+    assert e.t.tolist() == [500_000, 1_000_000] and e.p.tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_failure_leaves_the_old_file(tmp_path, kind):
+    need(kind)
+    path = tmp_path / FILES[kind]
+    path.write_text("old")
+    with pytest.raises(ZeroDivisionError):
+        with event_writer(path, H, W, format=kind) as writer:
+            writer.append(random_events(100))
+            1 / 0
+    assert path.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_output_names(tmp_path):
+    with pytest.raises(OutputError, match="unknown event file ending"):
+        write_events(tmp_path / "e.xyz", Events.empty(), H, W)
+    with pytest.raises(OutputError, match="unknown event format"):
+        write_events(tmp_path / "e.raw", Events.empty(), H, W, format="evt4")
+    with pytest.raises(EventDataError, match="11-bit"):
+        write_events(tmp_path / "e.raw", Events.empty(), 4000, 3000)
+    with pytest.raises(EventDataError, match="outside the sensor"):
+        write_events(tmp_path / "e.raw", random_events(100), 10, 10)
+    assert list(tmp_path.iterdir()) == []

@@ -246,7 +246,7 @@ def _walk(rng, config, space, radius, start, length, flat) -> np.ndarray:
     """(K, 3) way-points from ``start``, legs of about length / (waypoints - 1), until ``length`` is covered."""
     leg = length / (config.waypoints - 1)
     points, covered, direction = [start], 0.0, None
-    while covered < length and len(points) <= 4 * config.waypoints:
+    while covered < length and len(points) <= 16 * config.waypoints:
         step = leg * rng.uniform(0.6, 1.4)
         for attempt in range(4 * _TRIES):
             # Hemmed in: shorter legs, and no more insisting on the last direction.

@@ -27,9 +27,9 @@ def placed(x, y, z):
     return T
 
 
-@pytest.mark.parametrize("speed, rate, duration", [(1.0, 90.0, SECOND), (0.05, 5.0, SECOND), (8.0, 1500.0, SECOND), (1.0, 40.0, 10 * SECOND)])
+@pytest.mark.parametrize("speed, rate, duration", [(1.0, 90.0, SECOND), (0.05, 5.0, SECOND), (8.0, 1500.0, SECOND), (1.0, 40.0, 20 * SECOND)])
 def test_mean_speed_and_rate_are_the_configured_ones(speed, rate, duration):
-    config = ObjectMotion(speed=speed, rotation_rate=rate, waypoints=max(6, duration * 3 // SECOND))
+    config = ObjectMotion(speed=speed, rotation_rate=rate)
     for seed in range(4):
         path = random_path(rng(seed), 0, duration, config, SPACE, 0.2)
         got = statistics(path, 0, duration, samples=2000)

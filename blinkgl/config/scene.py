@@ -38,8 +38,8 @@ Color = tuple[Fraction, Fraction, Fraction]
 class ObjectsConfig(Config):
     """The random world's objects."""
 
-    count: int = Field(14, ge=0, le=1000, description="number of objects")
-    size: PositiveRange = Field((0.5, 2.5), description="diameter of an object's bounding sphere, m; log-uniform")
+    count: int = Field(20, ge=0, le=1000, description="number of objects")
+    size: PositiveRange = Field((0.4, 2.2), description="diameter of an object's bounding sphere, m; log-uniform")
     distance: PositiveRange = Field((2.0, 20.0), description="distance from the camera's first position, m; log-uniform")
     flying: Fraction = Field(0.5, description="fraction that flies; the others rest on the ground")
     in_view: Fraction = Field(0.85, description="fraction placed in the camera's first field of view; the others anywhere around it")
@@ -114,8 +114,8 @@ class RegionConfig(Config):
 class LightConfig(Config):
     """One white sun and a sky: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)."""
 
-    sun: float = Field(0.8, ge=0, description="strength of the sun, radiance of a white facing surface")
-    sky: float = Field(0.4, ge=0, description="strength of the sky")
+    sun: float = Field(0.9, ge=0, description="strength of the sun, radiance of a white facing surface")
+    sky: float = Field(0.6, ge=0, description="strength of the sky")
     sun_elevation: float | None = Field(None, ge=-90, le=90, description="degrees above the horizon; null: random in [25, 80] (60 where nothing is random)")
     sun_azimuth: float | None = Field(None, ge=-360, le=360, description="degrees from +x towards +y; null: random (40 where nothing is random)")
     unlit: bool = Field(False, description="radiance = albedo on every surface")

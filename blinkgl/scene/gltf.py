@@ -157,7 +157,7 @@ class Document:
         for number, primitive in enumerate(_items(_item(self.tree, "meshes", mesh, self.where), "primitives", self.where)):
             mode = primitive.get("mode", 4)
             if mode not in (4, 5, 6):
-                self.log.append(f"{self.where}: points or lines of mesh {mesh} left out")
+                self.log.append(f"{self.path.name}: points or lines of mesh {mesh} left out")
                 continue
             if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
                 raise AssetError("Draco compression is not supported", where=self.where, accepted="an uncompressed export")
@@ -167,9 +167,9 @@ class Document:
             vertices = self.accessor(attributes["POSITION"]).astype(np.float64)
             order = self.accessor(primitive["indices"]).astype(np.int64).ravel() if "indices" in primitive else np.arange(len(vertices))
             if primitive.get("targets"):
-                self.log.append(f"{self.where}: morph targets of mesh {mesh} are not supported, its base shape is used")
+                self.log.append(f"{self.path.name}: morph targets of mesh {mesh} are not supported, its base shape is used")
             if "JOINTS_0" in attributes:
-                self.log.append(f"{self.where}: skinning of mesh {mesh} is not supported, its rest shape is used")
+                self.log.append(f"{self.path.name}: skinning of mesh {mesh} is not supported, its rest shape is used")
             material, uv_set, uv_matrix = self.material(primitive.get("material"))
             normals = self.accessor(attributes["NORMAL"]).astype(np.float64) if "NORMAL" in attributes else None
             uvs = self.accessor(attributes[f"TEXCOORD_{uv_set}"]).astype(np.float64) if f"TEXCOORD_{uv_set}" in attributes else None
@@ -239,7 +239,7 @@ class Document:
     def _texture(self, index: int) -> Texture | None:
         source = _item(self.tree, "textures", index, self.where).get("source")
         if source is None:
-            self.log.append(f"{self.where}: texture {index} has no plain image, left out")
+            self.log.append(f"{self.path.name}: texture {index} has no plain image, left out")
             return None
         if source not in self._textures:
             image = _item(self.tree, "images", source, self.where)
@@ -267,7 +267,7 @@ class Document:
             if node not in self.nodes:
                 continue
             if path not in ("translation", "rotation", "scale") or self.nodes[node].matrix is not None:
-                self.log.append(f"{self.where}: animation of {path} of node '{self.nodes[node].name}' is not supported")
+                self.log.append(f"{self.path.name}: animation of {path} of node '{self.nodes[node].name}' is not supported")
                 continue
             sampler = samplers[_index(channel.get("sampler"), len(samplers), "animation sampler", self.where)]
             times = self.accessor(sampler["input"]).astype(np.float64).ravel()

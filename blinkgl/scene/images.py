@@ -18,8 +18,9 @@ from blinkgl.errors import AssetError
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr")
 MAX_PIXELS = 120_000_000
 HDR_WHITE = 1.5     # brightest radiance kept of an HDR image: light sources would drown everything else
+# Not those that are mostly black (retina, hubble_deep_field): no light, no events.
 _PHOTOGRAPHS = ("astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png", "grass.png", "gravel.png",
-                "hubble_deep_field.jpg", "ihc.png", "moon.png", "motorcycle_left.png", "retina.jpg", "rocket.jpg")
+                "ihc.png", "moon.png", "motorcycle_left.png", "rocket.jpg")
 
 
 def content_hash(*chunks: bytes) -> str:
@@ -124,14 +125,15 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
 _DECODE = srgb_to_linear(np.arange(256) / 255)
 
 
-def cube_faces(panorama: np.ndarray, size: int) -> list[np.ndarray]:
+def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.ndarray]:
     """The six sides of a box seen from its centre, from an equirectangular image: +x, -x, +y, -y, +z, -z, each (size,
-    size, 3) of the panorama's dtype, upright, not mirrored (right is right for the viewer inside).
+    size, 3) of the panorama's dtype, upright, not mirrored (right is right for the viewer inside). ``margin``: the image
+    reaches this fraction of a half edge over the box's edges, so that filtering near them finds what is really there.
 
     The panorama's middle column is seen in direction +x, and longitude grows to the right, i.e. clockwise from above.
     """
     height, width = panorama.shape[:2]
-    s = (np.arange(size) + 0.5) / size * 2 - 1
+    s = ((np.arange(size) + 0.5) / size * 2 - 1) * (1 + margin)
     right, down = np.meshgrid(s, s)
     padded = np.concatenate([panorama[:, -2:], panorama, panorama[:, :2]], axis=1)    # the seam is interpolated across
     faces = []

@@ -69,7 +69,8 @@ def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_B
     digest = source_hash or content_hash(data, *dependencies(path, data))
     log: list[str] = []
     if suffix in (".glb", ".gltf"):
-        pieces = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, textures=keep_materials).pieces()
+        document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, textures=keep_materials)
+        pieces, log = document.pieces(), document.log
     else:
         pieces = _trimesh_pieces(path, data, suffix[1:], max_faces, max_texture if keep_materials else None)
     total = sum(len(p.faces) for p in pieces)
@@ -92,7 +93,7 @@ def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_B
         parts = [Part(concatenate(tuple(p.mesh for p in parts), name=path.stem, source_hash=digest), Material())]
     elif closed_together(tuple(p.mesh for p in parts)):
         parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]     # one solid, split by material
-    return Asset(path.stem, digest, tuple(parts), has_materials, tuple(log))
+    return Asset(path.stem, digest, tuple(parts), has_materials, tuple(dict.fromkeys(log)))
 
 
 def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.types import Mesh
 
 CREASE_DEGREES = 40.0
-WELD_RELATIVE = 1e-6        # vertices nearer than this times the extent are one point when topology is asked for
+WELD_RELATIVE = 1e-6        # vertices nearer than this times the extent are one point
+COARSE_WELD_RELATIVE = 1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part by itself
 _MAX_COORDINATE = 1e15      # squares of larger coordinates lose all meaning in float32 and overflow soon after
 
 
@@ -39,7 +41,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
     Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, too many
     or no faces.
     """
-    where = where or name or "mesh"
+    where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
     vertices = np.array(vertices, dtype=np.float64)
     faces = np.asarray(faces)
@@ -65,29 +67,30 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
     uvs_given = uvs is not None
     uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
 
+    points, welded = weld(vertices, faces)
+    closed, inside_out = closed_or_nearly(points, welded)     # before slivers go: they close gaps of no width
     kept = _faces_with_area(vertices, faces)
     if not kept.any():
         raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
     if not kept.all():
-        log.append(f"{where}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
-        faces = faces[kept]
+        if (~kept).mean() > 0.1:        # a few slivers are in almost every file
+            log.append(f"{label}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
+        faces, welded = faces[kept], welded[kept]
 
     if normals is not None and not _usable_normals(normals, vertices, faces):
-        log.append(f"{where}: the normals are unusable, made new ones")
+        log.append(f"{label}: the normals are unusable, made new ones")
         normals = None
     if uvs_given:
         broken = uvs is None or not np.isfinite(uvs[faces]).all()
         if broken or (project_degenerate and uvs_degenerate(vertices, faces, uvs)):
-            log.append(f"{where}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones")
+            log.append(f"{label}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones")
             uvs = None
 
-    # From here on corner attributes: (F, 3, …), welded to vertices at the end.
-    points, welded = weld(vertices, faces)
-    closed, inside_out = closedness(points, welded)
+    # From here on corner attributes, (F, 3, …), joined to vertices at the end.
     corner_normals = crease_normals(vertices, faces, welded, crease_degrees) if normals is None else np.asarray(normals, np.float64)[faces]
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
     if inside_out:
-        log.append(f"{where}: the mesh was inside out, turned round")
+        log.append(f"{label}: the mesh was inside out, turned round")
         faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
         if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
             corner_normals = -corner_normals
@@ -148,11 +151,13 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
     _, shell = connected_components(coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count)), directed=False)
     a, b, c = ((points - points.mean(axis=0))[welded[:, i]] for i in range(3))
     volumes = np.bincount(shell[welded[:, 0]], weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
-    inside_out = bool(volumes.sum() < 0)
+    # A sheet made of two coincident layers has no volume and is as good as closed.
+    noise = 1e-9 * float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))) ** 3
+    inside_out = bool(volumes.sum() < -noise)
     volumes = -volumes if inside_out else volumes
     shells = np.unique(shell[welded[:, 0]])
-    hollow = [s for s in shells if volumes[s] <= 0]
-    if len(hollow) == len(shells) or len(hollow) > 64:
+    hollow = [s for s in shells if volumes[s] < -noise]
+    if len(hollow) > 64:
         return False, False
     boxes = {s: (points[shell == s].min(axis=0), points[shell == s].max(axis=0)) for s in shells} if hollow else {}
     for s in hollow:
@@ -160,6 +165,22 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
         if not any(volumes[o] > 0 and (boxes[o][0] <= low).all() and (boxes[o][1] >= high).all() for o in shells):
             return False, False
     return True, inside_out
+
+
+def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
+    """:func:`closedness`; when that fails also over points merged within ``COARSE_WELD_RELATIVE`` of the extent, gaps that
+    no pixel can show."""
+    closed, inside_out = closedness(points, welded)
+    if closed:
+        return closed, inside_out
+    extent = float((points.max(axis=0) - points.min(axis=0)).max())
+    near = cKDTree(points).query_pairs(extent * COARSE_WELD_RELATIVE, output_type="ndarray") if len(points) < 100_000 else []
+    if len(near) == 0 or len(near) > 4 * len(points):      # nothing to merge, or so fine a mesh that all of it would be
+        return False, False
+    count, label = connected_components(coo_matrix((np.ones(len(near), np.int8), (near[:, 0], near[:, 1])), shape=(len(points),) * 2), directed=False)
+    merged = np.empty((count, 3))
+    merged[label] = points
+    return closedness(merged, label[welded].astype(np.int64))
 
 
 def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
@@ -294,5 +315,5 @@ def closed_together(meshes: tuple[Mesh, ...]) -> bool:
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     vertices = np.concatenate([m.vertices for m in meshes])
     faces = np.concatenate([m.faces.astype(np.int64) + o for m, o in zip(meshes, offsets)])
-    closed, inside_out = closedness(*weld(vertices, faces))
+    closed, inside_out = closed_or_nearly(*weld(vertices, faces))
     return closed and not inside_out

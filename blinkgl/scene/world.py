@@ -28,6 +28,8 @@ from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, Scen
 
 _PLACEMENTS = 300      # positions tried for an object before it is left out
 _GAP = 0.05            # m between bounding spheres at t0
+_STAND_OFF = 0.8       # m beyond the clearance that way-points keep from the camera: nothing should fill the view
+_PANORAMA_MARGIN = 1 / 16
 
 
 def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, split: str, seed: int, sequence: int, base: Path) -> Scene:
@@ -63,20 +65,20 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     items = list(backdrop)
     for k, (name, parts, T, radius, resting) in enumerate(placed):
         others = np.arange(len(placed)) != k
-        space = FreeSpace(low, high, ground_z, centres[others], radii[others])
+        space = FreeSpace(low, high, ground_z, np.vstack([centres[others], T_cam[:3, 3]]), np.append(radii[others], clearance + _STAND_OFF))
         items.append((name, "object", parts, random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=resting)))
-    space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii)
+    space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
     path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
 
     scene_objects = tuple(SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items))
     result = resolve_collisions(scene_objects, path, clearance, t0_ns, t1_ns)
-    log += result.log
-    bad = {c.second if c.first == "camera" else c.first for c in result.at_start if {c.first, c.second} & {o.name for o in scene_objects if o.category == "object"}}
-    bad = {name for name in bad if name in {o.name for o in scene_objects if o.category == "object"}}
-    if bad:     # bounding spheres were apart, so this takes a mesh that sinks into a wall: leave it out and stop nobody for it
+    # Bounding spheres were apart, so only one that sinks into ground or wall can touch at t0: leave it out.
+    ours = {o.name for o in scene_objects if o.category == "object"}
+    bad = ours & {name for c in result.at_start for name in (c.first, c.second)}
+    if bad:
+        result = resolve_collisions(tuple(o for o in scene_objects if o.name not in bad), path, clearance, t0_ns, t1_ns)
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
-        kept = tuple(o for o in scene_objects if o.name not in bad)
-        result = resolve_collisions(kept, path, clearance, t0_ns, t1_ns)
+    log += result.log
     return Scene(objects=result.objects, camera=make_camera(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
                  light=make_light(config.light, rng), background=config.background, log=tuple(log))
 
@@ -149,7 +151,7 @@ def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, spli
             elif not floor + (radius if config.ground else 0) + _GAP <= position[2] <= floor + region.height:
                 continue
             gap = np.linalg.norm(np.array(centres) - position, axis=1) - radii - radius
-            if (np.abs(position[:2]) <= region.width / 2).all() and gap.min() > _GAP and gap[0] > 0.5 * radius:
+            if (np.abs(position[:2]) <= region.width / 2).all() and gap.min() > _GAP and gap[0] > max(radius, _STAND_OFF):
                 break
         else:
             log.append(f"object {k} ({asset.name}, radius {radius:.2f} m) left out: no free place in {_PLACEMENTS} tries")
@@ -206,9 +208,9 @@ def _sky(config: SkyConfig, textures: Pool, rng, split, floor, base, log) -> tup
     """Six inward squares around the origin."""
     half, n = config.size / 2, config.subdivisions
     brightness = float(rng.uniform(*config.brightness))
-    repeats = _log_uniform(rng, config.repeat)
+    repeats, inset = _log_uniform(rng, config.repeat), 1.0
     if config.panoramas:
-        images, repeats = _panorama_faces(config, rng, split, textures.test_fraction, base), 1.0
+        images, repeats, inset = _panorama_faces(config, rng, split, textures.test_fraction, base), 1.0, 1 / (1 + _PANORAMA_MARGIN)
     elif config.per_face:
         images = [textures.draw(rng, split, log) for _ in SKY_SIDES]
     else:
@@ -216,8 +218,9 @@ def _sky(config: SkyConfig, textures: Pool, rng, split, floor, base, log) -> tup
     parts = []
     for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
         positions, normals, uvs, faces = _square(half * (forward - right + down), 2 * half * right, -2 * half * down, n, n)
+        uvs = 0.5 + (uvs - 0.5) * inset
         mesh = Mesh(positions, faces.astype(np.int32), np.ascontiguousarray(normals, np.float32), uvs.astype(np.float32), name=f"sky {side}",
-                    source_hash=parameter_hash("sky", config.size, n, side))
+                    source_hash=parameter_hash("sky", config.size, n, side, inset))
         parts.append(Part(mesh, Material(texture, (brightness,) * 3, (repeats, repeats), unlit=True)))
     return tuple(parts)
 
@@ -238,7 +241,7 @@ def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[
     digest, file = mine[int(rng.integers(len(mine)))]
     image = shrink(decode_image(file.read_bytes(), None, str(file)), 4096)
     image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
-    return [Texture(face, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, face in enumerate(cube_faces(image, max(image.shape[1] // 4, 1)))]
+    return [Texture(face, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, face in enumerate(cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN))]
 
 
 def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_texture, split, floor, log):

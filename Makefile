@@ -11,10 +11,10 @@ PIP = .venv/bin/python -m pip --disable-pip-version-check
 INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
 INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 
-.PHONY: demo test slow bench doctor setup clean
+.PHONY: demo test slow bench doctor setup opengl clean
 .DELETE_ON_ERROR:
 
-demo: .venv/.installed-core .venv/.checked-opengl
+demo: .venv/.installed-core opengl
 	@rm -rf out/demo
 	.venv/bin/blinkgl generate configs/demo.yaml --out out/demo
 	@echo
@@ -22,19 +22,19 @@ demo: .venv/.installed-core .venv/.checked-opengl
 	@find out/demo -name preview.mp4 | sort | sed 's/^/  /'
 	@echo "and beside it events.h5, flow/, images/ in DSEC's layout. Next: README.md."
 
-test: .venv/.installed-dev .venv/.checked-opengl
+test: .venv/.installed-dev opengl
 	.venv/bin/python -m pytest -q -n $(JOBS) --maxprocesses 4 --dist worksteal
 
-slow: .venv/.installed-dev .venv/.checked-opengl
+slow: .venv/.installed-dev opengl
 	.venv/bin/python -m pytest -q -m slow
 
-bench: .venv/.installed-dev .venv/.checked-opengl
+bench: .venv/.installed-dev opengl
 	@for program in tools/bench_*.py; do echo "== $$program"; .venv/bin/python $$program || exit 1; done
 
 doctor: .venv/.installed-core
 	.venv/bin/blinkgl doctor
 
-setup: .venv/.installed-dev .venv/.checked-opengl
+setup: .venv/.installed-dev opengl
 
 # Stamps: a step runs again only when what it depends on has changed.
 
@@ -56,9 +56,9 @@ setup: .venv/.installed-dev .venv/.checked-opengl
 	@$(INSTALL) -e '.[check]' || echo "pyrender could not be installed: the comparisons with it will be skipped"
 	@touch $@
 
-.venv/.checked-opengl: .venv/.installed-core
+# No stamp: it takes half a second, and system packages come and go without make seeing it.
+opengl: .venv/.installed-core
 	@tools/setup.sh opengl
-	@touch $@
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .hypothesis

@@ -14,7 +14,8 @@ What pyrender does, as found by reading and trying version 0.1.45, and what is d
   that is 8-bit sRGB here is rounded once more on the way.
 * Every picture is drawn 4x multi-sampled, and the depth that comes back is that of one of the samples, not of the pixel
   centre: wrong by up to 3/8 px on a slant. The SEG flag turns multi-sampling off, so depth and ids come from a SEG pass.
-* SEG culls back faces whatever the material says: two-sided surfaces are handed over with every face doubled.
+* SEG culls back faces whatever the material says: two-sided surfaces are handed over with every face doubled. When it is
+  timed, which needs no SEG pass, they are double-sided by its own means instead.
 * Depth is a 24-bit standard depth buffer, linearised in float32. With an infinite far plane its step is
   2^-24 Z / near relative to Z: choose ``near`` close to the nearest thing (``near`` argument) to read depth.
 * Texture row 0 is turned to the bottom on upload, hence v -> 1 - v. Its principal point is measured from the image's
@@ -67,18 +68,19 @@ def measure(scene: Scene, times_ns, repeat: int = 3) -> dict:
     return json.loads(str(result["timing"]))
 
 
-def export(scene: Scene, times_ns, near: float | None = None, **more) -> dict[str, np.ndarray]:
-    """The scene as plain arrays: geometry once, poses for each time."""
+def export(scene: Scene, times_ns, near: float | None = None, double: bool = True, **more) -> dict[str, np.ndarray]:
+    """The scene as plain arrays: geometry once, poses for each time. double : two faces for one of a two-sided surface."""
     camera, arrays = scene.camera, {}
     parts = [(thing, part) for thing in scene.objects for part in thing.parts]
     for k, (_, part) in enumerate(parts):
         mesh, paint = part.mesh, part.material
         two_sided = paint.double_sided or not mesh.closed
-        faces = np.concatenate([mesh.faces, mesh.faces[:, ::-1]]) if two_sided else mesh.faces
+        faces = np.concatenate([mesh.faces, mesh.faces[:, ::-1]]) if two_sided and double else mesh.faces
         uv = mesh.uvs.astype(np.float64) * paint.uv_scale
         arrays[f"vertices{k}"] = mesh.vertices.astype(np.float32)
         arrays[f"faces{k}"] = faces.astype(np.uint32)
         arrays[f"uvs{k}"] = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1).astype(np.float32)
+        arrays[f"two_sided{k}"] = np.array(two_sided)
         arrays[f"base{k}"] = np.array([*paint.base_color, 1.0])
         if paint.texture is not None:
             arrays[f"texture{k}"] = _linear_bytes(paint.texture.image)
@@ -113,7 +115,7 @@ def _linear_bytes(image: np.ndarray) -> np.ndarray:
 def _run(scene: Scene, times_ns, near, repeat: int) -> dict[str, np.ndarray]:
     with tempfile.TemporaryDirectory(prefix="blinkgl-peer-") as folder:
         job, answer = Path(folder) / "job.npz", Path(folder) / "answer.npz"
-        np.savez(job, **export(scene, times_ns, near, repeat=np.array(repeat)))
+        np.savez(job, **export(scene, times_ns, near, double=repeat == 0, repeat=np.array(repeat)))
         environment = {"PYOPENGL_PLATFORM": "egl", **os.environ}
         command = [sys.executable, str(Path(__file__).resolve()), str(job), str(answer)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
@@ -172,7 +174,9 @@ def _primitive(pyrender, job, k):
     if texture is not None:
         repeat = pyrender.Sampler(wrapS=10497, wrapT=10497)
         texture = pyrender.Texture(source=texture, source_channels="RGB", sampler=repeat)
-    paint = pyrender.MetallicRoughnessMaterial(baseColorFactor=job[f"base{k}"], baseColorTexture=texture)
+    paint = pyrender.MetallicRoughnessMaterial(
+        baseColorFactor=job[f"base{k}"], baseColorTexture=texture, doubleSided=bool(job[f"two_sided{k}"])
+    )
     return pyrender.Primitive(
         positions=job[f"vertices{k}"], indices=job[f"faces{k}"], material=paint, mode=4,
         texcoord_0=job[f"uvs{k}"] if texture is not None else None,

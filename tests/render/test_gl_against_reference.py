@@ -7,6 +7,7 @@ a pixel centre may fall on either side of an edge, depending on how a rasteriser
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib.resources import files
 
 import numpy as np
 import pytest
@@ -15,10 +16,13 @@ from render_scenes import (
 )  # fmt: skip
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from shared_data import shared
 
-from blinkgl.config.sequence import RenderConfig
+from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.gl.shader import ShaderLoader, shader_folder
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Light, Material
 
 MS = 1_000_000
@@ -350,3 +354,68 @@ def test_curved_paths_of_many_objects(gl):
     np.testing.assert_array_equal(labels.ids[~band], ref.instance[~band])
     error = length(labels.backward.flow - ref.backward.flow)[off]
     assert np.median(error) <= 1e-5 and error.max() <= 1e-3
+
+
+# ------------------------------------------------------------------------------------------------- the whole house
+
+
+def test_random_world_of_real_meshes_and_photographs(gl):
+    """A sequence of configs/flying_objects.yaml at a quarter of its size, from real assets, as generation draws it."""
+    models, textures = shared("data/assets/models_cc0"), shared("data/assets/textures_cc0")
+    options = [f"scene.pool.folders=[{models}]", f"scene.textures.folders=[{textures}]", "camera.width=160", "camera.height=120"]
+    config = load_run(files("blinkgl.configs") / "flying_objects.yaml", options).sequence(1)
+    world = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, seed=config.seed, sequence=1)
+    t = world.t0_ns + 400 * MS
+    ref = reference.render(world, t, forward_ns=t + 100 * MS)
+    with Renderer(gl, world, RenderConfig()) as renderer:
+        labels = renderer.labels(t, LabelRequest(depth=True, ids=True, velocity=True, flow_forward=True, occlusion=True), t + 100 * MS)
+    assert len(np.unique(ref.instance)) >= 4
+    band = reference.silhouette_band(ref.instance, ref.depth)
+    flips = labels.ids != ref.instance
+    assert not flips[~band].any() and flips.sum() <= 0.02 * band.sum()
+    off = ref.hit & ~band
+    np.testing.assert_allclose(labels.depth[off], ref.depth[off], rtol=1e-5)
+    np.testing.assert_array_equal(labels.forward.valid[off], ref.forward.valid[off])
+    error = length(labels.forward.flow - ref.forward.flow)[off & ref.forward.valid]
+    assert np.median(error) <= 1e-5 and error.max() <= 1e-3
+    error = length(labels.velocity - ref.velocity)[off] / np.median(length(ref.velocity)[off])
+    assert np.median(error) < 2e-6 and error.max() < 1e-4
+    assert (labels.forward.occluded != ref.forward.occluded)[off].mean() < 0.02
+
+
+@pytest.mark.parametrize(
+    "file, right, wrong",
+    [
+        ("include/motion.glsl", "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next", "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next"),
+        ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
+        ("include/motion.glsl", "* d.z) / w_next", "* d.z) * gl_FragCoord.w"),
+        ("label.glsl", "depth = 1.0 / gl_FragCoord.w", "depth = 1.0 / gl_FragCoord.w - 0.05"),
+    ],
+    ids=["sign of the flow", "no perspective division", "division by the old depth", "depth off by the near plane"],
+)  # fmt: skip
+def test_the_oracle_finds_a_broken_shader(gl, tmp_path, monkeypatch, file, right, wrong):
+    """Mistakes that give plausible pictures fail the bounds above by orders of magnitude."""
+    for source in ("label.glsl", "luminance.glsl", *(f"include/{n}.glsl" for n in ("motion", "light"))):
+        text = (shader_folder() / source).read_text()
+        (tmp_path / source).parent.mkdir(exist_ok=True)
+        (tmp_path / source).write_text(text.replace(right, wrong) if source == file else text)
+        assert source != file or right in text, "the shader has changed: break it in another way"
+    monkeypatch.setattr(gl, "shaders", ShaderLoader(gl.ctx, tmp_path))
+    world = shapes()["everything"]
+    ref = reference.render(world, T0, forward_ns=T1)
+    labels, _ = drawn(gl, world)
+    gl.shaders.clear()
+    off = off_silhouettes(ref)
+    flow, depth = length(labels.forward.flow - ref.forward.flow)[off], np.abs(labels.depth / ref.depth - 1)[off]
+    assert max(np.median(flow) / 1e-5, np.median(depth) / 1e-5) > 100
+
+
+def test_empty_scene(gl):
+    world = scene([], camera(24, 16), background=0.25)
+    ref = reference.render(world, T0, forward_ns=T1)
+    labels, luminance = drawn(gl, world)
+    for frame in (ref, labels):
+        assert np.isinf(frame.depth).all() and not frame.forward.valid.any() and not frame.forward.occluded.any()
+        np.testing.assert_array_equal(frame.colour, 0.25)
+    assert not labels.ids.any() and not ref.instance.any()
+    np.testing.assert_allclose(luminance, ref.luminance)

@@ -165,7 +165,7 @@ def _egl(device: int) -> Any:
     if libegl is None:
         raise _EGLUnavailable("libEGL.so.1 not found")
     # glcontext opens libGL beside libEGL, although EGL hands out every function: machines without X11 have no libGL.
-    libgl = os.environ.get("GLCONTEXT_LINUX_LIBGL") or _loadable(_GL_LIBRARIES)
+    libgl = os.environ.get("GLCONTEXT_LINUX_LIBGL") or _loadable(_GL_LIBRARIES) or libegl
     try:
         return egl.create_context(mode="standalone", libegl=libegl, libgl=libgl, glversion=REQUIRED_VERSION, device_index=device)
     except Exception as error:  # glcontext raises bare Exception

@@ -17,10 +17,7 @@ INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 demo: .venv/.installed-core opengl
 	@rm -rf out/demo
 	.venv/bin/blinkgl generate configs/demo.yaml --out out/demo
-	@echo
-	@echo "Look at:"
-	@find out/demo -name preview.mp4 | sort | sed 's/^/  /'
-	@echo "and beside it events.h5, flow/, images/ in DSEC's layout. Next: README.md."
+	@echo "beside it: events.h5, flow/, images/ in DSEC's layout; README.md says what to do next"
 
 test: .venv/.installed-dev opengl
 	.venv/bin/python -m pytest -q -n $(JOBS) --maxprocesses 4 --dist worksteal

@@ -116,7 +116,8 @@ def _run(scene: Scene, times_ns, near, repeat: int) -> dict[str, np.ndarray]:
     with tempfile.TemporaryDirectory(prefix="blinkgl-peer-") as folder:
         job, answer = Path(folder) / "job.npz", Path(folder) / "answer.npz"
         np.savez(job, **export(scene, times_ns, near, double=repeat == 0, repeat=np.array(repeat)))
-        environment = {"PYOPENGL_PLATFORM": "egl", **os.environ}
+        # PYGLET_HEADLESS: pyrender imports its viewer, which otherwise wants all of X11 where there is some of it.
+        environment = {"PYOPENGL_PLATFORM": "egl", "PYGLET_HEADLESS": "1", **os.environ}
         command = [sys.executable, str(Path(__file__).resolve()), str(job), str(answer)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         if done.returncode:

@@ -126,7 +126,9 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
                 events = emulator.step(luminance, t_ns)
             with clock("write"):
                 writer.append_events(events)
-            preview.step(t_ns, events)
+            preview.add_events(events)
+            if preview.due(t_ns):
+                preview.frame(t_ns)
             report.frames += 1
             report.events += len(events)
             if progress is not None:

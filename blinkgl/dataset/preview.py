@@ -25,17 +25,22 @@ class PreviewRecorder:
                 writer.path("preview.mp4"), renderer.height, renderer.width, t0_us=config.time.t0_ns // 1000,
                 rate_hz=config.preview.rate, fps=config.preview.rate / config.preview.slowdown)
 
-    def step(self, t_ns: int, events: Events) -> None:
-        if self._video is None:
-            return
-        with self._clock("preview"):
-            self._video.add_events(events)
-        if self._video.due(t_ns // 1000):
-            colour = self._renderer.colour(t_ns, supersample=1)
-            velocity = self._renderer.velocity(t_ns)
+    def add_events(self, events: Events) -> None:
+        """Every chunk, in order."""
+        if self._video is not None:
             with self._clock("preview"):
-                self._video.set_flow(velocity * self._interval_s)
-                self._video.frame(t_ns // 1000, colour)
+                self._video.add_events(events)
+
+    def due(self, t_ns: int) -> bool:
+        return self._video is not None and self._video.due(t_ns // 1000)
+
+    def frame(self, t_ns: int) -> None:
+        """The picture at t_ns: colour and flow are drawn for it."""
+        colour = self._renderer.colour(t_ns, supersample=1)
+        velocity = self._renderer.velocity(t_ns)
+        with self._clock("preview"):
+            self._video.set_flow(velocity * self._interval_s)
+            self._video.frame(t_ns // 1000, colour)
 
     def __enter__(self) -> "PreviewRecorder":
         return self

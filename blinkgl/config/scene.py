@@ -53,7 +53,8 @@ class PoolConfig(Config):
     primitives: Literal["all"] | tuple[PrimitiveKind, ...] = Field("all", description="'all' or a list of kinds; [] for none")
     variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
     folders: tuple[str, ...] = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
-    urdfs: Literal["auto"] | bool = Field("auto", description="pybullet's random_urdfs: auto uses them when the wheel is installed")
+    urdfs: Literal["auto"] | bool = Field(False, description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that "
+                                        "the same YAML gives other scenes there")
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
     max_file_mb: float = Field(512.0, gt=0, description="a larger mesh file is refused unread")
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")

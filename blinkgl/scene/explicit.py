@@ -1,1 +1,130 @@
-def explicit_scene(*a): ...
+"""Custom scenes: named meshes and materials, objects and camera with poses or key frames, as written in the YAML."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.scene import ExplicitSceneConfig, KeyedMotionConfig, MaterialConfig, MeshConfig, PoseConfig
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.images import content_hash, decode_image, photographs
+from blinkgl.scene.mesh_files import Asset, load_asset
+from blinkgl.scene.meshes import transform_mesh
+from blinkgl.scene.paths import KeyframePath, StaticPath
+from blinkgl.scene.pool import resolve
+from blinkgl.scene.primitives import BUILDERS
+from blinkgl.scene.textures import procedural_texture
+from blinkgl.scene.trajectories import look_rotation
+from blinkgl.scene.types import Material, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.world import make_camera, make_light
+
+_PROCEDURAL_SIZE = 1024
+# A camera (OpenCV axes) that looks along the world's +x with z up.
+_LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+
+
+def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path) -> Scene:
+    """The scene as configured; nothing is drawn at random and no collision is looked for.
+
+    Raises ConfigError (unknown mesh or material name, missing file, bad parameter, name given twice) and AssetError."""
+    log: list[str] = []
+    materials = {name: _material(m, base, f"scene.materials.{name}") for name, m in config.materials.items()}
+    assets: dict[tuple[str, bool], Asset] = {}
+    objects, names = [], set()
+    for k, item in enumerate(config.objects):
+        where = f"scene.objects.{k}"
+        _known(item.mesh, config.meshes, f"{where}.mesh", "scene.meshes")
+        if item.material is not None:
+            _known(item.material, materials, f"{where}.material", "scene.materials")
+        own = item.material is None
+        if (item.mesh, own) not in assets:
+            assets[item.mesh, own] = _asset(config.meshes[item.mesh], item.mesh, own, base, config.max_faces)
+            log += [line for line in assets[item.mesh, own].log if line not in log]
+        name = item.name or (item.mesh if item.mesh not in names else f"{item.mesh}#{k}")
+        if name in names:
+            raise ConfigError("the name is given to two objects", where=f"{where}.name", value=name)
+        names.add(name)
+        matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
+        parts = []
+        for part in assets[item.mesh, own].parts:
+            material = part.material if own else materials[item.material]
+            material = replace(material, unlit=material.unlit or config.light.unlit)
+            parts.append(Part(transform_mesh(part.mesh, matrix), material))
+        objects.append(SceneObject(name, k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category))
+    path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
+    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background, tuple(log))
+
+
+def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
+    """The configured pose over [t0, t1], or the path through its key frames (whose times are seconds on the sequence's clock)."""
+    if not config.keyframes:
+        return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
+    poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
+    times = [round(k.time * 1e9) for k in config.keyframes]
+    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation, f"{where}.keyframes")
+
+
+def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
+    """(4, 4) T_world_body.
+
+    quaternion : the rotation itself; for a camera that of its OpenCV axes.
+    euler, or nothing : turned about the world's x, then y, then z, from rest; a camera at rest looks along +x with z up.
+    look_at : a camera's z axis (x level), an object's x axis (y level) points there.
+    """
+    T = np.eye(4)
+    T[:3, 3] = config.position
+    if config.look_at is not None:
+        R = look_rotation(np.subtract(config.look_at, config.position))
+        T[:3, :3] = R if camera else np.column_stack([R[:, 2], -R[:, 0], -R[:, 1]])
+    elif config.quaternion is not None:
+        w, x, y, z = config.quaternion
+        T[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    else:
+        turn = Rotation.from_euler("xyz", config.euler or (0, 0, 0), degrees=True)
+        T[:3, :3] = (turn * _LEVEL_CAMERA if camera else turn).as_matrix()
+    return T
+
+
+def _known(name: str, table: dict, where: str, what: str) -> None:
+    if name not in table:
+        raise ConfigError(f"no such name under {what}", where=where, value=name, accepted="one of: " + ", ".join(table) if table else f"a name under {what}")
+
+
+def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int) -> Asset:
+    where = f"scene.meshes.{name}"
+    if config.primitive is not None:
+        try:
+            mesh = BUILDERS[config.primitive](**config.parameters)
+        except AssetError as error:
+            key = (error.where or "").partition(".")[2]
+            raise ConfigError(error.problem, where=f"{where}.parameters" + (f".{key}" if key else ""), value=error.value, accepted=error.accepted) from None
+        return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
+    path = resolve(config.file, base)
+    if not path.is_file():
+        raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a mesh file")
+    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs, uv_size=config.uv_size)
+
+
+def _material(config: MaterialConfig, base: Path, where: str) -> Material:
+    texture = None
+    if config.texture is not None:
+        texture = _texture(resolve(config.texture, base), config.max_size, f"{where}.texture", config.texture)
+    elif config.procedural is not None:
+        texture = procedural_texture(config.procedural, config.seed, min(config.max_size, _PROCEDURAL_SIZE))
+    elif config.photograph is not None:
+        bundled = photographs()
+        if config.photograph not in bundled:
+            raise ConfigError("no such photograph", where=f"{where}.photograph", value=config.photograph,
+                              accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'")
+        texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
+    return Material(texture, config.color, config.uv_scale, config.unlit, config.double_sided)
+
+
+def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:
+    if not path.is_file():
+        raise ConfigError("no such file", where=where, value=given, accepted="an image file")
+    data = path.read_bytes()
+    return Texture(decode_image(data, max_size, str(path)), path.name, content_hash(data))

@@ -19,7 +19,7 @@ from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, PoolConfig, Tex
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
 from blinkgl.scene.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
-from blinkgl.scene.primitives import random_primitive
+from blinkgl.scene.primitives import random_primitive, random_primitive_hash
 from blinkgl.scene.textures import procedural_hash, procedural_texture
 from blinkgl.scene.types import Material, Part, Texture
 
@@ -112,8 +112,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
     entries = []
     for kind in kinds:
         for index in range(config.variants):
-            mesh = random_primitive(kind, np.random.default_rng([PRIMITIVE_KINDS.index(kind), index]))
-            entries.append(Entry(mesh.source_hash, f"{kind}-{index}", "primitives", kind=kind, index=index))
+            entries.append(Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index))
     folders = [(resolve(folder, base), f"{where}.folders.{i}", folder) for i, folder in enumerate(config.folders)]
     urdfs = _random_urdfs(config.urdfs, f"{where}.urdfs")
     if urdfs is not None:
@@ -124,8 +123,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
-            mesh = random_primitive(entry.kind, np.random.default_rng([PRIMITIVE_KINDS.index(entry.kind), entry.index]))
-            return Asset(entry.name, entry.source_hash, (Part(mesh, Material()),), has_materials=False).normalised()
+            return Asset(entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)).normalised()
         asset = load_asset(entry.file, max_faces=config.max_faces, max_bytes=limit, keep_materials=config.keep_materials,
                            max_texture=max_texture, source_hash=entry.source_hash)
         return asset.normalised()

@@ -10,12 +10,14 @@ from __future__ import annotations
 import hashlib
 import inspect
 import math
+from dataclasses import replace
 from functools import wraps
 
 import numpy as np
 
+from blinkgl.config.scene import PRIMITIVE_KINDS
 from blinkgl.errors import AssetError
-from blinkgl.scene.meshes import closedness, make_mesh, weld
+from blinkgl.scene.meshes import closedness, make_mesh, transform_mesh, weld
 from blinkgl.scene.types import Mesh
 
 _MAX_SEGMENTS = 4096
@@ -74,7 +76,7 @@ def _lattice(columns: int, rows: int) -> np.ndarray:
     return np.stack([np.stack([i, right, up + 1], 1), np.stack([i, up + 1, up], 1)], axis=1).reshape(-1, 3)
 
 
-def _square(origin, right, up, columns: int, rows: int):
+def square(origin, right, up, columns: int, rows: int):
     """Flat parallelogram seen counter-clockwise; uv (0, 0) at its top left."""
     s, t = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)))
     origin, right, up = (np.asarray(a, float) for a in (origin, right, up))
@@ -122,15 +124,15 @@ def cuboid(extents=(1.0, 1.0, 1.0), subdivisions=1):
     x, y, z = np.array(extents) / 2
     n = subdivisions
     return _join([
-        _square((x, -y, -z), (0, 2 * y, 0), (0, 0, 2 * z), n, n), _square((-x, y, -z), (0, -2 * y, 0), (0, 0, 2 * z), n, n),
-        _square((x, y, -z), (-2 * x, 0, 0), (0, 0, 2 * z), n, n), _square((-x, -y, -z), (2 * x, 0, 0), (0, 0, 2 * z), n, n),
-        _square((-x, -y, z), (2 * x, 0, 0), (0, 2 * y, 0), n, n), _square((x, -y, -z), (-2 * x, 0, 0), (0, 2 * y, 0), n, n)])
+        square((x, -y, -z), (0, 2 * y, 0), (0, 0, 2 * z), n, n), square((-x, y, -z), (0, -2 * y, 0), (0, 0, 2 * z), n, n),
+        square((x, y, -z), (-2 * x, 0, 0), (0, 0, 2 * z), n, n), square((-x, -y, -z), (2 * x, 0, 0), (0, 0, 2 * z), n, n),
+        square((-x, -y, z), (2 * x, 0, 0), (0, 2 * y, 0), n, n), square((x, -y, -z), (-2 * x, 0, 0), (0, 2 * y, 0), n, n)])
 
 
 @_primitive
 def grid(width=1.0, depth=1.0, subdivisions=1):
     """Rectangle in z = 0 facing +z, ``width`` in x and ``depth`` in y; the texture once on it. Not closed."""
-    return _square((-width / 2, -depth / 2, 0), (width, 0, 0), (0, depth, 0), subdivisions, subdivisions)
+    return square((-width / 2, -depth / 2, 0), (width, 0, 0), (0, depth, 0), subdivisions, subdivisions)
 
 
 @_primitive
@@ -217,7 +219,7 @@ def prism(sides=6, radius=0.5, height=1.0):
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
     rim[-1] = rim[0]
-    walls = [_square(rim[i], rim[i + 1] - rim[i], (0, 0, height), 1, 1) for i in range(sides)]
+    walls = [square(rim[i], rim[i + 1] - rim[i], (0, 0, height), 1, 1) for i in range(sides)]
     return _join([*walls, _disc(radius, height / 2, True, sides), _disc(radius, -height / 2, False, sides)])
 
 
@@ -239,22 +241,33 @@ def pyramid(sides=4, radius=0.5, height=1.0):
 BUILDERS = {f.__name__: f for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid)}
 
 
-def random_primitive(kind: str, rng: np.random.Generator) -> Mesh:
-    """A primitive of this kind with random proportions, about one unit large."""
+def random_primitive(kind: str, index: int) -> Mesh:
+    """The ``index``-th body of a kind, about one unit large. No two have the same proportions, so that bodies of different
+    indices may be told apart by a train/test split; ``source_hash`` is of (kind, index)."""
+    rng = np.random.default_rng([PRIMITIVE_KINDS.index(kind), index])
+
+    def between(low: float, high: float) -> float:
+        # Log-uniform, and rounded: the last bit of exp differs between platforms.
+        return round(math.exp(rng.uniform(math.log(low), math.log(high))), 6)
+
     if kind == "cuboid":
-        return cuboid(extents=tuple(np.exp(rng.uniform(np.log(0.25), 0, 3))), subdivisions=2)
-    if kind in ("cylinder", "cone"):
-        return BUILDERS[kind](radius=0.5, height=float(np.exp(rng.uniform(np.log(0.3), np.log(3)))))
-    if kind == "sphere":
-        return sphere(segments=int(rng.integers(12, 41)), rings=int(rng.integers(8, 21)))
-    if kind == "icosphere":
-        return icosphere(radius=0.5 * float(rng.uniform(0.9, 1.1)), subdivisions=int(rng.integers(0, 4)))
-    if kind == "torus":
-        return torus(tube=float(rng.uniform(0.06, 0.25)))
-    if kind == "capsule":
-        return capsule(height=float(rng.uniform(0.1, 1.2)))
-    if kind == "prism":
-        return prism(sides=int(rng.integers(3, 9)), height=float(np.exp(rng.uniform(np.log(0.3), np.log(3)))))
-    if kind == "pyramid":
-        return pyramid(sides=int(rng.integers(3, 7)), height=float(rng.uniform(0.5, 1.6)))
-    raise ValueError(kind)
+        mesh = cuboid(extents=(between(0.25, 1), between(0.25, 1), between(0.25, 1)), subdivisions=2)
+    elif kind in ("cylinder", "cone"):
+        mesh = BUILDERS[kind](radius=0.5, height=between(0.3, 3))
+    elif kind == "sphere":
+        mesh = transform_mesh(sphere(), np.diag([1, between(0.6, 1), between(0.6, 1)]))
+    elif kind == "icosphere":
+        mesh = transform_mesh(icosphere(subdivisions=int(rng.integers(1, 4))), np.diag([1, between(0.6, 1), between(0.6, 1)]))
+    elif kind == "torus":
+        mesh = torus(tube=between(0.06, 0.25))
+    elif kind == "capsule":
+        mesh = capsule(height=between(0.1, 1.2))
+    elif kind == "prism":
+        mesh = prism(sides=int(rng.integers(3, 9)), height=between(0.3, 3))
+    else:
+        mesh = pyramid(sides=int(rng.integers(3, 7)), height=between(0.5, 1.6))
+    return replace(mesh, source_hash=random_primitive_hash(kind, index), name=f"{kind}-{index}")
+
+
+def random_primitive_hash(kind: str, index: int) -> str:
+    return parameter_hash("random primitive", 1, kind, index)

@@ -101,7 +101,8 @@ def _perlin(rng, size):
 
 def _fbm(rng, size):
     cells, gain = int(rng.integers(2, 7)), rng.uniform(0.45, 0.75)
-    return _stretch(sum(gain**k * _perlin_noise(rng, size, cells * 2**k) for k in range(6) if cells * 2**k <= size // 2))
+    octaves = [gain**k * _perlin_noise(rng, size, cells * 2**k) for k in range(6)]
+    return _stretch(sum(octaves[1:], octaves[0]))
 
 
 def _stripes(rng, size):

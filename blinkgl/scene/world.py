@@ -22,7 +22,7 @@ from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, cube_faces, decod
 from blinkgl.scene.meshes import scale_mesh
 from blinkgl.scene.paths import StaticPath
 from blinkgl.scene.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
-from blinkgl.scene.primitives import _square, cuboid, grid, parameter_hash
+from blinkgl.scene.primitives import cuboid, grid, parameter_hash, square
 from blinkgl.scene.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
 
@@ -217,7 +217,7 @@ def _sky(config: SkyConfig, textures: Pool, rng, split, floor, base, log) -> tup
         images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
     parts = []
     for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
-        positions, normals, uvs, faces = _square(half * (forward - right + down), 2 * half * right, -2 * half * down, n, n)
+        positions, normals, uvs, faces = square(half * (forward - right + down), 2 * half * right, -2 * half * down, n, n)
         uvs = 0.5 + (uvs - 0.5) * inset
         mesh = Mesh(positions, faces.astype(np.int32), np.ascontiguousarray(normals, np.float32), uvs.astype(np.float32), name=f"sky {side}",
                     source_hash=parameter_hash("sky", config.size, n, side, inset))

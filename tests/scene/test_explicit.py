@@ -1,0 +1,126 @@
+"""Custom scenes: poses, key frames, materials, scales, and bad input by message."""
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.base import validate
+from blinkgl.config.scene import ExplicitSceneConfig, PoseConfig
+from blinkgl.config.sequence import CameraConfig
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.build import build_scene
+from blinkgl.scene.explicit import pose_matrix
+from tests.scene.gltf_files import GltfBuilder
+
+CAMERA = CameraConfig(width=64, height=48)
+
+
+def build(tmp_path, **tree):
+    tree = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box"}], "camera": {"position": [-3, 0, 1]}, **tree}
+    return build_scene(validate(ExplicitSceneConfig, tree, where="scene"), CAMERA, 0, 10**9, base=tmp_path)
+
+
+def test_camera_orientations():
+    rest = pose_matrix(PoseConfig(), camera=True)[:3, :3]
+    np.testing.assert_allclose(rest, np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))      # z forward = +x, y down = -z
+    np.testing.assert_allclose(pose_matrix(PoseConfig(look_at=(5, 0, 0)), camera=True)[:3, :3], rest, atol=1e-12)
+    turned = pose_matrix(PoseConfig(euler=(0, 0, 90)), camera=True)[:3, :3]
+    np.testing.assert_allclose(turned[:, 2], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(pose_matrix(PoseConfig(quaternion=(2, 0, 0, 0)), camera=True)[:3, :3], np.eye(3), atol=1e-12)
+
+
+def test_object_orientations():
+    T = pose_matrix(PoseConfig(position=(1, 2, 3), look_at=(1, 7, 3)))
+    np.testing.assert_allclose(T, [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-12)
+    euler = pose_matrix(PoseConfig(euler=(10, 20, 30)))[:3, :3]
+    axes = [Rotation.from_rotvec(np.radians(a) * np.eye(3)[k]).as_matrix() for k, a in enumerate((10, 20, 30))]
+    np.testing.assert_allclose(euler, axes[2] @ axes[1] @ axes[0], atol=1e-12)
+    q = (0.5, -0.5, 0.1, 0.7)
+    np.testing.assert_allclose(pose_matrix(PoseConfig(quaternion=q))[:3, :3], Rotation.from_quat([*q[1:], q[0]]).as_matrix(), atol=1e-12)
+    for target in ((3, -2, 8), (0, 0, 4), (0, 0, -4)):
+        R = pose_matrix(PoseConfig(look_at=target))[:3, :3]
+        np.testing.assert_allclose(R[:, 0], np.array(target) / np.linalg.norm(target), atol=1e-12)
+        assert np.linalg.det(R) == pytest.approx(1)
+
+
+def test_keyframes_are_met_and_ends_held(tmp_path):
+    frames = [{"time": 0.1, "position": [0, 0, 0]}, {"time": 0.5, "position": [1, 0, 0], "euler": [0, 0, 90]}, {"time": 0.9, "position": [1, 1, 0], "euler": [0, 0, 180]}]
+    scene = build(tmp_path, objects=[{"mesh": "box", "keyframes": frames}], camera={"keyframes": [
+        {"time": 0, "position": [-3, 0, 1], "look_at": [0, 0, 0]}, {"time": 1, "position": [0, -3, 1], "look_at": [0, 0, 0]}]})
+    path = scene.objects[0].path
+    for k in frames:
+        T = path.pose(round(k["time"] * 1e9))
+        np.testing.assert_allclose(T, pose_matrix(PoseConfig(**{n: tuple(v) for n, v in k.items() if n != "time"})), atol=1e-9)
+    np.testing.assert_array_equal(path.pose(0), path.pose(100_000_000))
+    np.testing.assert_array_equal(path.pose(10**9), path.pose(900_000_000))
+    assert not path.is_static
+    for t in (0, 10**9):
+        T = scene.camera.path.pose(t)
+        to_origin = -T[:3, 3] / np.linalg.norm(T[:3, 3])
+        np.testing.assert_allclose(T[:3, 2], to_origin, atol=1e-9)
+
+
+def test_linear_interpolation(tmp_path):
+    frames = [{"time": 0, "position": [0, 0, 0]}, {"time": 0.5, "position": [1, 0, 0]}, {"time": 1, "position": [1, 4, 0]}]
+    scene = build(tmp_path, objects=[{"mesh": "box", "keyframes": frames, "interpolation": "linear"}])
+    np.testing.assert_allclose(scene.objects[0].path.pose(750_000_000)[:3, 3], [1, 2, 0], atol=1e-12)
+
+
+def test_materials_meshes_and_scale(tmp_path):
+    Image.new("RGB", (40, 20), (255, 0, 0)).save(tmp_path / "red.png")
+    trimesh.creation.icosphere(subdivisions=1).export(tmp_path / "ball.stl")
+    scene = build(tmp_path, meshes={"box": {"primitive": "cuboid", "parameters": {"extents": [1, 2, 3]}}, "ball": {"file": "ball.stl", "uv_size": 0.25},
+                                    "floor": {"primitive": "grid", "parameters": {"width": 20, "subdivisions": 8}}},
+                  materials={"red": {"texture": "red.png", "max_size": 10, "uv_scale": [2, 3], "color": [0.5, 1, 1]}, "noise": {"procedural": "perlin", "seed": 4, "max_size": 16},
+                             "screen": {"unlit": True, "double_sided": True}},
+                  objects=[{"mesh": "box", "material": "red", "scale": 2}, {"mesh": "ball", "material": "noise", "scale": [1, 1, 3], "name": "egg"},
+                           {"mesh": "floor", "material": "screen", "category": "ground"}, {"mesh": "box"}], light={"sun_elevation": 90, "sun": 2})
+    box, egg, floor, second = scene.objects
+    assert [o.name for o in scene.objects] == ["box", "egg", "floor", "box#3"] and [o.instance_id for o in scene.objects] == [1, 2, 3, 4]
+    np.testing.assert_allclose(np.ptp(box.parts[0].mesh.vertices, axis=0), [2, 4, 6])
+    assert np.ptp(egg.parts[0].mesh.vertices[:, 2]) > 5.5 and egg.parts[0].mesh.closed
+    assert box.parts[0].material.texture.image.shape == (5, 10, 3) and box.parts[0].material.uv_scale == (2, 3) and box.parts[0].material.base_color == (0.5, 1, 1)
+    assert egg.parts[0].material.texture.image.shape == (16, 16, 3)
+    assert floor.category == "ground" and floor.parts[0].material.unlit and floor.parts[0].material.double_sided
+    assert second.parts[0].material.texture is None
+    assert scene.light.sun == 2 and scene.light.sun_direction == pytest.approx((0, 0, 1), abs=1e-12)
+
+
+def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
+    builder = GltfBuilder()
+    builder.tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 0.25, 1]}, "doubleSided": True}]
+    builder.node(mesh=builder.mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], uvs=np.zeros((3, 2)), material=0))
+    (tmp_path / "a.glb").write_bytes(builder.glb())
+    scene = build(tmp_path, meshes={"a": {"file": "a.glb"}}, materials={"checks": {"procedural": "checks", "max_size": 8}},
+                  objects=[{"mesh": "a"}, {"mesh": "a", "material": "checks"}])
+    own, other = (o.parts[0] for o in scene.objects)
+    assert own.material.base_color == (1, 0.5, 0.25) and own.material.double_sided
+    assert other.material.texture is not None and np.ptp(other.mesh.uvs) > 0.5      # degenerate ones were projected
+    assert scene.log == ("a: the texture coordinates are degenerate, projected new ones",)
+
+
+@pytest.mark.parametrize("tree, expected", [
+    ({"objects": [{"mesh": "bax"}]}, "scene.objects.0.mesh: no such name under scene.meshes (got 'bax'); expected one of: box"),
+    ({"objects": [{"mesh": "box", "material": "m"}]}, "scene.objects.0.material: no such name under scene.materials (got 'm')"),
+    ({"objects": [{"mesh": "box", "name": "a"}, {"mesh": "box", "name": "a"}]}, "scene.objects.1.name: the name is given to two objects (got 'a')"),
+    ({"objects": []}, "scene.objects: "),
+    ({"objects": [{"mesh": "box", "scale": 0}]}, "scene.objects.0"),
+    ({"meshes": {"box": {"file": "gone.obj"}}}, "scene.meshes.box.file: no such file (got 'gone.obj'); expected a mesh file"),
+    ({"meshes": {"box": {}}}, "scene.meshes.box: give exactly one of primitive and file"),
+    ({"meshes": {"box": {"primitive": "sphere", "parameters": {"radius": -1}}}}, "scene.meshes.box.parameters.radius: bad parameter (got -1); expected a number greater than 0"),
+    ({"meshes": {"box": {"primitive": "sphere", "parameters": {"radios": 1}}}}, "scene.meshes.box.parameters: unknown parameter (got 'radios')"),
+    ({"materials": {"m": {"texture": "gone.png"}}}, "scene.materials.m.texture: no such file (got 'gone.png'); expected an image file"),
+    ({"materials": {"m": {"texture": "a.png", "procedural": "dots"}}}, "scene.materials.m: only one of texture, procedural, photograph may be given, not texture and procedural"),
+    ({"materials": {"m": {"photograph": "lena"}}}, "scene.materials.m.photograph: no such photograph (got 'lena')"),
+    ({"camera": {"euler": [0, 0, 0], "look_at": [1, 0, 0]}}, "scene.camera: only one of quaternion, euler, look_at may be given, not euler and look_at"),
+    ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera: a quaternion must not be zero"),
+    ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera: one key frame is no motion"),
+    ({"camera": {"keyframes": [{"time": 1}, {"time": 1}]}}, "scene.camera: the key frames' times must increase"),
+    ({"camera": {"position": [1, 0, 0], "keyframes": [{"time": 0}, {"time": 1}]}}, "scene.camera: give a fixed pose or keyframes, not both"),
+])
+def test_bad_input(tmp_path, tree, expected):
+    with pytest.raises((ConfigError, AssetError)) as error:
+        build(tmp_path, **tree)
+    assert str(error.value).startswith(expected) and "\n" not in str(error.value)

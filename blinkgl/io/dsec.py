@@ -53,6 +53,7 @@ class DsecEventWriter:
                                  accepted="1 to 65536 px a side")
         self.path, self.height, self.width, self.t_offset_us = Path(path), int(height), int(width), int(t_offset_us)
         self.count = 0
+        self.t_end_us: int | None = None  # may be set any time before close
         self._last_t = self.t_offset_us
         self._next_ms = 0
         self._written = 0
@@ -106,6 +107,7 @@ class DsecEventWriter:
         last event's, so that ``ms_to_idx`` covers windows up to it."""
         if self._closed:
             return
+        t_end_us = self.t_end_us if t_end_us is None else t_end_us
         end = max(self._last_t + 1 if self.count else self.t_offset_us, self.t_offset_us if t_end_us is None else int(t_end_us))
         try:
             self._submit({k: v[: self._fill] for k, v in self._block.items()})

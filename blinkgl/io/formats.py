@@ -32,7 +32,10 @@ SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 128
 
 
 class EventWriter(Protocol):
-    """What every format's writer offers; ``abort`` never raises."""
+    """What every format's writer offers; ``abort`` never raises. ``t_end_us`` may be set before the end: the recording's, where it
+    is later than the last event's (used by DSEC's table)."""
+
+    t_end_us: int | None
 
     def append(self, events: Events) -> None: ...
     def close(self, t_end_us: int | None = None) -> None: ...

@@ -34,6 +34,11 @@ def read_pfm(path: str | os.PathLike) -> np.ndarray:
         data = Path(path).read_bytes()
     except OSError as error:
         raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    return decode_pfm(data, path)
+
+
+def decode_pfm(data: bytes, path: str | os.PathLike) -> np.ndarray:
+    """:func:`read_pfm` of bytes; ``path`` is for messages."""
     header = _HEADER.match(data)
     if not header:
         raise AssetError("not a PFM file: wrong header", where=str(path))

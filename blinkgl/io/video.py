@@ -14,6 +14,7 @@ import imageio_ffmpeg
 import numpy as np
 
 from blinkgl.errors import AssetError, OutputError
+from blinkgl.io.pfm import decode_pfm
 
 
 class VideoWriter:
@@ -122,6 +123,17 @@ class VideoReader:
                 process.wait()
         if status or trouble or data or count == 0:
             raise AssetError(f"video truncated or corrupt after frame {count}" + (f": {trouble}" if trouble else ""), where=str(self.path))
+
+
+def read_exr(path: str | os.PathLike) -> np.ndarray:
+    """(H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; ffmpeg does. AssetError: undecodable."""
+    if not os.path.isfile(path):
+        raise AssetError("no such file", where=str(path))
+    command = [_ffmpeg(AssetError, path), "-loglevel", "error", "-nostdin", "-i", os.fspath(path), "-frames:v", "1", "-c:v", "pfm", "-f", "image2pipe", "-"]
+    result = subprocess.run(command, capture_output=True)
+    if result.returncode or not result.stdout:
+        raise AssetError(f"cannot decode OpenEXR image: {_gist(result.stderr.decode(errors='replace'))}", where=str(path))
+    return decode_pfm(result.stdout, path)
 
 
 def _ffmpeg(error: type, where) -> str:

@@ -1,0 +1,155 @@
+"""Frame sources: videos, folders, arrays, time stamps; and what is wrong with them."""
+
+from __future__ import annotations
+
+import subprocess
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io.frames import open_frames, read_any_image, read_timestamps
+from blinkgl.io.pfm import write_pfm
+from blinkgl.io.video import VideoWriter
+from tests.shared_data import shared
+
+
+def images(folder, count=3, size=(12, 16), ending="png"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for i in range(count):
+        cv2.imwrite(str(folder / f"f{i}.{ending}"), np.full(size, 10 * i, np.uint8))
+    return folder
+
+
+def listed(source):
+    return [(int(frame.flat[0]), t, name) for frame, t, name in source]
+
+
+def test_folder_in_natural_order(tmp_path):
+    images(tmp_path, 11)
+    source = open_frames(tmp_path, fps=100)
+    assert (source.height, source.width, source.count) == (12, 16, 11)
+    assert listed(source) == [(10 * i, i * 10_000_000, f"f{i}.png") for i in range(11)]
+    assert listed(source) == listed(source), "can be read again"
+
+
+@pytest.mark.parametrize("name, text, expected", [
+    ("timestamps.txt", "0\n1000\n2500\n", [0, 10**6, 2_500_000]),
+    ("timestamps.txt", "# seconds\n0.0\n1e-3\n0.0025\n", [0, 10**6, 2_500_000]),
+    ("images.txt", "0.5 f0.png\n0.6 f1.png\n0.75 f2.png\n0.9 f3.png\n", [500_000_000, 600_000_000, 750_000_000]),
+])
+def test_time_stamp_files_are_found(tmp_path, name, text, expected):
+    images(tmp_path)
+    (tmp_path / name).write_text(text)
+    assert [t for _, t, _ in open_frames(tmp_path)] == expected
+    assert [t for _, t, _ in open_frames(tmp_path, fps=1)] == [0, 10**9, 2 * 10**9], "--fps wins"
+
+
+def test_event_camera_dataset_folder():
+    root = shared("data/events/slider_depth")
+    for path in (root, root / "images"):
+        source = open_frames(path)
+        frames = list(source)
+        assert len(frames) == 12 and frames[1][1] == 38_766_001 and frames[0][0].shape == (180, 240) and frames[0][0].dtype == np.uint8
+
+
+def test_video(tmp_path):
+    with VideoWriter(tmp_path / "v.mp4", 32, 48, 50) as video:
+        for i in range(5):
+            video.write(np.full((32, 48, 3), 40 * i, np.uint8))
+    source = open_frames(tmp_path / "v.mp4")
+    assert source.count == 5 and [t for _, t, _ in source] == [i * 20_000_000 for i in range(5)]
+    assert [t for _, t, _ in open_frames(tmp_path / "v.mp4", fps=1000)] == [i * 10**6 for i in range(5)]
+    (tmp_path / "t.txt").write_text("0\n1\n2\n")
+    with pytest.raises(EventDataError, match="no time stamp for frame 3"):
+        list(open_frames(tmp_path / "v.mp4", timestamps=tmp_path / "t.txt"))
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "f4", "f8"])
+@pytest.mark.parametrize("channels", [(), (1,), (3,)])
+def test_arrays(tmp_path, dtype, channels):
+    frames = np.random.default_rng(0).integers(0, 200, (4, 6, 8, *channels)).astype(dtype)
+    np.save(tmp_path / "a.npy", frames)
+    np.savez(tmp_path / "a.npz", frames=frames, timestamps_us=[0, 5, 10, 20])
+    for source, times in ((open_frames(tmp_path / "a.npy", fps=10), [0, 10**8, 2 * 10**8, 3 * 10**8]),
+                          (open_frames(tmp_path / "a.npz"), [0, 5000, 10000, 20000])):
+        got = list(source)
+        assert [t for _, t, _ in got] == times
+        expected = frames[..., 0] if channels == (1,) else frames
+        assert np.array_equal(np.stack([f for f, _, _ in got]), expected)
+        assert got[0][0].dtype == (np.float32 if dtype in ("f4", "f8") else dtype)
+
+
+def test_float_and_deep_images(tmp_path):
+    rng = np.random.default_rng(0)
+    colour = (rng.random((10, 14, 3)) * 4).astype(np.float32)
+    raw = np.ascontiguousarray(np.moveaxis(colour, -1, 0)[[1, 2, 0]]).tobytes()
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "gbrpf32le", "-s", "14x10", "-i", "-",
+                    "-format", "float", str(tmp_path / "a.exr")], input=raw, check=True)
+    assert np.array_equal(read_any_image(tmp_path / "a.exr"), colour)
+    cv2.imwrite(str(tmp_path / "a.hdr"), colour[..., ::-1])
+    assert np.allclose(read_any_image(tmp_path / "a.hdr"), colour, rtol=0.02, atol=0.02)
+    write_pfm(tmp_path / "a.pfm", colour)
+    assert np.array_equal(read_any_image(tmp_path / "a.pfm"), colour)
+    deep = rng.integers(0, 65536, (10, 14, 3)).astype(np.uint16)
+    for ending in ("png", "tiff"):
+        cv2.imwrite(str(tmp_path / f"a.{ending}"), deep[..., ::-1])
+        assert np.array_equal(read_any_image(tmp_path / f"a.{ending}"), deep)
+    (tmp_path / "b.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:300])
+    with pytest.raises(AssetError, match="cannot decode OpenEXR"):
+        read_any_image(tmp_path / "b.exr")
+
+
+def test_bad_folders(tmp_path):
+    with pytest.raises(AssetError, match="no such file or folder"):
+        open_frames(tmp_path / "none", fps=1)
+    with pytest.raises(AssetError, match="no images in the folder"):
+        open_frames(tmp_path, fps=1)
+    folder = images(tmp_path / "a")
+    with pytest.raises(EventDataError, match="frames without times.*expected --fps"):
+        open_frames(folder)
+    with pytest.raises(EventDataError, match="--fps: frame rate .got 0"):
+        open_frames(folder, fps=0)
+    with pytest.raises(EventDataError, match="at least two frames"):
+        open_frames(images(tmp_path / "one", 1), fps=1)
+    (folder / "timestamps.txt").write_text("0\n1\n")
+    with pytest.raises(EventDataError, match="one time stamp per image .got '2 stamps, 3 images'"):
+        open_frames(folder)
+    (folder / "timestamps.txt").write_text("0 f0.png\n1 f1.png\n")
+    with pytest.raises(EventDataError, match="no time stamp for image f2.png"):
+        open_frames(folder)
+    (folder / "timestamps.txt").write_text("0\n20\n10\n")
+    with pytest.raises(EventDataError, match=r"frame 2 \(f2.png\): time stamps must increase \(got '1e-05 s'\); expected more than 2e-05 s"):
+        list(open_frames(folder))
+    (folder / "f1.png").write_bytes(b"\x89PNG")
+    with pytest.raises(AssetError, match="f1.png: cannot decode"):
+        list(open_frames(folder, fps=1))
+    cv2.imwrite(str(folder / "f1.png"), np.zeros((12, 17), np.uint8))
+    with pytest.raises(EventDataError, match=r"frame 1 \(f1.png\): frame size changed \(got \(12, 17\)\)"):
+        list(open_frames(folder, fps=1))
+
+
+def test_bad_arrays_and_files(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 4)))
+    with pytest.raises(AssetError, match="not frames"):
+        open_frames(tmp_path / "a.npy", fps=1)
+    np.save(tmp_path / "a.npy", np.zeros((3, 4, 5), np.int64))
+    with pytest.raises(AssetError, match="unsupported pixel type"):
+        open_frames(tmp_path / "a.npy", fps=1)
+    np.save(tmp_path / "a.npy", np.zeros((3, 4, 5)))
+    with pytest.raises(EventDataError, match="frames without times"):
+        open_frames(tmp_path / "a.npy")
+    (tmp_path / "a.npy").write_bytes((tmp_path / "a.npy").read_bytes()[:-10])
+    with pytest.raises(AssetError, match="cannot read"):
+        open_frames(tmp_path / "a.npy", fps=1)
+    np.savez(tmp_path / "a.npz", other=1)
+    with pytest.raises(AssetError, match="no array 'frames'"):
+        open_frames(tmp_path / "a.npz", fps=1)
+    (tmp_path / "a.xyz").touch()
+    with pytest.raises(AssetError, match="unknown input"):
+        open_frames(tmp_path / "a.xyz", fps=1)
+    (tmp_path / "t.txt").write_text("time\n0\nx\n")
+    with pytest.raises(EventDataError, match="line 3 is not a time stamp"):
+        read_timestamps(tmp_path / "t.txt")

@@ -95,15 +95,20 @@ class SceneResources:
         """Of a material without texture."""
         return float(LUMA @ np.asarray(material.base_color, np.float64))
 
-    def release(self) -> None:
+    def forget_vertex_arrays(self) -> None:
+        """To be called before the programs they were made for are replaced."""
         for vao in self._vaos.values():
             vao.release()
+        self._vaos = {}
+
+    def release(self) -> None:
+        self.forget_vertex_arrays()
         for pair in self._buffers.values():
             for buffer in pair:
                 buffer.release()
         for texture in self._textures.values():
             texture.release()
-        self._vaos, self._buffers, self._textures = {}, {}, {}
+        self._buffers, self._textures = {}, {}
 
     def _mesh_buffers(self, mesh: Mesh, uv_scale: tuple[float, float]) -> tuple[moderngl.Buffer, moderngl.Buffer]:
         key = (id(mesh), uv_scale)

@@ -28,13 +28,13 @@ MAX_YAML_BYTES = 4 << 20
 class CameraConfig(Config):
     """A pin-hole camera. Give the field of view or the focal length, not both."""
 
-    width: int = Field(346, ge=1, le=16384, description="px")
-    height: int = Field(260, ge=1, le=16384, description="px")
+    width: int = Field(346, ge=1, le=16384, description="columns, px")
+    height: int = Field(260, ge=1, le=16384, description="rows, px")
     fov: float | None = Field(None, gt=0.01, lt=179.9, description="horizontal field of view, degrees; default 60")
     focal: float | None = Field(None, gt=0, description="focal length, px (fx = fy)")
     cx: float | None = Field(None, description="principal point x, px; default the image centre, (width - 1) / 2")
     cy: float | None = Field(None, description="principal point y, px; default (height - 1) / 2")
-    near: float = Field(0.05, gt=0, description="near plane, world units; also the least distance to any surface")
+    near: float = Field(0.05, gt=0, description="near plane: nothing nearer is drawn, world units")
 
     @model_validator(mode="after")
     def _one_of(self):
@@ -149,16 +149,16 @@ class LabelsConfig(Config):
 class PreviewConfig(Config):
     """preview.mp4: frames, events and flow side by side."""
 
-    enabled: bool = True
+    enabled: bool = Field(True, description="false: no preview")
     rate: float = Field(60.0, gt=0, le=1e4, description="pictures per second of simulated time, Hz")
     slowdown: float = Field(3.0, gt=0, le=1000, description="play-back this many times slower than the simulation")
 
 
 class OutputConfig(Config):
-    """Where sequences go below the output folder: <out>/<split>/<name>_<index>/."""
+    """Where sequences go below the output folder: `OUT/SPLIT/NAME_000000`, …"""
 
     name: str = Field("sequence", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$", description="name of the sequences")
-    split: Literal["train", "test"] = "train"
+    split: Literal["train", "test"] = Field("train", description="which side of the object and texture pools; disjoint by content")
     sequences: int = Field(1, ge=1, le=10_000_000, description="how many (--num overrides)")
     first_index: int = Field(0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone")
 
@@ -167,16 +167,16 @@ class SequenceConfig(Config):
     """One sequence, every value plain and final."""
 
     seed: int = Field(0, ge=0, lt=2**63, description="of the whole run; 0 is a seed")
-    output: OutputConfig = OutputConfig()
-    camera: CameraConfig = CameraConfig()
-    time: TimeConfig = TimeConfig()
-    timeline: TimelineConfig = DisplacementTimeline()
-    scene: SceneConfig = RandomSceneConfig()
-    render: RenderConfig = RenderConfig()
-    events: EmulatorConfig = EsimConfig()
-    labels: LabelsConfig = LabelsConfig()
-    preview: PreviewConfig = PreviewConfig()
-    gl: GLConfig = GLConfig()
+    output: OutputConfig = Field(OutputConfig(), description="where sequences go")
+    camera: CameraConfig = Field(CameraConfig(), description="resolution and intrinsics")
+    time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
+    timeline: TimelineConfig = Field(DisplacementTimeline(), description="when event frames are drawn")
+    scene: SceneConfig = Field(RandomSceneConfig(), description="what is in front of the camera and how it moves")
+    render: RenderConfig = Field(RenderConfig(), description="how a frame is drawn")
+    events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
+    labels: LabelsConfig = Field(LabelsConfig(), description="which ground truth is written")
+    preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
+    gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
 
 @dataclass(frozen=True)

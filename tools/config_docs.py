@@ -1,0 +1,128 @@
+"""Writes docs/configuration.md: every YAML key with its type, default, limits and meaning, from the models themselves.
+
+    python -m blinkgl.tools.config_docs > docs/configuration.md
+
+A test fails when the page and the models differ.
+"""
+
+from __future__ import annotations
+
+import types
+import typing
+from typing import Any
+
+import annotated_types
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+
+from blinkgl.config.sequence import SequenceConfig
+
+HEADER = """# Every key of the YAML
+
+Made from the configuration models by `python -m blinkgl.tools.config_docs`; do not edit.
+
+Keys that are left out have the default. Where a plain value stands, a distribution may stand instead and is drawn once per
+sequence: `{uniform: [a, b]}`, `{log_uniform: [a, b]}`, `{integer: [a, b]}` (both ends included), `{choice: [x, y, …]}`,
+`{weighted: {x: 3, y: 1}}`. Every sequence's own `config.yaml` records what was drawn.
+"""
+
+
+def page() -> str:
+    """The whole page as Markdown."""
+    return HEADER + "".join(_section(SequenceConfig, "", set()))
+
+
+def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> list[str]:
+    title = f"`{path}`{note}" if path else "Top level"
+    about = " ".join((model.__doc__ or "").split()).replace("``", "`")
+    rows, below = [], []
+    for name, info in model.model_fields.items():
+        inner = f"{path}.{name}" if path else name
+        meaning = (info.description or _about(info)).replace("``", "`")
+        rows.append(f"| `{name}` | {_type(info)} | {_default(info)} | {meaning} |\n")
+        children = _models(info.annotation)
+        tagged = [c for c in children if _tag(c)]
+        for child in children:
+            suffix = f" with `{_tag(child)[0]}: {_tag(child)[1]}`" if child in tagged and len(children) > 1 else ""
+            marker = (child, inner)
+            if marker not in done:
+                done.add(marker)
+                below += _section(child, inner + ("." + "<name>" if _is_dict(info.annotation) else "[]" if _is_list(info.annotation) else ""),
+                                  done, suffix)
+    head = f"\n## {title}\n\n{about}\n\n| key | type | default | meaning |\n|---|---|---|---|\n"
+    return [head, *rows, *below]
+
+
+def _about(info: FieldInfo) -> str:
+    return "; ".join(" ".join((m.__doc__ or "").split()).split(". ")[0].rstrip(".") for m in _models(info.annotation)[:1])
+
+
+def _tag(model: type[BaseModel]) -> tuple[str, str] | None:
+    for key in ("kind", "emulator"):
+        if key in model.model_fields:
+            values = typing.get_args(model.model_fields[key].annotation)
+            if len(values) == 1:
+                return key, values[0]
+    return None
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for a in typing.get_args(annotation) for m in _models(a)]
+
+
+def _is_dict(annotation: Any) -> bool:
+    return typing.get_origin(annotation) is dict
+
+
+def _is_list(annotation: Any) -> bool:
+    return typing.get_origin(annotation) in (tuple, list)
+
+
+def _type(info: FieldInfo) -> str:
+    limits = []
+    for m in info.metadata:
+        for attribute, sign in (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤")):
+            if isinstance(m, getattr(annotated_types, attribute.capitalize())):
+                limits.append(f"{sign} {getattr(m, attribute):g}")
+    return (_name(info.annotation) + (" " + ", ".join(limits) if limits else "")).replace("|", "\\|")
+
+
+def _name(annotation: Any) -> str:
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is typing.Annotated:
+        return _name(arguments[0])
+    if origin is typing.Literal:
+        return " | ".join(f"`{str(a).lower() if isinstance(a, bool) else a}`" for a in arguments)
+    if origin in (typing.Union, types.UnionType):
+        names = dict.fromkeys(_name(a) for a in arguments)
+        return " | ".join(names)
+    if origin is tuple and arguments and arguments[-1] is not Ellipsis:
+        return "[" + ", ".join(_name(a) for a in arguments) + "]"
+    if origin in (tuple, list):
+        return f"list of {_name(arguments[0])}"
+    if origin is dict:
+        return f"table of {_name(arguments[1])}"
+    if annotation is type(None):
+        return "null"
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return "table"
+    return {"float": "number", "int": "integer", "str": "text", "bool": "true/false"}.get(getattr(annotation, "__name__", ""), str(annotation))
+
+
+def _default(info: FieldInfo) -> str:
+    if info.is_required():
+        return "required"
+    value = info.default if info.default is not PydanticUndefined else info.default_factory()
+    if isinstance(value, BaseModel):
+        tag = _tag(type(value))
+        return f"`{tag[0]}: {tag[1]}`" if tag and len(_models(info.annotation)) > 1 else "see below"
+    if isinstance(value, tuple):
+        return "`[" + ", ".join(str(v) for v in value) + "]`"
+    return "`null`" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+if __name__ == "__main__":
+    print(page(), end="")

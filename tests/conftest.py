@@ -11,6 +11,8 @@ def pytest_configure(config: pytest.Config) -> None:
     # Under xdist there is one process per core already: more llvmpipe and numba threads would only fight over them.
     if os.environ.get("PYTEST_XDIST_WORKER"):
         os.environ.setdefault("LP_NUM_THREADS", "0")
+    # pyrender imports its viewer's pyglet, which fails where there is only half of X11.
+    os.environ.setdefault("PYGLET_HEADLESS", "1")
 
 
 @pytest.fixture(scope="session")

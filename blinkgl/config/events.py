@@ -12,9 +12,10 @@ from pydantic import Field, model_validator
 
 from blinkgl.config.base import Config
 
-_MAX_EVENTS = Field(2**25, ge=1_000, le=2**31 - 1, description="Most events one step may emit. If more could fire, every "
-                    "pixel is cut to the same number per interval; levels still move, the cut events are counted in "
-                    "`emulator.saturated`. 2^25 events need about 1 GB while they are sorted.")
+_MAX_EVENTS = Field(2**25, ge=1_000, le=2**31 - 1, description="Most events one step may emit, shared out equally among blocks "
+                    "of 1024 pixels (a block may always emit one per pixel). Where more could fire, each pixel of the block "
+                    "is cut to the same number; levels still move, the cut events are counted in `emulator.saturated`. "
+                    "2^25 events need about 1 GB while they are sorted.")
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
@@ -72,7 +73,7 @@ class V2eConfig(Config):
                                "events of a pixel (v2e: leak_jitter_fraction 0.1).")
     leak_cov_decades: float = Field(0.1, ge=0, le=3, description="Spread of the leak rate over the pixels, decades (v2e: "
                                     "noise_rate_cov_decades 0.1).")
-    shot_noise_rate_hz: float = Field(0.001, ge=0, le=1e5, description="Noise events per second and pixel in the dark, ON and "
+    shot_noise_rate_hz: float = Field(0.001, ge=0, le=1e4, description="Noise events per second and pixel in the dark, ON and "
                                       "OFF together (v2e: 0.001); at full scale a quarter of it.")
     photoreceptor_noise: bool = Field(False, description="Make the noise events by low-passed noise before the comparator, "
                                       "at the rate shot_noise_rate_hz, instead of drawing events.")

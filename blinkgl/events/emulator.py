@@ -14,13 +14,14 @@ from blinkgl.events.packing import MAX_INTERVAL_NS, PackedBuffer
 from blinkgl.events.types import Events
 
 BLOCK = 1024
-"""Pixels a kernel looks at in one go: its scratch stays in the first-level cache. Bands are whole blocks."""
+"""Pixels a kernel takes in one go: everything about them stays in the first cache levels. Threads get whole blocks."""
 INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 """Bit pattern of the largest accepted intensity. Read as unsigned integers, negative numbers, infinities and NaN
 are all larger, so one running maximum per frame checks everything at once."""
 MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
-NO_CAP = 2**62
+NO_FRAME, NO_CODES = np.empty(0, np.float32), np.empty(0, np.uint8)
+"""Stand for the kind of frame that was not given."""
 
 
 class Emulator(ABC):
@@ -56,7 +57,7 @@ class Emulator(ABC):
         """Events cut by ``max_events_per_step`` so far."""
         self._decode = np.arange(256, dtype=np.float32) / np.float32(255.0)
         self._buffer = PackedBuffer()
-        self._active = np.empty(height * width + BLOCK, np.int32)
+        self._blocks = -(-self.height * self.width // BLOCK)
 
     # -- input ----------------------------------------------------------------------------------------------
     def set_decode(self, table: np.ndarray) -> None:
@@ -75,6 +76,7 @@ class Emulator(ABC):
         """Events since the last frame; see the class."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
+        self._check_intensity(frame)
         events = self._start(frame, t_ns) if self.t_ns is None else self._advance(frame, t_ns)
         self.t_ns = t_ns
         self.frames += 1
@@ -100,13 +102,15 @@ class Emulator(ABC):
                                  accepted="at most 17 minutes between two frames")
         return t_ns
 
-    def _refuse_bad_intensity(self, frame: np.ndarray, worst_bits: int) -> None:
-        if worst_bits <= INTENSITY_LIMIT_BITS:
+    def _check_intensity(self, frame: np.ndarray) -> None:
+        """Before anything changes. One pass over bit patterns; the slow look only where that finds something."""
+        if frame.dtype == np.uint8 or frame.view(np.uint32).max() <= INTENSITY_LIMIT_BITS:
             return
-        bad = int(np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))[0])
-        raise EventDataError(f"intensity at pixel x={bad % self.width}, y={bad // self.width} cannot be used",
-                             where=f"frame {self.frames}", value=float(frame[bad]),
-                             accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}")
+        bad = np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))  # -0.0 is not bad
+        if bad.size:
+            y, x = divmod(int(bad[0]), self.width)
+            raise EventDataError(f"intensity at pixel x={x}, y={y} cannot be used", where=f"frame {self.frames}",
+                                 value=float(frame[bad[0]]), accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}")
 
     @abstractmethod
     def _start(self, frame: np.ndarray, t_ns: int) -> Events: ...
@@ -114,13 +118,32 @@ class Emulator(ABC):
     @abstractmethod
     def _advance(self, frame: np.ndarray, t_ns: int) -> Events: ...
 
-    # -- threads --------------------------------------------------------------------------------------------
-    def _band_edges(self) -> np.ndarray:
-        """(B + 1,) int64 pixel numbers, one band of whole blocks per thread."""
-        pixels = self.height * self.width
-        blocks = -(-pixels // BLOCK)
-        bands = min(numba.get_num_threads(), blocks)
-        return np.minimum(BLOCK * (blocks * np.arange(bands + 1, dtype=np.int64) // bands), pixels)
+    # -- running the kernels --------------------------------------------------------------------------------
+    def _run(self, serial, parallel, arguments: tuple, base_us: int, span_us: int) -> Events:
+        """Run a band kernel over all blocks, on numba's threads, and sort what it emits.
+
+        ``serial(first_block, stop_block, share, packed, filled, *arguments) -> (next_block, filled, cut)`` works
+        through whole blocks and stops early when ``packed`` might not hold the next one; it then goes on from
+        there in a larger buffer. ``share`` is the number of events a block may emit.
+        """
+        bands = min(numba.get_num_threads(), self._blocks)
+        edges = self._blocks * np.arange(bands + 1, dtype=np.int64) // bands
+        share = max(BLOCK, self.config.max_events_per_step // self._blocks)
+        progress = np.zeros((bands, 3), np.int64)  # next block, events so far, events cut
+        progress[:, 0] = edges[:-1]
+        while True:
+            packed = self._buffer.rows(bands, self.height * self.width // (4 * bands))
+            if bands == 1:
+                next_block, filled, cut = serial(progress[0, 0], edges[1], share, packed[0], progress[0, 1], *arguments)
+                progress[0] = next_block, filled, progress[0, 2] + cut
+            else:
+                parallel(edges, progress, share, packed, *arguments)
+            if (progress[:, 0] >= edges[1:]).all():
+                break
+            # No block emits more than its share or, at one event each, its pixels; so this ends, and is bounded.
+            self._buffer.grow(bands, 2 * packed.shape[1] + 8 * BLOCK, progress[:, 1])
+        self.saturated += int(progress[:, 2].sum())
+        return self._buffer.to_events(progress[:, 1].copy(), base_us, span_us)
 
     # -- state ----------------------------------------------------------------------------------------------
     def state_dict(self) -> dict[str, np.ndarray]:

@@ -119,41 +119,47 @@ class PackedBuffer:
     """Scratch memory for one emulator's packed events; grows to the largest step seen, never with the clip."""
 
     def __init__(self) -> None:
-        self.packed = np.empty(0, np.int64)
-        self._other = np.empty(0, np.int64)
+        self._rows = np.empty((0, 0), np.int64)
+        self._sorted = np.empty((2, 0), np.int64)
         self._histogram = np.empty(0, np.int64)
 
-    def reserve(self, capacity: int) -> np.ndarray:
-        """(>= capacity,) int64 to emit into; contents are lost when it grows."""
-        if self.packed.size < capacity:
-            self.packed = np.empty(capacity + capacity // 4, np.int64)
-        return self.packed
+    def rows(self, bands: int, capacity: int) -> np.ndarray:
+        """(bands, >= capacity) int64, one row per thread to emit into; keeps its size between steps."""
+        if self._rows.shape[0] != bands or self._rows.shape[1] < capacity:
+            self._rows = np.empty((bands, max(capacity, self._rows.size // bands, 1)), np.int64)
+        return self._rows
 
-    def to_events(self, starts: np.ndarray, counts: np.ndarray, base_us: int, span_us: int) -> Events:
-        """Events of the runs ``packed[starts[b] : starts[b] + counts[b]]``, sorted.
+    def grow(self, bands: int, capacity: int, filled: np.ndarray) -> None:
+        """More room per row, keeping the first ``filled[b]`` events of each."""
+        old, self._rows = self._rows, np.empty((bands, capacity), np.int64)
+        for band in range(bands):
+            self._rows[band, : filled[band]] = old[band, : filled[band]]
 
-        starts, counts : (B,) int64, one run per band, bands in raster order.
+    def to_events(self, counts: np.ndarray, base_us: int, span_us: int) -> Events:
+        """The events of ``rows[b, : counts[b]]``, sorted.
+
+        counts : (B,) int64, events per row, rows in raster order.
         base_us, span_us : time of offset 0, and the largest offset that can occur.
         """
-        total = int(counts.sum())
+        total, bands = int(counts.sum()), len(counts)
         if total == 0:
             return Events.empty()
-        if self._other.size < total:
-            self._other = np.empty(total + total // 4, np.int64)
         bits = max(1, int(span_us).bit_length())
         digit_bits = bits if bits <= _SINGLE_PASS_BITS else _DIGIT_BITS
-        bands = len(starts)
+        if self._sorted.shape[1] < total:
+            self._sorted = np.empty((2 if bits > digit_bits else 1, total + total // 4), np.int64)
+        if len(self._sorted) < 2 and bits > digit_bits:
+            self._sorted = np.empty((2, self._sorted.shape[1]), np.int64)
         if self._histogram.size < bands << digit_bits:
             self._histogram = np.empty(bands << digit_bits, np.int64)
         histogram = self._histogram[: bands << digit_bits].reshape(bands, 1 << digit_bits)
         sort_pass = _sort_pass_parallel if bands > 1 else _sort_pass_serial
-        source, target = self.packed, self._other
-        for low in range(0, bits, digit_bits):
+        source, starts, counts = self._rows.reshape(-1), self._rows.shape[1] * np.arange(bands), counts
+        for k, low in enumerate(range(0, bits, digit_bits)):
+            target = self._sorted[k % 2]
             sort_pass(source, starts, counts, T_SHIFT + low, (1 << digit_bits) - 1, histogram, target)
-            source, target = target, (self._other if target is self.packed else self.packed)
-            if low == 0 and digit_bits < bits:  # contiguous from now on
-                edges = total * np.arange(bands + 1) // bands
-                starts, counts = edges[:-1], np.diff(edges)
+            source, edges = target, total * np.arange(bands + 1) // bands  # contiguous from now on
+            starts, counts = edges[:-1], np.diff(edges)
         x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
         t, p = np.empty(total, np.int64), np.empty(total, np.uint8)
         if bands > 1:

@@ -1,6 +1,6 @@
 """Slow twins of the emulators: the papers, one pixel and one event at a time.
 
-They share the arithmetic and the random numbers of the kernels (:mod:`~blinkgl.events.arith`,
+They share the elementary functions and the random numbers of the kernels (:mod:`~blinkgl.events.arith`,
 :mod:`~blinkgl.events.philox`, here on NumPy arrays) and nothing else: no blocks, no packing, no threads, no compiled
 code. The tests ask for equality event for event. For small frames only.
 """
@@ -11,9 +11,10 @@ import math
 
 import numpy as np
 
-from blinkgl.config.events import EsimConfig
+from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.events import v2e
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.philox import Stream, normal2, pixel_counters
+from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
 from blinkgl.events.types import Events
 
 
@@ -89,3 +90,148 @@ class ReferenceEsim:
             if self.last_ns[i] is None or t - self.last_ns[i] >= round(self.config.refractory_us * 1000):
                 self.last_ns[i] = t
                 rows.append((t // 1000, y, x, p))
+
+
+class ReferenceV2e:
+    """Hu et al. 2021 in continuous time, as the docstring of :mod:`blinkgl.events.v2e` says it."""
+
+    def __init__(self, height: int, width: int, config: V2eConfig, seed: int = 0):
+        self.height, self.width, self.config, self.seed = height, width, config, np.uint64(seed)
+        self.pixels = height * width
+        nominal = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
+        normals = normal2(self.seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
+        self.on, self.off = (np.clip(c + config.threshold_sigma * n, min(0.01, c / 2), 10.0).astype(np.float32)
+                             for c, n in zip(nominal, normals))
+        self.leak = v2e.draw_leaks(height, width, config, self.on, self.seed)
+        if not self.leak.size:
+            self.leak = np.zeros(self.pixels, np.float32)
+        self.mean_leak = self.leak.copy()
+        self.leaks = bool(config.leak_rate_hz or config.hot_pixel_fraction)
+        self.rebase_ns = int(v2e.REBASE / float(np.median(self.leak[self.leak > 0])) * 1e9) if self.leaks else 2**61
+        self.largest = min(v2e.MAX_SHOT_FACTOR, max(float((c / t).max()) for c, t in zip(nominal, (self.on, self.off))))
+        self.nominal = nominal
+        self.refractory = round(config.refractory_us * 1000)
+        self.events_so_far = [0] * self.pixels
+        self.release: list[int | None] = [None] * self.pixels
+        self.t_ns: int | None = None
+
+    def shot_times(self, block: int):
+        """All candidate events of one block of pixels: (ns, pixel in block, index), endlessly."""
+        rate = v2e.BLOCK * self.config.shot_noise_rate_hz * self.largest * 1e-9
+        b = np.uint64(block)
+        t = self.t_ns + v2e.shot_gap_ns(self.seed, b, np.uint64(2**62), rate)[0]
+        index = 0
+        while True:
+            gap, offset = v2e.shot_gap_ns(self.seed, b, np.uint64(index), rate)
+            yield int(t), int(offset), index
+            t, index = t + gap, index + 1
+
+    def step(self, luminance: np.ndarray, t_ns: int) -> Events:
+        intensity = (as_luminance(luminance) * np.float32(self.config.full_scale)).ravel()
+        x = v2e.lin_log(intensity)
+        rows = []
+        if self.t_ns is None:
+            self.t_ns = self.epoch = t_ns
+            phase = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))[0]
+            reference = x - phase.astype(np.float32) * self.on if self.leaks else x
+            self.upper, self.lower = reference + self.on, reference - self.off
+            lag = np.zeros(self.pixels, np.float32)
+            if self.config.shot_noise_rate_hz:
+                self.clocks = [self.shot_times(b) for b in range(-(-self.pixels // v2e.BLOCK))]
+                self.pending = [next(clock) for clock in self.clocks]
+        else:
+            kappa = 2 * np.pi * self.config.cutoff_hz * (t_ns - self.t_ns) * 1e-9 / 275.0
+            lag = self.lag
+            if self.config.cutoff_hz:
+                lag = v2e.relax(self.lag, self.x, x, self.intensity, intensity, np.float32(kappa))
+            noise = self.noise(intensity, t_ns)
+            for i in range(self.pixels):
+                rows += self.pixel(i, x, lag, intensity, kappa, t_ns, noise[i])
+        self.x, self.intensity, self.lag, self.t_ns = x, intensity, lag, t_ns
+        if t_ns - self.epoch >= self.rebase_ns:
+            gone = self.leak * np.float32((t_ns - self.epoch) * 1e-9)
+            self.upper, self.lower, self.epoch = self.upper - gone, self.lower - gone, t_ns
+        return sorted_events(rows)
+
+    def noise(self, intensity: np.ndarray, t_ns: int) -> list[list[tuple[int, int]]]:
+        """Accepted shot noise of the interval, per pixel: (ns from its start, polarity) in time order."""
+        accepted = [[] for _ in range(self.pixels)]
+        for block, clock in enumerate(getattr(self, "clocks", [])):
+            while self.pending[block][0] <= t_ns:
+                t, offset, index = self.pending[block]
+                self.pending[block] = next(clock)
+                i = block * v2e.BLOCK + offset
+                if i >= self.pixels:
+                    continue
+                after = max(t - self.t_ns, 0)
+                here = self.intensity[i] + (intensity[i] - self.intensity[i]) * (after / (t_ns - self.t_ns))
+                u, w = uniform2(self.seed, np.uint64(block), np.uint64(Stream.SHOT), np.uint64(2 * index + 1))
+                p = int(u < 0.5)
+                theta = self.on[i] if p else self.off[i]
+                ratio = min(self.nominal[1 - p] / theta, v2e.MAX_SHOT_FACTOR)
+                if w < ratio / self.largest * v2e.shot_rate_factor(here):
+                    accepted[i].append((after, p))
+        return [sorted(events) for events in accepted]
+
+    def pixel(self, i, x, lag, intensity, kappa, t_ns, noise) -> list[tuple[int, int, int, int]]:
+        f = np.float64
+        dt_ns, (y, column) = t_ns - self.t_ns, divmod(i, self.width)
+        since = (self.t_ns - self.epoch) * 1e-9, (t_ns - self.epoch) * 1e-9
+        z_now = x[i] + lag[i] if self.config.cutoff_hz else x[i]
+        z_now = z_now + self.leak[i] * np.float32(since[1]) if self.leaks else z_now
+        waiting = self.release[i] is not None
+        if not (waiting or noise or z_now >= self.upper[i] or z_now <= self.lower[i]):
+            return []
+        x0, dx = f(self.x[i]), f(x[i]) - f(self.x[i])
+        curve_lag, k = f(0), f(-1)
+        if self.config.cutoff_hz:
+            curve_lag, k = f(self.lag[i]), kappa * (0.5 * (f(self.intensity[i]) + f(intensity[i])) + 20.0)
+        leak = f(self.leak[i])
+        curve = lambda: (x0 + leak * since[0], leak * (dt_ns * 1e-9), dx, curve_lag, k)
+        z = lambda s: v2e.signal_at(s, *curve())
+        end = (x0 + leak * since[0]) + (0.0 + leak * (dt_ns * 1e-9)) + dx
+        if self.config.cutoff_hz:
+            end = end + f(lag[i])
+        on, off, up, down = f(self.on[i]), f(self.off[i]), f(self.upper[i]), f(self.lower[i])
+        s, after, rows = f(0), 0, []
+        if waiting:
+            if self.release[i] > t_ns:
+                return []
+            after = max(self.release[i] - self.t_ns, 0)
+            s, self.release[i] = f(after / dt_ns), None
+            up, down = z(s) + on, z(s) - off
+        while True:
+            noise = [n for n in noise if n[0] >= after]
+            p = 1 if end >= up else 0 if end <= down else None
+            event = None
+            if p is not None:
+                level = up if p else down
+                event_s = v2e.crossing_fraction(s, level, p, *curve(), end)
+                event = int(event_s * dt_ns), p, event_s, level
+            if noise and (event is None or noise[0][0] <= event[0]):
+                after, p = noise.pop(0)
+                event = after, p, f(after / dt_ns), None
+            if event is None:
+                break
+            after, p, s, reference = event
+            rows.append(((self.t_ns + after) // 1000, y, column, p))
+            if self.leaks and self.config.leak_jitter:
+                self.events_so_far[i] += 1
+                n, _ = normal2(self.seed, np.uint64(i), np.uint64(Stream.LEAK_JITTER), np.uint64(self.events_so_far[i]))
+                self.leak[i] = np.float32(self.mean_leak[i] / max(0.1, 1.0 + self.config.leak_jitter * n))
+                change = f(self.leak[i]) - leak
+                leak += change
+                end += change * since[1]
+                if reference is not None:
+                    reference += change * (since[0] + s * (dt_ns * 1e-9))
+            if self.refractory:
+                after += self.refractory
+                if after > dt_ns:
+                    self.release[i] = self.t_ns + after
+                    break
+                s, reference = f(after / dt_ns), None
+            if reference is None:
+                reference = z(s)
+            up, down = reference + on, reference - off
+        self.upper[i], self.lower[i] = np.float32(up), np.float32(down)
+        return rows

@@ -1,0 +1,542 @@
+"""V2E: lin-log photoreceptor of finite bandwidth, threshold mismatch, leak, shot noise, refractory period.
+
+Hu, Liu, Delbruck, "v2e: From Video Frames to Realistic DVS Events", CVPRW 2021, section 3, as a process in
+continuous time, so that nothing but the accuracy of the interpolation depends on the frame rate:
+
+* The photoreceptor follows the lin-log intensity x, linear in time between frames, through a first-order low-pass
+  with k = 2 pi f_c dt (I + 20)/275 time constants per interval. With the lag D = y - x the exact solution over an
+  interval is D' = D e^-k - dx (1 - e^-k)/k: stable for every k, second order in the frame spacing.
+* The comparator sees z = y + leak (t - epoch) and fires where z, on its exact curve, meets the level (Newton's
+  method), not on frame times.
+* After any event the reference is z at the end of the dead time: with no refractory period the level just passed,
+  with one whatever the signal has become, so that change during the dead time never comes out as a backlog.
+* Leak is a drift of the reference; with jitter each event draws the length of the pixel's next leak interval.
+  Hot pixels are pixels with a large leak.
+* Shot noise is a Poisson process per block of 1024 pixels at the largest rate that a pixel can have, thinned to
+  each pixel's own rate (R/2)(1 - 0.75 (I + 20)/275) theta_nominal/theta per polarity at that instant (the last
+  ratio at most 4).
+* Photoreceptor noise (instead of shot noise) is the stationary noise of the same low-pass, added before the
+  comparator; :mod:`blinkgl.events.noise` sets its size so that the rate holds at any frame spacing.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+from blinkgl.config.events import V2eConfig
+from blinkgl.errors import EventDataError
+from blinkgl.events.arith import exp_f32, exp_f64, log_f32, log_f64, select
+from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
+from blinkgl.events.esim import draw_thresholds
+from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
+from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
+from blinkgl.events.types import Events
+
+_F = np.float32
+_ZERO, _ONE, _HALF, _JOINT, _SLOPE = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.log(20.0) / 20.0)
+_INF = np.float32(np.inf)
+_SHOT, _LEAK_JITTER = np.uint64(Stream.SHOT), np.uint64(Stream.LEAK_JITTER)
+_U2, _U1, _U1000, _MASK41 = np.uint64(2), np.uint64(1), np.uint64(1000), 2**41 - 1
+_INSERTION_LIMIT = 32
+_FARTHEST, _FAR_BELOW = np.float32(1e6), np.int32(-(2**31))
+MAX_SHOT_FACTOR = 4.0
+"""A pixel with a small threshold is noisier in proportion, but at most this much."""
+REBASE = 0.02
+"""Leak (ln units) after which the leak clock starts anew: small beside a threshold, so that float32 does."""
+
+
+# --- the photoreceptor, shared with the slow twin (elementwise) --------------------------------------------
+@register_jitable
+def lin_log(intensity):
+    """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
+    return select(intensity <= _JOINT, intensity * _SLOPE, log_f32(np.maximum(intensity, _JOINT)))
+
+
+_P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040))
+
+
+@register_jitable
+def decay(k):
+    """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
+    small = np.minimum(k, _HALF)
+    p = small * _P6 + _P5
+    p = p * small + _P4
+    p = p * small + _P3
+    p = p * small + _P2
+    p = p * small + _P1
+    p = p * small + _P0
+    large = np.maximum(k, _HALF)
+    e = exp_f32(-large)
+    return select(k < _HALF, _ONE - small * p, e), select(k < _HALF, p, (_ONE - e) / large)
+
+
+@register_jitable
+def relax(lag, before, now, intensity_before, intensity_now, kappa):
+    """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
+    a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
+    return lag * a - (now - before) * g
+
+
+@register_jitable
+def signal_at(s, base, drift, dx, lag, k):
+    """z at fraction s of the interval, float64; k < 0: no low-pass."""
+    if k < 0:
+        return base + (drift + dx) * s
+    e = exp_f64(-k * s)
+    return base + drift * s + dx * (s - (1.0 - e) / k) + lag * e
+
+
+@register_jitable
+def crossing_fraction(start, target, polarity, base, drift, dx, lag, k, end):
+    """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
+
+    The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
+    1e-6 of the interval unless the curve is flat there."""
+    if k < 0:
+        return min(max((target - base) / (drift + dx), start), 1.0)
+    sign = 1.0 if polarity else -1.0
+    low, high = start, 1.0
+    f_low = sign * ((base + lag if start == 0.0 else signal_at(start, base, drift, dx, lag, k)) - target)
+    if f_low >= 0:
+        return start
+    f_high = sign * (end - target)
+    # z' at both ends in closed form: at the end e^-k follows from z itself.
+    fall = lag * k + dx
+    rise = drift + dx
+    e_end = (end - base - rise + dx / k) / (lag + dx / k) if fall != 0.0 else 0.0
+    v_low = sign * (rise - fall * (1.0 if start == 0.0 else exp_f64(-k * start)))
+    v_high = sign * (rise - fall * e_end)
+    width, height = high - low, f_high - f_low
+    u = -f_low / height
+    s = low + width * u
+    if v_low > 0 and v_high > 0:
+        m_low, m_high = height / (v_low * width), height / (v_high * width)
+        guess = u * ((1.0 - u) * ((1.0 - u) * m_low - u * m_high) + u * (3.0 - 2.0 * u))
+        if 0.0 < guess < 1.0:
+            s = low + width * guess
+    for _ in range(60):
+        e = exp_f64(-k * s)
+        f = sign * (base + drift * s + dx * (s - (1.0 - e) / k) + lag * e - target)
+        if f < 0:
+            low = s
+        else:
+            high = s
+        slope = sign * (rise - fall * e)
+        following = s - f / slope if slope > 0 else -1.0
+        if not (low <= following <= high):
+            following = 0.5 * (low + high)
+        moved = abs(following - s)
+        s = following
+        if moved * (1.0 + k) < 1e-3:  # the error after a Newton step is about its square
+            break
+    return s
+
+
+# --- shot noise --------------------------------------------------------------------------------------------
+@register_jitable
+def shot_gap_ns(seed, block, index, rate_per_ns):
+    """Draws number ``index`` of a block: (ns to the event after it, pixel within the block)."""
+    u, v = uniform2(seed, block, _SHOT, index * _U2)
+    return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), np.int64(v * BLOCK)
+
+
+@register_jitable
+def shot_rate_factor(intensity):
+    """Noise falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR 0.25)."""
+    return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
+
+
+class Pixels(NamedTuple):
+    """Per-pixel arrays, flat; size 0 when the feature is off. What the photoreceptor holds is of the frame before."""
+
+    intensity: np.ndarray  # float32 DN
+    x: np.ndarray  # float32 lin-log
+    lag: np.ndarray  # float32 y - x; [] without low-pass
+    noise: np.ndarray  # float32 photoreceptor noise, standard normal; []
+    upper: np.ndarray  # float32 levels; -inf and +inf in the dead time, so that the pixel is looked at
+    lower: np.ndarray
+    on: np.ndarray  # float32 thresholds, constant
+    off: np.ndarray
+    leak: np.ndarray  # float32, per second; changes with jitter
+    leak_mean: np.ndarray
+    fired: np.ndarray  # int32 count of events, for the jitter's draws
+    release: np.ndarray  # int64 ns, end of the dead time or NEVER
+    clock_ns: np.ndarray  # (blocks,) int64 time of the next shot-noise candidate; []
+    clock_index: np.ndarray  # (blocks,) int64 its number
+
+
+class Interval(NamedTuple):
+    t0_ns: int
+    dt_ns: int
+    base_us: int
+    since_epoch_0: float  # seconds from the leak epoch to both ends
+    since_epoch_1: float
+    kappa: float
+    scale: np.float32
+    seed: np.uint64
+    width: int
+    refractory_ns: int
+    leak_jitter: float
+    shot_rate_per_ns: float  # of a block of pixels at the largest rate
+    shot_largest: float  # largest ratio theta_nominal / theta
+    theta_on: float
+    theta_off: float
+    inverse_threshold: float
+    bound_per_pixel: int
+
+
+@numba.njit(**JIT)
+def _scale_block(frame, scale, out):
+    for i in range(frame.size):
+        out[i] = frame[i] * scale
+
+
+@numba.njit(**JIT)
+def _lin_log_block(intensity, out, z):
+    for i in range(intensity.size):
+        x = lin_log(intensity[i])
+        out[i] = x
+        z[i] = x
+
+
+@numba.njit(**JIT)
+def _lookup_block(codes, table, x_table, intensity, x, z):
+    for i in range(codes.size):
+        intensity[i] = table[codes[i]]
+        x[i] = x_table[codes[i]]
+        z[i] = x_table[codes[i]]
+
+
+@numba.njit(**JIT)
+def _relax_block(lag, before, now, intensity_before, intensity_now, kappa, out, z):
+    for i in range(now.size):
+        lag_now = relax(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
+        out[i] = lag_now
+        z[i] += lag_now
+
+
+@numba.njit(**JIT)
+def _add_scaled_block(a, scale, out):
+    for i in range(a.size):
+        out[i] += a[i] * scale
+
+
+@numba.njit(**JIT)
+def _copy_block(source, target):
+    for i in range(source.size):
+        target[i] = source[i]
+
+
+@numba.njit(**JIT)
+def _flag_block(z, upper, lower, flags):
+    """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
+    farthest = _FAR_BELOW
+    for i in range(z.size):
+        above, below = np.float32(z[i] - upper[i]), np.float32(lower[i] - z[i])
+        beyond = np.float32(select(above > below, above, below))
+        flags[i] = np.uint8(beyond >= _ZERO)
+        farthest = max(farthest, beyond.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
+    return np.int32(farthest).view(np.float32)
+
+
+@numba.njit(**JIT)
+def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
+    """Shot noise of one block in the interval: accepted events into ``keys`` (pixel in block << 42 | ns from the
+    interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1 events
+    when ``keys`` is too small."""
+    count, first, end_ns = 0, block * BLOCK, v.t0_ns + v.dt_ns
+    t_ns, index = p.clock_ns[block], p.clock_index[block]
+    while t_ns <= end_ns:
+        gap, offset = shot_gap_ns(v.seed, np.uint64(block), np.uint64(index), v.shot_rate_per_ns)
+        if offset < pixels_in_block:
+            i = first + offset
+            after = max(t_ns - v.t0_ns, 0)
+            s = after / v.dt_ns
+            intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * s
+            u, w = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)
+            on = u < 0.5
+            ratio = v.theta_on / p.on[i] if on else v.theta_off / p.off[i]
+            if w < min(ratio, MAX_SHOT_FACTOR) / v.shot_largest * shot_rate_factor(intensity):
+                if count == keys.size:
+                    return -1, t_ns, index
+                key = (offset << 42) | (after << 1) | np.int64(on)
+                place = count
+                if count < _INSERTION_LIMIT:
+                    while place > 0 and keys[place - 1] > key:
+                        keys[place] = keys[place - 1]
+                        place -= 1
+                keys[place] = key
+                count += 1
+        index += 1
+        t_ns += gap
+    if count > _INSERTION_LIMIT:
+        keys[:count].sort()
+    return count, t_ns, index
+
+
+@numba.njit(**JIT)
+def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, begin):
+    """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves levels.
+
+    ``now``: (intensity, x, lag, noise) of the block at the interval's end. Returns (end of the events, cut)."""
+    out, cut, noise = begin, 0, 0
+    intensity_now, x_now, lag_now, noise_now = now
+    dt_ns, dt = v.dt_ns, v.dt_ns * 1e-9
+    start_ns, end_ns = v.t0_ns - 1000 * v.base_us, v.t0_ns + v.dt_ns
+    y = first // v.width
+    row_end = (y + 1) * v.width
+    for j in range(count):
+        i = np.int64(active[j])
+        o = i - first
+        while i >= row_end:
+            y += 1
+            row_end += v.width
+        pixel = (y << 17) | ((i - row_end + v.width) << 1)
+        leak = np.float64(p.leak[i]) if p.leak.size else 0.0
+        x0 = np.float64(p.x[i])
+        dx = np.float64(x_now[o]) - x0
+        lag, k = 0.0, -1.0
+        if p.lag.size:
+            lag = np.float64(p.lag[i])
+            k = v.kappa * (0.5 * (np.float64(p.intensity[i]) + np.float64(intensity_now[o])) + 20.0)
+        shift = 0.0
+        if p.noise.size:
+            x0 += np.float64(p.noise[i])
+            shift = np.float64(noise_now[o]) - np.float64(p.noise[i])
+        base, drift = x0 + leak * v.since_epoch_0, shift + leak * dt
+        end = base + drift + dx  # z(1); the low-pass has been evaluated already
+        if p.lag.size:
+            end += np.float64(lag_now[o])
+        up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
+        on, off = np.float64(p.on[i]), np.float64(p.off[i])
+        s, now_ns, dead = 0.0, np.int64(0), False
+        if p.release.size and p.release[i] != NEVER_NS:
+            if p.release[i] > end_ns:
+                dead = True
+            else:
+                now_ns = max(p.release[i] - v.t0_ns, 0)
+                s = now_ns / dt_ns
+                reference = signal_at(s, base, drift, dx, lag, k)
+                up, down = reference + on, reference - off
+                p.release[i] = NEVER_NS
+        while noise < noise_end and (keys[noise] >> 42) < o:
+            noise += 1
+        emitted = 0
+        while not dead:
+            while noise < noise_end and (keys[noise] >> 42) == o and ((keys[noise] >> 1) & _MASK41) < now_ns:
+                noise += 1
+            fires, polarity, target = False, np.int64(0), 0.0
+            if end >= up:
+                fires, polarity, target = True, np.int64(1), up
+            elif end <= down:
+                fires, target = True, down
+            event_s, event_ns, reference = 2.0, np.int64(0), target
+            if fires:
+                event_s = crossing_fraction(s, target, polarity, base, drift, dx, lag, k, end)
+                event_ns = np.int64(event_s * dt_ns)
+            from_noise = False
+            if noise < noise_end and (keys[noise] >> 42) == o:
+                noise_ns = (keys[noise] >> 1) & _MASK41
+                if not fires or noise_ns <= event_ns:
+                    fires, from_noise, polarity, event_ns = True, True, keys[noise] & 1, noise_ns
+                    event_s = noise_ns / dt_ns
+                    noise += 1
+            if not fires:
+                break
+            if emitted < cap:
+                packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | pixel | polarity
+                out += 1
+                emitted += 1
+            else:
+                cut += 1
+            s, now_ns = event_s, event_ns
+            if p.fired.size:
+                p.fired[i] += 1
+                a, b = normal2(v.seed, np.uint64(i), _LEAK_JITTER, np.uint64(p.fired[i]))
+                p.leak[i] = np.float32(p.leak_mean[i] / max(0.1, 1.0 + v.leak_jitter * a))
+                change = np.float64(p.leak[i]) - leak
+                leak += change
+                reference += change * (v.since_epoch_0 + s * dt)  # the same reference, seen from the new drift
+                base, drift = x0 + leak * v.since_epoch_0, shift + leak * dt
+                end += change * v.since_epoch_1
+            if p.release.size:
+                now_ns = event_ns + v.refractory_ns
+                if now_ns > dt_ns:
+                    p.release[i] = v.t0_ns + now_ns
+                    dead = True
+                    break
+                s = now_ns / dt_ns
+            if from_noise or p.release.size:
+                reference = signal_at(s, base, drift, dx, lag, k)
+            up, down = reference + on, reference - off
+        if dead:
+            p.upper[i], p.lower[i] = -_INF, _INF
+        else:
+            p.upper[i], p.lower[i] = np.float32(up), np.float32(down)
+    return out, cut
+
+
+@numba.njit(**JIT)
+def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
+    """Band kernel, see :meth:`Emulator._run`."""
+    cut, pixels = 0, p.x.size
+    flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
+    z, intensity, x, lag, noise = (np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
+                                   np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32))
+    keys = np.empty(BLOCK, np.int64)
+    kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
+    for block in range(first_block, stop_block):
+        s = block * BLOCK
+        e = min(s + BLOCK, pixels)
+        n = e - s
+        if n < BLOCK:
+            flags[:] = 0
+        if codes.size:
+            _lookup_block(codes[s:e], table, x_table, intensity[:n], x[:n], z[:n])
+        else:
+            _scale_block(frame[s:e], v.scale, intensity[:n])
+            _lin_log_block(intensity[:n], x[:n], z[:n])
+        if p.lag.size:
+            _relax_block(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
+        if p.leak.size:
+            _add_scaled_block(p.leak[s:e], since, z[:n])
+        farthest = _flag_block(z[:n], p.upper[s:e], p.lower[s:e], flags)
+        shots, clock_ns, clock_index = 0, np.int64(0), np.int64(0)
+        if p.clock_ns.size:
+            shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys)
+            while shots < 0:
+                keys = np.empty(2 * keys.size, np.int64)
+                shots, clock_ns, clock_index = _shot_block(block, n, p, v, intensity, keys)
+            for j in range(shots):
+                flags[keys[j] >> 42] = 1
+        if farthest >= _ZERO or shots:
+            count = compact_flags(flags, scratch, s, active)
+            cap = min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
+            if count * cap > share:
+                cap = max(1, share // count)
+            if filled + count * cap > packed.size:
+                return block, filled, cut
+            now = (intensity, x, lag, noise)
+            filled, cut_here = _emit_block(active, count, s, now, keys, shots, p, v, cap, packed, filled)
+            cut += cut_here
+        _copy_block(intensity[:n], p.intensity[s:e])
+        _copy_block(x[:n], p.x[s:e])
+        if p.lag.size:
+            _copy_block(lag[:n], p.lag[s:e])
+        if p.clock_ns.size:
+            p.clock_ns[block], p.clock_index[block] = clock_ns, clock_index
+    return stop_block, filled, cut
+
+
+@numba.njit(**JIT_PARALLEL)
+def _bands(edges, progress, share, packed, frame, codes, table, x_table, p, v):
+    for b in numba.prange(edges.size - 1):
+        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, x_table,
+                                   p, v)
+        progress[b, 0], progress[b, 1] = block, filled
+        progress[b, 2] += cut
+
+
+class V2e(Emulator):
+    """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
+
+    State: 16 bytes per pixel, 4 more with the low-pass, 8 with the dead time, 8 with leak and its jitter, 4 with
+    photoreceptor noise; thresholds are constants."""
+
+    _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_fired", "_release", "_clock_ns",
+              "_clock_index", "_epoch_ns")
+
+    def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0):
+        super().__init__(height, width, seed)
+        self.config = config = config or V2eConfig()
+        pixels = self.height * self.width
+        frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
+        on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
+        self._on, self._off = (c.astype(np.float32) for c in
+                               draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed))
+        self._intensity, self._x, self._upper, self._lower = (frame() for _ in range(4))
+        self._lag, self._noise = frame(config.cutoff_hz > 0), frame(False)
+
+        self._leak_mean = draw_leaks(height, width, config, self._on, self.seed)
+        self._leak = self._leak_mean.copy()
+        jitters = bool(self._leak.size and config.leak_jitter)
+        self._fired = np.zeros(pixels if jitters else 0, np.int32)
+        self._rebase_ns = 2**61
+        if self._leak.size and self._leak.max() > 0:
+            self._rebase_ns = int(REBASE / float(np.median(self._leak[self._leak > 0])) * 1e9)
+        self._epoch_ns = np.zeros(1, np.int64)
+
+        self._refractory_ns = int(round(config.refractory_us * 1000))
+        self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
+
+        shot = config.shot_noise_rate_hz > 0 and not config.photoreceptor_noise
+        blocks = -(-pixels // BLOCK) if shot else 0
+        self._clock_ns, self._clock_index = np.zeros(blocks, np.int64), np.zeros(blocks, np.int64)
+        largest = min(MAX_SHOT_FACTOR, max(float((on / self._on).max()), float((off / self._off).max())))
+        self._shot = (BLOCK * config.shot_noise_rate_hz * largest * 1e-9, largest, on, off)
+        self._inverse_threshold = 1.0 / float(min(self._on.min(), self._off.min()))
+        self._scale = np.float32(config.full_scale)
+        self._tables_changed()
+
+    def _tables_changed(self) -> None:
+        self._table = self._decode * self._scale
+        self._x_table = lin_log(self._table)
+
+    def _start(self, frame: np.ndarray, t_ns: int) -> Events:
+        if frame.dtype == np.uint8:
+            _lookup_block(frame, self._table, self._x_table, self._intensity, self._x, self._upper)
+        else:
+            self._intensity[...] = frame * self._scale
+            self._x[...] = lin_log(self._intensity)
+        reference = self._x
+        if self._leak.size:  # else every pixel's first leak event would come at the same time
+            phase, _ = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))
+            reference = reference - phase.astype(np.float32) * self._on
+        self._upper[...], self._lower[...] = reference + self._on, reference - self._off
+        for block in range(len(self._clock_ns)):
+            gap, _ = shot_gap_ns(self.seed, np.uint64(block), np.uint64(2**62), self._shot[0])
+            self._clock_ns[block] = t_ns + gap
+        self._epoch_ns[0] = t_ns
+        return Events.empty()
+
+    def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
+        config, dt_ns = self.config, t_ns - self.t_ns
+        if self._shot[0] * len(self._clock_ns) * dt_ns > config.max_events_per_step:
+            raise EventDataError("more shot noise than max_events_per_step in one interval", where=f"frame {self.frames}",
+                                 value=f"{dt_ns} ns", accepted="a shorter interval or a lower shot_noise_rate_hz")
+        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._upper, self._lower, self._on, self._off,
+                        self._leak, self._leak_mean, self._fired, self._release, self._clock_ns, self._clock_index)
+        base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
+        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9,
+                            2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0, self._scale, self.seed, self.width,
+                            self._refractory_ns, config.leak_jitter, *self._shot, self._inverse_threshold,
+                            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
+        source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
+        events = self._run(_band, _bands, (*source, self._table, self._x_table, pixels, interval), base_us,
+                           t_ns // 1000 - base_us)
+        if t_ns - epoch >= self._rebase_ns:
+            gone = self._leak * np.float32((t_ns - epoch) * 1e-9)
+            self._upper -= gone
+            self._lower -= gone
+            self._epoch_ns[0] = t_ns
+        return events
+
+
+def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:
+    """Drift of the comparator by leak, ln units per second, (H*W,) float32; empty when there is none.
+
+    Log-normal over the pixels (v2e: 10^(cov N)); hot pixels: exponential around their mean rate.
+    """
+    if config.leak_rate_hz == 0 and config.hot_pixel_fraction == 0:
+        return np.empty(0, np.float32)
+    pixels = pixel_counters(height, width)
+    spread, _ = normal2(seed, pixels, np.uint64(Stream.LEAK), np.uint64(0))
+    rate = config.leak_rate_hz * exp_f64(np.log(10.0) * config.leak_cov_decades * spread)
+    if config.hot_pixel_fraction:
+        u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
+        rate = np.where(u < config.hot_pixel_fraction, -log_f64(v) * config.hot_pixel_rate_hz, rate)
+    return (rate * on).astype(np.float32)

@@ -7,3 +7,12 @@ import os as _os
 _os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str):
+    # Lazy, so that `import blinkgl` stays instant: the emulators bring numba.
+    if name == "simulate":
+        from blinkgl.simulation import simulate
+
+        return simulate
+    raise AttributeError(f"module 'blinkgl' has no attribute {name!r}")

@@ -70,6 +70,67 @@ def generate(
     generate_with_progress(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet)
 
 
+@app.command()
+def simulate(
+    source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")],
+    emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    config: Annotated[Optional[str], typer.Option("--config", help="YAML file of emulator parameters.")] = None,
+    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")] = None,
+    fps: Annotated[Optional[float], typer.Option(help="Frames per second (default: the video's, or the time stamps).")] = None,
+    timestamps: Annotated[Optional[str], typer.Option(help="File of frame times: µs as integers, or seconds with a point.")] = None,
+    gamma: Annotated[Optional[str], typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats).")] = None,
+    interpolate: Annotated[str, typer.Option(help="Between frames: linear, cubic, or motion (dense-flow warp).")] = "linear",
+    max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
+    factor: Annotated[int, typer.Option(min=1, max=1000, help="cubic: steps per given frame.")] = 4,
+    seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
+    preview: Annotated[Optional[str], typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+) -> None:
+    """Turn any video into events."""
+    from blinkgl import commands
+
+    commands.simulate(source, out, quiet, emulator=commands.emulator_options(emulator, config, overrides or []), fps=fps,
+                      timestamps=timestamps, gamma=gamma, interpolate=interpolate, max_px=max_px, factor=factor, seed=seed,
+                      preview=preview, overwrite=overwrite)
+
+
+@app.command()
+def compare(
+    a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
+    b: Annotated[Optional[str], typer.Argument(metavar="B", help="Event file, or frames (video, folder, .npy).")] = None,
+    frames: Annotated[Optional[str], typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
+    out: Annotated[Optional[str], typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
+    fps: Annotated[Optional[float], typer.Option(help="Frame rate of the frames.")] = None,
+    timestamps: Annotated[Optional[str], typer.Option(help="Frame times.")] = None,
+    gamma: Annotated[str, typer.Option(help="Of the frames: linear, srgb or an exponent.")] = "linear",
+    frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
+    interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
+    zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
+) -> None:
+    """Compare two recordings, or a recording with frames: counts, rates, intervals, polarity against brightness."""
+    from blinkgl import commands
+
+    commands.compare(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
+                     interval_ms=interval_ms, zero_time=zero_time)
+
+
+@app.command()
+def convert(
+    source: Annotated[str, typer.Argument(metavar="IN", help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .txt, .csv, .npz, .npy.")],
+    target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
+    format: Annotated[Optional[str], typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
+    size: Annotated[Optional[str], typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
+    zero_time: Annotated[bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+) -> None:
+    """Convert an event file from one format to another."""
+    from blinkgl import commands
+
+    commands.convert(source, target, format=format, size=size, zero_time=zero_time, overwrite=overwrite)
+
+
 # --- frame ------------------------------------------------------------------------------------------------------------
 
 

@@ -38,7 +38,8 @@ def _reason(error: OSError) -> str:
     code = error.errno
     if code is None and (found := re.search(r"errno = (\d+)", str(error))):
         code = int(found.group(1))
-    if code == errno.ENOSPC:
+    # NumPy's tofile and HDF5 say it in words only.
+    if code == errno.ENOSPC or re.search(r"no(t enough free)? space|requested and \d+ written", str(error), re.I):
         return "no space left on the device"
     return os.strerror(code).lower() if code else " ".join(str(error).split())
 

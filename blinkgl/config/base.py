@@ -63,6 +63,12 @@ def _locate(model: type[BaseModel], loc: tuple) -> tuple[list[str], type[BaseMod
             path.append(str(step))
             candidates = [a for c in candidates for a in _arguments(c)] or candidates
             continue
+        table = next((c for c in candidates if typing.get_origin(c) is dict), None)
+        if table is not None:
+            path.append(str(step))
+            candidates = _flatten(typing.get_args(table)[1])
+            owner = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), owner)
+            continue
         holder = next((m for m in models if step in m.model_fields), None)
         if holder is not None:
             path.append(step)

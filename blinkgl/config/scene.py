@@ -6,9 +6,9 @@ whether they exist; the models here only know shapes, units and limits.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Union
+from typing import Annotated, Any, Literal, Union
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from blinkgl.config.base import Config
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
@@ -26,13 +26,49 @@ def _ordered(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
+def _as_pair(value: Any) -> Any:
+    return (value, value) if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+def _as_list(value: Any) -> Any:
+    return (value,) if isinstance(value, str) else value
+
+
+def _one_of(words: tuple, kinds: tuple[str, ...] = ()):
+    """Refuses what is neither one of ``words`` nor a list of ``kinds``: pydantic would name the union's first member only."""
+    def check(value: Any) -> Any:
+        listed = isinstance(value, (list, tuple)) and kinds
+        if not (any(value is w or (isinstance(w, str) and value == w) for w in words) or (listed and all(v in kinds for v in value))):
+            said = ", ".join(str(w).lower() for w in words)
+            raise ValueError(f"must be {said}" + (" or a list of " + ", ".join(kinds) if kinds else ""))
+        return value
+
+    return BeforeValidator(check)
+
+
+def _number_or_three(value: Any) -> Any:
+    items = value if isinstance(value, (list, tuple)) else [value]
+    try:
+        ok = len(items) in ((3,) if items is value else (1,)) and not any(isinstance(v, bool) for v in items) and [float(v) for v in items]
+    except (TypeError, ValueError):
+        ok = False
+    if not ok:
+        raise ValueError("must be a number or a list of three")
+    return value
+
+
+def _greater_than_zero(value: Any) -> Any:
+    if min(value if isinstance(value, tuple) else (value,)) <= 0:
+        raise ValueError("must be greater than 0")
+    return value
+
+
 Positive = Annotated[float, Field(gt=0)]
 Unsigned = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
-PositiveRange = Annotated[tuple[Positive, Positive], AfterValidator(_ordered)]
-UnsignedRange = Annotated[tuple[Unsigned, Unsigned], AfterValidator(_ordered)]
+PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_as_pair), AfterValidator(_ordered)]
+Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
 Vector3 = tuple[float, float, float]
-Color = tuple[Fraction, Fraction, Fraction]
 
 
 class ObjectsConfig(Config):
@@ -50,11 +86,13 @@ class ObjectsConfig(Config):
 class PoolConfig(Config):
     """Where the random world's objects come from."""
 
-    primitives: Literal["all"] | tuple[PrimitiveKind, ...] = Field("all", description="'all' or a list of kinds; [] for none")
+    primitives: Annotated[Literal["all"] | tuple[PrimitiveKind, ...], _one_of(("all",), PRIMITIVE_KINDS)] = Field(
+        "all", description="'all' or a list of kinds; [] for none")
     variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
-    folders: tuple[str, ...] = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
-    urdfs: Literal["auto"] | bool = Field(False, description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that "
-                                        "the same YAML gives other scenes there")
+    folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
+    urdfs: Annotated[Literal["auto"] | bool, _one_of(("auto", True, False))] = Field(
+        False, description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that the same YAML "
+        "gives other scenes there")
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
     max_file_mb: float = Field(512.0, gt=0, description="a larger mesh file is refused unread")
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
@@ -65,10 +103,11 @@ class PoolConfig(Config):
 class TexturesConfig(Config):
     """Where the random world's textures come from."""
 
-    procedural: bool | tuple[TextureKind, ...] = Field(True, description="true, false or a list of kinds")
+    procedural: Annotated[bool | tuple[TextureKind, ...], _one_of((True, False), TEXTURE_KINDS)] = Field(
+        True, description="true, false or a list of kinds")
     variants: int = Field(40, ge=1, le=100_000, description="textures of each procedural kind")
     photographs: bool = Field(True, description="the photographs bundled with scikit-image")
-    folders: tuple[str, ...] = Field((), description="folders searched recursively for images (also .hdr)")
+    folders: Paths = Field((), description="folders searched recursively for images (also .hdr)")
     max_size: int = Field(512, ge=8, le=8192, description="longer image sides are reduced to this, px")
     test_fraction: Fraction = Field(0.1, description="fraction of textures kept for split 'test', chosen by content hash")
     bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unreadable image and draws another")
@@ -83,7 +122,7 @@ class SkyConfig(Config):
     repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
     per_face: bool = Field(True, description="a texture of its own on each face, or one on all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
-    panoramas: tuple[str, ...] = Field((), description="equirectangular images or folders of them (jpg, png, hdr) used instead of the texture pool")
+    panoramas: Paths = Field((), description="equirectangular images or folders of them (jpg, png, hdr) used instead of the texture pool")
 
 
 class GroundConfig(Config):
@@ -117,8 +156,10 @@ class LightConfig(Config):
 
     sun: float = Field(0.9, ge=0, description="strength of the sun, radiance of a white facing surface")
     sky: float = Field(0.6, ge=0, description="strength of the sky")
-    sun_elevation: float | None = Field(None, ge=-90, le=90, description="degrees above the horizon; null: random in [25, 80] (60 where nothing is random)")
-    sun_azimuth: float | None = Field(None, ge=-360, le=360, description="degrees from +x towards +y; null: random (40 where nothing is random)")
+    sun_elevation: float | None = Field(None, ge=-90, le=90, description="degrees above the horizon; null: random in [25, 80] "
+                                        "(60 where nothing is random)")
+    sun_azimuth: float | None = Field(None, ge=-360, le=360, description="degrees from +x towards +y; null: random "
+                                      "(40 where nothing is random)")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
 
@@ -132,7 +173,8 @@ class RandomSceneConfig(Config):
     region: RegionConfig = RegionConfig()
     sky: SkyConfig | None = Field(SkyConfig(), description="null: none, the background is seen")
     ground: GroundConfig | None = Field(GroundConfig(), description="null: none; then every object flies")
-    walls: WallsConfig | bool = Field(False, description="true: four walls")
+    walls: Annotated[WallsConfig, BeforeValidator(lambda v: WallsConfig(count=4 * v) if isinstance(v, bool) else v)] = Field(
+        WallsConfig(), description="true: four walls")
     light: LightConfig = LightConfig()
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
@@ -197,7 +239,8 @@ class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
     primitive: Literal[PrimitiveKind, "grid"] | None = Field(None, description="kind of primitive")
-    parameters: dict[str, float | int | Vector3] = Field({}, description="the primitive's keyword arguments, see blinkgl.scene.primitives")
+    parameters: dict[str, Annotated[int | float | Vector3, BeforeValidator(_number_or_three)]] = Field(
+        {}, description="the primitive's keyword arguments, see blinkgl.scene.primitives")
     file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
     project_uvs: bool = Field(False, description="replace the file's texture coordinates by a box projection")
     uv_size: float = Field(1.0, gt=0, description="edge of one repeat of projected texture coordinates, in the mesh's units")
@@ -238,14 +281,9 @@ class ObjectConfig(KeyedMotionConfig):
     name: str | None = Field(None, description="null: the mesh's name")
     mesh: str = Field(description="a name under scene.meshes")
     material: str | None = Field(None, description="a name under scene.materials; null: the file's own materials")
-    scale: float | Annotated[tuple[Positive, Positive, Positive], Field()] = Field(1.0, description="factor on the mesh, one or per axis")
+    scale: Annotated[float | Vector3, BeforeValidator(_number_or_three), AfterValidator(_greater_than_zero)] = Field(
+        1.0, description="factor on the mesh, one or per axis")
     category: Literal["object", "ground", "wall", "sky"] = "object"
-
-    @model_validator(mode="after")
-    def _scale(self):
-        if isinstance(self.scale, float) and self.scale <= 0:
-            raise ValueError("scale must be greater than 0")
-        return self
 
 
 class ExplicitSceneConfig(Config):

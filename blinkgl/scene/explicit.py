@@ -90,7 +90,8 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
 
 def _known(name: str, table: dict, where: str, what: str) -> None:
     if name not in table:
-        raise ConfigError(f"no such name under {what}", where=where, value=name, accepted="one of: " + ", ".join(table) if table else f"a name under {what}")
+        raise ConfigError(f"no such name under {what}", where=where, value=name,
+                          accepted="one of: " + ", ".join(table) if table else f"a name under {what}")
 
 
 def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int) -> Asset:
@@ -100,7 +101,8 @@ def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_f
             mesh = BUILDERS[config.primitive](**config.parameters)
         except AssetError as error:
             key = (error.where or "").partition(".")[2]
-            raise ConfigError(error.problem, where=f"{where}.parameters" + (f".{key}" if key else ""), value=error.value, accepted=error.accepted) from None
+            raise ConfigError(error.problem, where=f"{where}.parameters" + (f".{key}" if key else ""), value=error.value,
+                              accepted=error.accepted) from None
         return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
     path = resolve(config.file, base)
     if not path.is_file():

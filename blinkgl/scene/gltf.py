@@ -28,7 +28,8 @@ from blinkgl.scene.types import Material, Texture
 
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
-SUPPORTED = {"KHR_materials_unlit", "KHR_texture_transform", "KHR_mesh_quantization", "KHR_materials_emissive_strength", "KHR_lights_punctual"}
+SUPPORTED = {"KHR_materials_unlit", "KHR_texture_transform", "KHR_mesh_quantization", "KHR_materials_emissive_strength",
+             "KHR_lights_punctual"}
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_NODES, _MAX_DEPTH = 200_000, 256
@@ -84,7 +85,8 @@ class Node:
         if self.matrix is not None:
             return self.matrix
         T = np.eye(4)
-        T[:3, :3] = Rotation.from_quat(self.rotation if rotation is None else rotation).as_matrix() * (self.scale if scale is None else scale)
+        turn = Rotation.from_quat(self.rotation if rotation is None else rotation).as_matrix()
+        T[:3, :3] = turn * (self.scale if scale is None else scale)
         T[:3, 3] = self.translation if translation is None else translation
         return T
 
@@ -195,10 +197,9 @@ class Document:
         else:
             values = np.zeros((count, width), dtype)
         if "sparse" in a:
-            sparse = a["sparse"]
-            n = _count(sparse, self.where)
-            at = self._view(sparse["indices"]["bufferView"], sparse["indices"].get("byteOffset", 0), n, 1, np.dtype(_DTYPES[sparse["indices"]["componentType"]]), index)
-            new = self._view(sparse["values"]["bufferView"], sparse["values"].get("byteOffset", 0), n, width, np.dtype(dtype), index)
+            where, what, n = a["sparse"]["indices"], a["sparse"]["values"], _count(a["sparse"], self.where)
+            at = self._view(where["bufferView"], where.get("byteOffset", 0), n, 1, np.dtype(_DTYPES[where["componentType"]]), index)
+            new = self._view(what["bufferView"], what.get("byteOffset", 0), n, width, np.dtype(dtype), index)
             if n and int(at.max()) >= count:
                 raise AssetError(f"accessor {index} has a sparse index outside it", where=self.where)
             values = values.copy()
@@ -250,7 +251,8 @@ class Document:
             else:
                 data = _fetch(image.get("uri", ""), self.path, "image")
             name = str(image.get("name") or f"image-{source}")
-            self._textures[source] = Texture(decode_image(data, self.max_texture, f"{self.where} (image '{name}')"), name, content_hash(data))
+            pixels = decode_image(data, self.max_texture, f"{self.where} (image '{name}')")
+            self._textures[source] = Texture(pixels, name, content_hash(data))
         return self._textures[source]
 
     # ---- animations
@@ -293,7 +295,8 @@ def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, m
         tree, binary = _parse(data, where)
         required = [e for e in tree.get("extensionsRequired", []) if e not in SUPPORTED]
         if required:
-            raise AssetError("the file needs an extension that is not supported", where=where, value=required[0], accepted="a plain glTF 2.0 export")
+            raise AssetError("the file needs an extension that is not supported", where=where, value=required[0],
+                             accepted="a plain glTF 2.0 export")
         document = Document(path, tree, _buffers(tree, binary, path), max_texture, textures)
         document.nodes = _nodes(tree, where)
         _check_faces(document, max_faces)
@@ -354,7 +357,8 @@ def _buffers(tree: dict, binary: bytes, path: Path) -> list[bytes]:
     for number, buffer in enumerate(_items(tree, "buffers", str(path))):
         data = _fetch(buffer["uri"], path, "buffer") if "uri" in buffer else binary if number == 0 else b""
         if len(data) < int(buffer.get("byteLength", 0)):
-            raise AssetError(f"buffer {number} is truncated", where=str(path), value=len(data), accepted=f"{buffer.get('byteLength')} bytes")
+            raise AssetError(f"buffer {number} is truncated", where=str(path), value=len(data),
+                             accepted=f"{buffer.get('byteLength')} bytes")
         buffers.append(data)
     return buffers
 
@@ -391,7 +395,8 @@ def _nodes(tree: dict, where: str) -> dict[int, Node]:
         n = raw[_index(i, len(raw), "node", where)]
         matrix = np.array(n["matrix"], float).reshape(4, 4).T if "matrix" in n else None
         rest = [tuple(map(float, n.get(k, d))) for k, d in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))]
-        if not np.isfinite(np.concatenate([np.ravel(matrix) if matrix is not None else [0.0], *rest])).all() or not np.linalg.norm(rest[1]) > 1e-9:
+        numbers = np.concatenate([[0.0] if matrix is None else matrix.ravel(), *rest])
+        if not np.isfinite(numbers).all() or np.linalg.norm(rest[1]) < 1e-9:
             raise AssetError("a node's transform is not finite", where=where, value=n.get("name", i))
         nodes[i] = Node(str(n.get("name") or f"node-{i}"), parent, n.get("mesh"), n.get("camera"), *rest, matrix)
         stack += [(int(c), i, depth + 1) for c in reversed(n.get("children", []))]

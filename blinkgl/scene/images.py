@@ -78,8 +78,7 @@ def _decode_ldr(data: bytes, where: str) -> np.ndarray:
             warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(data)) as opened:
                 width, height = opened.size
-                if width * height > MAX_PIXELS:
-                    raise AssetError("the image is too large", where=where, value=f"{width}x{height}", accepted=f"at most {MAX_PIXELS // 10**6} Mpx")
+                _check_size(width, height, where)
                 opened.load()
                 image = ImageOps.exif_transpose(opened)
                 if image.mode.startswith("I") or image.mode == "F":     # 16-bit grey
@@ -89,15 +88,15 @@ def _decode_ldr(data: bytes, where: str) -> np.ndarray:
     except AssetError:
         raise
     except Exception as error:     # Pillow's decoders raise anything: OSError, SyntaxError, ValueError, struct.error, …
-        raise AssetError(f"the image is corrupt or of an unknown format ({type(error).__name__}: {' '.join(str(error).split())[:80]})", where=where) from None
+        detail = f"{type(error).__name__}: {' '.join(str(error).split())[:80]}"
+        raise AssetError(f"the image is corrupt or of an unknown format ({detail})", where=where) from None
 
 
 def _decode_hdr(data: bytes, where: str) -> np.ndarray:
     size = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
     if size is None:
         raise AssetError("the image is corrupt (no size in the Radiance header)", where=where)
-    if int(size[1]) * int(size[2]) > MAX_PIXELS:
-        raise AssetError("the image is too large", where=where, value=f"{int(size[2])}x{int(size[1])}", accepted=f"at most {MAX_PIXELS // 10**6} Mpx")
+    _check_size(int(size[2]), int(size[1]), where)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -107,6 +106,11 @@ def _decode_hdr(data: bytes, where: str) -> np.ndarray:
     image = image[..., 2::-1].astype(np.float32)
     level = float(np.percentile(image.max(axis=2), 90))
     return np.clip(image * (0.8 / level if level > 0 else 1.0), 0, HDR_WHITE)
+
+
+def _check_size(width: int, height: int, where: str) -> None:
+    if width * height > MAX_PIXELS:
+        raise AssetError("the image is too large", where=where, value=f"{width}x{height}", accepted=f"at most {MAX_PIXELS // 10**6} Mpx")
 
 
 def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:

@@ -49,8 +49,8 @@ def scene_from_file(config: FileSceneConfig, camera, t0_ns: int, t1_ns: int, bas
     return unlit(scene) if config.light.unlit else scene
 
 
-def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: str | int | None = None, camera_path: PosePath | None = None,
-              intrinsics: str = "config", animation: str | int | None = 0, light: Light = Light(), background: float = 0.2,
+def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: str | int | None = None,
+              camera_path: PosePath | None = None, intrinsics: str = "config", animation: str | int | None = 0, light: Light = Light(), background: float = 0.2,
               max_faces: int = 5_000_000, max_texture: int = 2048) -> Scene:
     """A glTF 2.0 file with its materials, cameras and node animations.
 
@@ -84,7 +84,8 @@ def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: 
 
 
 def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
-                 near: float = 0.05, light: Light = Light(), background: float = 0.2, max_faces: int = 5_000_000, max_texture: int = 2048) -> Scene:
+                 near: float = 0.05, light: Light = Light(), background: float = 0.2, max_faces: int = 5_000_000,
+                 max_texture: int = 2048) -> Scene:
     """A ``trimesh.Scene``.
 
     camera : intrinsics; None takes the scene's own camera (resolution, K).
@@ -120,8 +121,8 @@ def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000,
     return _scene(objects, scene_camera, t0_ns, t1_ns, light, background, log)
 
 
-def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, intrinsics: str = "file",
-                  up: str = "z", light: Light | None = None, background: float | None = None, max_texture: int = 2048) -> Scene:
+def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
+                  intrinsics: str = "file", up: str = "z", light: Light | None = None, background: float | None = None, max_texture: int = 2048) -> Scene:
     """A ``pyrender.Scene`` (pyrender itself is not imported here).
 
     camera : width, height and, with intrinsics="config", the rest; "file" takes the main camera's yfov or fx, fy, cx, cy.
@@ -146,13 +147,17 @@ def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, 
         raise AssetError("the scene has no faces", where="from_pyrender", accepted="a scene with a mesh")
     node = scene.main_camera_node
     if node is None and (camera_path is None or intrinsics == "file"):
-        raise ConfigError("the pyrender scene has no camera", where="from_pyrender", accepted="a camera node, or camera_path and intrinsics='config'")
+        raise ConfigError("the pyrender scene has no camera", where="from_pyrender",
+                          accepted="a camera node, or camera_path and intrinsics='config'")
     if camera_path is None:
         camera_path = StaticPath(split_rigid(turn @ scene.get_pose(node))[0] @ CV_FROM_GL, t0_ns, t1_ns)
     changes = _pyrender_intrinsics(node.camera, camera) if intrinsics == "file" else {}
     if light is None:
         suns = sorted(getattr(scene, "directional_light_nodes", ()), key=lambda n: str(n.name or ""))
-        light = Light() if not suns else replace(Light(), sun_direction=tuple(float(v) for v in (split_rigid(turn @ scene.get_pose(suns[0]))[0])[:3, 2]))
+        light = Light()
+        if suns:    # it shines along its -z axis
+            T, _ = split_rigid(turn @ scene.get_pose(suns[0]))
+            light = replace(light, sun_direction=tuple(float(v) for v in T[:3, 2]))
     if background is None:
         background = float(np.mean(np.asarray(scene.bg_color, float)[:3]))
     return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, log)
@@ -160,7 +165,10 @@ def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, 
 
 def unlit(scene: Scene) -> Scene:
     """The scene with radiance = albedo everywhere."""
-    return replace(scene, objects=tuple(replace(o, parts=tuple(Part(p.mesh, replace(p.material, unlit=True)) for p in o.parts)) for o in scene.objects))
+    def of(parts):
+        return tuple(Part(p.mesh, replace(p.material, unlit=True)) for p in parts)
+
+    return replace(scene, objects=tuple(replace(o, parts=of(o.parts)) for o in scene.objects))
 
 
 def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -214,8 +222,8 @@ def _channels(document: gltf.Document, animation: str | int | None) -> list[gltf
     names = [str(a.get("name", i)) for i, a in enumerate(listed)]
     index = names.index(animation) if animation in names else animation
     if not isinstance(index, int) or not 0 <= index < len(listed):
-        raise ConfigError("no such animation in the file", where="scene.animation", value=animation,
-                          accepted=("one of: " + ", ".join(names) + f", or an index below {len(names)}") if names else "null (the file has none)")
+        accepted = f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
+        raise ConfigError("no such animation in the file", where="scene.animation", value=animation, accepted=accepted)
     return document.channels(index)
 
 
@@ -267,7 +275,8 @@ def _camera_node(document: gltf.Document, name: str | int | None) -> int:
         return order[name]
     if name in names:
         return names[name]
-    raise ConfigError("no such camera in the file", where="scene.camera", value=name, accepted="one of: " + ", ".join(names) + f", or an index below {len(order)}")
+    raise ConfigError("no such camera in the file", where="scene.camera", value=name,
+                      accepted=f"one of: {', '.join(names)}, or an index below {len(order)}")
 
 
 def _gltf_intrinsics(document: gltf.Document, node: int, camera) -> dict:
@@ -275,7 +284,8 @@ def _gltf_intrinsics(document: gltf.Document, node: int, camera) -> dict:
     perspective = description.get("perspective", {})
     yfov = perspective.get("yfov")
     if description.get("type") != "perspective" or not isinstance(yfov, (int, float)) or not 0 < yfov < np.pi:
-        raise AssetError("the camera is not a perspective one with a valid yfov", where=document.where, value=yfov, accepted="intrinsics: config")
+        raise AssetError("the camera is not a perspective one with a valid yfov", where=document.where, value=yfov,
+                         accepted="intrinsics: config")
     focal = camera.height / 2 / np.tan(yfov / 2)
     znear = perspective.get("znear", camera.near)
     return dict(fx=focal, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2, near=float(znear) if znear > 0 else camera.near)
@@ -294,7 +304,8 @@ def _pyrender_piece(primitive, max_texture: int, name: str) -> gltf.Piece:
         if texture is not None:
             image = np.asarray(texture.convert("RGB") if hasattr(texture, "convert") else texture)
             image = np.round(image * 255).astype(np.uint8) if image.dtype.kind == "f" else image
-            image = np.repeat(image[..., None] if image.ndim == 2 else image[..., :1], 3, axis=2) if image.ndim == 2 or image.shape[2] < 3 else image[..., :3]
+            image = image[..., None] if image.ndim == 2 else image
+            image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
             texture = Texture(shrink(np.ascontiguousarray(image), max_texture), f"{name} texture", content_hash(image.tobytes()))
         colour = (1.0, 1.0, 1.0) if factor is None else tuple(float(c) for c in np.asarray(factor, float)[:3])
         material = Material(texture, colour, double_sided=bool(getattr(source, "doubleSided", False)))
@@ -308,7 +319,8 @@ def _pyrender_intrinsics(source, camera) -> dict:
         focal = camera.height / 2 / np.tan(source.yfov / 2)
         # pyrender scales x by the aspect ratio: the viewport's, unless the camera states one.
         aspect = getattr(source, "aspectRatio", None) or camera.width / camera.height
-        return dict(fx=focal * camera.width / camera.height / aspect, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2, near=near)
+        fx = focal * camera.width / camera.height / aspect
+        return dict(fx=fx, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2, near=near)
     if hasattr(source, "fx"):
         # pyrender counts from the image's corner, we from the first pixel's centre.
         return dict(fx=float(source.fx), fy=float(source.fy), cx=float(source.cx) - 0.5, cy=float(source.cy) - 0.5, near=near)

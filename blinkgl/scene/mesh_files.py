@@ -62,7 +62,8 @@ def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_B
     try:
         size = path.stat().st_size
         if size > max_bytes:
-            raise AssetError("the mesh file is too large", where=where, value=f"{size / 1e6:.0f} MB", accepted=f"at most {max_bytes / 1e6:.0f} MB")
+            raise AssetError("the mesh file is too large", where=where, value=f"{size / 1e6:.0f} MB",
+                             accepted=f"at most {max_bytes / 1e6:.0f} MB")
         data = path.read_bytes()
     except OSError as error:
         raise AssetError(f"cannot read the mesh: {error.strerror or error}", where=where) from None
@@ -151,12 +152,12 @@ def _material(visual, max_texture: int, where: str) -> Material | None:
         image = material.image
         diffuse = material.diffuse
         # An untouched default is no material; a texture is not darkened by the usual grey diffuse default.
-        if image is None and material.name is None and tuple(np.asarray(diffuse)[:3]) == tuple(np.asarray(trimesh.visual.color.DEFAULT_COLOR)[:3]):
+        if image is None and material.name is None and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3]):
             return None
         colour = (1.0, 1.0, 1.0) if image is not None else gltf.to_linear(np.asarray(diffuse, float)[:3] / 255)
     else:
-        factor = (1.0, 1.0, 1.0) if factor is None else np.asarray(factor, float)[:3] / (255 if np.asarray(factor).dtype.kind in "iu" else 1)
-        colour = tuple(float(c) for c in factor)       # glTF factors are linear
+        factor = np.ones(3) if factor is None else np.asarray(factor)[:3]
+        colour = tuple(float(c) for c in (factor / 255 if factor.dtype.kind in "iu" else factor))     # glTF factors are linear
     texture = None
     if image is not None:
         stream = io.BytesIO()
@@ -209,11 +210,11 @@ def _check_ply(data: bytes, max_faces: int, where: str) -> None:
     if not data.startswith(b"ply") or end < 0:
         raise AssetError("the mesh is corrupt (no PLY header)", where=where)
     for name, count in re.findall(rb"element\s+(\w+)\s+(\d+)", data[:end]):
+        what = "faces" if name == b"face" else f"{name.decode(errors='replace')} elements"
         if int(count) > (max_faces if name == b"face" else 3 * max_faces + 1_000_000):
-            raise AssetError(f"the mesh has too many {'faces' if name == b'face' else name.decode(errors='replace') + ' elements'}", where=where,
-                             value=int(count), accepted=f"at most {max_faces} faces")
+            raise AssetError(f"the mesh has too many {what}", where=where, value=int(count), accepted=f"at most {max_faces} faces")
         if int(count) > len(data) - end:       # an element takes a byte at least
-            raise AssetError(f"the mesh is truncated: {int(count)} {name.decode(errors='replace')} elements in {len(data)} bytes", where=where)
+            raise AssetError(f"the mesh is truncated: {int(count)} {what} in {len(data)} bytes", where=where)
 
 
 def _check_obj(data: bytes, max_faces: int, where: str) -> None:

@@ -133,6 +133,11 @@ def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return vertices[first], index.reshape(-1)[faces]
 
 
+def _components(left: np.ndarray, right: np.ndarray, count: int) -> tuple[int, np.ndarray]:
+    """(number of, (count,) label of) the connected components of ``count`` nodes joined by edges left-right."""
+    return connected_components(coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(count, count)), directed=False)
+
+
 def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
     """(closed, inside_out) of a welded mesh.
 
@@ -148,7 +153,7 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
     start, end = welded.ravel(), np.roll(welded, -1, axis=1).ravel()
     if not np.array_equal(np.sort(start * count + end), np.sort(end * count + start)):
         return False, False
-    _, shell = connected_components(coo_matrix((np.ones(len(start), np.int8), (start, end)), shape=(count, count)), directed=False)
+    _, shell = _components(start, end, count)
     a, b, c = ((points - points.mean(axis=0))[welded[:, i]] for i in range(3))
     volumes = np.bincount(shell[welded[:, 0]], weights=np.einsum("ij,ij->i", a, np.cross(b, c)) / 6)
     # A sheet made of two coincident layers has no volume and is as good as closed.
@@ -177,7 +182,7 @@ def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool
     near = cKDTree(points).query_pairs(extent * COARSE_WELD_RELATIVE, output_type="ndarray") if len(points) < 100_000 else []
     if len(near) == 0 or len(near) > 4 * len(points):      # nothing to merge, or so fine a mesh that all of it would be
         return False, False
-    count, label = connected_components(coo_matrix((np.ones(len(near), np.int8), (near[:, 0], near[:, 1])), shape=(len(points),) * 2), directed=False)
+    count, label = _components(near[:, 0], near[:, 1], len(points))
     merged = np.empty((count, 3))
     merged[label] = points
     return closedness(merged, label[welded].astype(np.int64))
@@ -207,7 +212,7 @@ def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, 
     direct = a[first] == a[second]
     left = np.concatenate([first, f_next])
     right = np.concatenate([np.where(direct, second, s_next), np.where(direct, s_next, second)])
-    _, fan = connected_components(coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(3 * count, 3 * count)), directed=False)
+    _, fan = _components(left, right, 3 * count)
     weighted = (unit[:, None, :] * angle[:, :, None]).reshape(-1, 3)
     total = np.stack([np.bincount(fan, weights=weighted[:, i], minlength=fan.max() + 1) for i in range(3)], axis=1)[fan]
     length = np.linalg.norm(total, axis=1, keepdims=True)
@@ -252,7 +257,8 @@ def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, *
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     uvs = uvs.reshape(-1, 2).astype(np.float32)
     # Adding 0.0 turns -0.0 into 0.0, which would otherwise split vertices. Normals are compared to 1e-5: float noise.
-    rows = np.concatenate([(positions + 0.0).view(np.int64), np.round(normals * 1e5).astype(np.int64), (uvs + 0.0).view(np.int32).astype(np.int64)], axis=1)
+    rows = np.concatenate([(positions + 0.0).view(np.int64), np.round(normals * 1e5).astype(np.int64),
+                           (uvs + 0.0).view(np.int32).astype(np.int64)], axis=1)
     _, first, index = np.unique(np.ascontiguousarray(rows).view([("", np.int64)] * 8).ravel(), return_index=True, return_inverse=True)
     # Vertices in order of first use: good for the vertex cache, and independent of how np.unique sorts.
     order = np.argsort(first, kind="stable")

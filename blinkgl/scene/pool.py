@@ -58,9 +58,9 @@ class Pool:
     where: str
     what: str
     bad_assets: str = "error"
-    cache_size: int = 128
+    cache_bytes: int = 256_000_000
     _cache: OrderedDict = field(default_factory=OrderedDict, repr=False)
-    _bad: set = field(default_factory=set, repr=False)
+    _cached_bytes: int = 0
 
     def split(self, split: str) -> dict[str, tuple[Entry, ...]]:
         """source -> its entries on this side; sources without any are left out. ConfigError when nothing is left."""
@@ -78,14 +78,15 @@ class Pool:
         return {source: tuple(entries) for source, entries in sides.items()}
 
     def load(self, entry: Entry):
-        """The entry's content, from a cache of the last ``cache_size``."""
+        """The entry's content, from a cache of the last ones within ``cache_bytes``."""
         if entry.source_hash in self._cache:
             self._cache.move_to_end(entry.source_hash)
             return self._cache[entry.source_hash]
         loaded = self.load_entry(entry)
         self._cache[entry.source_hash] = loaded
-        if len(self._cache) > self.cache_size:
-            self._cache.popitem(last=False)
+        self._cached_bytes += _bytes_of(loaded)
+        while self._cached_bytes > self.cache_bytes and len(self._cache) > 1:
+            self._cached_bytes -= _bytes_of(self._cache.popitem(last=False)[1])
         return loaded
 
     def draw(self, rng: np.random.Generator, split: str, log: list[str] | None = None):
@@ -103,6 +104,13 @@ class Pool:
                 if log is not None:
                     log.append(f"skipped: {error}")
         raise AssetError(f"{_MAX_REDRAWS} {self.what} drawn in a row are unusable", where=self.where)
+
+
+def _bytes_of(loaded: Texture | Asset) -> int:
+    if isinstance(loaded, Texture):
+        return loaded.image.nbytes
+    own = sum(a.nbytes for p in loaded.parts for a in (p.mesh.vertices, p.mesh.faces, p.mesh.normals, p.mesh.uvs))
+    return own + sum(t.image.nbytes for t in {id(p.material.texture): p.material.texture for p in loaded.parts}.values() if t is not None)
 
 
 def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
@@ -166,7 +174,8 @@ def resolve(path: str, base: Path) -> Path:
 def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...], what: str) -> list[Path]:
     """Files with these suffixes, recursively, sorted by name. ConfigError when the folder is missing or holds none."""
     if not folder.is_dir():
-        raise ConfigError("no such folder" if not folder.exists() else "is not a folder", where=where, value=given, accepted=f"a folder of {what}")
+        raise ConfigError("is not a folder" if folder.exists() else "no such folder", where=where, value=given,
+                          accepted=f"a folder of {what}")
     try:
         files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
     except OSError as error:
@@ -184,7 +193,8 @@ def _folder_entries(folder: Path, where: str, given: str, suffixes, limit: int |
         try:
             size = file.stat().st_size
             if limit is not None and size > limit:
-                raise AssetError("the mesh file is too large", where=str(file), value=f"{size / 1e6:.0f} MB", accepted=f"at most {limit / 1e6:.0f} MB")
+                raise AssetError("the mesh file is too large", where=str(file), value=f"{size / 1e6:.0f} MB",
+                                 accepted=f"at most {limit / 1e6:.0f} MB")
             digest = content_hash(file.read_bytes(), *dependencies(file))
         except OSError as error:
             raise AssetError(f"cannot read the file: {error.strerror or error}", where=str(file)) from None
@@ -212,5 +222,6 @@ def _random_urdfs(setting, where: str) -> Path | None:
     if folder is not None and folder.is_dir():
         return folder
     if setting is True:
-        raise ConfigError("pybullet's random_urdfs are not installed", where=where, value=True, accepted="run 'pip install pybullet', or set it to auto or false")
+        raise ConfigError("pybullet's random_urdfs are not installed", where=where, value=True,
+                          accepted="run 'pip install pybullet', or set it to auto or false")
     return None

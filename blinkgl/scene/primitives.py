@@ -20,6 +20,7 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.meshes import closedness, make_mesh, transform_mesh, weld
 from blinkgl.scene.types import Mesh
 
+_LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1}
 _MAX_SEGMENTS = 4096
 
 
@@ -37,14 +38,14 @@ def _primitive(build):
         where = build.__name__
         unknown = set(parameters) - set(signature.parameters)
         if unknown:
-            raise AssetError("unknown parameter", where=where, value=sorted(unknown)[0], accepted="one of " + ", ".join(signature.parameters))
+            raise AssetError("unknown parameter", where=where, value=sorted(unknown)[0],
+                             accepted="one of " + ", ".join(signature.parameters))
         bound = signature.bind(**parameters)
         bound.apply_defaults()
         for key, value in bound.arguments.items():
             default = signature.parameters[key].default
             if isinstance(default, int):
-                low = 3 if key in ("segments", "sides", "tube_segments") else 2 if key == "rings" else 0 if key == "subdivisions" and where == "icosphere" else 1
-                high = 7 if where == "icosphere" else _MAX_SEGMENTS
+                low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MAX_SEGMENTS)
                 if float(value) != int(value) or not low <= value <= high:
                     raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=f"a whole number in {low}..{high}")
                 bound.arguments[key] = int(value)
@@ -181,11 +182,12 @@ def cone(radius=0.5, height=1.0, segments=32, rings=4):
     t = np.linspace(0, 1, rings)
     profile = np.stack([radius * (1 - t), (t - 0.5) * height], axis=1)
     profile[-1, 0] = 0.0
-    positions, normals, uvs, faces = _revolve(profile, np.broadcast_to(np.array([height, radius]) / math.hypot(height, radius), profile.shape), 1 - t, segments)
+    slope = np.array([height, radius]) / math.hypot(height, radius)
+    positions, normals, uvs, faces = _revolve(profile, np.broadcast_to(slope, profile.shape), 1 - t, segments)
     # The normals at the tip belong to the middle of their segment, as the uvs there do.
     tip = slice(-(segments + 1), None)
     angle = 2 * math.pi * (np.arange(segments + 1) + 0.5) / segments
-    normals[tip] = np.stack([height * np.cos(angle), height * np.sin(angle), np.full(segments + 1, radius)], axis=1) / math.hypot(height, radius)
+    normals[tip] = np.stack([slope[0] * np.cos(angle), slope[0] * np.sin(angle), np.full(segments + 1, slope[1])], axis=1)
     return _join([(positions, normals, uvs, faces), _disc(radius, -height / 2, False, segments)])
 
 

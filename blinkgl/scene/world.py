@@ -44,16 +44,16 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     clearance = max(config.camera_clearance, 1.01 * near_corner(camera))
     backdrop = []
     if config.sky:
-        backdrop.append(("sky", "sky", _sky(config.sky, textures, rng_texture, split, floor, base, log), StaticPath(_shift(floor), t0_ns, t1_ns)))
+        parts = _sky(config.sky, textures, rng_texture, split, base, log)
+        backdrop.append(("sky", "sky", parts, StaticPath(_shift(floor), t0_ns, t1_ns)))
     if config.ground:
         size = config.ground.size or (config.sky.size if config.sky else 4 * config.region.width)
         mesh = grid(width=size, depth=size, subdivisions=config.ground.subdivisions)
         repeats = size / _log_uniform(rng_texture, config.ground.tile)
         material = Material(textures.draw(rng_texture, split, log), uv_scale=(repeats, repeats), unlit=unlit)
         backdrop.append(("ground", "ground", (Part(mesh, material),), StaticPath(_shift(floor), t0_ns, t1_ns)))
-    walls = config.walls if isinstance(config.walls, WallsConfig) else WallsConfig(count=4 if config.walls else 0)
     backdrop += [(f"wall-{k}", "wall", parts, StaticPath(T, t0_ns, t1_ns))
-                 for k, (parts, T) in enumerate(_walls(walls, config, textures, rng, rng_texture, split, floor, log))]
+                 for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))]
 
     placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log)
     centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
@@ -66,7 +66,8 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     for k, (name, parts, T, radius, resting) in enumerate(placed):
         others = np.arange(len(placed)) != k
         space = FreeSpace(low, high, ground_z, np.vstack([centres[others], T_cam[:3, 3]]), np.append(radii[others], clearance + _STAND_OFF))
-        items.append((name, "object", parts, random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=resting)))
+        path = random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=resting)
+        items.append((name, "object", parts, path))
     space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
     path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
 
@@ -95,8 +96,8 @@ _texture_pool = lru_cache(maxsize=4)(lambda config, base: texture_pool(config, b
 def make_camera(camera, path, **changes) -> Camera:
     """Scene camera from anything with width, height, fx, fy, near and principal_point or cx, cy."""
     cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
-    fields = dict(width=camera.width, height=camera.height, fx=float(camera.fx), fy=float(camera.fy), cx=float(cx), cy=float(cy), near=camera.near)
-    return Camera(path=path, **{**fields, **changes})
+    made = Camera(camera.width, camera.height, float(camera.fx), float(camera.fy), float(cx), float(cy), path, camera.near)
+    return replace(made, **changes)
 
 
 def near_corner(camera) -> float:
@@ -197,14 +198,15 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
     for part in asset.parts:
         mesh = scale_mesh(part.mesh, radius)
         if asset.has_materials:
-            material = replace(part.material, unlit=part.material.unlit or config.light.unlit, double_sided=part.material.double_sided or not mesh.closed)
+            material = replace(part.material, unlit=part.material.unlit or config.light.unlit,
+                               double_sided=part.material.double_sided or not mesh.closed)
         else:
             material = Material(texture, tuple(float(c) for c in tint), (repeats, repeats), config.light.unlit, not mesh.closed)
         parts.append(Part(mesh, material))
     return tuple(parts)
 
 
-def _sky(config: SkyConfig, textures: Pool, rng, split, floor, base, log) -> tuple[Part, ...]:
+def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[Part, ...]:
     """Six inward squares around the origin."""
     half, n = config.size / 2, config.subdivisions
     brightness = float(rng.uniform(*config.brightness))
@@ -219,8 +221,8 @@ def _sky(config: SkyConfig, textures: Pool, rng, split, floor, base, log) -> tup
     for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
         positions, normals, uvs, faces = square(half * (forward - right + down), 2 * half * right, -2 * half * down, n, n)
         uvs = 0.5 + (uvs - 0.5) * inset
-        mesh = Mesh(positions, faces.astype(np.int32), np.ascontiguousarray(normals, np.float32), uvs.astype(np.float32), name=f"sky {side}",
-                    source_hash=parameter_hash("sky", config.size, n, side, inset))
+        mesh = Mesh(positions, faces.astype(np.int32), np.ascontiguousarray(normals, np.float32), uvs.astype(np.float32),
+                    name=f"sky {side}", source_hash=parameter_hash("sky", config.size, n, side, inset))
         parts.append(Part(mesh, Material(texture, (brightness,) * 3, (repeats, repeats), unlit=True)))
     return tuple(parts)
 
@@ -241,7 +243,8 @@ def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[
     digest, file = mine[int(rng.integers(len(mine)))]
     image = shrink(decode_image(file.read_bytes(), None, str(file)), 4096)
     image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
-    return [Texture(face, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, face in enumerate(cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN))]
+    sides = cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN)
+    return [Texture(side, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)]
 
 
 def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_texture, split, floor, log):

@@ -86,7 +86,7 @@ def test_sources_have_equal_chances(tmp_path):
 
 def test_cache_keeps_identity_and_stays_bounded():
     pool = texture_pool(TexturesConfig(photographs=False, max_size=8), ".")
-    pool.cache_size = 5
+    pool.cache_bytes = 5 * 8 * 8 * 3
     first = pool.load(pool.entries[0])
     assert pool.load(pool.entries[0]) is first
     for entry in pool.entries[:20]:

@@ -202,9 +202,10 @@ def message(make):
     ({"objects": {"count": -1}}, "scene.objects.count: input should be greater than or equal to 0 (got -1)"),
     ({"objects": {"size": [2, 1]}}, "scene.objects.size: the range must be [smallest, largest] (got [2, 1])"),
     ({"objects": {"size": [0, 1]}}, "scene.objects.size.0: input should be greater than 0 (got 0)"),
-    ({"pool": {"primitives": ["cube"]}}, "scene.pool.primitives"),
+    ({"pool": {"primitives": ["cube"]}}, "scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid (got ['cube'])"),
+    ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),
     ({"pool": {"test_fraction": 1.5}}, "scene.pool.test_fraction: input should be less than or equal to 1 (got 1.5)"),
-    ({"textures": {"procedural": ["noise"]}}, "scene.textures.procedural"),
+    ({"textures": {"procedural": ["noise"]}}, "scene.textures.procedural: must be true, false or a list of value, perlin,"),
     ({"sky": {"size": 20}}, "scene: sky.size 20 must be at least 36 to hold the region and its objects"),
     ({"region": {"height": 0.5}}, "scene: region.camera_height must begin below region.height 0.5"),
 ])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import logging
 import re
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -39,7 +40,7 @@ class Asset:
     has_materials: bool = False
     log: tuple[str, ...] = ()
 
-    def normalised(self) -> "Asset":
+    def normalised(self) -> Asset:
         """Bounding box centred on the origin, bounding radius 1."""
         meshes = normalise(tuple(p.mesh for p in self.parts), self.name)
         return replace(self, parts=tuple(Part(m, p.material) for m, p in zip(meshes, self.parts)))
@@ -73,7 +74,7 @@ def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_B
         document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, textures=keep_materials)
         pieces, log = document.pieces(), document.log
     else:
-        pieces = _trimesh_pieces(path, data, suffix[1:], max_faces, max_texture if keep_materials else None)
+        pieces = _trimesh_pieces(path, data, suffix[1:], max_faces, max_texture if keep_materials else None, log)
     total = sum(len(p.faces) for p in pieces)
     if total > max_faces:
         raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
@@ -104,21 +105,25 @@ def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
     return gltf.buffer_contents(path, path.read_bytes() if data is None else data)
 
 
-def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None) -> list["gltf.Piece"]:
+def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, log: list[str]) -> list[gltf.Piece]:
     where = str(path)
     {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj}[kind](data, max_faces, where)
     resolver = FolderResolver(path.parent, where)
     try:
-        loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False, maintain_order=True,
-                                    skip_materials=max_texture is None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False, maintain_order=True,
+                                        skip_materials=max_texture is None)
     except AssetError:
         raise
     except MemoryError:
         raise AssetError("the mesh does not fit into memory", where=where) from None
     except Exception as error:      # parsers of broken files raise anything
         raise AssetError(f"the mesh is corrupt ({type(error).__name__}: {' '.join(str(error).split())[:80]})", where=where) from None
-    if resolver.refused is not None and max_texture is not None:
-        raise resolver.refused
+    if max_texture is not None:
+        if resolver.refused is not None:
+            raise resolver.refused
+        log += [f"{path.name}: '{name}' is missing, done without it" for name in dict.fromkeys(resolver.missing)]
     pieces = [piece_of_trimesh(g, max_texture=max_texture, where=where, file_normals=True)
               for g in loaded.geometry.values() if isinstance(g, trimesh.Trimesh)]
     if not pieces:
@@ -126,7 +131,7 @@ def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_text
     return pieces
 
 
-def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: str, file_normals: bool) -> "gltf.Piece":
+def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: str, file_normals: bool) -> gltf.Piece:
     """Raw triangles and material of a ``trimesh.Trimesh``. ``file_normals`` uses normals that came with the mesh;
     trimesh's own smooth ones would round off a cuboid."""
     normals = mesh._cache.cache.get("vertex_normals") if file_normals else None
@@ -170,26 +175,26 @@ class FolderResolver(trimesh.resolvers.Resolver):
     """Reads material and image files beside a mesh; refuses what leads out of its folder."""
 
     def __init__(self, folder: Path, where: str):
-        self.folder, self.where, self.refused = Path(folder), where, None
+        self.folder, self.where, self.refused, self.missing = Path(folder), where, None, []
 
     def get(self, name: str) -> bytes:
         try:
-            return inside(self.folder, name, self.where).read_bytes()
-        except AssetError as error:
-            self.refused = self.refused or error       # trimesh swallows it; load_asset raises it again
+            return gltf.inside(self.folder, name, self.where).read_bytes()
+        except AssetError as error:         # trimesh swallows it; load_asset raises or logs it
+            if "missing" in error.problem:
+                self.missing.append(str(name))
+            else:
+                self.refused = self.refused or error
             raise
 
     def write(self, name, data):
         raise AssetError("a mesh loader wanted to write", where=self.where, value=name)
 
     def namespaced(self, namespace):
-        return FolderResolver(inside(self.folder, namespace, self.where), self.where)
+        return FolderResolver(gltf.inside(self.folder, namespace, self.where), self.where)
 
     def keys(self):
         return [p.name for p in self.folder.iterdir() if p.suffix.lower() in (".mtl", *IMAGE_SUFFIXES)]
-
-
-inside = gltf.inside
 
 
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:

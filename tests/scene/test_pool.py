@@ -10,6 +10,7 @@ from PIL import Image
 
 from blinkgl.config.scene import PoolConfig, TexturesConfig
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.mesh_files import load_asset
 from blinkgl.scene.pool import object_pool, split_of, texture_pool
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
@@ -275,6 +276,22 @@ def test_obj_materials_cannot_leave_their_folder(tmp_path):
     assert "refers to a file outside its folder (got '../secret.mtl')" in config_error(lambda: pool.load(pool.entries[0]))
     plain = object_pool(PoolConfig(folders=(str(folder),), **NOTHING), ".")
     assert len(plain.load(plain.entries[0]).parts[0].mesh.faces) == 1      # not asked for, not read
+
+
+def test_obj_materials(tmp_path):
+    Image.new("RGB", (4, 4), (10, 200, 30)).save(tmp_path / "t.png")
+    (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0.5 0\nnewmtl tex\nKd 0.2 0.2 0.2\nmap_Kd t.png\n")
+    (tmp_path / "a.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\n"
+                                    "usemtl red\nf 1/1/1 2/2/1 3/3/1\nusemtl tex\nf 2/1/1 4/2/1 3/3/1\n")
+    parts = {p.material.texture is not None: p for p in load_asset(tmp_path / "a.obj").parts}
+    assert parts[False].material.base_color == pytest.approx((1, 0.214, 0), abs=3e-3)      # Kd is a code, made linear
+    assert (parts[True].material.texture.image == (10, 200, 30)).all() and parts[True].material.base_color == (1, 1, 1)
+    corner = (parts[False].mesh.vertices == [0, 0, 0]).all(axis=1)
+    np.testing.assert_array_equal(parts[False].mesh.uvs[corner], [[0, 1]])      # vt (0, 0) is the bottom left
+    assert len(load_asset(tmp_path / "a.obj", keep_materials=False).parts) == 1
+    (tmp_path / "b.obj").write_text("mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    plain = load_asset(tmp_path / "b.obj")
+    assert plain.log == ("b.obj: 'gone.mtl' is missing, done without it",) and not plain.has_materials
 
 
 def test_corrupt_image_in_a_folder_is_named_or_skipped(tmp_path):

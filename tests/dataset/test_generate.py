@@ -223,7 +223,7 @@ def test_preview_shows_the_sequence(tmp_path):
     ("camera.widht=3", "camera.widht: unknown key; expected 'width' (nearest)"),
     ("scene.pool.folders=[nowhere]", "scene.pool.folders.0: "),
     ("scene.pool={primitives: [], urdfs: false}", "scene.pool: "),
-    ("gl.device=99", "gl.device"),
+    ("gl={backend: egl, device: 99}", "gl"),
     ("events.emulator=blender", "events.emulator: unknown or missing choice"),
 ])
 def test_bad_input_is_one_line_and_status_2(tmp_path, capsys, option, message):

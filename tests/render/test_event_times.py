@@ -1,0 +1,103 @@
+"""Rendered scenes whose event times are known in closed form: the whole way from texture to microsecond.
+
+A camera slides past a wall painted so that ln(luminance) at a pixel is a sinusoid, or a ramp, in time. Linear
+reconstruction between frames is then off by O(step²) for the sinusoid and exact for the ramp.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blinkgl.config.events import EsimConfig
+from blinkgl.events import Esim, Events
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.types import Camera, Material, Texture
+
+from render_scenes import LEVEL, SECOND, drift, quad, scene, still, thing
+
+PLAIN = SimpleNamespace(supersample=1, image_supersample=1, anisotropy=1.0)
+THRESHOLD, PERIODS_PER_SECOND, AMPLITUDE, TEXELS, WIDTH, HEIGHT = 0.1, 4.0, 1.0, 2048, 24, 6
+DURATION = 0.2
+RAMP_PER_PERIOD = 3.0  # ln units
+
+
+def profile(kind: str, u: np.ndarray) -> np.ndarray:
+    """ln(luminance) along the wall, u in periods of the texture."""
+    return AMPLITUDE * np.sin(2 * np.pi * u) if kind == "sinusoid" else RAMP_PER_PERIOD * (u - np.floor(u)) - 1.0
+
+
+def wall(kind: str):
+    """One texture period per 2 world units; a pixel covers a fraction of a texel, so that filtering plays no part."""
+    u = (np.arange(TEXELS) + 0.5) / TEXELS
+    image = np.repeat(np.exp(profile(kind, u)).astype(np.float32)[None, :, None], 3, axis=2)
+    texture = Texture(np.repeat(image, 2, axis=0))
+    sheet = quad(8.0, 8.0)  # 8 periods wide: uv_scale below
+    speed = 2.0 * PERIODS_PER_SECOND * DURATION
+    start = 0.2 if kind == "ramp" else 0.0  # the ramp's jump stays out of sight
+    facing = drift((start, -1.0, 0.0), (start + speed, -1.0, 0.0), LEVEL, LEVEL, DURATION)
+    upright = LEVEL * LEVEL.from_euler("x", 180, degrees=True)  # the quad's +z towards the camera, its +x to the right
+    material = Material(texture, unlit=True, uv_scale=(8.0, 8.0))
+    return scene([thing("wall", 1, sheet, still(rotation=upright), material)], Camera(WIDTH, HEIGHT, 6000.0, 6000.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, facing))
+
+
+def simulate(gl, kind: str, step_ns: int, world) -> Events:
+    emulator = Esim(HEIGHT, WIDTH, EsimConfig(contrast_threshold=THRESHOLD, threshold_sigma=0.0, log_eps=1e-9), seed=1)
+    with Renderer(gl, world, PLAIN) as renderer:
+        return Events.concatenate([emulator.step(renderer.luminance(t), t) for t in range(0, int(DURATION * SECOND) + 1, step_ns)])
+
+
+def closed_form(kind: str, column: int, polarity_of_motion: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times (s) and polarities of every crossing at one column, from ln(luminance) as a function of time alone."""
+    x = (column - (WIDTH - 1) / 2) / 6000.0  # world offset of the pixel's ray on the wall, one unit away
+    start = 0.2 if kind == "ramp" else 0.0
+    t = np.linspace(0, DURATION, 400_001)
+    u = (start + 2.0 * PERIODS_PER_SECOND * t + x) / 2.0 * polarity_of_motion + 4.0
+    level = profile(kind, u)
+    times, polarities, reference = [], [], level[0]
+    # 0.5 µs sampling of the exact curve; the crossing inside a sample is found linearly (error far below 1 µs).
+    for i in range(1, len(t)):
+        while abs(level[i] - reference) >= THRESHOLD:
+            sign = np.sign(level[i] - reference)
+            reference += sign * THRESHOLD
+            times.append(t[i - 1] + (reference - level[i - 1]) / (level[i] - level[i - 1]) * (t[i] - t[i - 1]))
+            polarities.append(sign > 0)
+    return np.array(times), np.array(polarities)
+
+
+def errors(events: Events, kind: str, sign: float) -> np.ndarray:
+    """|time - closed form| in µs for every event of three columns; the counts and polarities have to agree."""
+    found = []
+    for column in (0, WIDTH // 2, WIDTH - 1):
+        times, polarities = closed_form(kind, column, sign)
+        at = (events.x == column) & (events.y == HEIGHT // 2)
+        n = min(at.sum(), len(times))
+        assert abs(int(at.sum()) - len(times)) <= 1, "an event at the very end may fall on either side of it"
+        np.testing.assert_array_equal(events.p[at][:n].astype(bool), polarities[:n])
+        found.append(np.abs(events.t[at][:n] + 0.5 - times[:n] * 1e6))  # stamps are floored to the microsecond
+    return np.concatenate(found)
+
+
+@pytest.fixture
+def direction(gl):
+    """+1 or -1: whether u grows along +x on the rendered wall (read off one frame, so the test asks physics, not layout)."""
+    world = wall("ramp")
+    with Renderer(gl, world, PLAIN) as renderer:
+        row = renderer.luminance(0)[HEIGHT // 2]
+    return 1.0 if row[-1] > row[0] else -1.0
+
+
+def test_a_ramp_is_exact_at_any_frame_rate(gl, direction):
+    world = wall("ramp")
+    for step in (20_000_000, 2_500_000):
+        off = errors(simulate(gl, "ramp", step, world), "ramp", direction)
+        assert len(off) > 40 and np.median(off) < 1.0 and off.max() < 3.0
+
+
+def test_a_sinusoid_converges_with_second_order(gl, direction):
+    world = wall("sinusoid")
+    steps = [8_000_000, 4_000_000, 2_000_000]
+    medians = [np.median(errors(simulate(gl, "sinusoid", step, world), "sinusoid", direction)) for step in steps]
+    order = np.polyfit(np.log(steps), np.log(medians), 1)[0]
+    assert abs(order - 2) < 0.3, f"order {order:.2f}, median errors {medians} µs"
+    assert medians[-1] < 50

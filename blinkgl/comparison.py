@@ -5,7 +5,9 @@ Everything streams interval by interval; memory is a handful of sensor-sized map
 
 from __future__ import annotations
 
+import contextlib
 import os
+import zipfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -277,8 +279,9 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 def _is_event_file(path) -> bool:
     path = Path(path)
     if path.suffix.lower() in (".npy", ".npz") and path.is_file():
-        with np.load(path, mmap_mode="r" if path.suffix == ".npy" else None, allow_pickle=False) as data:
-            return "x" in (data.dtype.names or ()) if isinstance(data, np.ndarray) else "x" in data.files
+        with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile):  # damaged: the reader will say so
+            data = np.load(path, mmap_mode="r" if path.suffix == ".npy" else None, allow_pickle=False)
+            return "x" in ((data.dtype.names or ()) if isinstance(data, np.ndarray) else data.files)
     return path.suffix.lower() in ENDINGS and not path.is_dir()
 
 

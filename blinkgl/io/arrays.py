@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -38,9 +39,7 @@ class ArrayReader:
                 data.close()
         except (OSError, ValueError, EOFError, KeyError) as error:
             raise AssetError(f"cannot read: {' '.join(str(error).split())}", where=str(path)) from error
-        except Exception as error:  # zipfile.BadZipFile has no common base with the rest
-            if isinstance(error, AssetError) or type(error).__name__ != "BadZipFile":
-                raise
+        except zipfile.BadZipFile as error:
             raise AssetError("damaged .npz file", where=str(path)) from error
         self._events = _events(columns, path)
 

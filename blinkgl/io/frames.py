@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -160,9 +161,7 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
                     times = [round(float(t) * scale) if data[stamp].dtype.kind == "f" else int(t) * int(scale) for t in data[stamp]]
     except (OSError, ValueError, EOFError, KeyError) as error:
         raise AssetError(f"cannot read: {' '.join(str(error).split())}", where=str(path)) from error
-    except Exception as error:
-        if type(error).__name__ != "BadZipFile":
-            raise
+    except zipfile.BadZipFile as error:
         raise AssetError("damaged .npz file", where=str(path)) from error
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3))) or not frames.shape[0]:
         raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W) or (N, H, W, 3)")

@@ -65,13 +65,14 @@ class PreviewWriter:
         self._pending += len(events)
 
     def set_flow(self, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
-        """(H, W, 2) px and its valid mask. Full saturation is the largest 99th percentile of speed so far."""
+        """(H, W, 2) px and its valid mask. Full saturation follows the 95th percentile of speed: up at once, down
+        slowly, so that neither a passing object washes out the rest nor the colours flicker."""
         if not self._has_flow:
             return
         speed = np.hypot(flow[::4, ::4, 0], flow[::4, ::4, 1])
         speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
         if speed.size:
-            self._flow_max = max(self._flow_max, float(np.percentile(speed, 99)))
+            self._flow_max = max(0.95 * self._flow_max, float(np.percentile(speed, 95)))
         nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # noqa: E731 - edges stay true
         shown = None if valid is None else nearest(np.asarray(valid, np.uint8)) > 0
         self._panel_view(2)[:] = flow_colour(nearest(np.asarray(flow, np.float32)), self._flow_max or None, shown)

@@ -101,7 +101,7 @@ class VideoReader:
             probe.close()
         except Exception as error:  # noqa: BLE001 - it raises IOError, RuntimeError, IndexError, StopIteration …
             raise AssetError(f"cannot read video: {_gist(str(error))}", where=str(path)) from error
-        self.width, self.height = meta["size"]
+        self.width, self.height = meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]  # ffmpeg turns frames upright
         self.fps = float(meta.get("fps") or 0)
         self.expected = round(float(meta.get("duration") or 0) * self.fps)
 
@@ -121,7 +121,9 @@ class VideoReader:
                 process.kill()
                 process.stdout.close()
                 process.wait()
-        if status or trouble or data or count == 0:
+        # Decoders also grumble about files that they decode whole: those words alone do not condemn a file.
+        damaged = re.search(r"invalid data|error while decoding|partial file|concealing|corrupt|truncat|ended prematurely", trouble, re.I)
+        if status or data or count == 0 or damaged or count < 0.95 * self.expected - 2:
             raise AssetError(f"video truncated or corrupt after frame {count}" + (f": {trouble}" if trouble else ""), where=str(self.path))
 
 
@@ -152,6 +154,6 @@ def _gist(text: str) -> str:
     """ffmpeg's most telling line, without addresses."""
     lines = [re.sub(r"^\[[^\]]*\]\s*", "", line).strip() for line in text.splitlines()]
     lines = [re.sub(r" @ 0x[0-9a-f]+", "", line) for line in lines if line]
-    telling = [line for line in lines if re.search(r"invalid|error|not found|no space|denied|partial|truncat|corrupt|moov|no such", line, re.I)
+    telling = [line for line in lines if re.search(r"invalid|error|not found|no space|denied|partial|truncat|corrupt|moov|no such|premature", line, re.I)
                and not line.startswith(("Conversion failed", "Error opening input file"))]
     return (telling or lines or [""])[-1][:200]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+
 import cv2
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -57,6 +60,18 @@ def test_unreadable_video(tmp_path, content, message):
     with pytest.raises(AssetError, match=message) as caught:
         VideoReader(tmp_path / "v.mp4")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("degrees, shape", [(0, (48, 64)), (90, (64, 48)), (180, (48, 64)), (270, (64, 48))])
+def test_rotated_video_comes_upright(tmp_path, degrees, shape):
+    write_video(tmp_path / "v.mp4")
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-display_rotation", str(degrees), "-i", tmp_path / "v.mp4", "-c", "copy",
+                    tmp_path / "r.mp4"], check=True)
+    reader = VideoReader(tmp_path / "r.mp4")
+    upright = np.rot90(next(iter(VideoReader(tmp_path / "v.mp4"))), degrees // 90)
+    frame = next(iter(reader))
+    assert (reader.height, reader.width) == shape == frame.shape[:2] == upright.shape[:2]
+    assert np.abs(frame.astype(int) - upright).mean() < 6
 
 
 def test_video_without_pictures(tmp_path):

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from blinkgl.config.events import EsimConfig, V2eConfig
-from blinkgl.events import v2e
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.events import v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
 from blinkgl.events.types import Events
@@ -235,3 +235,60 @@ class ReferenceV2e:
             up, down = reference + on, reference - off
         self.upper[i], self.lower[i] = np.float32(up), np.float32(down)
         return rows
+
+
+class ReferenceVoltmeter:
+    """Lin et al. 2022, sections 3 and 4."""
+
+    def __init__(self, height: int, width: int, config: VoltmeterConfig, seed: int = 0):
+        self.width, self.config, self.seed = width, config, np.uint64(seed)
+        self.v = np.zeros(height * width, np.int32)
+        self.release: list[int | None] = [None] * (height * width)
+        self.t_ns: int | None = None
+        self.frame = 0
+
+    def step(self, luminance: np.ndarray, t_ns: int) -> Events:
+        c, f = self.config, np.float32
+        intensity = (as_luminance(luminance) * f(c.full_scale)).ravel()
+        rows = []
+        if self.t_ns is not None:
+            dt = (t_ns - self.t_ns) * 1e-3
+            drift, noise = voltmeter.drift_and_noise(self.intensity, intensity, f(c.k1), f(c.k2), f(c.k3), f(c.k4 * dt),
+                                                     f(c.k5 * dt), f(c.k6), f(np.sqrt(dt)))
+            v_end = voltmeter.move(self.v, drift)
+            near = voltmeter.near_threshold(self.v, v_end, noise)
+            for i in range(len(self.v)):
+                if near[i] or self.release[i] is not None:
+                    v_end[i] = self.pixel(i, np.float64(intensity[i]), dt, t_ns, rows)
+            self.v = v_end
+        self.intensity, self.t_ns, self.frame = intensity, t_ns, self.frame + 1
+        return sorted_events(rows)
+
+    def pixel(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> int:
+        """Draw the interval of one pixel; returns its voltage at the end."""
+        c, before, (y, x) = self.config, np.float64(self.intensity[i]), divmod(i, self.width)
+        mean = 0.5 * (before + after)
+        mu = c.k1 * (after - before) / dt / (mean + c.k2) + c.k4 + c.k5 * mean
+        sigma = c.k3 * np.sqrt(mean) / (mean + c.k2) + c.k6
+        v, t, refractory = np.float64(self.v[i] / voltmeter.V_ONE), 0.0, round(c.refractory_us * 1000)
+        if self.release[i] is not None:
+            if self.release[i] > t_ns:
+                return voltmeter.IN_DEAD_TIME
+            v, t, self.release[i] = np.float64(0), max(self.release[i] - self.t_ns, 0) * 1e-3, None
+        draw = self.frame << 20
+        while True:
+            side, which = uniform2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw))
+            normal, _ = normal2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw + 1))
+            draw += 2
+            p = int(side < voltmeter.on_first(1.0 - v, 1.0 + v, mu, sigma))
+            hit = t + voltmeter.hitting_time(1.0 - v if p else 1.0 + v, mu, sigma, normal, which)
+            if not hit <= dt:
+                return int(np.clip(v + mu * (dt - t), -voltmeter.NEAREST, voltmeter.NEAREST) * voltmeter.V_ONE)
+            v, t = np.float64(0), hit
+            after_ns = min(int(hit * 1e3), t_ns - self.t_ns)
+            rows.append(((self.t_ns + after_ns) // 1000, y, x, p))
+            if refractory:
+                if after_ns + refractory > t_ns - self.t_ns:
+                    self.release[i] = self.t_ns + after_ns + refractory
+                    return voltmeter.IN_DEAD_TIME
+                t = (after_ns + refractory) * 1e-3

@@ -1,0 +1,156 @@
+"""DVS-Voltmeter: kernel = slow twin, the laws of first passage, leak rate, state."""
+
+from __future__ import annotations
+
+import mpmath
+import numba
+import numpy as np
+import pytest
+from scipy import stats
+
+from blinkgl.config.events import VoltmeterConfig
+from blinkgl.events import DvsVoltmeter, Events
+from blinkgl.events.philox import normal2, uniform2
+from blinkgl.events.reference import ReferenceVoltmeter
+from blinkgl.events.voltmeter import hitting_time, on_first, one_minus_exp
+from tests.events.clips import assert_same, random_clip, run
+from tests.events.test_esim import threads  # noqa: F401  (fixture)
+
+MS = 10**6
+VARIANTS = {
+    "DVS346": {},
+    "DVS240": dict(preset="DVS240"),
+    "dead time": dict(refractory_us=3000.0),
+    "very noisy": dict(k3=0.01, k6=0.002),
+    "noiseless": dict(k3=0.0, k6=0.0),
+    "leaky": dict(k4=2e-4, refractory_us=100.0),
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_equals_slow_twin(variant, dtype, threads):  # noqa: F811
+    clip, times = random_clip(1, frames=5, dtype=dtype)
+    config = VoltmeterConfig(**VARIANTS[variant])
+    fast = run(DvsVoltmeter(37, 45, config, seed=9), clip, times)
+    assert len(fast) > 1000
+    assert_same(fast, run(ReferenceVoltmeter(37, 45, config, seed=9), clip, times))
+
+
+def test_resumes_bit_identically():
+    clip, times = random_clip(2, frames=8)
+    config = VoltmeterConfig(k3=0.01, refractory_us=9000.0)
+    whole = run(DvsVoltmeter(37, 45, config, 3), clip, times)
+    first, second = DvsVoltmeter(37, 45, config, 3), DvsVoltmeter(37, 45, config, 3)
+    head = run(first, clip[:3], times[:3])
+    second.load_state_dict(first.state_dict())
+    assert_same(whole, Events.concatenate([head, run(second, clip[3:], times[3:])]))
+
+
+def test_on_first_against_fifty_digits():
+    mpmath.mp.dps = 50
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        v, mu, sigma = rng.uniform(-0.999, 0.999), rng.choice([-1, 1]) * 10 ** rng.uniform(-12, 1), 10 ** rng.uniform(-4, 1)
+        a, b = 1 - v, 1 + v
+        r = 2 * mpmath.mpf(float(mu)) / mpmath.mpf(float(sigma)) ** 2
+        exact = (mpmath.exp(r * b) - 1) / (mpmath.exp(r * b) - mpmath.exp(-r * a))
+        got = on_first(a, b, float(mu), float(sigma))
+        assert abs(got - float(exact)) < 1e-9 and 0 <= got <= 1
+    assert on_first(0.5, 1.5, 0.0, 0.1) == 0.75
+    assert on_first(0.5, 1.5, 3.0, 0.0) == 1.0 and on_first(0.5, 1.5, -3.0, 0.0) == 0.0
+    assert on_first(1.0, 1.0, 1e300, 1e-300) == 1.0 and on_first(1.0, 1.0, -1e300, 1e-300) == 0.0
+
+
+def test_one_minus_exp():
+    x = np.logspace(-15, 2, 500)
+    assert max(abs(one_minus_exp(float(v)) / -np.expm1(-v) - 1) for v in x) < 1e-10
+
+
+@numba.njit
+def _hitting_times(n, distance, mu, sigma):
+    out = np.empty(n)
+    for i in range(n):
+        _, u = uniform2(np.uint64(3), np.uint64(i), np.uint64(7), np.uint64(0))
+        z, _ = normal2(np.uint64(3), np.uint64(i), np.uint64(7), np.uint64(1))
+        out[i] = hitting_time(distance, mu, sigma, z, u)
+    return out
+
+
+N = 200_000
+
+
+@pytest.mark.parametrize("distance, mu, sigma", [(1.0, 2.0, 0.5), (0.3, 1e-3, 0.2), (1.7, -0.4, 3.0), (1.0, 5e-4, 1e-3)])
+def test_hitting_times_are_inverse_gaussian(distance, mu, sigma):
+    t = _hitting_times(N, distance, mu, sigma)
+    mean, shape = distance / abs(mu), (distance / sigma) ** 2
+    law = stats.invgauss(mu=mean / shape, scale=shape)
+    assert stats.kstest(t, law.cdf).pvalue > 1e-3
+
+
+def test_hitting_times_without_drift_are_levy():
+    distance, sigma = 0.8, 0.3
+    law = stats.levy(scale=(distance / sigma) ** 2)
+    assert stats.kstest(_hitting_times(N, distance, 0.0, sigma), law.cdf).pvalue > 1e-3
+    assert stats.kstest(_hitting_times(N, distance, 1e-14, sigma), law.cdf).pvalue > 1e-3  # and continuous in the drift
+
+
+def test_kernel_event_times_are_inverse_gaussian():
+    """Straight from the emulator: the first event of 10^5 pixels under one long ramp step."""
+    h, w = 250, 400
+    config = VoltmeterConfig(k1=5.0, k2=20.0, k3=0.0, k4=0.0, k5=0.0, k6=4e-3)
+    emulator = DvsVoltmeter(h, w, config, seed=8)
+    emulator.step(np.full((h, w), 100 / 255, np.float32), 0)
+    dt = 200_000  # us
+    events = emulator.step(np.full((h, w), 200 / 255, np.float32), dt * 1000)
+    mu, sigma = 5.0 * 100 / dt / 170, 4e-3
+    _, first = np.unique(events.y.astype(int) * w + events.x, return_index=True)
+    t = events.t[first] + 0.5
+    mean, shape = 1 / mu, sigma**-2
+    law = stats.invgauss(mu=mean / shape, scale=shape)
+    on = events.p[first] == 1
+    expected_on = on_first(1.0, 1.0, mu, sigma)
+    assert abs(len(first) / (h * w) - law.cdf(dt)) < 5e-3 and abs(on.mean() - expected_on) < 5 * np.sqrt(expected_on * (1 - expected_on) / len(on)) + 1e-3
+    assert stats.kstest(t, lambda x: law.cdf(x) / law.cdf(dt)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("frame_ms", [1, 100])
+def test_leak_rate_by_temperature_and_photocurrent(frame_ms):
+    """A still scene: k4 + k5 L events per us, ON, at any frame rate (V is fine enough to hold the small drift)."""
+    config = VoltmeterConfig(preset="DVS240", k4=2e-6, k6=1e-5, k3=1e-5)
+    emulator = DvsVoltmeter(10, 10, config, seed=4)
+    frame = np.full((10, 10), 0.4, np.float32)
+    seconds = 3
+    events = run(emulator, [frame] * (seconds * 1000 // frame_ms + 1), range(0, seconds * 10**9 + 1, frame_ms * MS))
+    rate = 2.0 + 0.05 * 102
+    assert (events.p == 1).mean() > 0.99
+    assert abs(len(events) / (100 * seconds * rate) - 1) < 0.03  # 21.3 events per pixel, whole ones counted
+
+
+def test_effective_threshold():
+    """About k1 events per unit of ln(L + k2)."""
+    emulator = DvsVoltmeter(20, 20, VoltmeterConfig(k4=0, k5=0), seed=1)
+    ramp = np.linspace(20, 200, 400)
+    events = run(emulator, [np.full((20, 20), v / 255, np.float32) for v in ramp], np.arange(400) * MS)
+    assert abs(len(events) / 400 - np.floor(5.265 * np.log(220 / 40))) < 0.2
+
+
+def test_dead_time_and_burst(threads):  # noqa: F811
+    config = VoltmeterConfig(refractory_us=700.0)
+    emulator = DvsVoltmeter(30, 30, config)
+    emulator.step(np.zeros((30, 30), np.float32), 0)
+    events = Events.concatenate([emulator.step(np.ones((30, 30), np.float32), 2 * MS),
+                                 emulator.step(np.zeros((30, 30), np.float32), 3 * MS)])
+    pixel = events.y.astype(int) * 30 + events.x
+    order = np.lexsort((events.t, pixel))
+    assert np.diff(events.t[order])[np.diff(pixel[order]) == 0].min() >= 699
+
+    emulator = DvsVoltmeter(40, 50, VoltmeterConfig(k1=100.0, k2=1e-3, max_events_per_step=20_000))
+    emulator.step(np.zeros((40, 50), np.float32), 0)
+    events = emulator.step(np.ones((40, 50), np.float32), MS)
+    assert len(events) <= 20_000 and emulator.saturated > 2000 * 150
+
+
+def test_presets():
+    assert VoltmeterConfig(preset="DVS240").k2 == 23.0 and VoltmeterConfig().k1 == 5.265
+    assert VoltmeterConfig(preset="DVS240", k1=6.0).k1 == 6.0 and VoltmeterConfig(preset="DVS240").k5 == 5e-8

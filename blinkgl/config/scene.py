@@ -283,7 +283,7 @@ class ObjectConfig(KeyedMotionConfig):
     material: str | None = Field(None, description="a name under scene.materials; null: the file's own materials")
     scale: Annotated[float | Vector3, BeforeValidator(_number_or_three), AfterValidator(_greater_than_zero)] = Field(
         1.0, description="factor on the mesh, one or per axis")
-    category: Literal["object", "ground", "wall", "sky"] = "object"
+    category: Literal["object", "ground", "wall", "sky"] = Field("object", description="what it is: collisions and drawing order")
 
 
 class ExplicitSceneConfig(Config):
@@ -293,6 +293,7 @@ class ExplicitSceneConfig(Config):
     meshes: dict[str, MeshConfig] = Field({}, description="by name")
     materials: dict[str, MaterialConfig] = Field({}, description="by name")
     objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="at least one")
+    collisions: bool = Field(False, description="true: find collisions along the trajectories and stop what collides there")
     camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")

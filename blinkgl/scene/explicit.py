@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.scene import ExplicitSceneConfig, KeyedMotionConfig, MaterialConfig, MeshConfig, PoseConfig
 from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.collision import resolve_collisions
 from blinkgl.scene.images import content_hash, decode_image, photographs
 from blinkgl.scene.mesh_files import Asset, load_asset
 from blinkgl.scene.meshes import transform_mesh
@@ -19,7 +20,7 @@ from blinkgl.scene.primitives import BUILDERS
 from blinkgl.scene.textures import procedural_texture
 from blinkgl.scene.trajectories import look_rotation
 from blinkgl.scene.types import Material, Part, PosePath, Scene, SceneObject, Texture
-from blinkgl.scene.world import make_camera, make_light
+from blinkgl.scene.world import make_camera, make_light, near_corner
 
 _PROCEDURAL_SIZE = 1024
 # A camera (OpenCV axes) that looks along the world's +x with z up.
@@ -27,9 +28,10 @@ _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 
 
 
 def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path) -> Scene:
-    """The scene as configured; nothing is drawn at random and no collision is looked for.
+    """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
 
-    Raises ConfigError (unknown mesh or material name, missing file, bad parameter, name given twice) and AssetError."""
+    Raises ConfigError (unknown mesh or material name, missing file, bad parameter, name given twice; with ``collisions``,
+    bodies that touch at the start) and AssetError."""
     log: list[str] = []
     materials = {name: _material(m, base, f"scene.materials.{name}") for name, m in config.materials.items()}
     assets: dict[tuple[str, bool], Asset] = {}
@@ -55,6 +57,12 @@ def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, 
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
         objects.append(SceneObject(name, k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
+    if config.collisions:
+        result = resolve_collisions(tuple(objects), path, 1.01 * near_corner(camera), t0_ns, t1_ns)
+        if result.at_start:
+            raise ConfigError(f"{result.at_start[0]}, at the start", where="scene.collisions",
+                              accepted="bodies apart at the start, or collisions: false")
+        objects, path, log = result.objects, result.camera_path, log + list(result.log)
     return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background, tuple(log))
 
 

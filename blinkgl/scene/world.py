@@ -27,6 +27,7 @@ from blinkgl.scene.trajectories import FreeSpace, look_rotation, random_camera_p
 from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
 
 _PLACEMENTS = 300      # positions tried for an object before it is left out
+_CAMERA_PATHS = 6      # camera paths tried for one that runs into nothing; the last is cut where it does
 _GAP = 0.05            # m between bounding spheres at t0
 _STAND_OFF = 0.8       # m beyond the clearance that way-points keep from the camera: nothing should fill the view
 _PANORAMA_MARGIN = 1 / 16
@@ -68,11 +69,13 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
         space = FreeSpace(low, high, ground_z, np.vstack([centres[others], T_cam[:3, 3]]), np.append(radii[others], clearance + _STAND_OFF))
         path = random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=resting)
         items.append((name, "object", parts, path))
-    space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
-    path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
-
     scene_objects = tuple(SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items))
-    result = resolve_collisions(scene_objects, path, clearance, t0_ns, t1_ns)
+    space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
+    for _ in range(_CAMERA_PATHS):  # a camera that was stopped would see a still world from then on: another path is better
+        path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
+        result = resolve_collisions(scene_objects, path, clearance, t0_ns, t1_ns)
+        if not any("camera" in event.cut for event in result.events):
+            break
     # Bounding spheres were apart, so only one that sinks into ground or wall can touch at t0: leave it out.
     ours = {o.name for o in scene_objects if o.category == "object"}
     bad = ours & {name for c in result.at_start for name in (c.first, c.second)}

@@ -68,6 +68,32 @@ def test_linear_interpolation(tmp_path):
     np.testing.assert_allclose(scene.objects[0].path.pose(750_000_000)[:3, 3], [1, 2, 0], atol=1e-12)
 
 
+CRASH = [{"mesh": "box", "name": "still", "position": [3, 0, 0]},
+         {"mesh": "box", "name": "moving", "interpolation": "linear",
+          "keyframes": [{"time": 0, "position": [0, 0, 0]}, {"time": 1, "position": [4, 0, 0]}]}]
+
+
+def test_collisions_are_found_when_asked_for(tmp_path):
+    """Unit cubes 3 apart, one at 4 units/s: their faces meet after 2 units, at 0.5 s."""
+    free = build(tmp_path, objects=CRASH)
+    assert free.objects[1].path.pose(10**9)[0, 3] == pytest.approx(4) and free.log == ()
+    stopped = build(tmp_path, objects=CRASH, collisions=True)
+    assert stopped.objects[1].path.pose(10**9)[0, 3] == pytest.approx(2, abs=2e-3)
+    assert "moving" in stopped.log[0] and "t=0.4" in stopped.log[0] or "t=0.5" in stopped.log[0]
+
+
+def test_the_camera_is_stopped_by_a_solid(tmp_path):
+    keys = [{"time": 0, "position": [-3, 0, 0], "look_at": [5, 0, 0]}, {"time": 1, "position": [3, 0, 0], "look_at": [5, 0, 0]}]
+    scene = build(tmp_path, camera={"keyframes": keys, "interpolation": "linear"}, collisions=True)
+    end = scene.camera.path.pose(10**9)[0, 3]
+    assert -0.7 < end < -0.5, "in front of the cube's face at -0.5, by about the near distance"
+
+
+def test_overlapping_bodies_with_collisions_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="scene.collisions: .*at the start"):
+        build(tmp_path, objects=[{"mesh": "box", "position": [0.5, 0.1, 0.2]}, CRASH[1]], collisions=True)
+
+
 def test_materials_meshes_and_scale(tmp_path):
     Image.new("RGB", (40, 20), (255, 0, 0)).save(tmp_path / "red.png")
     trimesh.creation.icosphere(subdivisions=1).export(tmp_path / "ball.stl")

@@ -222,3 +222,23 @@ def test_assets_are_checked_before_work_starts(tmp_path):
     explicit = validate(ExplicitSceneConfig, {"kind": "explicit", "meshes": {"a": {"file": "gone.obj"}}, "objects": [{"mesh": "a"}], "camera": {}})
     assert message(lambda: check_assets(explicit, tmp_path)) == "scene.meshes.a.file: no such file (got 'gone.obj'); expected a mesh file"
     assert message(lambda: build(config(), split="val")) == "output.split: unknown split (got 'val'); expected train or test"
+
+
+def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_path):
+    """The first path is reported as cut; the world then draws another, and the scene's camera is not stopped."""
+    from blinkgl.scene import world as module
+    from blinkgl.scene.collision import Collision
+
+    drawn, resolve = [], module.resolve_collisions
+
+    def once_unlucky(objects, path, *rest):
+        drawn.append(path)
+        result = resolve(objects, path, *rest)
+        if len(drawn) == 1:
+            return replace(result, events=(Collision(1, "camera", objects[0].name, "contact", 0.0, ("camera",)),))
+        return result
+
+    monkeypatch.setattr(module, "resolve_collisions", once_unlucky)
+    scene = module.random_world(config(), CAMERA, 0, 10**9, "train", 3, 0, tmp_path)
+    assert len(drawn) >= 2 and not np.allclose(drawn[0].pose(5 * 10**8), drawn[1].pose(5 * 10**8))
+    assert scene.camera.path is drawn[-1]

@@ -16,8 +16,10 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
+from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False)
+app.add_typer(shader_app)
 
 
 def _print_version(wanted: bool) -> None:

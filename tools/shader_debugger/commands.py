@@ -1,0 +1,137 @@
+"""What ``passes``, ``probe`` and ``diff`` do, without the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.errors import OutputError
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.tools.shader_debugger.compare import Comparison, Report, parse_tolerances
+from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass
+from blinkgl.tools.shader_debugger.probe import as_text, probe
+from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, open_renderer
+
+
+def write_passes(subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None) -> list[Path]:
+    """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the folder ``out``. Returns the paths.
+
+    Super-sampled as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
+    from blinkgl.tools.shader_debugger import picture
+
+    names = [check_pass(name) for name in names] if names else list(PASSES)
+    folder = _folder(out)
+    paths, tiles = [], []
+    caption = f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
+    with open_renderer(subject, shaders, as_configured=True) as renderer:
+        gpu = GpuMoment(renderer, when, subject.log_eps)
+        for name in names:
+            info, array = PASSES[name], gpu[name]
+            with atomic_file(folder / f"{name}.npy") as temporary, output_errors(folder / f"{name}.npy"), temporary.open("wb") as file:
+                np.save(file, np.ascontiguousarray(array), allow_pickle=False)
+            rgb, legend = picture.picture(info.kind, array, hit=_meaningful(gpu, info))
+            picture.save_labelled(folder / f"{name}.png", info, rgb, legend, f"{caption}, {renderer.gl.renderer}")
+            paths += [folder / f"{name}.npy", folder / f"{name}.png"]
+            tiles.append((info, rgb, legend))
+        picture.save_contact_sheet(folder / "contact_sheet.png", tiles, f"{caption}   ·   {renderer.gl.renderer}")
+    return [*paths, folder / "contact_sheet.png"]
+
+
+def _meaningful(moment, info) -> np.ndarray | None:
+    """Where a buffer's values mean something: where something is hit, or where the flow is valid."""
+    if info.name.startswith("flow_"):
+        return moment[info.name.replace("flow", "valid")]
+    return moment["id"] != 0 if info.kind in ("scalar", "signed", "motion") and info.name not in ("luminance", "log_luminance", "dL_dt") else None
+
+
+def _folder(out: str) -> Path:
+    folder = Path(out)
+    if folder.exists() and not folder.is_dir():
+        raise OutputError("is a file", where=str(folder), accepted="a folder")
+    with output_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = None, as_json: bool = False) -> str:
+    """What ``blinkgl shader probe`` prints."""
+    x, y = check_pixel(subject.scene, pixel)
+    with open_renderer(subject, shaders) as renderer:
+        found = probe(GpuMoment(renderer, when, subject.log_eps), ReferenceMoment(subject.scene, when, subject.log_eps), x, y)
+    return json.dumps(_finite(found)) if as_json else as_text(found)
+
+
+def run_diff(subject: Subject, when: When, names: list[str] | None, tolerances: list[str], shaders: str | None = None,
+             out: str | None = None) -> list[Report]:
+    """Compares the named buffers (default: all that can be); with ``out`` also writes diff.png and NAME_error.npy there."""
+    from blinkgl.tools.shader_debugger.compare import QUANTITIES
+
+    if names:
+        names = [check_pass(name, QUANTITIES) for name in names]
+    with open_renderer(subject, shaders) as renderer:
+        comparison = Comparison(GpuMoment(renderer, when, subject.log_eps), ReferenceMoment(subject.scene, when, subject.log_eps))
+        names = names or comparison.names()
+        limits = parse_tolerances(tolerances, names)
+        reports = [comparison.report(name, limits.get(name)) for name in names]
+    if out is not None:
+        from blinkgl.tools.shader_debugger import picture
+
+        folder = _folder(out)
+        for report in reports:
+            with atomic_file(folder / f"{report.quantity.name}_error.npy") as temporary, temporary.open("wb") as file:
+                np.save(file, report.errors, allow_pickle=False)
+        title = f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = {when.t_ns * 1e-9:.6g} s"
+        picture.save_errors(folder / "diff.png", reports, title + "   (log scale; silhouettes and shared edges greyed)")
+    return reports
+
+
+def diff_json(reports: list[Report]) -> str:
+    return json.dumps(_finite({"passed": all(r.passed for r in reports), "buffers": [r.summary() for r in reports]}))
+
+
+def _finite(value):
+    """JSON has no inf and nan: as text."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    return value
+
+
+def diff_text(reports: list[Report]) -> str:
+    """The table, then histogram, worst pixels and suspicions of each buffer that failed, or of a single one."""
+    lines = [f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} {'max':>8}   silhouette band: over / pixels"]
+    summaries = [report.summary() for report in reports]
+    for s in summaries:
+        e, b = s["off_silhouettes"], s["silhouette_band"]
+        lines.append(f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  {s['unit']:<24} {e['pixels']:>8} "
+                     f"{e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   {b['over_tolerance']} / {b['pixels']}")
+    notes = {s["note"]: [] for s in summaries if s["note"]}
+    for s in summaries:
+        if s["note"]:
+            notes[s["note"]].append(s["buffer"])
+    lines += [""] + [f"{', '.join(names)}: {note}" for note, names in notes.items()]
+    for s in summaries:
+        if s["passed"] and len(summaries) > 1:
+            continue
+        lines += ["", f"{s['buffer']}: {s['off_silhouettes']['over_tolerance']} of {s['off_silhouettes']['pixels']} graded pixels over {s['tolerance']:g} {s['unit']}"]
+        lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
+        top = max([1, *s["histogram"].values()])
+        lines += [f"  {name:>6} {count:>8} {'#' * max(1, round(40 * np.log1p(count) / np.log1p(top)))}" for name, count in s["histogram"].items() if count]
+        lines += [f"  worst: ({w['x']}, {w['y']}) error {w['error']:.3g}, GPU {_short(w['gpu'])}, reference {_short(w['reference'])}, "
+                  f"{w['object'] or 'nothing hit'}" + (f" triangle {w['triangle']}" if w["object"] else "") for w in s["worst"]]
+    failed = [s for s in summaries if not s["passed"]]
+    if failed:
+        w = failed[0]["worst"][0] if failed[0]["worst"] else None
+        lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance" + (f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else "")]
+    else:
+        lines += ["", f"all {len(summaries)} buffers agree with the reference"]
+    return "\n".join(lines)
+
+
+def _short(v) -> str:
+    return "(" + ", ".join(f"{x:.5g}" for x in v) + ")" if isinstance(v, list) else (str(v) if isinstance(v, (bool, int)) else f"{v:.6g}")

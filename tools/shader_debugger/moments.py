@@ -1,0 +1,226 @@
+"""Every buffer of one moment by name: :class:`GpuMoment` reads them from OpenGL, :class:`ReferenceMoment` computes them in
+float64. Both hand out the same names, shapes and conventions, each computed when it is first asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from blinkgl.errors import ConfigError
+from blinkgl.render import reference
+from blinkgl.render.colour import LUMA
+from blinkgl.render.renderer import LabelRequest
+from blinkgl.scene.types import Scene
+from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
+from blinkgl.tools.shader_debugger.session import DebugRenderer, When
+
+
+@dataclass(frozen=True)
+class Pass:
+    """kind : how it is shown: scalar, signed, ids, mask, light (linear rgb), unit (vectors), uv, motion.
+    source : the program and output that write it."""
+
+    name: str
+    title: str
+    unit: str
+    kind: str
+    source: str
+
+
+PASSES = {p.name: p for p in (
+    Pass("colour", "colour", "linear radiance", "light", "label.glsl OUT_COLOUR"),
+    Pass("albedo", "albedo", "linear", "light", "debug.glsl OUT_ALBEDO"),
+    Pass("irradiance", "irradiance factor", "1", "scalar", "debug.glsl OUT_SHADE"),
+    Pass("normals", "normals", "camera axes", "unit", "label.glsl OUT_NORMAL"),
+    Pass("depth", "depth", "world units", "scalar", "label.glsl OUT_DEPTH"),
+    Pass("id", "instance id", "0: nothing hit", "ids", "label.glsl OUT_ID"),
+    Pass("triangle", "triangle of its part", "0: nothing hit", "ids", "debug.glsl OUT_TRIANGLE"),
+    Pass("uv", "uv", "texture repeats", "uv", "debug.glsl OUT_UV"),
+    Pass("mip_level", "mip level", "log2(texels per px)", "signed", "debug.glsl OUT_LOD"),
+    Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
+    Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
+    Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
+    Pass("velocity", "velocity", "px/s", "motion", "label.glsl OUT_VELOCITY"),
+    Pass("flow_forward", "forward flow", "px", "motion", "label.glsl OUT_FLOW_FORWARD"),
+    Pass("flow_backward", "backward flow", "px", "motion", "label.glsl OUT_FLOW_BACKWARD"),
+    Pass("valid_forward", "valid, forward", "", "mask", "label.glsl OUT_FLOW_FORWARD"),
+    Pass("valid_backward", "valid, backward", "", "mask", "label.glsl OUT_FLOW_BACKWARD"),
+    Pass("occluded_forward", "occluded, forward", "", "mask", "render/occlusion.py"),
+    Pass("occluded_backward", "occluded, backward", "", "mask", "render/occlusion.py"),
+)}
+
+
+def check_pass(name: str, known=PASSES, where: str = "--pass") -> str:
+    """``name`` if it is one of ``known``. Raises ConfigError."""
+    if name not in known:
+        raise ConfigError("unknown pass", where=where, value=name, accepted="one of " + ", ".join(known))
+    return name
+
+
+class _Lazy:
+    """``self[name]``, computed by the method that makes its group of buffers."""
+
+    def __init__(self):
+        self._made: dict[str, np.ndarray] = {}
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._made:
+            self._made.update(self._make(name))
+        return self._made[name]
+
+    def _make(self, name: str) -> dict[str, np.ndarray]:
+        raise NotImplementedError
+
+
+class GpuMoment(_Lazy):
+    """What the GPU wrote. Besides :data:`PASSES`: shade (H, W, 2) float32 albedo luminance and irradiance factor;
+    part (H, W) int32, -1: nothing hit; local (H, W, 3); window (H, W, 4) gl_FragCoord; next_depth_forward|backward (H, W), the
+    depth at t' that the flow program returns.
+
+    Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
+    """
+
+    def __init__(self, renderer: DebugRenderer, when: When, log_eps: float):
+        super().__init__()
+        self.renderer, self.when, self.log_eps = renderer, when, log_eps
+
+    def _make(self, name):
+        draw, when = self.renderer, self.when
+        if name == "colour":
+            return {name: draw.colour(when.t_ns)}
+        if name == "luminance":
+            return {name: draw.luminance(when.t_ns)}
+        if name == "log_luminance":
+            return {name: np.log(self["luminance"] + np.float32(self.log_eps))}
+        if name == "dL_dt":
+            change = draw.luminance(when.after_ns) - draw.luminance(when.before_ns)
+            return {name: change / np.float32(when.step_s)}
+        if name in ("albedo", "irradiance", "triangle", "uv", "mip_level", "shade", "part", "local", "window"):
+            return self._inspect()
+        if name.startswith("next_depth_"):
+            way = name.removeprefix("next_depth_")
+            raw = draw.raw(when.t_ns, f"FLOW_{way.upper()}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
+            return {name: raw[f"FLOW_{way.upper()}"][..., 2]}
+        return self._labels()
+
+    def _inspect(self):
+        out = self.renderer.inspect(self.when.t_ns)
+        return {"albedo": out["ALBEDO"][..., :3], "irradiance": out["SHADE"][..., 1], "triangle": out["TRIANGLE"], "uv": out["UV"],
+                "mip_level": out["LOD"][..., 1], "shade": out["SHADE"], "part": out["LOCAL"][..., 3].astype(np.int32) - 1,
+                "local": out["LOCAL"][..., :3], "window": out["WINDOW"]}
+
+    def _labels(self):
+        when = self.when
+        ask = LabelRequest(depth=True, ids=True, normals=True, velocity=True, flow_forward=True, flow_backward=True, occlusion=True)
+        labels = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
+        out = {"depth": labels.depth, "id": labels.ids, "normals": labels.normals, "velocity": labels.velocity}
+        for way in ("forward", "backward"):
+            flow = getattr(labels, way)
+            out |= {f"flow_{way}": flow.flow, f"valid_{way}": flow.valid, f"occluded_{way}": flow.occluded}
+        return out
+
+
+class ReferenceMoment(_Lazy):
+    """What the GPU should have written, float64, by :mod:`blinkgl.render.reference`. ``frame``: the reference's own frame.
+
+    mip_level is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6, section 8.14, eq. 8.7),
+    from the exact derivatives of uv on the triangle's plane; a GPU takes it from 2 x 2 pixels. albedo, and what follows from it
+    (colour, luminance, log_luminance, dL_dt), is sampled at that level by the CPU twin in :mod:`mipmaps`, because the reference
+    itself has no mip maps; its own values, at full resolution, are albedo_level0, colour_level0 and luminance_level0.
+    """
+
+    def __init__(self, scene: Scene, when: When, log_eps: float):
+        super().__init__()
+        self.scene, self.when, self.log_eps = scene, when, log_eps
+        self._frame: reference.ReferenceFrame | None = None
+        self._others: dict[int, reference.ReferenceFrame] = {}
+
+    @property
+    def frame(self) -> reference.ReferenceFrame:
+        if self._frame is None:
+            self._frame = reference.render(self.scene, self.when.t_ns, forward_ns=self.when.forward_ns, backward_ns=self.when.backward_ns)
+        return self._frame
+
+    def at(self, t_ns: int) -> reference.ReferenceFrame:
+        """The frame of another time, without flow."""
+        if t_ns == self.when.t_ns:
+            return self.frame
+        if t_ns not in self._others:
+            self._others[t_ns] = reference.render(self.scene, t_ns)
+        return self._others[t_ns]
+
+    def _make(self, name):
+        frame = self.frame
+        if name == "depth":
+            return {name: frame.depth}
+        if name.endswith("_level0"):
+            return {name: getattr(frame, name.removesuffix("_level0"))}
+        if name == "id":
+            return {name: frame.instance}
+        if name == "triangle":
+            return {name: frame.triangle + 1}
+        if name == "part":
+            return {name: frame.part}
+        if name == "local":
+            return {name: np.where(frame.hit[..., None], frame.local, 0.0)}
+        if name == "velocity":
+            return {name: np.where(frame.hit[..., None], frame.velocity, 0.0)}
+        if name == "normals":
+            rotation = self.scene.camera.path.pose(self.when.t_ns)[:3, :3]
+            return {name: np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)}
+        if name == "log_luminance":
+            return {name: np.log(self["luminance"] + self.log_eps)}
+        if name == "dL_dt":
+            before, after = (self._surface(t)["luminance"] for t in (self.when.before_ns, self.when.after_ns))
+            return {name: (after - before) / self.when.step_s}
+        if name in ("uv", "irradiance", "mip_level", "albedo", "colour", "luminance"):
+            return self._surface(self.when.t_ns)
+        flows = {}
+        for way in ("forward", "backward"):
+            flow = getattr(frame, way)
+            flows |= {f"flow_{way}": np.where(flow.valid[..., None], flow.flow, 0.0), f"valid_{way}": flow.valid,
+                      f"occluded_{way}": flow.occluded, f"next_depth_{way}": np.where(frame.hit, flow.depth, 0.0)}
+        return flows
+
+    def _surface(self, t_ns: int) -> dict[str, np.ndarray]:
+        frame, scene = self.at(t_ns), self.scene
+        shape = frame.hit.shape
+        uv, light, level, albedo = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3))
+        rays = (reference.pixel_grid(scene.camera) - [scene.camera.cx, scene.camera.cy]) / [scene.camera.fx, scene.camera.fy]
+        rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1).reshape(*shape, 3)
+        for p, (thing, part) in enumerate(reference.scene_parts(scene)):
+            on = frame.part == p
+            if not on.any():
+                continue
+            light[on] = 1.0 if part.material.unlit else reference.irradiance(scene, frame.normal[on])
+            if part.material.texture is not None:  # else the GPU has no coordinates either
+                uv[on] = frame.uv[on] * part.material.uv_scale
+                corners = part.mesh.faces[frame.triangle[on]]
+                pose = reference.relative_pose_at(scene, thing, t_ns)
+                points = part.mesh.vertices[corners] @ pose[:3, :3].T + pose[:3, 3]
+                texels = part.mesh.uvs[corners].astype(np.float64) * part.material.uv_scale * part.material.texture.image.shape[1::-1]
+                level[on] = footprint(points, texels, rays[on], (scene.camera.fx, scene.camera.fy))
+            albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
+        colour = np.where(frame.hit[..., None], albedo * light[..., None], frame.colour)
+        return {"uv": uv, "irradiance": light, "mip_level": level, "albedo": albedo, "colour": colour, "luminance": colour @ LUMA}
+
+
+def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, focal: tuple[float, float]) -> np.ndarray:
+    """(N,) log2 of the texels that one pixel step covers on the planes of N triangles.
+
+    points : (N, 3, 3) corners, camera axes.   texels : (N, 3, 2) texture coordinates of the corners, in texels.
+    rays : (N, 3) (rx, ry, 1).   focal : fx, fy in px.
+    With b = inv([A B C]) r the coordinates are (sum b_i u_i) / (sum b_i); the adjugate does, its scale cancels."""
+    a, b, c = points[:, 0], points[:, 1], points[:, 2]
+    rows = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    weights = np.einsum("nij,nj->ni", rows, rays)
+    total = weights.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        here = np.einsum("ni,nik->nk", weights, texels) / total[:, None]
+        steps = []
+        for axis in (0, 1):
+            slope = rows[:, :, axis] / focal[axis]  # d weights / d pixel
+            change = np.einsum("ni,nik->nk", slope, texels) - here * slope.sum(axis=1)[:, None]
+            steps.append(np.linalg.norm(change / total[:, None], axis=1))
+        return np.log2(np.maximum(steps[0], steps[1]))

@@ -1,0 +1,232 @@
+"""Arrays as pictures: colour maps, labelled PNGs with colour bars, the contact sheet, error maps. matplotlib draws with Agg."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from blinkgl.errors import ConfigError
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.colour import flow_colour, flow_wheel
+from blinkgl.render.colour import linear_to_srgb
+from blinkgl.tools.shader_debugger.moments import PASSES, Pass
+
+SCALAR_MAP, SIGNED_MAP, ERROR_MAP = "viridis", "RdBu_r", "inferno"
+MAPS = ("viridis", "turbo", "inferno", "gray", "RdBu_r", "coolwarm")
+COMPONENTS = ("auto", "length", "x", "y", "z", "w")
+EMPTY = np.array([40, 40, 40], np.uint8)  # nothing hit, or not a number
+INK, PAPER, MUTED = "#1f2933", "#ffffff", "#64748b"
+
+
+def finite_range(values: np.ndarray, signed: bool = False, share: float = 0.005) -> tuple[float, float]:
+    """A range for display: the finite values without the outermost ``share`` on either side; symmetric when signed."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 1.0
+    low, high = (float(v) for v in np.quantile(finite, [share, 1 - share]))
+    if signed:
+        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
+    if not high > low:
+        low, high = low - 0.5 * (abs(low) or 1.0), high + 0.5 * (abs(high) or 1.0)
+    return low, high
+
+
+def map_scalar(values: np.ndarray, name: str, low: float, high: float) -> np.ndarray:
+    """(H, W, 3) uint8; not finite: dark grey."""
+    if name not in MAPS:
+        raise ConfigError("unknown colour map", where="map", value=name, accepted="one of " + ", ".join(MAPS))
+    with np.errstate(invalid="ignore", over="ignore"):
+        scaled = np.clip((values.astype(np.float64) - low) / ((high - low) or 1.0), 0.0, 1.0)
+    rgb = (matplotlib.colormaps[name](np.nan_to_num(scaled))[..., :3] * 255).round().astype(np.uint8)
+    rgb[~np.isfinite(values)] = EMPTY
+    return rgb
+
+
+def id_colours(ids: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8: distinct hues by the golden ratio, dark grey for 0; the same number always has the same colour."""
+    numbers = ids.astype(np.int64)
+    hue = (numbers * 0.61803398875) % 1.0
+    value = 0.62 + 0.38 * ((numbers * 0.7548776662) % 1.0)
+    rgb = matplotlib.colors.hsv_to_rgb(np.stack([hue, np.full(hue.shape, 0.62), value], axis=-1))
+    out = (rgb * 255).round().astype(np.uint8)
+    out[numbers == 0] = EMPTY
+    return out
+
+
+def component(array: np.ndarray, which: str) -> np.ndarray:
+    """(H, W) of (H, W[, C]): a component, or the length of the vector."""
+    if array.ndim == 2:
+        return array
+    if which in ("auto", "length"):
+        return np.linalg.norm(array.astype(np.float64), axis=-1)
+    k = "xyzw".find(which) if len(which) == 1 else -1
+    if not 0 <= k < array.shape[2]:
+        raise ConfigError("no such component", where="component", value=which, accepted="one of auto, length, " + ", ".join("xyzw"[: array.shape[2]]))
+    return array[..., k]
+
+
+def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str | None = None, low: float | None = None,
+            high: float | None = None, hit: np.ndarray | None = None) -> tuple[np.ndarray, dict]:
+    """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high"}, {"kind": "wheel", "high"} or {"kind": kind}.
+
+    kind : as in :class:`Pass`.   which : component of a vector; "auto" takes the kind's own way.
+    hit : (H, W) bool, where scalars mean something (they set the range, the rest is dark grey)."""
+    if array.dtype == bool or kind == "mask":
+        return np.where(array[..., None], np.uint8(245), np.uint8(25)).repeat(3, axis=-1), {"kind": "mask"}
+    if which == "auto" and colours is None:
+        if kind == "ids":
+            return id_colours(array), {"kind": "ids"}
+        if kind == "light":
+            top = high if high is not None else 1.0
+            return (linear_to_srgb(array / top) * 255).round().astype(np.uint8), {"kind": "light", "high": top}
+        if kind == "unit":
+            rgb = np.clip(127.5 + 127.5 * array, 0, 255).round().astype(np.uint8)
+            rgb[(array == 0).all(axis=-1)] = EMPTY
+            return rgb, {"kind": "unit"}
+        if kind == "uv":
+            with np.errstate(invalid="ignore"):
+                fraction = np.nan_to_num(array % 1.0)
+            rgb = np.concatenate([fraction * 255, np.full((*array.shape[:2], 1), 60)], axis=-1).round().astype(np.uint8)
+            return rgb, {"kind": "uv"}
+        if kind == "motion":
+            speed = component(array, "length")
+            top = high if high is not None else finite_range(speed if hit is None or not hit.any() else speed[hit])[1]
+            return flow_colour(array, top, hit), {"kind": "wheel", "high": float(top)}
+    values = component(np.asarray(array), which).astype(np.float64)
+    if hit is not None and kind != "error":
+        values = np.where(hit, values, np.nan)
+    signed = kind == "signed" or (kind in ("motion", "unit") and which in ("x", "y", "z"))
+    name = colours or (SIGNED_MAP if signed else SCALAR_MAP)
+    auto = finite_range(values, signed)
+    low, high = auto[0] if low is None else low, auto[1] if high is None else high
+    return map_scalar(values, name, low, high), {"kind": "bar", "map": name, "low": float(low), "high": float(high)}
+
+
+def png_bytes(rgb: np.ndarray) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(rgb).save(out, "PNG", compress_level=1)
+    return out.getvalue()
+
+
+# ------------------------------------------------------------------------------------------------- figures
+
+
+def _style(axes) -> None:
+    axes.set_xticks([]), axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color("#cbd5e1"), spine.set_linewidth(0.6)
+
+
+def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict, size: float) -> None:
+    """Draws the colour bar, or what stands for it, into box (x, y, w, h in figure fractions)."""
+    kind = legend["kind"]
+    if kind == "bar":
+        axes = figure.add_axes(box)
+        axes.imshow(np.linspace(0, 1, 256)[None], aspect="auto", cmap=legend["map"], extent=(legend["low"], legend["high"], 0, 1))
+        axes.set_yticks([])
+        axes.locator_params(axis="x", nbins=5)
+        axes.tick_params(axis="x", labelsize=size, colors=MUTED, length=2, pad=1)
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+        return
+    x, y, w, h = box
+    text = {"mask": "white: yes, black: no", "ids": "one colour per number", "unit": "r, g, b = x, y, z; grey is 0",
+            "uv": "r, g = fractional part of u, v", "light": f"sRGB, white = {legend.get('high', 1):.3g}"}.get(kind, "")
+    if kind == "wheel":
+        ratio = figure.get_figheight() / figure.get_figwidth()
+        side = 2.1 * h
+        axes = figure.add_axes((x, y + h - side, side * ratio, side))
+        axes.imshow(flow_wheel()), _style(axes)
+        axes.set_frame_on(False)
+        figure.text(x + side * ratio * 1.25, y + h / 2, f"rim = {legend['high']:.3g}; hue is the direction", fontsize=size, color=MUTED, va="center")
+        return
+    figure.text(x, y + h / 2, text, fontsize=size, color=MUTED, va="center")
+
+
+def _save(figure: Figure, path: Path, dpi: int = 100, palette: bool = False) -> None:
+    """palette : 256 colours, a third of the size."""
+    FigureCanvasAgg(figure)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=dpi, facecolor=PAPER)
+    image = Image.open(io.BytesIO(out.getvalue())).convert("RGB")
+    with atomic_file(path) as temporary, output_errors(path):
+        (image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE) if palette else image).save(temporary, "PNG", optimize=True)
+
+
+def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
+    """One buffer: title with unit, the pixels enlarged by a whole factor, colour bar, caption."""
+    height, width = rgb.shape[:2]
+    factor = max(1, round(700 / width))
+    w, h, top, bottom = width * factor, height * factor, 46, 74
+    figure = Figure(figsize=((w + 40) / 100, (h + top + bottom) / 100))
+    W, H = w + 40, h + top + bottom
+    axes = figure.add_axes((20 / W, bottom / H, w / W, h / H))
+    axes.imshow(rgb, interpolation="nearest", aspect="auto"), _style(axes)
+    figure.text(20 / W, 1 - 18 / H, info.title, fontsize=12, color=INK, va="center", weight="bold")
+    figure.text(1 - 20 / W, 1 - 18 / H, f"{info.unit}   ·   {info.source}".strip(" ·"), fontsize=8, color=MUTED, va="center", ha="right")
+    _legend(figure, (20 / W, 44 / H, min(360, w) / W, 14 / H), legend, 8)
+    figure.text(20 / W, 10 / H, caption, fontsize=7, color=MUTED, va="center")
+    _save(figure, path)
+
+
+def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], caption: str, columns: int = 5) -> None:
+    """All buffers on one page."""
+    height, width = tiles[0][1].shape[:2]
+    w = 250
+    h = round(w * height / width)
+    rows = -(-len(tiles) // columns)
+    gap, head, foot, top = 14, 20, 32, 44
+    W, H = columns * (w + gap) + gap, top + rows * (h + head + foot) + 4
+    figure = Figure(figsize=(W / 100, H / 100))
+    figure.text(gap / W, 1 - 22 / H, caption, fontsize=10, color=INK, va="center", weight="bold")
+    for k, (info, rgb, legend) in enumerate(tiles):
+        x = gap + (k % columns) * (w + gap)
+        y = H - top - (k // columns) * (h + head + foot) - head - h
+        axes = figure.add_axes((x / W, y / H, w / W, h / H))
+        axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
+        figure.text(x / W, (y + h + 9) / H, info.title, fontsize=8.5, color=INK, va="center", weight="bold")
+        figure.text((x + w) / W, (y + h + 9) / H, info.unit, fontsize=7, color=MUTED, va="center", ha="right")
+        _legend(figure, (x / W, (y - 12) / H, w / W, 8 / H), legend, 6)
+    _save(figure, path, palette=True)
+
+
+def save_errors(path: Path, reports: list, caption: str) -> None:
+    """Error map (log scale, silhouette band in grey) and histogram of each compared buffer."""
+    columns = 4
+    height, width = reports[0].errors.shape
+    w, gap, head, below, top = 300, 22, 20, 92, 44
+    h = round(w * height / width)
+    rows = -(-len(reports) // columns)
+    W, H = columns * (w + gap) + gap, top + rows * (h + head + below) + 6
+    figure = Figure(figsize=(W / 100, H / 100))
+    figure.text(gap / W, 1 - 22 / H, caption, fontsize=10, color=INK, va="center", weight="bold")
+    for k, report in enumerate(reports):
+        x = gap + (k % columns) * (w + gap)
+        y = H - top - (k // columns) * (h + head + below) - head - h
+        errors = np.where(report.errors > 0, report.errors, 1e-12)
+        decades = np.log10(np.minimum(errors, 1e12))
+        rgb = map_scalar(np.clip(decades, -9, 2), ERROR_MAP, -9, 2)
+        rgb[~report.graded] = (rgb[~report.graded] * 0.35 + 255 * 0.3).astype(np.uint8)
+        axes = figure.add_axes((x / W, y / H, w / W, h / H))
+        axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
+        verdict, colour = ("ok", "#15803d") if report.passed else ("over tolerance", "#b91c1c")
+        figure.text(x / W, (y + h + 9) / H, PASSES[report.quantity.name].title, fontsize=8.5, color=INK, va="center", weight="bold")
+        figure.text((x + w) / W, (y + h + 9) / H, f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}", fontsize=7,
+                    color=colour, va="center", ha="right")
+        bars = figure.add_axes((x / W, (y - 62) / H, w / W, 56 / H))
+        inside = np.clip(decades[report.graded], -9, 2)
+        bars.hist(inside, bins=np.linspace(-9, 2, 56), color="#3b6ea5")
+        if report.tolerance > 0:
+            bars.axvline(np.clip(np.log10(report.tolerance), -9, 2), color="#b91c1c", linewidth=1)
+        bars.set_xlim(-9, 2), bars.set_yscale("log"), bars.set_yticks([]), bars.minorticks_off()
+        bars.set_xticks([-9, -6, -3, 0], ["≤1e-9", "1e-6", "1e-3", "1"])
+        bars.tick_params(labelsize=6, colors=MUTED, length=2, pad=1)
+        for spine in bars.spines.values():
+            spine.set_color("#cbd5e1")
+    _save(figure, path, palette=True)

@@ -1,0 +1,229 @@
+"""What the debugger looks at: one sequence's scene as a generation run would build it, a time in it, and an OpenGL
+renderer of it whose shaders may be edited while it runs."""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
+from blinkgl.errors import ConfigError, GLError
+from blinkgl.gl import GLContext, ShaderLoader, create_context
+from blinkgl.gl.shader import shader_folder
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.build import build_scene, check_assets
+from blinkgl.scene.types import Scene
+
+DEBUG_PROGRAM = "debug.glsl"
+STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """One sequence. path : its YAML file.   index : its number."""
+
+    path: str
+    config: SequenceConfig
+    index: int
+    scene: Scene
+
+    @property
+    def log_eps(self) -> float:
+        """What the emulator adds to the luminance before the logarithm."""
+        return float(getattr(self.config.events, "log_eps", 1e-3))
+
+
+@dataclass(frozen=True)
+class When:
+    """Times in ns: the moment, the other ends of its flows, and the two times whose difference quotient is dL/dt."""
+
+    t_ns: int
+    forward_ns: int
+    backward_ns: int
+    before_ns: int
+    after_ns: int
+
+    @property
+    def step_s(self) -> float:
+        """Seconds between before and after."""
+        return (self.after_ns - self.before_ns) * 1e-9
+
+    @property
+    def interval_s(self) -> float:
+        return (self.forward_ns - self.t_ns) * 1e-9
+
+
+def open_subject(config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()) -> Subject:
+    """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number ``sequence`` (default: its first).
+
+    Raises ConfigError and AssetError."""
+    template = load_run(config, overrides, seed=seed)
+    index = template.sequence(0).output.first_index if sequence is None else sequence
+    one = template.sequence(index)
+    check_assets(one.scene, template.base, one.output.split)
+    scene = build_scene(one.scene, one.camera, one.time.t0_ns, one.time.t1_ns, split=one.output.split, seed=one.seed, sequence=index,
+                        base=template.base)
+    return Subject(str(config), one, index, scene)
+
+
+def moment(subject: Subject, seconds: float | None = None, step_us: float | None = None) -> When:
+    """The times that belong to a moment ``seconds`` on the sequence's clock (default: the first label).
+
+    Flows run one label interval forward and backward; beyond the sequence's ends the poses are held, as everywhere.
+    Raises ConfigError for a time outside the sequence or a step that is not positive."""
+    timing, scene = subject.config.time, subject.scene
+    if seconds is None:
+        t_ns = timing.label_times_ns[0]
+    else:
+        t_ns = round(seconds * NS_PER_S) if math.isfinite(seconds) else None
+        if t_ns is None or not scene.t0_ns <= t_ns <= scene.t1_ns:
+            raise ConfigError("outside the sequence", where="--time", value=seconds,
+                              accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s")
+    if step_us is None:
+        step = max(1000, timing.interval_ns // STEP_FRACTION)
+    elif math.isfinite(step_us) and step_us * 1000 >= 1:
+        step = round(step_us * 1000)
+    else:
+        raise ConfigError("not a time step", where="--step", value=step_us, accepted="at least 0.001 µs")
+    before, after = max(scene.t0_ns, t_ns - step), min(scene.t1_ns, t_ns + step)
+    return When(t_ns, t_ns + timing.interval_ns, t_ns - timing.interval_ns, before, after)
+
+
+def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
+    """"X,Y" as two integers inside the image. Raises ConfigError."""
+    width, height = scene.camera.width, scene.camera.height
+    accepted = f"X,Y with 0 <= X < {width} and 0 <= Y < {height}"
+    try:
+        x, y = (int(v) for v in text.split(","))
+    except ValueError:
+        raise ConfigError("not a pixel", where="--pixel", value=text, accepted=accepted) from None
+    if not (0 <= x < width and 0 <= y < height):
+        raise ConfigError("outside the image", where="--pixel", value=text, accepted=accepted)
+    return x, y
+
+
+class EditedFolder:
+    """A user's copy of shaders/, to which :data:`DEBUG_PROGRAM` is lent when the copy is older than the debugger."""
+
+    def __init__(self, folder: Path):
+        self.path = folder
+
+    def __truediv__(self, name: str):
+        own = self.path / name
+        return shader_folder() / name if name == DEBUG_PROGRAM and not own.exists() else own
+
+    def iterdir(self):
+        return self.path.iterdir()
+
+
+def open_folder(shaders: str | None):
+    """The folder whose shaders are debugged: ``shaders``, or the shipped ones. Raises GLError when it cannot be read."""
+    if shaders is None:
+        return shader_folder()
+    folder = Path(shaders)
+    accepted = "a copy of the shaders/ folder"
+    if not folder.is_dir():
+        raise GLError("no such shader folder" if not folder.exists() else "is not a folder", where="--shaders", value=shaders, accepted=accepted)
+    if not os.access(folder, os.R_OK | os.X_OK):
+        raise GLError("shader folder cannot be read", where="--shaders", value=shaders, accepted="a folder with read permission")
+    if not any(folder.glob("*.glsl")):
+        raise GLError("no shaders in this folder", where="--shaders", value=shaders, accepted=accepted)
+    return EditedFolder(folder)
+
+
+def files_of(folder) -> list[Path]:
+    """Every shader file below ``folder``, for watching and for messages."""
+    root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
+    return sorted([*root.glob("*.glsl"), *(root / "include").glob("*.glsl")])
+
+
+class _Nothing:
+    """A uniform that the compiler optimised away: takes any value."""
+
+    value = None
+
+    def write(self, data: bytes) -> None:
+        pass
+
+
+class _Uniforms(dict):
+    def __missing__(self, name: str) -> _Nothing:
+        return _Nothing()
+
+
+class _Variants(dict):
+    """The renderer's table of uniforms, tolerant of edited shaders that no longer use one of them."""
+
+    def __setitem__(self, key, value) -> None:
+        super().__setitem__(key, _Uniforms(value) if isinstance(value, dict) else value)
+
+
+class DebugRenderer(Renderer):
+    """The production renderer, plus the debug pass, plus reloading. Draws what :class:`Renderer` draws, by its code."""
+
+    OUTPUTS = (("UV", "RG32F"), ("LOD", "RG32F"), ("ALBEDO", "RGBA32F"), ("SHADE", "RG32F"), ("TRIANGLE", "R32UI"),
+               ("LOCAL", "RGBA32F"), ("WINDOW", "RGBA32F"))
+
+    def __init__(self, gl: GLContext, scene: Scene, config):
+        super().__init__(gl, scene, config)
+        self._uniforms = _Variants()
+        parts = [(index, part) for index, thing in enumerate(scene.objects) for part in thing.parts]
+        numbers = list(range(len(parts)))
+        self.part_of: dict[int, int] = {}  # id of a draw item -> index into reference.scene_parts
+        for item in self._resources.items:
+            match = next(n for n in numbers if parts[n][0] == item.object_index and parts[n][1].mesh is item.mesh
+                         and parts[n][1].material is item.material)
+            numbers.remove(match)
+            self.part_of[id(item)] = match
+
+    def use_shaders(self, loader: ShaderLoader) -> None:
+        """Draw with another loader's programs from now on."""
+        self.gl.shaders = loader
+        self._uniforms.clear()
+        self._resources.forget_vertex_arrays()
+
+    def inspect(self, t_ns: int) -> dict[str, np.ndarray]:
+        """The outputs of debug.glsl, keyed as in :attr:`OUTPUTS`; 0 where nothing is hit."""
+        defines = {f"OUT_{name}": i for i, (name, _) in enumerate(self.OUTPUTS)}
+        target = self._target("debug", 1, tuple(fmt for _, fmt in self.OUTPUTS))
+        moment = self._moment(t_ns)
+        self._begin(target, moment, 0.0)
+        for item in self._visible(moment):
+            uniforms = self._bind(DEBUG_PROGRAM, item, moment, defines)
+            uniforms["part_number"].value = self.part_of[id(item)] + 1
+            uniforms["base_color"].value = tuple(item.material.base_color)
+            if item.textured:
+                uniforms["albedo"].value, uniforms["albedo_luminance"].value = 0, 1
+                self._resources.colour_texture(item.material).use(0)
+                self._resources.luminance_texture(item.material).use(1)
+            else:
+                uniforms["albedo_luminance"].value = self._resources.albedo_luminance(item.material)
+            self._draw(uniforms, item)
+        return {name: self._read(target, i, time.perf_counter(), None) for i, (name, _) in enumerate(self.OUTPUTS)}
+
+    def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
+        """Buffers of label.glsl as the shader wrote them, without the renderer's masks: DEPTH, ID, FLOW_FORWARD …"""
+        formats = {"DEPTH": "R32F", "ID": "R32UI", "FLOW_FORWARD": "RGBA32F", "FLOW_BACKWARD": "RGBA32F"}
+        return self._geometry(t_ns, [(name, formats[name]) for name in names], forward_ns, backward_ns)
+
+
+@contextmanager
+def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured: bool = False):
+    """A :class:`DebugRenderer` of the subject with the shaders of a folder, on the configuration's OpenGL.
+
+    as_configured : super-sample as generation does; otherwise one sample at the pixel centre, which is what the
+    reference's rays see.   Raises GLError."""
+    folder = open_folder(shaders)
+    with create_context(subject.config.gl.backend, subject.config.gl.device) as gl:
+        gl.shaders = ShaderLoader(gl.ctx, folder)
+        config = subject.config.render
+        if not as_configured:
+            config = config.model_copy(update={"supersample": 1, "image_supersample": 1})
+        with DebugRenderer(gl, subject.scene, config) as renderer:
+            yield renderer

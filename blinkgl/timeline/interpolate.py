@@ -19,58 +19,57 @@ _EPS = np.float32(1e-3)
 
 def cubic(frames: Iterable[Timed], factor: int = 4) -> Iterator[Timed]:
     """``factor - 1`` frames between any two by monotone piecewise-cubic interpolation of ln(1e-3 + I) over four neighbours (Fritsch
-    and Butland 1984: no over-shoot, hence no invented events; unequal spacing is respected)."""
-    window: list[tuple[np.ndarray, np.ndarray, int]] = []  # (luminance, log, t): frames k-1, k, k+1, k+2
-
-    def between(before, a, b, after) -> Iterator[Timed]:
-        slope = _secant(a, b)
-        m0 = slope if before is None else _monotone(_secant(before, a), slope, a[2] - before[2], b[2] - a[2])
-        m1 = slope if after is None else _monotone(slope, _secant(b, after), b[2] - a[2], after[2] - b[2])
-        for k in range(1, factor):
-            t = a[2] + (b[2] - a[2]) * k // factor
-            if t > a[2]:
-                yield np.maximum(np.exp(_hermite(a, b, m0, m1, t)) - _EPS, 0), t
-
+    and Butland 1984: no over-shoot, hence no invented events; unequal spacing is respected; linear at both ends)."""
+    a = b = None  # the last two nodes: (frame, log, t)
+    slope_a = secant = None  # slope at a, secant from a to b; per ms: float32 products of slopes per ns would underflow
     for frame, t in frames:
-        window.append((frame, np.log(frame + _EPS), t))
-        if len(window) == 1:
-            yield frame, t
-        elif len(window) >= 3:
-            before = window[-4] if len(window) == 4 else None
-            yield from between(before, *window[-3:])
-            yield window[-2][0], window[-2][2]
-            window = window[-3:]
-    if len(window) >= 2:
-        yield from between(window[-3] if len(window) == 3 else None, window[-2], window[-1], None)
-        yield window[-1][0], window[-1][2]
+        c = (frame, np.log(frame + _EPS), t)
+        if b is not None:
+            following = (c[1] - b[1]) / np.float32((t - b[2]) * 1e-6)
+            if a is not None:
+                slope_b = np.empty_like(secant)
+                _monotone(secant.ravel(), following.ravel(), b[2] - a[2], t - b[2], slope_b.reshape(-1))
+                yield from _segment(a, b, slope_a, slope_b, factor)
+                slope_a = slope_b
+            else:
+                slope_a = following
+            yield b[0], b[2]
+            secant = following
+        a, b = b, c
+    if a is not None:
+        yield from _segment(a, b, slope_a, secant, factor)
+    if b is not None:
+        yield b[0], b[2]
 
 
-def _secant(a, b) -> np.ndarray:
-    return (b[1] - a[1]) / np.float32(b[2] - a[2])
+def _segment(a, b, slope_a: np.ndarray, slope_b: np.ndarray, factor: int) -> Iterator[Timed]:
+    h = (b[2] - a[2]) * 1e-6
+    for k in range(1, factor):
+        t = a[2] + (b[2] - a[2]) * k // factor
+        if t == a[2]:
+            continue
+        s = (t - a[2]) * 1e-6 / h
+        weights = map(np.float32, ((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), h * s * (1 - s) ** 2, h * s * s * (s - 1)))
+        frame = np.empty_like(a[1])
+        _combine(a[1].ravel(), b[1].ravel(), slope_a.ravel(), slope_b.ravel(), *weights, frame.reshape(-1))
+        np.exp(frame, out=frame)
+        frame -= _EPS
+        yield np.maximum(frame, 0, out=frame), t
 
 
 @numba.njit(cache=True, nogil=True)
-def _weighted(d0, d1, h0, h1, out):
-    w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+def _monotone(d0, d1, h0, h1, out):
+    """Slope at a node: weighted harmonic mean of the secants beside it, 0 at an extremum."""
+    share = np.float32((2 * h1 + h0) / (3 * (h0 + h1)))
     for i in range(len(out)):
-        out[i] = (w0 + w1) * d0[i] * d1[i] / (w0 * d1[i] + w1 * d0[i]) if d0[i] * d1[i] > 0 else 0.0
+        product = d0[i] * d1[i]
+        out[i] = product / (share * d1[i] + (1 - share) * d0[i]) if product > 0 else np.float32(0)
 
 
-def _monotone(d0: np.ndarray, d1: np.ndarray, h0: int, h1: int) -> np.ndarray:
-    """Node slope: weighted harmonic mean of the secants beside it, 0 at an extremum."""
-    scale = float(h0 + h1)
-    out = np.empty(d0.size, np.float32)
-    # Scaled to about one: products of secants per nanosecond underflow float32.
-    _weighted((d0 * np.float32(scale)).ravel(), (d1 * np.float32(scale)).ravel(), h0 / scale, h1 / scale, out)
-    return out.reshape(d0.shape) / np.float32(scale)
-
-
-def _hermite(a, b, m0, m1, t) -> np.ndarray:
-    h = b[2] - a[2]
-    s = (t - a[2]) / h
-    f = np.float32
-    return (a[1] * f((1 + 2 * s) * (1 - s) ** 2) + b[1] * f(s * s * (3 - 2 * s))
-            + m0 * f(h * s * (1 - s) ** 2) + m1 * f(h * s * s * (s - 1)))
+@numba.njit(cache=True, nogil=True)
+def _combine(a, b, m0, m1, w0, w1, w2, w3, out):
+    for i in range(len(out)):
+        out[i] = w0 * a[i] + w1 * b[i] + w2 * m0[i] + w3 * m1[i]
 
 
 @dataclass

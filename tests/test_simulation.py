@@ -79,7 +79,7 @@ def test_luminance_of_colour_and_gamma():
     assert np.allclose(Decoder(None)(real, ""), real @ np.array([0.2126, 0.7152, 0.0722]), rtol=1e-6), "floats are linear"
 
 
-@pytest.mark.parametrize("emulator", ["esim", "v2e"])
+@pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
 @pytest.mark.parametrize("interpolate", ["linear", "cubic", "motion"])
 def test_interpolations_run_and_order_events(emulator, interpolate):
     report = SimulationReport()

@@ -118,7 +118,7 @@ class SkyConfig(Config):
 
     kind: Literal["box"] = "box"
     size: float = Field(100.0, gt=0, le=1e6, description="edge length, m")
-    subdivisions: int = Field(16, ge=1, le=256, description="cells per edge; huge triangles cost flow precision")
+    subdivisions: int = Field(4, ge=1, le=256, description="cells per edge; 1 costs a third of the flow's precision, more than 4 gains none")
     repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
     per_face: bool = Field(True, description="a texture of its own on each face, or one on all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
@@ -130,7 +130,7 @@ class GroundConfig(Config):
 
     size: float | None = Field(None, gt=0, le=1e6, description="edge length, m; null: as the sky box")
     height: float = Field(0.0, description="z of the ground, m")
-    subdivisions: int = Field(32, ge=1, le=1024, description="cells per edge")
+    subdivisions: int = Field(8, ge=1, le=1024, description="cells per edge; more gains no precision, less costs some")
     tile: PositiveRange = Field((2.0, 8.0), description="edge of one texture repeat, m; log-uniform")
 
 

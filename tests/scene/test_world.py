@@ -119,7 +119,7 @@ def test_structure(worlds):
         for p in sky.parts:      # faces look inwards, cells are small
             v = p.mesh.vertices[p.mesh.faces]
             assert (np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]) * -v.mean(axis=1)).sum(axis=1).min() > 0
-            assert np.linalg.norm(v[:, 1] - v[:, 0], axis=1).max() < 10
+            assert np.linalg.norm(v[:, 1] - v[:, 0], axis=1).max() < 1.5 * SkyConfig().size / SkyConfig().subdivisions
         assert np.ptp(sky.parts[0].mesh.vertices) == pytest.approx(100)
         for o in scene.objects:
             assert all(p.mesh.closed or o.category != "object" for p in o.parts)

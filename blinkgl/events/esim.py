@@ -80,6 +80,12 @@ def lookup_block(codes, table, out):
 
 
 @numba.njit(**JIT)
+def copy_block(source, target):
+    for i in range(source.size):  # a loop over slices: vectorised, which indices with an offset are not
+        target[i] = source[i]
+
+
+@numba.njit(**JIT)
 def _flag_block(level, upper, lower, flags):
     """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
     farthest = _FAR_BELOW
@@ -178,8 +184,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
                 return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled)
             cut += cut_here
-        for o in range(n):
-            p.log[s + o] = now[o]
+        copy_block(now[:n], p.log[s:e])
     return stop_block, filled, cut
 
 

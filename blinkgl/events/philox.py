@@ -86,6 +86,26 @@ def normal2(seed, pixel, stream, index):
     return radius * c, radius * s
 
 
+_THREE_ROOT, _TWO, _ULP32 = _D(np.sqrt(3.0)), _D(2.0), _D(2.0**-32)
+
+
+@register_jitable
+def rough_normal(seed, pixel, stream, index):
+    """Mean 0, variance 1, near normal (sum of four uniforms, within +-3.5): a third of the cost of a normal, for
+    jitters whose exact law nobody has measured."""
+    w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
+    return (_D(w0 + w1 + w2 + w3) * _ULP32 + (_TWO * _ULP32 - _TWO)) * _THREE_ROOT
+
+
+@register_jitable
+def normal_and_uniform(seed, pixel, stream, index):
+    """A standard normal (angle of 32 bits) and an independent uniform (32 bits) from one block."""
+    w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
+    u = (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53
+    c, _ = cos_sin_turn((_D(w2) + _HALF) * _ULP32)
+    return np.sqrt(_MINUS2 * log_f64(u)) * c, (_D(w3) + _HALF) * _ULP32
+
+
 def pixel_counters(height: int, width: int) -> np.ndarray:
     """(H*W,) uint64 pixel numbers in raster order, the ``pixel`` argument of the draws."""
     return np.arange(height * width, dtype=np.uint64)

@@ -14,7 +14,7 @@ import numpy as np
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
-from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
+from blinkgl.events.philox import Stream, normal2, normal_and_uniform, pixel_counters, rough_normal, uniform2
 from blinkgl.events.types import Events
 
 
@@ -108,22 +108,23 @@ class ReferenceV2e:
         self.mean_leak = self.leak.copy()
         self.leaks = bool(config.leak_rate_hz or config.hot_pixel_fraction)
         self.rebase_ns = int(v2e.REBASE / float(np.median(self.leak[self.leak > 0])) * 1e9) if self.leaks else 2**61
-        self.largest = min(v2e.MAX_SHOT_FACTOR, max(float((c / t).max()) for c, t in zip(nominal, (self.on, self.off))))
-        self.nominal = nominal
+        self.shot_table = v2e.shot_tables(self.on, self.off, *nominal)
         self.refractory = round(config.refractory_us * 1000)
         self.events_so_far = [0] * self.pixels
         self.release: list[int | None] = [None] * self.pixels
         self.t_ns: int | None = None
 
     def shot_times(self, block: int):
-        """All candidate events of one block of pixels: (ns, pixel in block, index), endlessly."""
-        rate = v2e.BLOCK * self.config.shot_noise_rate_hz * self.largest * 1e-9
+        """All candidate events of one block of pixels: (ns, pixel in block, polarity, index), endlessly."""
+        whole = np.float64(self.shot_table[block, -1])
+        rate = 0.5 * self.config.shot_noise_rate_hz * v2e.DARKEST * 1e-9 * whole
         b = np.uint64(block)
-        t = self.t_ns + v2e.shot_gap_ns(self.seed, b, np.uint64(2**62), rate)[0]
+        t = self.t_ns + v2e.shot_draw(self.seed, b, np.uint64(2**62), rate)[0]
         index = 0
         while True:
-            gap, offset = v2e.shot_gap_ns(self.seed, b, np.uint64(index), rate)
-            yield int(t), int(offset), index
+            gap, pick = v2e.shot_draw(self.seed, b, np.uint64(index), rate)
+            place = int(np.sum(self.shot_table[block] <= np.float32(pick * whole)))
+            yield int(t), place % v2e.BLOCK, int(place < v2e.BLOCK), index
             t, index = t + gap, index + 1
 
     def step(self, luminance: np.ndarray, t_ns: int) -> Events:
@@ -158,18 +159,15 @@ class ReferenceV2e:
         accepted = [[] for _ in range(self.pixels)]
         for block, clock in enumerate(getattr(self, "clocks", [])):
             while self.pending[block][0] <= t_ns:
-                t, offset, index = self.pending[block]
+                t, offset, p, index = self.pending[block]
                 self.pending[block] = next(clock)
                 i = block * v2e.BLOCK + offset
                 if i >= self.pixels:
                     continue
                 after = max(t - self.t_ns, 0)
                 here = self.intensity[i] + (intensity[i] - self.intensity[i]) * (after / (t_ns - self.t_ns))
-                u, w = uniform2(self.seed, np.uint64(block), np.uint64(Stream.SHOT), np.uint64(2 * index + 1))
-                p = int(u < 0.5)
-                theta = self.on[i] if p else self.off[i]
-                ratio = min(self.nominal[1 - p] / theta, v2e.MAX_SHOT_FACTOR)
-                if w < ratio / self.largest * v2e.shot_rate_factor(here):
+                u, _ = uniform2(self.seed, np.uint64(block), np.uint64(Stream.SHOT), np.uint64(2 * index + 1))
+                if u * v2e.DARKEST < v2e.shot_factor(here):
                     accepted[i].append((after, p))
         return [sorted(events) for events in accepted]
 
@@ -187,9 +185,10 @@ class ReferenceV2e:
         if self.config.cutoff_hz:
             curve_lag, k = f(self.lag[i]), kappa * (0.5 * (f(self.intensity[i]) + f(intensity[i])) + 20.0)
         leak = f(self.leak[i])
-        curve = lambda: (x0 + leak * since[0], leak * (dt_ns * 1e-9), dx, curve_lag, k)
-        z = lambda s: v2e.signal_at(s, *curve())
-        end = (x0 + leak * since[0]) + (0.0 + leak * (dt_ns * 1e-9)) + dx
+        base, drift = x0 + leak * since[0], leak * (dt_ns * 1e-9)
+        c, rise, fall = v2e.curve_of(base, drift, dx, curve_lag, k)
+        z = lambda s: v2e.signal_at(s, c, rise, fall, k)
+        end = base + drift + dx
         if self.config.cutoff_hz:
             end = end + f(lag[i])
         on, off, up, down = f(self.on[i]), f(self.off[i]), f(self.upper[i]), f(self.lower[i])
@@ -206,7 +205,7 @@ class ReferenceV2e:
             event = None
             if p is not None:
                 level = up if p else down
-                event_s = v2e.crossing_fraction(s, level, p, *curve(), end)
+                event_s = v2e.crossing_fraction(s, level, p, c, rise, fall, k, end)
                 event = int(event_s * dt_ns), p, event_s, level
             if noise and (event is None or noise[0][0] <= event[0]):
                 after, p = noise.pop(0)
@@ -217,11 +216,11 @@ class ReferenceV2e:
             rows.append(((self.t_ns + after) // 1000, y, column, p))
             if self.leaks and self.config.leak_jitter:
                 self.events_so_far[i] += 1
-                n, _ = normal2(self.seed, np.uint64(i), np.uint64(Stream.LEAK_JITTER), np.uint64(self.events_so_far[i]))
+                n = rough_normal(self.seed, np.uint64(i), np.uint64(Stream.LEAK_JITTER), np.uint64(self.events_so_far[i]))
                 self.leak[i] = np.float32(self.mean_leak[i] / max(0.1, 1.0 + self.config.leak_jitter * n))
                 change = f(self.leak[i]) - leak
                 leak += change
-                end += change * since[1]
+                c, rise, end = c + change * since[0], rise + change * (dt_ns * 1e-9), end + change * since[1]
                 if reference is not None:
                     reference += change * (since[0] + s * (dt_ns * 1e-9))
             if self.refractory:
@@ -277,8 +276,10 @@ class ReferenceVoltmeter:
             v, t, self.release[i] = np.float64(0), max(self.release[i] - self.t_ns, 0) * 1e-3, None
         draw = self.frame << 20
         while True:
-            side, which = uniform2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw))
-            normal, _ = normal2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw + 1))
+            if not voltmeter.in_reach(v, mu * (dt - t), sigma * np.sqrt(dt - t)):
+                return int((v + mu * (dt - t)) * voltmeter.V_ONE)
+            normal, which = normal_and_uniform(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw))
+            side, _ = uniform2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw + 1))
             draw += 2
             p = int(side < voltmeter.on_first(1.0 - v, 1.0 + v, mu, sigma))
             hit = t + voltmeter.hitting_time(1.0 - v if p else 1.0 + v, mu, sigma, normal, which)

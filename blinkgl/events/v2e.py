@@ -12,9 +12,8 @@ continuous time, so that nothing but the accuracy of the interpolation depends o
   with one whatever the signal has become, so that change during the dead time never comes out as a backlog.
 * Leak is a drift of the reference; with jitter each event draws the length of the pixel's next leak interval.
   Hot pixels are pixels with a large leak.
-* Shot noise is a Poisson process per block of 1024 pixels at the largest rate that a pixel can have, thinned to
-  each pixel's own rate (R/2)(1 - 0.75 (I + 20)/275) theta_nominal/theta per polarity at that instant (the last
-  ratio at most 4).
+* Shot noise is a Poisson process per block of 1024 pixels at its rate in the dark, thinned to
+  each pixel's own rate (R/2)(1 - 0.75 (I + 20)/275) theta_nominal/theta per polarity at that instant.
 * Photoreceptor noise (instead of shot noise) is the stationary noise of the same low-pass, added before the
   comparator; :mod:`blinkgl.events.noise` sets its size so that the rate holds at any frame spacing.
 """
@@ -31,9 +30,9 @@ from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import exp_f32, exp_f64, log_f32, log_f64, select
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.esim import draw_thresholds
+from blinkgl.events.esim import copy_block, draw_thresholds
 from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
-from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
+from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
 from blinkgl.events.types import Events
 
 _F = np.float32
@@ -43,8 +42,6 @@ _SHOT, _LEAK_JITTER = np.uint64(Stream.SHOT), np.uint64(Stream.LEAK_JITTER)
 _U2, _U1, _U1000, _MASK41 = np.uint64(2), np.uint64(1), np.uint64(1000), 2**41 - 1
 _INSERTION_LIMIT = 32
 _FARTHEST, _FAR_BELOW = np.float32(1e6), np.int32(-(2**31))
-MAX_SHOT_FACTOR = 4.0
-"""A pixel with a small threshold is noisier in proportion, but at most this much."""
 REBASE = 0.02
 """Leak (ln units) after which the leak clock starts anew: small beside a threshold, so that float32 does."""
 
@@ -63,15 +60,21 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 
 def decay(k):
     """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
     small = np.minimum(k, _HALF)
-    p = small * _P6 + _P5
-    p = p * small + _P4
-    p = p * small + _P3
-    p = p * small + _P2
-    p = p * small + _P1
-    p = p * small + _P0
+    p = _gentle_growth(small)
     large = np.maximum(k, _HALF)
     e = exp_f32(-large)
     return select(k < _HALF, _ONE - small * p, e), select(k < _HALF, p, (_ONE - e) / large)
+
+
+@register_jitable
+def _gentle_growth(k):
+    """(1 - e^-k)/k for k < 1/2, Taylor."""
+    p = k * _P6 + _P5
+    p = p * k + _P4
+    p = p * k + _P3
+    p = p * k + _P2
+    p = p * k + _P1
+    return p * k + _P0
 
 
 @register_jitable
@@ -82,50 +85,67 @@ def relax(lag, before, now, intensity_before, intensity_now, kappa):
 
 
 @register_jitable
-def signal_at(s, base, drift, dx, lag, k):
-    """z at fraction s of the interval, float64; k < 0: no low-pass."""
-    if k < 0:
-        return base + (drift + dx) * s
-    e = exp_f64(-k * s)
-    return base + drift * s + dx * (s - (1.0 - e) / k) + lag * e
+def relax_gently(lag, before, now, intensity_before, intensity_now, kappa):
+    """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
+    k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
+    g = _gentle_growth(k)
+    return lag * (_ONE - k * g) - (now - before) * g
 
 
 @register_jitable
-def crossing_fraction(start, target, polarity, base, drift, dx, lag, k, end):
+def curve_of(base, drift, dx, lag, k):
+    """(c, rise, fall) of z(s) = c + rise s + fall e^{-k s} over an interval, s in [0, 1], float64.
+
+    base: lin-log intensity and leak at the start; drift: change by leak and noise; dx: change of the lin-log
+    intensity; lag: y - x at the start; k: time constants in the interval, negative for no low-pass.
+    """
+    if k < 0:
+        return base, drift + dx, 0.0
+    behind = dx / k
+    return base - behind, drift + dx, lag + behind
+
+
+@register_jitable
+def signal_at(s, c, rise, fall, k):
+    """z at fraction s of the interval."""
+    if k < 0:
+        return c + rise * s
+    return c + rise * s + fall * exp_f64(-k * s)
+
+
+@register_jitable
+def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
     """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
 
     The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
     1e-6 of the interval unless the curve is flat there."""
     if k < 0:
-        return min(max((target - base) / (drift + dx), start), 1.0)
+        return min(max((target - c) / rise, start), 1.0)
     sign = 1.0 if polarity else -1.0
     low, high = start, 1.0
-    f_low = sign * ((base + lag if start == 0.0 else signal_at(start, base, drift, dx, lag, k)) - target)
+    e_low = 1.0 if start == 0.0 else exp_f64(-k * start)
+    f_low = sign * (c + rise * start + fall * e_low - target)
     if f_low >= 0:
         return start
     f_high = sign * (end - target)
-    # z' at both ends in closed form: at the end e^-k follows from z itself.
-    fall = lag * k + dx
-    rise = drift + dx
-    e_end = (end - base - rise + dx / k) / (lag + dx / k) if fall != 0.0 else 0.0
-    v_low = sign * (rise - fall * (1.0 if start == 0.0 else exp_f64(-k * start)))
-    v_high = sign * (rise - fall * e_end)
+    # z' at both ends; at the end fall e^-k follows from z itself.
+    v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
     width, height = high - low, f_high - f_low
     u = -f_low / height
     s = low + width * u
     if v_low > 0 and v_high > 0:
-        m_low, m_high = height / (v_low * width), height / (v_high * width)
-        guess = u * ((1.0 - u) * ((1.0 - u) * m_low - u * m_high) + u * (3.0 - 2.0 * u))
+        stretch = height / (width * v_low * v_high)
+        guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
         if 0.0 < guess < 1.0:
             s = low + width * guess
     for _ in range(60):
-        e = exp_f64(-k * s)
-        f = sign * (base + drift * s + dx * (s - (1.0 - e) / k) + lag * e - target)
+        e = fall * exp_f64(-k * s)
+        f = sign * (c + rise * s + e - target)
         if f < 0:
             low = s
         else:
             high = s
-        slope = sign * (rise - fall * e)
+        slope = sign * (rise - k * e)
         following = s - f / slope if slope > 0 else -1.0
         if not (low <= following <= high):
             following = 0.5 * (low + high)
@@ -137,17 +157,35 @@ def crossing_fraction(start, target, polarity, base, drift, dx, lag, k, end):
 
 
 # --- shot noise --------------------------------------------------------------------------------------------
-@register_jitable
-def shot_gap_ns(seed, block, index, rate_per_ns):
-    """Draws number ``index`` of a block: (ns to the event after it, pixel within the block)."""
-    u, v = uniform2(seed, block, _SHOT, index * _U2)
-    return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), np.int64(v * BLOCK)
+DARKEST = 1.0 - 0.75 * 20.0 / 275.0
+"""Shot-noise factor at intensity 0, the largest."""
 
 
 @register_jitable
-def shot_rate_factor(intensity):
+def shot_factor(intensity):
     """Noise falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR 0.25)."""
     return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
+
+
+@register_jitable
+def shot_draw(seed, block, index, rate_per_ns):
+    """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
+    u, v = uniform2(seed, block, _SHOT, index * _U2)
+    return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), v
+
+
+def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: float) -> np.ndarray:
+    """Cumulative noise of the pixels of each block of 1024, ON pixels then OFF pixels, (blocks, 2048) float32.
+
+    One unit is a pixel with nominal threshold and one polarity; the last entry of a block is its whole noise.
+    """
+    blocks = -(-len(on) // BLOCK)
+    weights = np.zeros((blocks, 2, BLOCK))
+    for polarity, (nominal, theta) in enumerate(((theta_on, on), (theta_off, off))):
+        padded = np.zeros(blocks * BLOCK)
+        padded[: len(on)] = nominal / theta.astype(np.float64)
+        weights[:, polarity] = padded.reshape(blocks, BLOCK)
+    return np.cumsum(weights.reshape(blocks, 2 * BLOCK), axis=1).astype(np.float32)
 
 
 class Pixels(NamedTuple):
@@ -167,6 +205,7 @@ class Pixels(NamedTuple):
     release: np.ndarray  # int64 ns, end of the dead time or NEVER
     clock_ns: np.ndarray  # (blocks,) int64 time of the next shot-noise candidate; []
     clock_index: np.ndarray  # (blocks,) int64 its number
+    shot_table: np.ndarray  # (blocks, 2048) float32, see shot_tables
 
 
 class Interval(NamedTuple):
@@ -176,15 +215,13 @@ class Interval(NamedTuple):
     since_epoch_0: float  # seconds from the leak epoch to both ends
     since_epoch_1: float
     kappa: float
+    gentle: bool  # k < 1/2 at every pixel
     scale: np.float32
     seed: np.uint64
     width: int
     refractory_ns: int
     leak_jitter: float
-    shot_rate_per_ns: float  # of a block of pixels at the largest rate
-    shot_largest: float  # largest ratio theta_nominal / theta
-    theta_on: float
-    theta_off: float
+    shot_unit_per_ns: float  # rate of a dark pixel with nominal threshold, one polarity
     inverse_threshold: float
     bound_per_pixel: int
 
@@ -220,15 +257,17 @@ def _relax_block(lag, before, now, intensity_before, intensity_now, kappa, out, 
 
 
 @numba.njit(**JIT)
-def _add_scaled_block(a, scale, out):
-    for i in range(a.size):
-        out[i] += a[i] * scale
+def _relax_block_gently(lag, before, now, intensity_before, intensity_now, kappa, out, z):
+    for i in range(now.size):
+        lag_now = relax_gently(lag[i], before[i], now[i], intensity_before[i], intensity_now[i], kappa)
+        out[i] = lag_now
+        z[i] += lag_now
 
 
 @numba.njit(**JIT)
-def _copy_block(source, target):
-    for i in range(source.size):
-        target[i] = source[i]
+def _add_scaled_block(a, scale, out):
+    for i in range(a.size):
+        out[i] += a[i] * scale
 
 
 @numba.njit(**JIT)
@@ -249,27 +288,28 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
     interval's start << 1 | polarity), sorted. Returns (events, time and number of the next candidate); -1 events
     when ``keys`` is too small."""
     count, first, end_ns = 0, block * BLOCK, v.t0_ns + v.dt_ns
+    table = p.shot_table[block]
+    whole = np.float64(table[table.size - 1])
     t_ns, index = p.clock_ns[block], p.clock_index[block]
     while t_ns <= end_ns:
-        gap, offset = shot_gap_ns(v.seed, np.uint64(block), np.uint64(index), v.shot_rate_per_ns)
+        gap, pick = shot_draw(v.seed, np.uint64(block), np.uint64(index), v.shot_unit_per_ns * whole)
+        place = np.searchsorted(table, np.float32(pick * whole), side="right")
+        offset, on = place & (BLOCK - 1), place < BLOCK
         if offset < pixels_in_block:
             i = first + offset
             after = max(t_ns - v.t0_ns, 0)
-            s = after / v.dt_ns
-            intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * s
-            u, w = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)
-            on = u < 0.5
-            ratio = v.theta_on / p.on[i] if on else v.theta_off / p.off[i]
-            if w < min(ratio, MAX_SHOT_FACTOR) / v.shot_largest * shot_rate_factor(intensity):
+            intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
+            u, _ = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)
+            if u * DARKEST < shot_factor(intensity):
                 if count == keys.size:
                     return -1, t_ns, index
                 key = (offset << 42) | (after << 1) | np.int64(on)
-                place = count
+                slot = count
                 if count < _INSERTION_LIMIT:
-                    while place > 0 and keys[place - 1] > key:
-                        keys[place] = keys[place - 1]
-                        place -= 1
-                keys[place] = key
+                    while slot > 0 and keys[slot - 1] > key:
+                        keys[slot] = keys[slot - 1]
+                        slot -= 1
+                keys[slot] = key
                 count += 1
         index += 1
         t_ns += gap
@@ -308,6 +348,7 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
             x0 += np.float64(p.noise[i])
             shift = np.float64(noise_now[o]) - np.float64(p.noise[i])
         base, drift = x0 + leak * v.since_epoch_0, shift + leak * dt
+        c, rise, fall = curve_of(base, drift, dx, lag, k)
         end = base + drift + dx  # z(1); the low-pass has been evaluated already
         if p.lag.size:
             end += np.float64(lag_now[o])
@@ -320,7 +361,7 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
             else:
                 now_ns = max(p.release[i] - v.t0_ns, 0)
                 s = now_ns / dt_ns
-                reference = signal_at(s, base, drift, dx, lag, k)
+                reference = signal_at(s, c, rise, fall, k)
                 up, down = reference + on, reference - off
                 p.release[i] = NEVER_NS
         while noise < noise_end and (keys[noise] >> 42) < o:
@@ -336,7 +377,7 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
                 fires, target = True, down
             event_s, event_ns, reference = 2.0, np.int64(0), target
             if fires:
-                event_s = crossing_fraction(s, target, polarity, base, drift, dx, lag, k, end)
+                event_s = crossing_fraction(s, target, polarity, c, rise, fall, k, end)
                 event_ns = np.int64(event_s * dt_ns)
             from_noise = False
             if noise < noise_end and (keys[noise] >> 42) == o:
@@ -356,12 +397,13 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
             s, now_ns = event_s, event_ns
             if p.fired.size:
                 p.fired[i] += 1
-                a, b = normal2(v.seed, np.uint64(i), _LEAK_JITTER, np.uint64(p.fired[i]))
+                a = rough_normal(v.seed, np.uint64(i), _LEAK_JITTER, np.uint64(p.fired[i]))
                 p.leak[i] = np.float32(p.leak_mean[i] / max(0.1, 1.0 + v.leak_jitter * a))
                 change = np.float64(p.leak[i]) - leak
                 leak += change
                 reference += change * (v.since_epoch_0 + s * dt)  # the same reference, seen from the new drift
-                base, drift = x0 + leak * v.since_epoch_0, shift + leak * dt
+                c += change * v.since_epoch_0
+                rise += change * dt
                 end += change * v.since_epoch_1
             if p.release.size:
                 now_ns = event_ns + v.refractory_ns
@@ -371,7 +413,7 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
                     break
                 s = now_ns / dt_ns
             if from_noise or p.release.size:
-                reference = signal_at(s, base, drift, dx, lag, k)
+                reference = signal_at(s, c, rise, fall, k)
             up, down = reference + on, reference - off
         if dead:
             p.upper[i], p.lower[i] = -_INF, _INF
@@ -401,7 +443,10 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             _scale_block(frame[s:e], v.scale, intensity[:n])
             _lin_log_block(intensity[:n], x[:n], z[:n])
         if p.lag.size:
-            _relax_block(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
+            if v.gentle:
+                _relax_block_gently(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
+            else:
+                _relax_block(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
         if p.leak.size:
             _add_scaled_block(p.leak[s:e], since, z[:n])
         farthest = _flag_block(z[:n], p.upper[s:e], p.lower[s:e], flags)
@@ -423,10 +468,10 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             now = (intensity, x, lag, noise)
             filled, cut_here = _emit_block(active, count, s, now, keys, shots, p, v, cap, packed, filled)
             cut += cut_here
-        _copy_block(intensity[:n], p.intensity[s:e])
-        _copy_block(x[:n], p.x[s:e])
+        copy_block(intensity[:n], p.intensity[s:e])
+        copy_block(x[:n], p.x[s:e])
         if p.lag.size:
-            _copy_block(lag[:n], p.lag[s:e])
+            copy_block(lag[:n], p.lag[s:e])
         if p.clock_ns.size:
             p.clock_ns[block], p.clock_index[block] = clock_ns, clock_index
     return stop_block, filled, cut
@@ -448,7 +493,7 @@ class V2e(Emulator):
     photoreceptor noise; thresholds are constants."""
 
     _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_fired", "_release", "_clock_ns",
-              "_clock_index", "_epoch_ns")
+              "_clock_index", "_epoch_ns", "_brightest")
 
     def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0):
         super().__init__(height, width, seed)
@@ -468,7 +513,7 @@ class V2e(Emulator):
         self._rebase_ns = 2**61
         if self._leak.size and self._leak.max() > 0:
             self._rebase_ns = int(REBASE / float(np.median(self._leak[self._leak > 0])) * 1e9)
-        self._epoch_ns = np.zeros(1, np.int64)
+        self._epoch_ns, self._brightest = np.zeros(1, np.int64), np.zeros(1)
 
         self._refractory_ns = int(round(config.refractory_us * 1000))
         self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
@@ -476,8 +521,8 @@ class V2e(Emulator):
         shot = config.shot_noise_rate_hz > 0 and not config.photoreceptor_noise
         blocks = -(-pixels // BLOCK) if shot else 0
         self._clock_ns, self._clock_index = np.zeros(blocks, np.int64), np.zeros(blocks, np.int64)
-        largest = min(MAX_SHOT_FACTOR, max(float((on / self._on).max()), float((off / self._off).max())))
-        self._shot = (BLOCK * config.shot_noise_rate_hz * largest * 1e-9, largest, on, off)
+        self._shot_unit = 0.5 * config.shot_noise_rate_hz * DARKEST * 1e-9
+        self._shot_table = shot_tables(self._on, self._off, on, off) if shot else np.empty((0, 0), np.float32)
         self._inverse_threshold = 1.0 / float(min(self._on.min(), self._off.min()))
         self._scale = np.float32(config.full_scale)
         self._tables_changed()
@@ -498,26 +543,31 @@ class V2e(Emulator):
             reference = reference - phase.astype(np.float32) * self._on
         self._upper[...], self._lower[...] = reference + self._on, reference - self._off
         for block in range(len(self._clock_ns)):
-            gap, _ = shot_gap_ns(self.seed, np.uint64(block), np.uint64(2**62), self._shot[0])
+            rate = self._shot_unit * float(self._shot_table[block, -1])
+            gap, _ = shot_draw(self.seed, np.uint64(block), np.uint64(2**62), rate)
             self._clock_ns[block] = t_ns + gap
-        self._epoch_ns[0] = t_ns
+        self._epoch_ns[0], self._brightest[0] = t_ns, self._intensity.max()
         return Events.empty()
 
     def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
         config, dt_ns = self.config, t_ns - self.t_ns
-        if self._shot[0] * len(self._clock_ns) * dt_ns > config.max_events_per_step:
+        if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > config.max_events_per_step:
             raise EventDataError("more shot noise than max_events_per_step in one interval", where=f"frame {self.frames}",
                                  value=f"{dt_ns} ns", accepted="a shorter interval or a lower shot_noise_rate_hz")
         pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._upper, self._lower, self._on, self._off,
-                        self._leak, self._leak_mean, self._fired, self._release, self._clock_ns, self._clock_index)
+                        self._leak, self._leak_mean, self._fired, self._release, self._clock_ns, self._clock_index,
+                        self._shot_table)
         base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
-        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9,
-                            2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0, self._scale, self.seed, self.width,
-                            self._refractory_ns, config.leak_jitter, *self._shot, self._inverse_threshold,
+        kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
+        brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
+        gentle = kappa * (max(brightest, self._brightest[0]) + 20.0) < 0.499
+        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9, kappa, gentle, self._scale, self.seed, self.width,
+                            self._refractory_ns, config.leak_jitter, self._shot_unit, self._inverse_threshold,
                             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         events = self._run(_band, _bands, (*source, self._table, self._x_table, pixels, interval), base_us,
                            t_ns // 1000 - base_us)
+        self._brightest[0] = brightest
         if t_ns - epoch >= self._rebase_ns:
             gone = self._leak * np.float32((t_ns - epoch) * 1e-9)
             self._upper -= gone

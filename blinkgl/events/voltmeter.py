@@ -26,8 +26,9 @@ from numba.extending import register_jitable
 from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events.arith import exp_f64, select
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
+from blinkgl.events.esim import copy_block
 from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
-from blinkgl.events.philox import Stream, normal2, uniform2
+from blinkgl.events.philox import Stream, normal_and_uniform, uniform2
 from blinkgl.events.types import Events
 
 _F = np.float32
@@ -35,7 +36,8 @@ _HALF, _ONE, _I0 = _F(0.5), _F(1.0), np.int32(0)
 V_ONE = 2**29
 _V_SCALE, _V_UNIT, _DRIFT_LIMIT = _F(V_ONE), _F(1.0 / V_ONE), _F(2.25)
 _DIFFUSION = np.uint64(Stream.DIFFUSION)
-_U1000, _U20, _MAX_BOUND = np.uint64(1000), np.uint64(20), np.float32(1e7)
+_U1000, _U20, _U1, _MAX_BOUND = np.uint64(1000), np.uint64(20), np.uint64(1), np.float32(1e7)
+_FAR_64 = 6.5
 FAR = np.float32(6.5)
 NEAREST = 1.0 - 1e-6
 """|V| carried over never exceeds this: a threshold that the drift has passed is then reached at once."""
@@ -68,6 +70,13 @@ def near_threshold(v, v_end, noise):
 
 
 @register_jitable
+def in_reach(v, drift, noise):
+    """:func:`near_threshold` for the rest of an interval, float64, V in thresholds."""
+    reach = _FAR_64 * noise
+    return max(v, v + drift) + reach >= 1.0 or min(v, v + drift) - reach <= -1.0
+
+
+@register_jitable
 def one_minus_exp(x):
     """1 - e^-x for x >= 0, to 1e-11 relative."""
     return x * (1.0 - x * (0.5 - x * (1.0 / 6.0))) if x < 1e-4 else 1.0 - exp_f64(-x)
@@ -87,6 +96,8 @@ def on_first(to_on, to_off, mu, sigma):
     span = rate * (to_on + to_off)
     if span < 1e-12:
         return to_off / (to_on + to_off)
+    if rate * to_off > 40.0 and (mu > 0 or rate * to_on > 60.0):
+        return 1.0 if mu > 0 else 0.0  # to within 1e-17
     if mu > 0:
         return one_minus_exp(rate * to_off) / one_minus_exp(span)
     return one_minus_exp(rate * to_off) * exp_f64(-rate * to_on) / one_minus_exp(span)
@@ -198,14 +209,21 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
             p.release[i] = NEVER_NS
         emitted, draw, dead = 0, 0, False
         while True:
+            left_us = dt_us - t_us
+            if not in_reach(voltage, mu * left_us, sigma * np.sqrt(left_us)):
+                voltage += mu * left_us
+                break
             index = (np.uint64(v.step) << _U20) | np.uint64(2 * draw)
-            side, which = uniform2(v.seed, np.uint64(i), _DIFFUSION, index)
-            normal, _ = normal2(v.seed, np.uint64(i), _DIFFUSION, index + np.uint64(1))
-            polarity = np.int64(side < on_first(1.0 - voltage, 1.0 + voltage, mu, sigma))
+            normal, which = normal_and_uniform(v.seed, np.uint64(i), _DIFFUSION, index)
+            chance = on_first(1.0 - voltage, 1.0 + voltage, mu, sigma)
+            polarity = np.int64(chance)
+            if 0.0 < chance < 1.0:
+                side, _ = uniform2(v.seed, np.uint64(i), _DIFFUSION, index + _U1)
+                polarity = np.int64(side < chance)
             distance = 1.0 - voltage if polarity else 1.0 + voltage
             hit_us = t_us + hitting_time(distance, mu, sigma, normal, which)
             if not hit_us <= dt_us:
-                voltage = max(min(voltage + mu * (dt_us - t_us), NEAREST), -NEAREST)
+                voltage = max(min(voltage + mu * left_us, NEAREST), -NEAREST)
                 break
             draw += 1
             voltage, t_us = 0.0, hit_us
@@ -254,9 +272,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
                 return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, v_end, p, v, cap, packed, filled)
             cut += cut_here
-        for o in range(n):
-            p.intensity[s + o] = now[o]
-            p.v[s + o] = v_end[o]
+        copy_block(now[:n], p.intensity[s:e])
+        copy_block(v_end[:n], p.v[s:e])
     return stop_block, filled, cut
 
 

@@ -70,11 +70,12 @@ def test_crossing_is_on_the_exact_curve(k):
     for _ in range(40):
         base, dx, lag, drift = rng.normal(0, 1, 4) * [1, 1, 0.5, 0.05]
         ode = solve_ivp(lambda s, y: k * (base + dx * s - y), (0, 1), [base + lag], rtol=1e-10, atol=1e-12, method="LSODA")
-        z = lambda s: v2e.signal_at(s, base, drift, dx, lag, k)
+        curve = v2e.curve_of(base, drift, dx, lag, k)
+        z = lambda s: v2e.signal_at(s, *curve, k)
         assert abs(z(1.0) - drift - ode.y[0, -1]) < 1e-7
         start, end = z(0.0), z(1.0)
         target = start + rng.uniform(0.05, 0.95) * (end - start)
-        s = v2e.crossing_fraction(0.0, target, end > start, base, drift, dx, lag, k, end)
+        s = v2e.crossing_fraction(0.0, target, end > start, *curve, k, end)
         exact = brentq(lambda u: z(u) - target, 0, 1, xtol=1e-14)
         assert abs(z(s) - target) < 2e-6 * abs(end - start) or abs(s - exact) < 2e-6
 

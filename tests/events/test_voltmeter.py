@@ -10,7 +10,7 @@ from scipy import stats
 
 from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, Events
-from blinkgl.events.philox import normal2, uniform2
+from blinkgl.events.philox import normal_and_uniform
 from blinkgl.events.reference import ReferenceVoltmeter
 from blinkgl.events.voltmeter import hitting_time, on_first, one_minus_exp
 from tests.events.clips import assert_same, random_clip, run
@@ -71,8 +71,7 @@ def test_one_minus_exp():
 def _hitting_times(n, distance, mu, sigma):
     out = np.empty(n)
     for i in range(n):
-        _, u = uniform2(np.uint64(3), np.uint64(i), np.uint64(7), np.uint64(0))
-        z, _ = normal2(np.uint64(3), np.uint64(i), np.uint64(7), np.uint64(1))
+        z, u = normal_and_uniform(np.uint64(3), np.uint64(i), np.uint64(7), np.uint64(0))
         out[i] = hitting_time(distance, mu, sigma, z, u)
     return out
 

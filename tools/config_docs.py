@@ -24,7 +24,10 @@ Made from the configuration models by `python -m blinkgl.tools.config_docs`; do 
 
 Keys that are left out have the default. Where a plain value stands, a distribution may stand instead and is drawn once per
 sequence: `{uniform: [a, b]}`, `{log_uniform: [a, b]}`, `{integer: [a, b]}` (both ends included), `{choice: [x, y, …]}`,
-`{weighted: {x: 3, y: 1}}`. Every sequence's own `config.yaml` records what was drawn.
+`{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (dealt out, not rolled). Every sequence's own `config.yaml` records what was drawn.
+
+`groups: {name: {…}}` at the top level makes a recipe of several groups of sequences: each is what stands at the top level with
+the group's own keys laid over it, and `enabled: false` leaves a group out (`blinkgl/config/recipe.py`, `configs/blinkflow.yaml`).
 """
 
 

@@ -8,6 +8,11 @@ the drawn value is what the sequence's own ``config.yaml`` records:
     count: {integer: [8, 16]}                       # integer, both ends included
     emulator: {choice: [esim, v2e]}                 # one of the list, equal chances
     emulator: {weighted: {esim: 3, v2e: 1}}         # one of the keys, chances in proportion
+    events: {shares: [{share: 0.8, value: {emulator: v2e}}, {share: 0.2, value: {emulator: voltmeter}}]}
+
+``shares`` deals its values out instead of rolling dice: among any n sequences that follow one another, each value comes
+up as often as its share says, give or take a few (the additive recurrence of the golden ratio, from a seeded start). Its
+shares have to sum to 1.
 
 Each path draws from its own stream (seed, sequence, path), so adding one distribution changes no other draw.
 """
@@ -23,7 +28,8 @@ import numpy as np
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role
 
-_KINDS = ("uniform", "log_uniform", "integer", "choice", "weighted")
+_KINDS = ("uniform", "log_uniform", "integer", "choice", "weighted", "shares")
+_GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: k times this, modulo 2^64, is the most even sequence there is
 
 
 def is_distribution(node: Any) -> bool:
@@ -45,7 +51,7 @@ def extremes(tree: Any) -> list[Any]:
     def pick(index: int):
         def one(path, kind, spec):
             _check(path, kind, spec)
-            options = list(spec)
+            options = [part["value"] for part in spec] if kind == "shares" else list(spec)
             most[0] = max(most[0], len(options))
             return options[min(index, len(options) - 1)]
         return one
@@ -94,6 +100,17 @@ def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
             raise ConfigError("not a table of weights", where=where, value=spec,
                               accepted="{value: weight, …} with weights >= 0 and a positive sum")
         return
+    if kind == "shares":
+        try:
+            ok = isinstance(spec, list) and spec and all(set(part) == {"share", "value"} and _number(part["share"]) >= 0 for part in spec)
+        except (TypeError, ValueError):
+            ok = False
+        if not ok:
+            raise ConfigError("not a list of shares", where=where, value=spec, accepted="[{share: 0.8, value: …}, …]")
+        total = math.fsum(_number(part["share"]) for part in spec)
+        if abs(total - 1) > 1e-9:
+            raise ConfigError("the shares do not sum to 1", where=where, value=total, accepted="shares that sum to 1")
+        return
     try:
         low, high = (_number(x) for x in spec)
     except (TypeError, ValueError):
@@ -109,6 +126,9 @@ def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
 def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: int) -> Any:
     _check(path, kind, spec)
     key = int.from_bytes(hashlib.sha256("/".join(path).encode()).digest()[:8], "little")
+    if kind == "shares":
+        start = int(np.random.SeedSequence(seed, spawn_key=(int(Role.PARAMETERS), key)).generate_state(1, np.uint64)[0])
+        return _share_at((start + sequence * _GOLDEN) % 2**64 / 2**64, spec)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(sequence), int(Role.PARAMETERS), key)))
     if kind == "choice":
         return spec[int(rng.integers(len(spec)))]
@@ -121,3 +141,14 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     if kind == "log_uniform":
         return float(math.exp(rng.uniform(math.log(low), math.log(high))))
     return float(rng.uniform(low, high))
+
+
+def _share_at(u: float, spec: list[dict[str, Any]]) -> Any:
+    """The value whose stretch of [0, 1) holds u."""
+    given = [part for part in spec if _number(part["share"]) > 0]
+    upper = 0.0
+    for part in given:
+        upper += _number(part["share"])
+        if u < upper:
+            return part["value"]
+    return given[-1]["value"]

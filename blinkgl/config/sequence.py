@@ -17,6 +17,7 @@ from pydantic import Field, model_validator
 from blinkgl.config.base import Config, validate
 from blinkgl.config.draw import draw, extremes
 from blinkgl.config.events import EmulatorConfig, EsimConfig
+from blinkgl.config.frames import FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.errors import ConfigError
@@ -172,6 +173,8 @@ class SequenceConfig(Config):
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="when event frames are drawn")
     scene: SceneConfig = Field(RandomSceneConfig(), description="what is in front of the camera and how it moves")
+    frames: FramesConfig | None = Field(None, description="recorded frames to convert; then nothing is rendered, and `camera`, `time`, "
+                                        "`timeline`, `scene` and `render` have no meaning")
     render: RenderConfig = Field(RenderConfig(), description="how a frame is drawn")
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
     labels: LabelsConfig = Field(LabelsConfig(), description="which ground truth is written")
@@ -190,7 +193,10 @@ class RunTemplate:
     base: Path
 
     def sequence(self, index: int) -> SequenceConfig:
-        """The validated configuration of sequence ``index`` (>= 0). Raises ConfigError."""
+        """The validated configuration of sequence ``index`` (>= 0). Raises ConfigError, also where the file describes
+        several groups of sequences (:mod:`blinkgl.config.recipe` takes those apart)."""
+        if "groups" in self.tree:
+            raise ConfigError("the recipe has groups; only a group has numbered sequences", where="groups")
         return validate(SequenceConfig, draw(self.tree, self.seed, index))
 
     @property
@@ -199,7 +205,11 @@ class RunTemplate:
         return seed if isinstance(seed, int) and not isinstance(seed, bool) else 0
 
     def check(self) -> SequenceConfig:
-        """Validates both ends of every range; returns the first. Raises ConfigError before any work starts."""
+        """Validates both ends of every range, of every group; returns the first. Raises ConfigError before any work starts."""
+        if "groups" in self.tree:
+            from blinkgl.config.recipe import all_groups
+
+            return [group.template.check() for group in all_groups(self)][0]
         return [validate(SequenceConfig, tree) for tree in extremes(self.tree)][0]
 
 

@@ -1,4 +1,4 @@
-"""Generates sequences: one function that reads from top to bottom, and the loop around it.
+"""Generates sequences: one function that reads from top to bottom, and the plainest loop around it.
 
 Pass 1 is dense in time: luminance frames at adaptively chosen times go through the event emulator. Pass 2 is sparse:
 images and ground truth at the label times. Both stream; memory does not depend on the sequence's length.
@@ -6,81 +6,64 @@ images and ground truth at the label times. Both stream; memory does not depend 
 
 from __future__ import annotations
 
-import json
 import platform
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 import blinkgl
-from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
+from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.dataset.clock import StageClock
+from blinkgl.dataset.frames import convert_sequence
+from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
-from blinkgl.errors import OutputError
+from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.events import make_emulator
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.build import build_scene, check_assets
+from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
 from blinkgl.timeline import frame_times
-
-Progress = Callable[["SequenceReport", float], None]
-"""Called now and then with the running report and the fraction done, 0 … 1."""
-
-
-@dataclass
-class SequenceReport:
-    """What one sequence cost and holds. Times in wall seconds; they are shown, never written into the data set."""
-
-    index: int
-    path: Path
-    simulated_s: float = 0.0
-    frames: int = 0
-    events: int = 0
-    triangles: int = 0
-    labels: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)
-    total_s: float = 0.0
 
 
 def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
                  progress: Progress | None = None) -> Iterator[SequenceReport]:
-    """Generates ``num`` (default: the configuration's ``output.sequences``) sequences below ``out``, in order,
-    yielding a report after each.
+    """Generates ``num`` (default: the configuration's ``output.sequences``) sequences below ``out``, in order, in this
+    process, yielding a report after each. The first error ends it; :mod:`blinkgl.dataset.run` is the loop that does not give up.
 
     Raises BlinkGLError: any configuration or asset error, no OpenGL, or an output folder that exists; the folders
     are looked at before any work starts."""
     check_output(out)
-    first = template.sequence(0)
-    count = first.output.sequences if num is None else num
-    indices = range(first.output.first_index, first.output.first_index + count)
-    for index in indices:
-        refuse_existing(sequence_folder(first.output, out, index))
-    check_assets(first.scene, template.base, first.output.split)
-    with create_context(first.gl.backend, first.gl.device) as gl:
-        for index in indices:
-            yield generate_sequence(template.sequence(index), index, out, gl, base=template.base, progress=progress)
+    plan = Plan.of(template, num)
+    for task in plan.tasks:
+        refuse_existing(Path(out) / task.name)
+    plan.check_assets()
+    with ExitStack() as stack:
+        gl = None
+        for task in plan.tasks:
+            config = plan.config(task)
+            if gl is None and config.frames is None:
+                gl = stack.enter_context(create_context(config.gl.backend, config.gl.device))
+            yield generate_sequence(config, task.index, out, gl, base=template.base, progress=progress)
 
 
-def sequence_folder(output: OutputConfig, out: str | Path, index: int) -> Path:
-    """<out>/<split>/<name>_<index>"""
-    return Path(out) / output.split / f"{output.name}_{index:06d}"
-
-
-def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: GLContext, *, base: Path = Path("."),
+def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: GLContext | None, *, base: Path = Path("."),
                       progress: Progress | None = None) -> SequenceReport:
     """Generates one sequence directory, whole or not at all.
 
+    gl : context to draw with; not looked at (None) for a sequence that is converted from frames.
     base : folder that relative paths in the configuration start from.
     Raises BlinkGLError for anything the user or the machine caused."""
+    path = Path(out) / sequence_name(config.output, index)
+    if config.frames is not None:
+        return convert_sequence(config, index, path, base=base, progress=progress)
     clock = StageClock()
-    report = SequenceReport(index, sequence_folder(config.output, out, index))
+    report = SequenceReport(index, path)
     t0_ns, t1_ns = config.time.t0_ns, config.time.t1_ns
     with clock("scene"):
         scene = build_scene(config.scene, config.camera, t0_ns, t1_ns, split=config.output.split, seed=config.seed,
@@ -183,15 +166,6 @@ def poses_of(scene: Scene, times_ns: list[int]) -> dict[str, np.ndarray]:
     }
 
 
-def config_yaml(config: SequenceConfig, index: int) -> str:
-    """The resolved configuration as YAML; ``blinkgl generate`` takes it and makes this one sequence again."""
-    tree = json.loads(config.model_dump_json())
-    tree["output"].update(first_index=index, sequences=1)
-    return (f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
-            "# Relative paths start from the folder of the run's own configuration file.\n"
-            + yaml.safe_dump(tree, sort_keys=False))
-
-
 def manifest_info(config: SequenceConfig, index: int, scene: Scene, gl: GLContext, report: SequenceReport,
                   triangles: int) -> dict:
     """What a person needs to know where the sequence came from; no clock times (same seed, same manifest)."""
@@ -212,10 +186,3 @@ def manifest_info(config: SequenceConfig, index: int, scene: Scene, gl: GLContex
                      "source_hashes": sorted({p.mesh.source_hash for p in o.parts})} for o in scene.objects],
         "scene_log": list(scene.log),
     }
-
-
-def check_output(out: str | Path) -> None:
-    """OutputError when ``out`` cannot become a folder of sequences."""
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise OutputError("is a file", where=str(out), accepted="a folder")

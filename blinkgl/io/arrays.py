@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.images import numpy_errors
 
 DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 _NAMES = {"t": ("t", "ts", "timestamp", "timestamps"), "x": ("x",), "y": ("y",), "p": ("p", "polarity", "polarities", "pol", "on")}
@@ -25,7 +25,7 @@ class ArrayReader:
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         self.height = self.width = None
-        try:
+        with numpy_errors(path):
             data = np.load(path, allow_pickle=False)
             names = (data.dtype.names or ()) if isinstance(data, np.ndarray) else tuple(data.files)
             found = {k: next((n for n in options if n in names), None) for k, options in _NAMES.items()}
@@ -37,10 +37,6 @@ class ArrayReader:
                 if "height" in names and "width" in names:
                     self.height, self.width = int(data["height"]), int(data["width"])
                 data.close()
-        except (OSError, ValueError, EOFError, KeyError) as error:
-            raise AssetError(f"cannot read: {' '.join(str(error).split())}", where=str(path)) from error
-        except zipfile.BadZipFile as error:
-            raise AssetError("damaged .npz file", where=str(path)) from error
         self._events = _events(columns, path)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:

@@ -227,30 +227,31 @@ class DsecEventReader:
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         self._file = open_hdf5(self.path)
-        try:
-            missing = [k for k in ("events/x", "events/y", "events/t", "events/p") if k not in self._file]
+        with hdf5_errors(self.path, self._file):
+            missing = [k for k in ("events/x", "events/y", "events/t", "events/p") if not isinstance(self._file.get(k), h5py.Dataset)]
             if missing:
                 raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
             self._columns = {k: self._file["events"][k] for k in "xytp"}
+            if any(c.ndim != 1 or c.dtype.kind not in "iub" for c in self._columns.values()):
+                raise AssetError("event columns must be 1-D integers", where=str(path),
+                                 value={k: f"{c.dtype} {c.shape}" for k, c in self._columns.items()})
             lengths = {len(c) for c in self._columns.values()}
             if len(lengths) != 1:
                 raise AssetError("event columns differ in length", where=str(path), value=sorted(lengths))
             self.count = lengths.pop()
             self.t_offset_us = int(self._file["t_offset"][()]) if "t_offset" in self._file else 0
             self._ms_to_idx = self._file["ms_to_idx"][()].astype(np.int64) if "ms_to_idx" in self._file else None
-        except BaseException:
-            self._file.close()
-            raise
-        attrs = self._file.attrs
-        self.height = int(attrs["height"]) if "height" in attrs else None
-        self.width = int(attrs["width"]) if "width" in attrs else None
+            attrs = self._file.attrs
+            self.height = int(attrs["height"]) if "height" in attrs else None
+            self.width = int(attrs["width"]) if "width" in attrs else None
 
     def slice(self, t0_us: int, t1_us: int) -> Events:
         """Events of [t0_us, t1_us), image clock, by DSEC's rule: ``ms_to_idx`` gives the conservative range
         floor(t0)…ceil(t1) in ms, the exact bounds are searched inside it."""
         r0, r1 = int(t0_us) - self.t_offset_us, int(t1_us) - self.t_offset_us
         start, stop = self._index(r0 // 1000, 0), self._index(-(-r1 // 1000), self.count)
-        t = self._columns["t"][start:stop].astype(np.int64)
+        with hdf5_errors(self.path):
+            t = self._columns["t"][start:stop].astype(np.int64)
         i, j = np.searchsorted(t, (r0, r1), side="left")
         return self._read(start + int(i), start + int(j))
 
@@ -270,11 +271,8 @@ class DsecEventReader:
             yield self._read(start, min(self.count, start + size))
 
     def _read(self, start: int, stop: int) -> Events:
-        try:
+        with hdf5_errors(self.path):
             x, y, t, p = (self._columns[k][start:stop] for k in "xytp")
-        except OSError as error:
-            raise AssetError(f"events {start} to {stop} cannot be read: {' '.join(str(error).split())}",
-                             where=str(self.path)) from error
         return Events(x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False),
                       t.astype(np.int64) + self.t_offset_us, p.astype(np.uint8, copy=False))
 
@@ -298,6 +296,19 @@ def open_hdf5(path: Path) -> h5py.File:
         text = " ".join(str(error).split())
         problem = "truncated HDF5 file" if "truncated" in text else "not an HDF5 file" if "signature" in text else f"cannot be opened: {text}"
         raise AssetError(problem, where=str(path)) from error
+
+
+@contextlib.contextmanager
+def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
+    """h5py's ways of saying that bytes make no sense, as AssetError; ``file`` is closed on any exception."""
+    try:
+        yield
+    except BaseException as error:
+        if file is not None:
+            file.close()
+        if isinstance(error, (OSError, KeyError, RuntimeError, ValueError)):
+            raise AssetError(f"damaged HDF5 file: {' '.join(str(error).split())[:160]}", where=str(path)) from error
+        raise
 
 
 def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:

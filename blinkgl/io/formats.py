@@ -72,6 +72,16 @@ class EventFile:
                 last, count = int(t[-1]), count + len(t)
                 yield events
 
+    def close(self) -> None:
+        """Lets go of the file (only HDF5's stay open between reads)."""
+        getattr(self._reader, "close", lambda: None)()
+
+    def __enter__(self) -> "EventFile":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
     def read(self) -> Events:
         """All events at once."""
         return Events.concatenate(list(self.chunks()))
@@ -100,9 +110,9 @@ def open_events(path: str | os.PathLike) -> EventFile:
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
     if kind == "dsec":
-        from blinkgl.io.dsec import DsecEventReader, open_hdf5
+        from blinkgl.io.dsec import DsecEventReader, hdf5_errors, open_hdf5
         from blinkgl.io.mvsec import DATASET, MvsecReader
-        with open_hdf5(path) as file:
+        with open_hdf5(path) as file, hdf5_errors(path):
             kind = "mvsec" if DATASET in file else "dsec"
         reader = MvsecReader(path) if kind == "mvsec" else DsecEventReader(path)
     elif kind == "evt3":
@@ -185,14 +195,14 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str
     Returns the source with its size, and the number of events written.
     """
     output_format(target, format)
-    file = open_events(source)
-    if size is not None:
-        file = replace(file, height=size[0], width=size[1])
-    file = file.sized()
-    first = next((int(e.t[0]) for e in file.chunks()), 0)
-    shift = first if zero_time else 0
-    # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
-    offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
-    shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
-    count = write_events(target, shifted, file.height, file.width, format=format, t_offset_us=offset, overwrite=overwrite)
+    with open_events(source) as file:
+        if size is not None:
+            file = replace(file, height=size[0], width=size[1])
+        file = file.sized()
+        first = next((int(e.t[0]) for e in file.chunks()), 0)
+        shift = first if zero_time else 0
+        # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
+        offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
+        shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
+        count = write_events(target, shifted, file.height, file.width, format=format, t_offset_us=offset, overwrite=overwrite)
     return file, count

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Callable
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io.images import numpy_errors, read_image
 
 VIDEO = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".gif", ".mpg", ".mpeg", ".ts", ".wmv"}
 IMAGE = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".exr", ".hdr", ".pfm"}
@@ -92,7 +92,6 @@ def read_any_image(path: Path) -> np.ndarray:
     if path.suffix.lower() == ".exr":
         from blinkgl.io.video import read_exr
         return read_exr(path)
-    from blinkgl.io.images import read_image
     image = read_image(path)
     if image.dtype not in (np.uint8, np.uint16, np.float32):
         raise AssetError("unsupported pixel type", where=str(path), value=str(image.dtype), accepted="8-bit, 16-bit or float32")
@@ -146,7 +145,7 @@ def _video(path: Path, fps: float | None, timestamps) -> FrameSource:
 
 def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
     times = None
-    try:
+    with numpy_errors(path):
         if path.suffix.lower() == ".npy":
             frames = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
@@ -156,13 +155,7 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
                     raise AssetError("no array 'frames'", where=str(path), value=data.files)
                 frames = data[name]
                 stamp = next((k for k in ("timestamps", "t", "times", "timestamps_us", "timestamps_ns") if k in data.files), None)
-                if stamp:
-                    scale = 1 if stamp.endswith("_ns") else 1e9 if data[stamp].dtype.kind == "f" and not stamp.endswith("_us") else 1000
-                    times = [round(float(t) * scale) if data[stamp].dtype.kind == "f" else int(t) * int(scale) for t in data[stamp]]
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise AssetError(f"cannot read: {' '.join(str(error).split())}", where=str(path)) from error
-    except zipfile.BadZipFile as error:
-        raise AssetError("damaged .npz file", where=str(path)) from error
+                times = _stamps(stamp, data[stamp]) if stamp else None
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3))) or not frames.shape[0]:
         raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W) or (N, H, W, 3)")
     if frames.dtype not in (np.uint8, np.uint16) and frames.dtype.kind != "f":
@@ -179,10 +172,18 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
     def iterate():
         for i in range(len(frames)):
             frame = np.ascontiguousarray(frames[i])
-            frame = frame.astype(np.float32) if frame.dtype.kind == "f" else frame
+            if frame.dtype.kind == "f":
+                with np.errstate(over="ignore"):  # becomes inf, which is refused by name later
+                    frame = frame.astype(np.float32)
             yield frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame, times[i] if times else None, f"#{i}"
 
     return FrameSource(path, *frames.shape[1:3], len(frames), fps, iterate)
+
+
+def _stamps(name: str, values: np.ndarray) -> list[int]:
+    """ns of an array of times: by its name's unit, else floats are seconds and integers µs."""
+    unit = 1 if name.endswith("_ns") else 1000 if name.endswith("_us") or values.dtype.kind != "f" else 10**9
+    return [round(float(t) * unit) if values.dtype.kind == "f" else int(t) * unit for t in values]
 
 
 def read_timestamps(path: Path) -> list[tuple[int, str | None]]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -74,7 +76,17 @@ def encode_npy(array: np.ndarray) -> bytes:
 
 def read_npy(path: str | os.PathLike) -> np.ndarray:
     """An array; AssetError when missing, truncated or pickled."""
-    try:
+    with numpy_errors(path):
         return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise AssetError(f"cannot read .npy: {' '.join(str(error).split())}", where=str(path)) from error
+
+
+@contextlib.contextmanager
+def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
+    """Any failure to load ``path`` with NumPy as an AssetError: on damaged bytes it raises what its header parser, zipfile
+    and zlib happen to (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
+    try:
+        yield
+    except AssetError:
+        raise
+    except Exception as error:  # noqa: BLE001
+        raise AssetError(f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)) from error

@@ -10,7 +10,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.events.types import Events
-from blinkgl.io.dsec import open_hdf5
+from blinkgl.io.dsec import hdf5_errors, open_hdf5
 
 DATASET = "davis/left/events"
 
@@ -22,7 +22,7 @@ class MvsecReader:
 
     def __init__(self, path: str | os.PathLike, dataset: str = DATASET):
         self.path, self._dataset = Path(path), dataset
-        with open_hdf5(self.path) as file:
+        with open_hdf5(self.path) as file, hdf5_errors(self.path):
             if dataset not in file or file[dataset].ndim != 2 or file[dataset].shape[1] != 4:
                 raise AssetError(f"no (N, 4) dataset '{dataset}'", where=str(path))
 
@@ -30,9 +30,7 @@ class MvsecReader:
         with open_hdf5(self.path) as file:
             table = file[self._dataset]
             for i in range(0, len(table), size):
-                try:
+                with hdf5_errors(self.path):
                     rows = table[i:i + size]
-                except OSError as error:
-                    raise AssetError(f"events from {i} cannot be read: {' '.join(str(error).split())}", where=str(self.path)) from error
                 yield Events(rows[:, 0].astype(np.uint16), rows[:, 1].astype(np.uint16), np.rint(rows[:, 2] * 1e6).astype(np.int64),
                              (rows[:, 3] > 0).astype(np.uint8))

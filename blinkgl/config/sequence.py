@@ -151,8 +151,8 @@ class PreviewConfig(Config):
     """preview.mp4: frames, events and flow side by side."""
 
     enabled: bool = Field(True, description="false: no preview")
-    rate: float = Field(60.0, gt=0, le=1e4, description="pictures per second of simulated time, Hz")
-    slowdown: float = Field(3.0, gt=0, le=1000, description="play-back this many times slower than the simulation")
+    rate: float = Field(30.0, gt=0, le=1e4, description="pictures per second of simulated time, Hz")
+    slowdown: float = Field(2.0, gt=0, le=1000, description="play-back this many times slower than the simulation")
 
 
 class OutputConfig(Config):

@@ -102,6 +102,7 @@ class Renderer:
         self._targets: dict = {}
         self._uniforms: dict = {}
         self._last_moment: tuple[int, _Moment] | None = None
+        self._surfaces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._resources = SceneResources(gl.ctx, scene, config.anisotropy)
         items = self._resources.items
         self._item_object = np.array([i.object_index for i in items], np.intp)
@@ -242,16 +243,26 @@ class Renderer:
                 for i, (name, _) in enumerate(outputs)}
 
     def _flow(self, buffer: np.ndarray, ids: np.ndarray | None, t_other_ns: int, occlusion: bool) -> Flow:
+        surface = self._surface(t_other_ns) if occlusion else None
+        started = time.perf_counter()
         w_next = buffer[..., 2]
         hit = buffer[..., 3] > 0
         valid = hit & (w_next > 0) & np.isfinite(buffer[..., :2]).all(axis=-1)
         flow = np.where(valid[..., None], buffer[..., :2], np.float32(0))
         occluded = None
-        if occlusion:
-            other = self._geometry(t_other_ns, [("DEPTH", "R32F"), ("ID", "R32UI")], None, None)
-            occluded = occlusion_mask(flow, w_next, valid, ids, other["DEPTH"], other["ID"],
-                                      self.scene.camera.near)
+        if surface is not None:
+            occluded = occlusion_mask(flow, w_next, valid, ids, *surface, self.scene.camera.near)
+        self.stats.render_s += time.perf_counter() - started
         return Flow(flow, valid, occluded)
+
+    def _surface(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """(depth, ids) at t_ns. Neighbouring labels look at the same moments, so the last three are kept."""
+        if t_ns not in self._surfaces:
+            buffers = self._geometry(t_ns, [("DEPTH", "R32F"), ("ID", "R32UI")], None, None)
+            self._surfaces[t_ns] = (buffers["DEPTH"], buffers["ID"])
+            while len(self._surfaces) > 3:
+                self._surfaces.pop(next(iter(self._surfaces)))
+        return self._surfaces[t_ns]
 
     # ---- matrices ----------------------------------------------------------------------------------------------
 

@@ -50,6 +50,7 @@ setup: .venv/.installed-dev opengl
 .venv/.installed-dev: .venv/.installed-core
 	@echo "installing the test tools into .venv"
 	@$(INSTALL) -e '.[dev]'
+	@$(INSTALL) -e '.[learn]' || echo "torch could not be installed: the tests of eflow will be skipped"
 	@$(INSTALL) --no-deps pyrender PyOpenGL==3.1.10 freetype-py pyglet six \
 		|| echo "pyrender could not be installed: the comparisons with it will be skipped"
 	@touch $@

@@ -1,0 +1,200 @@
+"""Checkpoints: a folder that appears whole, of safetensors files and one JSON file. Nothing here can execute what it reads.
+
+    000500/weights.safetensors      parameters and buffers; the metadata holds the model configuration
+           ema.safetensors          the same, averaged (what evaluation uses), where averaging is on
+           optimizer.safetensors    AdamW's moments, named by parameter, and torch's generator states
+           state.json               step, configuration, loader position
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from blinkgl.errors import AssetError, OutputError
+from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
+from eflow.models import FlowModel, build_model, model_config
+
+FORMAT = "eflow-1"
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Tensors and metadata of a safetensors file. Raises AssetError: missing, truncated, or something else, e.g. a pickle."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(8)
+        if head[:2] == b"PK" or head[:1] == b"\x80":
+            raise AssetError("is a PyTorch pickle, which could run any code when loaded; refused", where=str(path), accepted="a .safetensors file")
+        with safe_open(path, framework="pt") as file:
+            return {k: file.get_tensor(k) for k in file.keys()}, dict(file.metadata() or {})
+    except FileNotFoundError:
+        raise AssetError("no such file", where=str(path)) from None
+    except OSError as error:
+        raise AssetError(f"cannot be read: {os.strerror(error.errno) if error.errno else error}".lower(), where=str(path)) from error
+    except SafetensorError as error:
+        raise AssetError(f"truncated or not a safetensors file ({' '.join(str(error).split())})", where=str(path)) from error
+
+
+def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+    with output_errors(path):
+        try:
+            save_file({k: v.detach().contiguous().cpu() for k, v in tensors.items()}, path, metadata)
+        except SafetensorError as error:
+            raise OutputError(f"cannot write: {' '.join(str(error).split())}", where=str(path)) from error
+        fsync(path)
+
+
+def metadata_of(model: FlowModel) -> dict[str, str]:
+    return {"format": FORMAT, "model": model.config.model_dump_json()}
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint that was found: ``folder`` (None for a lone weights file) and the weights file to use."""
+
+    folder: Path | None
+    weights: Path
+
+
+def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkpoint:
+    """``path``: a .safetensors file, a checkpoint folder, or a run folder (its newest checkpoint). Raises AssetError."""
+    path = Path(path)
+    if path.is_file():
+        return Checkpoint(None, path)
+    if not path.is_dir():
+        raise AssetError("no such checkpoint", where=str(path), accepted="a .safetensors file, a checkpoint folder or a run folder")
+    folder = path if (path / "weights.safetensors").is_file() else newest(path)
+    if folder is None:
+        raise AssetError("no checkpoint in this folder", where=str(path), accepted="weights.safetensors, or checkpoints/<step>")
+    ema = folder / "ema.safetensors"
+    return Checkpoint(folder, ema if averaged and ema.is_file() else folder / "weights.safetensors")
+
+
+def newest(run: Path) -> Path | None:
+    """The checkpoint of the highest step in ``run/checkpoints``."""
+    found = [p for p in (run / "checkpoints").glob("*") if p.name.isdigit() and p.is_dir()]
+    return max(found, key=lambda p: int(p.name), default=None)
+
+
+def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any = None) -> FlowModel:
+    """The model a checkpoint holds, in evaluation mode on the CPU.
+
+    averaged : the averaged weights where there are any. expected : a model configuration the checkpoint must be of.
+    Raises AssetError: none there, damaged, a pickle, or of another model or configuration."""
+    file = find_checkpoint(path, averaged=averaged).weights
+    tensors, metadata = read_tensors(file)
+    try:
+        if metadata["format"] != FORMAT:
+            raise AssetError("checkpoint of another format", where=str(file), value=metadata["format"], accepted=FORMAT)
+        tree = json.loads(metadata["model"])
+    except (KeyError, ValueError):
+        raise AssetError("safetensors file without a model configuration", where=str(file), accepted="a checkpoint of eflow train") from None
+    config = model_config(tree)
+    if expected is not None:
+        require_same(config, expected, str(file))
+    model = build_model(config)
+    load_weights(model, tensors, str(file))
+    return model.eval()
+
+
+def require_same(found: Any, expected: Any, where: str) -> None:
+    """AssetError naming the first key in which two model configurations differ."""
+    a, b = found.model_dump(), expected.model_dump()
+    for key in ["name", *sorted(set(a) | set(b))]:
+        if a.get(key) != b.get(key):
+            raise AssetError(f"checkpoint of another model: model.{key} differs", where=where, value=a.get(key), accepted=repr(b.get(key)))
+
+
+def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> None:
+    """Copies tensors into the model. AssetError when a name or shape does not fit; the model is then unchanged."""
+    wanted = model.state_dict()
+    for name in sorted(set(wanted) | set(tensors)):
+        if name not in tensors:
+            raise AssetError(f"lacks the tensor '{name}' of this model", where=where)
+        if name not in wanted:
+            raise AssetError(f"holds a tensor '{name}' that this model has not", where=where)
+        if wanted[name].shape != tensors[name].shape:
+            raise AssetError(f"tensor '{name}' has another shape", where=where, value=tuple(tensors[name].shape),
+                             accepted=str(tuple(wanted[name].shape)))
+    model.load_state_dict(tensors)
+
+
+def save_checkpoint(run: Path, step: int, model: FlowModel, ema: dict[str, Tensor] | None, optimizer: torch.optim.Optimizer,
+                    state: dict[str, Any], keep: int) -> Path:
+    """Writes ``run/checkpoints/<step>`` whole or not at all, and then deletes all but the newest ``keep``."""
+    final = run / "checkpoints" / f"{step:09d}"
+    with output_errors(final):
+        final.parent.mkdir(parents=True, exist_ok=True)
+    remove_stale(final.parent)
+    temporary = temporary_beside(final)
+    try:
+        with output_errors(final):
+            temporary.mkdir()
+        metadata = metadata_of(model)
+        write_tensors(temporary / "weights.safetensors", model.state_dict(), metadata)
+        if ema is not None:
+            write_tensors(temporary / "ema.safetensors", ema, metadata)
+        write_tensors(temporary / "optimizer.safetensors", optimizer_tensors(model, optimizer), {"format": FORMAT})
+        with output_errors(final):
+            (temporary / "state.json").write_text(json.dumps({"format": FORMAT, "step": step, **state}, indent=1) + "\n", encoding="utf-8")
+            fsync(temporary / "state.json")
+            fsync(temporary)
+            if final.exists():
+                shutil.rmtree(final)
+            os.rename(temporary, final)
+            fsync(final.parent)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    for old in sorted(p for p in final.parent.glob("*") if p.name.isdigit())[:-keep]:
+        shutil.rmtree(old, ignore_errors=True)
+    return final
+
+
+def optimizer_tensors(model: FlowModel, optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """AdamW's state by parameter name, and torch's CPU (and GPU) generator states."""
+    names = {p: n for n, p in model.named_parameters()}
+    tensors = {f"{names[p]}/{k}": v for p, s in optimizer.state.items() for k, v in s.items() if torch.is_tensor(v)}
+    tensors["/rng/cpu"] = torch.get_rng_state()
+    if torch.cuda.is_available():
+        tensors["/rng/cuda"] = torch.cuda.get_rng_state()
+    return tensors
+
+
+def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimizer) -> None:
+    """The reverse of :func:`optimizer_tensors`. Raises AssetError."""
+    tensors, _ = read_tensors(path)
+    for name, p in model.named_parameters():
+        found = {k.removeprefix(f"{name}/"): v for k, v in tensors.items() if k.startswith(f"{name}/")}
+        if any(v.shape not in ((), p.shape) for v in found.values()):
+            raise AssetError(f"optimiser state of '{name}' has another shape", where=str(path))
+        if found:  # AdamW keeps its step counter on the CPU
+            optimizer.state[p] = {k: v.clone() if k == "step" else v.to(p.device) for k, v in found.items()}
+    if "/rng/cpu" not in tensors:
+        raise AssetError("no generator state", where=str(path))
+    torch.set_rng_state(tensors["/rng/cpu"])
+    if "/rng/cuda" in tensors and torch.cuda.is_available():
+        torch.cuda.set_rng_state(tensors["/rng/cuda"])
+
+
+def read_state(folder: Path) -> dict[str, Any]:
+    """``state.json``. Raises AssetError."""
+    path = folder / "state.json"
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+        if state["format"] != FORMAT or not isinstance(state["step"], int):
+            raise ValueError
+    except OSError as error:
+        raise AssetError("cannot be read", where=str(path)) from error
+    except (ValueError, KeyError, TypeError):
+        raise AssetError("damaged", where=str(path), accepted="a state.json of eflow train") from None
+    return state

@@ -1,0 +1,293 @@
+"""The ``eflow`` command: thin functions over the library, one line per error, exit status as ``blinkgl``'s."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from pathlib import Path
+from typing import Annotated, Optional
+
+import typer
+
+from blinkgl import __version__
+from blinkgl.cli import _user_line
+from blinkgl.errors import BlinkGLError, ConfigError
+
+app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False)
+
+Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
+Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Overrides = Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")]
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", callback=lambda v: _print_version(v), is_eager=True, help="Print the version.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")] = False,
+) -> None:
+    """Train, evaluate and run event-flow networks."""
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"eflow {__version__}")
+        raise typer.Exit()
+
+
+@app.command()
+def train(
+    config: Annotated[str, typer.Argument(help="YAML file; see configs/eflow/.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Run folder to make (or to go on in, with --resume).")],
+    overrides: Overrides = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in the run folder.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+) -> None:
+    """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
+    from eflow.config import load_train_config
+    from eflow.train import train as run_training
+
+    result = run_training(load_train_config(config, overrides or []), out, resume=resume, quiet=quiet)
+    if not quiet:
+        print(f"{result.reason} at step {result.step}: {result.checkpoint}", file=sys.stderr)
+
+
+@app.command()
+def evaluate(
+    checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
+    dataset: Annotated[str, typer.Argument(help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences.")],
+    out: Annotated[Optional[str], typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
+    format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
+    dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
+    pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
+    iterations: Annotated[Optional[int], typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
+    limit: Annotated[Optional[int], typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+    precision: Precision = "fp32",
+    device: Device = "auto",
+) -> None:
+    """Score a network on a data set, beside zero flow and constant flow."""
+    from rich.console import Console
+
+    from eflow.data.sources import open_source
+    from eflow.evaluate import evaluate as score, show
+
+    _one_of("--empty", empty, ("error", "skip"))
+    model = _model(checkpoint, device, raw, precision, iterations)
+    source = open_source(dataset, _format(format), dt=dt)
+    console = Console(stderr=True)
+    with console.status("evaluating") as status:
+        result = score(model, source, out, pictures=pictures, empty=empty, precision=precision, limit=limit,
+                       progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"))
+    show(result)
+    if out:
+        typer.echo(f"written: {out}/results.json")
+
+
+@app.command()
+def predict(
+    checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
+    events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
+    out: Annotated[Optional[str], typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
+    window_ms: Annotated[float, typer.Option("--window-ms", min=0.001, help="Δ: length of each of the two windows.")] = 100.0,
+    start_ms: Annotated[Optional[float], typer.Option("--start-ms", help="From this time after the first event.")] = None,
+    end_ms: Annotated[Optional[float], typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
+    whole: Annotated[bool, typer.Option("--whole", help="One flow: first half against second half, scaled to the whole file.")] = False,
+    truth: Annotated[Optional[str], typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")] = None,
+    size: Annotated[Optional[str], typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
+    npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
+    warm_start: Annotated[bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")] = False,
+    empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
+    raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+    iterations: Annotated[Optional[int], typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    precision: Precision = "fp32",
+    device: Device = "auto",
+) -> None:
+    """Flow from any event file."""
+    import numpy as np
+
+    from eflow import infer
+    from eflow.metrics import frame_metrics
+
+    _one_of("--empty", empty, ("error", "zero"))
+    model = _model(checkpoint, device, raw, precision, iterations)
+    file = infer.open_sized(events, _size(size))
+    if whole:
+        window, factor = infer.whole_file(file)
+        stream, span = [window], window.new.t1 - window.old.t0
+    else:
+        first = next((int(c.t[0]) for c in file.chunks()), None)
+        if first is None:
+            raise BlinkGLError("holds no events", where=events)
+        at = lambda ms: None if ms is None else first + round(ms * 1000)  # noqa: E731
+        span, factor = round(window_ms * 1000), 1.0
+        stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
+    gt = infer.read_truth(truth, file.height, file.width) if truth else None
+    predictor = infer.Predictor(model, file.height, file.width, warm_start=warm_start, precision=precision, empty=empty)
+    writer = infer.FlowWriter(out, npy=npy) if out else None
+    count = 0
+    if writer:
+        writer.__enter__()
+    try:
+        for window in stream:
+            flow, tensor = predictor(window)
+            flow = flow * np.float32(factor)
+            count += 1
+            line = f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed {np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px"
+            if gt is not None:
+                valid = np.isfinite(gt).all(-1)
+                hit = np.zeros_like(valid)
+                hit[window.new.y, window.new.x] = True
+                hit[window.old.y, window.old.x] = True
+                for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
+                    m, zero = frame_metrics(flow, gt, mask), frame_metrics(np.zeros_like(flow), gt, mask)
+                    if m:
+                        line += f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE {zero['AEE']:.3f} px"
+            typer.echo(line)
+            if writer:
+                writer.add(window, flow, tensor, gt)
+        if not count:
+            raise BlinkGLError(f"shorter than two windows of {span / 1000:g} ms", where=events, accepted="a smaller --window-ms, or --whole")
+    except BaseException as error:
+        if writer:
+            writer.__exit__(type(error), error, None)
+        raise
+    if writer:
+        writer.__exit__(None, None, None)
+        typer.echo(f"written: {out}")
+
+
+@app.command()
+def submit(
+    checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
+    dataset: Annotated[str, typer.Argument(help="The benchmark's test set.")],
+    benchmark: Annotated[str, typer.Option(help="dsec or blinkflow.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Zip file to make.")],
+    full: Annotated[bool, typer.Option("--full", help="BlinkFlow: all pixels instead of one per 4x4 cell.")] = False,
+    precision: Precision = "fp32",
+    device: Device = "auto",
+) -> None:
+    """Write a benchmark's submission file; it is checked before it gets its name."""
+    from rich.console import Console
+
+    from eflow.submit import submit_blinkflow, submit_dsec
+
+    _one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
+    model = _model(checkpoint, device, False, precision)
+    with Console(stderr=True).status("predicting") as status:
+        options = {"precision": precision, "progress": lambda i, n: status.update(f"{i}/{n} flows")}
+        count = submit_dsec(model, dataset, out, **options) if benchmark == "dsec" else submit_blinkflow(model, dataset, out, full=full, **options)
+    typer.echo(f"written and checked: {out}, {count} files")
+
+
+@app.command()
+def bench(
+    model: Annotated[Optional[list[str]], typer.Option("--model", "-m", help="May be repeated; default: all.")] = None,
+    size: Annotated[Optional[list[str]], typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")] = None,
+    repeats: Annotated[int, typer.Option(min=1)] = 5,
+    training: Annotated[bool, typer.Option("--training/--no-training", help="Also a training step.")] = True,
+    plain: Annotated[bool, typer.Option("--plain", help="Also the RAFT-style slow twin of lookup and upsampling.")] = False,
+    json_out: Annotated[Optional[str], typer.Option("--json", help="Also write the rows to this file.")] = None,
+    precision: Precision = "fp32",
+) -> None:
+    """Milliseconds, GMACs and peak memory per model and resolution; each measured in a process of its own."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from eflow import bench as benchmark
+    from eflow.evaluate import write_json
+
+    _one_of("--precision", precision, ("fp32", "bf16"))
+    names = model or list(benchmark.PRESETS)
+    for name in names:
+        benchmark.preset(name)
+    sizes = [_size(s) for s in size or ["640x480"]]
+    rows = []
+    for name in names:
+        for height, width in sizes:
+            modes = [(False, False)] + ([(False, True)] if plain and "flownet" not in name else []) + ([(True, False)] if training else [])
+            for train_mode, slow in modes:
+                rows.append(benchmark.isolated(name=name, height=height, width=width, training=train_mode, plain=slow, repeats=repeats, precision=precision))
+    table = Table(title=benchmark.machine())
+    for c in ("model", "size", "mode", "ms", "GMACs", "M param", "peak MiB"):
+        table.add_column(c, justify="left" if c in ("model", "mode") else "right")
+    for r in rows:
+        mode = "training step" if r.get("training") or r.get("mode") == "train" else "forward, plain" if r.get("plain") else "forward"
+        cells = [r["error"], "", "", ""] if "error" in r else [f"{r['ms']:.0f}", f"{r['gmacs']:.1f}", f"{r['parameters'] / 1e6:.2f}", f"{r['peak_mib']:.0f}"]
+        table.add_row(r["model"], f"{r['width']}x{r['height']}", mode, *cells)
+    Console().print(table)
+    if json_out:
+        write_json(Path(json_out), {"rows": rows})
+
+
+def _model(checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None):
+    import torch
+
+    from eflow.checkpoint import load_model
+
+    _one_of("--precision", precision, ("fp32", "bf16"))
+    _one_of("--device", device, ("auto", "cpu", "cuda"))
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("no CUDA device on this machine", where="--device", value=device, accepted="cpu or auto")
+    model = load_model(checkpoint, averaged=not raw)
+    if iterations is not None:
+        if not hasattr(model.config, "iterations"):
+            raise ConfigError("this network has no iterations", where="--iterations", value=model.config.name)
+        model.config = model.config.model_copy(update={"iterations": iterations})
+    return model.to("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _format(name: str) -> str:
+    from eflow.data.sources import FORMATS
+
+    _one_of("--format", name, ("auto", *FORMATS))
+    return name
+
+
+def _one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
+    if value not in accepted:
+        raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """"640x480" to (480, 640)."""
+    if text is None:
+        return None
+    width, x, height = text.lower().partition("x")
+    if not (x and width.isdigit() and height.isdigit() and 0 < int(width) < 65536 and 0 < int(height) < 65536):
+        raise ConfigError("not a size", where="--size", value=text, accepted="WIDTHxHEIGHT, e.g. 640x480")
+    return int(height), int(width)
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    debug = "--debug" in arguments
+    arguments = [a for a in arguments if a != "--debug"] or ["--help"]
+    try:
+        status = app(arguments, prog_name="eflow", standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except (KeyboardInterrupt, typer.Abort):
+        print("interrupted", file=sys.stderr)
+        return 130
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "safetensors", "tensorboard"):
+            raise
+        print(f"error: {error.name} is not installed; run pip install 'blinkgl[learn]'", file=sys.stderr)
+        return BlinkGLError.exit_status
+    except Exception as error:
+        line = _user_line(error)
+        if debug or line is None:
+            traceback.print_exc()
+        if line is None:
+            print("this is a bug in eflow; please report the lines above and the command", file=sys.stderr)
+            return 1
+        print(f"error: {line}", file=sys.stderr)
+        return BlinkGLError.exit_status
+
+
+def main() -> None:
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+"""``eflow train``'s YAML, validated; the model part also travels inside every checkpoint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from blinkgl.config.base import Config, validate
+from blinkgl.config.sequence import MAX_YAML_BYTES, apply_overrides, parse_yaml
+from blinkgl.errors import ConfigError
+
+
+class VoxelConfig(Config):
+    """Input of the correlation networks."""
+
+    bins: int = Field(15, ge=2, le=64, description="time bins")
+    normalise: Literal["nonzero", "all", "none"] = Field("nonzero", description="cells that mean and std are taken over")
+    bounds: Literal["window", "events"] = Field("window", description="bins span the window, or its first to last event (E-RAFT's loader)")
+
+
+class _Refined(Config):
+    """What E-RAFT and E-FlowFormer share."""
+
+    input: VoxelConfig = VoxelConfig()
+    iterations: int = Field(12, ge=1, le=64, description="GRU iterations in evaluation")
+    train_iterations: int = Field(12, ge=1, le=64, description="GRU iterations in training")
+    context_norm: Literal["batch", "instance"] = Field("batch", description="norm of the context CNN; instance for batches of one or two")
+    correlation: Literal["auto", "dense", "on_demand"] = Field("auto", description="auto: dense below 8192 tokens")
+    checkpoint_iterations: bool = Field(False, description="recompute each iteration in the backward pass: less memory, ~30 % slower")
+
+
+class EraftConfig(_Refined):
+    """E-RAFT (Gehrig et al., 3DV 2021)."""
+
+    name: Literal["eraft"] = "eraft"
+
+
+class EFlowFormerConfig(_Refined):
+    """E-FlowFormer (BlinkFlow, IROS 2023)."""
+
+    name: Literal["eflowformer"] = "eflowformer"
+    variant: Literal["base", "small", "twins"] = Field("base", description="4 layers; 2 layers; 2 layers with dense reduction")
+    layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: the variant's")
+    init: Literal["match", "zero"] = Field("match", description="start of the GRU: the matching layer's flow, or zero as E-RAFT")
+
+
+class EvFlowNetConfig(Config):
+    """EV-FlowNet (Zhu et al., RSS 2018), supervised."""
+
+    name: Literal["ev_flownet"] = "ev_flownet"
+    input: Literal["counts", "voxel"] = Field("counts", description="4 channels of counts and latest times, or a voxel grid")
+    bins: int = Field(15, ge=2, le=64, description="time bins of the voxel input")
+
+
+class SpikeFlowNetConfig(Config):
+    """Spike-FlowNet (Lee et al., ECCV 2020), supervised."""
+
+    name: Literal["spike_flownet"] = "spike_flownet"
+    steps: int = Field(5, ge=1, le=50, description="spike time steps per group")
+    threshold: float = Field(0.75, gt=0, description="firing threshold of the integrate-and-fire neurons")
+
+
+class SteFlowNetConfig(Config):
+    """STE-FlowNet (Ding et al., AAAI 2022), supervised."""
+
+    name: Literal["ste_flownet"] = "ste_flownet"
+    slices: int = Field(5, ge=2, le=20, description="count slices of the window")
+    sweeps: int = Field(3, ge=1, le=10, description="passes of residual flow decoding")
+
+
+ModelConfig = Annotated[EraftConfig | EFlowFormerConfig | EvFlowNetConfig | SpikeFlowNetConfig | SteFlowNetConfig, Field(discriminator="name")]
+Probability = Annotated[float, Field(ge=0, le=1)]
+
+
+class AugmentConfig(Config):
+    """Probabilities and strengths; the draws depend on (seed, epoch, position) alone."""
+
+    horizontal_flip: Probability = 0.5
+    vertical_flip: Probability = 0.1
+    polarity: Probability = Field(0.5, description="all polarities swapped")
+    time_reversal: Probability = Field(0.0, description="film backwards, target the backward flow; needs backward labels")
+    drop_probability: Probability = 0.3
+    drop: float = Field(0.3, ge=0, lt=1, description="largest fraction of events dropped")
+    hot_probability: Probability = 0.2
+    hot_pixels: int = Field(20, ge=1, le=100_000, description="largest number of hot pixels")
+    hot_rate: float = Field(500.0, ge=0, le=1e6, description="largest rate of a hot pixel, events/s")
+    noise_probability: Probability = 0.3
+    noise_rate: float = Field(1.0, ge=0, le=1e4, description="largest rate of background noise, events/s per pixel")
+    scale_probability: Probability = 0.3
+    scale: tuple[float, float] = Field((-0.2, 0.5), description="exponent of 2 of the scale factor, [low, high]")
+
+    @model_validator(mode="after")
+    def _ordered(self):
+        if not -3 <= self.scale[0] <= self.scale[1] <= 3:
+            raise ValueError("scale must be [low, high] within [-3, 3]")
+        return self
+
+
+class SourceConfig(Config):
+    """One data set."""
+
+    path: str = Field(description="folder; relative to the YAML file")
+    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = "auto"
+    dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
+    weight: float = Field(1.0, gt=0, le=1e6, description="share of this set in the mixture")
+
+
+class DataConfig(Config):
+    """What is trained and validated on."""
+
+    train: tuple[SourceConfig, ...] = Field(min_length=1)
+    validate_on: tuple[SourceConfig, ...] = Field((), description="validation sets; the first samples of each are used")
+    validate_samples: int = Field(64, ge=1, description="samples of each validation set, evenly spaced")
+    crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
+    batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
+    workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0 loads in the training process")
+    empty: Literal["error", "skip"] = Field("error", description="a sample without events: stop, or take the next one")
+    augment: AugmentConfig | None = AugmentConfig()
+
+
+class OptimConfig(Config):
+    """AdamW with a linear one-cycle schedule."""
+
+    steps: int = Field(200_000, ge=1, le=10**9)
+    lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
+    warmup: float = Field(0.05, ge=0, lt=1, description="fraction of the steps that the rate rises over")
+    weight_decay: float = Field(1e-4, ge=0, le=1)
+    clip: float = Field(1.0, gt=0, description="largest gradient norm")
+    gamma: float = Field(0.8, gt=0, le=1, description="decay of the sequence loss towards early iterations")
+    match_weight: float = Field(1.0, ge=0, description="factor on the matching layer's term of the loss")
+    ema: float = Field(0.999, ge=0, lt=1, description="decay of the averaged weights; 0: none")
+
+
+class RunConfig(Config):
+    """How it runs and what it writes."""
+
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["fp32", "bf16"] = Field("fp32", description="bf16: autocast with fp32 islands")
+    channels_last: bool = False
+    compile: bool = Field(False, description="torch.compile of the update step")
+    threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's choice")
+    log_every: int = Field(20, ge=1, description="steps between log lines")
+    validate_every: int = Field(2000, ge=1)
+    checkpoint_every: int = Field(2000, ge=1)
+    keep_checkpoints: int = Field(3, ge=1, description="older ones are deleted")
+    picture_every: int = Field(2000, ge=1, description="steps between sample pictures")
+    time_limit: float | None = Field(None, gt=0, description="minutes after which training stops with a checkpoint; null: none")
+
+
+class TrainConfig(Config):
+    """One training run."""
+
+    seed: int = Field(0, ge=0, lt=2**63)
+    model: ModelConfig
+    data: DataConfig
+    optim: OptimConfig = OptimConfig()
+    run: RunConfig = RunConfig()
+    init_from: str | None = Field(None, description="checkpoint whose weights training starts from (fine-tuning)")
+
+
+def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] = ()) -> TrainConfig:
+    """Reads a YAML file and applies ``a.b=c`` overrides; data paths become absolute, from the YAML file's folder.
+
+    Raises ConfigError: missing file, bad YAML, unknown key, bad value."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_YAML_BYTES:
+            raise ConfigError("file is too large for a configuration", where=str(path), accepted=f"at most {MAX_YAML_BYTES} bytes")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError("no such file", where=str(path), accepted="a YAML file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {type(error).__name__}", where=str(path), accepted="a YAML text file in UTF-8") from None
+    tree = parse_yaml(text, str(path))
+    if not isinstance(tree, dict):
+        raise ConfigError("not a table of keys", where=str(path), value=tree, accepted="key: value lines")
+    config = validate(TrainConfig, apply_overrides(tree, overrides))
+    absolute = lambda p: str(path.parent.resolve() / p)  # noqa: E731 - an absolute p stays
+    sources = {k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k)) for k in ("train", "validate_on")}
+    return config.model_copy(update={"data": config.data.model_copy(update=sources),
+                                     "init_from": absolute(config.init_from) if config.init_from else None})

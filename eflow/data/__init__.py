@@ -1,0 +1,1 @@
+"""Event windows and ground truth: sources (files), representation (events to tensors), augmentation, order, batches."""

@@ -1,0 +1,214 @@
+"""From sources to batches: augmentation, grids, cropping, mixing; every sample a pure function of (seed, epoch, position).
+
+Nothing here keeps a state that a checkpoint would have to hold: training step s of any run takes the same samples with the same
+augmentation, whatever the number of workers and however often the run was interrupted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from blinkgl.errors import ConfigError, EventDataError
+from eflow.config import AugmentConfig
+from eflow.data.representation import Representation
+from eflow.data.sources import Source
+from eflow.data.window import RawSample
+
+MAX_FLOW = 400.0
+"""Ground truth at or beyond this many px is not supervised and not scored (BlinkFlow's rule)."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """One draw: which sample of which source, and the numbers that seed its augmentation."""
+
+    epoch: int
+    position: int
+    source: int
+    index: int
+
+
+class Mixture:
+    """The order of an endless training run over several sources.
+
+    weights : share of each source in an epoch. An epoch has as many samples as the sources together; each source contributes in
+    proportion to its weight, going through its own samples in an order that is new for every pass over it.
+    """
+
+    def __init__(self, sizes: list[int], weights: list[float], seed: int):
+        if not sizes or min(sizes) < 1 or len(sizes) != len(weights) or min(weights) < 0 or sum(weights) <= 0:
+            raise ValueError("sizes and weights")
+        self.sizes, self.seed, self.epoch_length = sizes, seed, sum(sizes)
+        share = np.array(weights, float) / sum(weights) * self.epoch_length
+        counts = np.floor(share).astype(int)
+        for i in np.argsort(counts - share, kind="stable")[: self.epoch_length - counts.sum()]:
+            counts[i] += 1  # largest remainders, so that the counts add up
+        self.counts = [int(c) for c in counts]
+        self._cache: tuple[int, list[Key]] | None = None
+
+    def epoch(self, epoch: int) -> list[Key]:
+        """The samples of one epoch, in order."""
+        if self._cache is None or self._cache[0] != epoch:
+            picks = []
+            for source, (size, count) in enumerate(zip(self.sizes, self.counts, strict=True)):
+                for n in range(epoch * count, (epoch + 1) * count):  # n-th sample ever drawn from this source
+                    pass_, place = divmod(n, size)
+                    picks.append((source, int(self._permutation(source, pass_, size)[place])))
+            order = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch))).permutation(len(picks))
+            self._cache = (epoch, [Key(epoch, position, *picks[i]) for position, i in enumerate(order)])
+        return self._cache[1]
+
+    def key(self, n: int) -> Key:
+        """The n-th sample of the run."""
+        epoch, position = divmod(n, self.epoch_length)
+        return self.epoch(epoch)[position]
+
+    def _permutation(self, source: int, pass_: int, size: int) -> np.ndarray:
+        wanted = (source, pass_)
+        if getattr(self, "_last", (None,))[0] != wanted:
+            rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(1, source, pass_)))
+            self._last = (wanted, rng.permutation(size))
+        return self._last[1]
+
+
+class FlowDataset(Dataset):
+    """Samples as tensors. ``dataset[key]`` for training (a :class:`Key`), ``dataset[i]`` for evaluation (no augmentation, no crop).
+
+    Gives a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400), mask (H, W) bool,
+    name, scene; without ground truth flow and valid are left out.
+
+    empty : "error" refuses a sample without an event in either window; "skip" takes the next sample that has some.
+    """
+
+    def __init__(self, sources: list[Source], representation: Representation, *, seed: int = 0, augment: AugmentConfig | None = None,
+                 crop: tuple[int, int] | None = None, empty: str = "error"):
+        self.sources, self.representation, self.seed = sources, representation, seed
+        self.augment, self.crop, self.empty = augment, crop, empty
+        self._starts = np.cumsum([0, *(len(s) for s in sources)])
+        if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
+            raise ConfigError("time reversal needs backward flow, which a training set lacks", where="data.augment.time_reversal",
+                              value=augment.time_reversal, accepted="0, or data generated with labels.flow: [forward, backward]")
+
+    def __len__(self) -> int:
+        return int(self._starts[-1])
+
+    def __getitem__(self, key: Key | int) -> dict:
+        if isinstance(key, Key):
+            rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(2, key.epoch, key.position)))
+            sample = self._raw(key.source, key.index)
+            if self.augment is not None:
+                sample = augmented(sample, self.augment, rng)
+            return self._tensors(sample, rng)
+        source = int(np.searchsorted(self._starts, key, side="right")) - 1
+        return self._tensors(self._raw(source, int(key - self._starts[source])), None)
+
+    def _raw(self, source: int, index: int) -> RawSample:
+        for step in range(len(self.sources[source])):
+            sample = self.sources[source][(index + step) % len(self.sources[source])]
+            if len(sample.old) and len(sample.new):
+                return sample
+            if self.empty == "error":
+                which = "old" if not len(sample.old) else "new"
+                w = getattr(sample, which)
+                raise EventDataError(f"no events in the {which} window [{w.t0}, {w.t1}) µs", where=sample.name,
+                                     accepted="use data.empty=skip to leave such samples out")
+        raise EventDataError("no sample has events", where=sample.name)
+
+    def _tensors(self, s: RawSample, rng: np.random.Generator | None) -> dict:
+        try:
+            grids = {k: self.representation(w, s.height, s.width) for k, w in (("old", s.old), ("new", s.new))}
+        except EventDataError as error:
+            raise EventDataError(error.problem, where=f"{s.name}: {error.where}") from None
+        out = {k: torch.from_numpy(g) for k, g in grids.items()}
+        if s.flow is not None:
+            if not np.isfinite(s.flow[s.valid]).all():
+                raise EventDataError("flow is NaN or infinite and marked valid", where=s.name)
+            out["flow"] = torch.from_numpy(np.ascontiguousarray(s.flow.transpose(2, 0, 1), dtype=np.float32))
+            out["valid"] = torch.from_numpy(np.ascontiguousarray(s.valid)) & ((out["flow"] ** 2).sum(0) < MAX_FLOW**2)
+            out["mask"] = torch.from_numpy(np.ascontiguousarray(s.mask)) if s.mask is not None else torch.ones_like(out["valid"])
+        if rng is not None:
+            if self.augment is not None and rng.random() < self.augment.scale_probability:
+                out = scaled(out, float(np.exp2(rng.uniform(*self.augment.scale))), least=self.crop)
+            if self.crop is not None:
+                out = cropped(out, self.crop, rng, s.name)
+        return {**out, "name": s.name, "scene": s.scene}
+
+
+def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> RawSample:
+    """The event-level augmentations, each with its own probability; all draws happen, so that switching one off moves no other."""
+    u = rng.random(7)
+    noise_rng, hot_rng, drop_rng = rng.spawn(3)
+    if u[0] < a.horizontal_flip:
+        sample = sample.flip("x")
+    if u[1] < a.vertical_flip:
+        sample = sample.flip("y")
+    if u[2] < a.polarity:
+        sample = sample.invert()
+    if u[3] < a.time_reversal:
+        sample = sample.reverse()
+    if u[4] < a.drop_probability:
+        sample = sample.drop(drop_rng.uniform(0, a.drop), drop_rng)
+    if u[5] < a.hot_probability:
+        sample = sample.hot_pixels(int(hot_rng.integers(1, a.hot_pixels + 1)), hot_rng.uniform(0, a.hot_rate), hot_rng)
+    if u[6] < a.noise_probability:
+        sample = sample.noise(noise_rng.uniform(0, a.noise_rate), noise_rng)
+    return sample
+
+
+def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) -> dict:
+    """Image scaled by ``factor`` (at least so that ``least`` = (H, W) fits), grids bilinear, flow bilinear times the true factor of
+    each axis, validity only where all four contributing pixels are valid."""
+    height, width = sample["new"].shape[-2:]
+    size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
+    resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]  # noqa: E731
+    out = {**sample, **{k: resize(sample[k]) for k in ("old", "new")}}
+    if "flow" in sample:
+        ratio = torch.tensor([size[1] / width, size[0] / height])[:, None, None]
+        out["flow"] = resize(torch.where(sample["valid"], sample["flow"], 0)) * ratio
+        for k in ("valid", "mask"):
+            out[k] = resize(sample[k][None].float())[0] > 0.999
+    return out
+
+
+def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name: str) -> dict:
+    """Random crop (H, W). Raises EventDataError when the sample is smaller."""
+    height, width = sample["new"].shape[-2:]
+    if height < size[0] or width < size[1]:
+        raise EventDataError("sample is smaller than the crop", where=f"data.crop, {name}", value=(height, width), accepted=f"at least {size}")
+    top, left = int(rng.integers(height - size[0] + 1)), int(rng.integers(width - size[1] + 1))
+    return {k: v[..., top:top + size[0], left:left + size[1]].contiguous() if torch.is_tensor(v) else v for k, v in sample.items()}
+
+
+class StepSampler(Sampler):
+    """Batches of keys from training step ``start`` on, for one rank of ``world``: step s takes samples s·B … (s+1)·B - 1 of the
+    mixture, rank r every world-th of them."""
+
+    def __init__(self, mixture: Mixture, batch: int, start: int, stop: int, rank: int = 0, world: int = 1):
+        self.mixture, self.batch, self.start, self.stop, self.rank, self.world = mixture, batch, start, stop, rank, world
+
+    def __len__(self) -> int:
+        return max(self.stop - self.start, 0)
+
+    def __iter__(self) -> Iterator[list[Key]]:
+        for step in range(self.start, self.stop):
+            yield [self.mixture.key(n) for n in range(step * self.batch + self.rank, (step + 1) * self.batch, self.world)]
+
+
+def collate(samples: list[dict]) -> dict:
+    """Stacks tensors, lists the rest."""
+    if len({tuple(s["new"].shape) for s in samples}) > 1:
+        raise EventDataError("samples of a batch differ in size", where="data.crop", value=[tuple(s["new"].shape[-2:]) for s in samples],
+                             accepted="a crop that fits all training sets")
+    return {k: torch.stack([s[k] for s in samples]) if torch.is_tensor(samples[0][k]) else [s[k] for s in samples] for k in samples[0]}
+
+
+def loader(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool = False) -> DataLoader:
+    """Batches in the sampler's order; the same ones for any number of workers."""
+    return DataLoader(dataset, batch_sampler=sampler, num_workers=workers, collate_fn=collate, pin_memory=pin,
+                      persistent_workers=workers > 0, prefetch_factor=4 if workers else None,
+                      multiprocessing_context="forkserver" if workers else None)

@@ -1,0 +1,174 @@
+"""MVSEC as samples: image pairs dt = 1 or 4 apart, ground truth propagated through the 20 Hz flow (Zhu et al., RSS 2018)."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io.dsec import open_hdf5
+from blinkgl.io.mvsec import DATASET
+from eflow.data.window import RawSample, Window
+
+HEIGHT, WIDTH = 260, 346
+CROP = 256
+HOOD_ROW = 193
+"""Outdoors the car's hood fills the rows from here down."""
+
+
+class NpzRows:
+    """Rows of arrays in an .npz without loading the arrays: MVSEC's flow is gigabytes. Never unpickles.
+
+    Raises AssetError: not an .npz, the array is missing, or of objects."""
+
+    def __init__(self, path: Path, names: tuple[str, ...]):
+        self.path, self._layout = path, {}
+        try:
+            with zipfile.ZipFile(path) as archive:
+                for name in names:
+                    with archive.open(f"{name}.npy") as member:
+                        version = np.lib.format.read_magic(member)
+                        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+                        shape, fortran, dtype = header(member)
+                        if fortran or dtype.hasobject:
+                            raise AssetError(f"array '{name}' is not a plain C-ordered array", where=str(path))
+                        self._layout[name] = (shape, dtype, member.tell())
+        except KeyError:
+            raise AssetError("missing array", where=str(path), accepted=", ".join(names)) from None
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
+            raise AssetError(f"not a readable .npz: {' '.join(str(error).split())}", where=str(path)) from error
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        return self._layout[name][0]
+
+    def read(self, name: str, row: int | None = None) -> np.ndarray:
+        """One row, or the whole array."""
+        shape, dtype, start = self._layout[name]
+        count = int(np.prod(shape if row is None else shape[1:]))
+        try:
+            with zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
+                member.seek(start + (row or 0) * count * dtype.itemsize)
+                data = member.read(count * dtype.itemsize)
+            return np.frombuffer(data, dtype).reshape(shape if row is None else shape[1:])
+        except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+            raise AssetError(f"array '{name}' cannot be read: {' '.join(str(error).split())}", where=str(self.path)) from error
+
+
+class MvsecSource:
+    """Samples of ``<seq>_data.hdf5`` + ``<seq>_gt_flow_dist.npz`` files at or below ``root``.
+
+    Sample i of a sequence: events between images i - dt … i (old) and i … i + dt (new); ground truth over the same time, by
+    following pixels through the successive 20 Hz flow fields. ``mask``: pixels with an event in the new window, inside the
+    256x256 centre crop, above the hood outdoors. Times: µs since the sequence's first image."""
+
+    has_backward = False
+
+    def __init__(self, root: Path, dt: int = 1):
+        if dt not in (1, 4):
+            raise EventDataError("MVSEC interval", where="dt", value=dt, accepted="1 or 4")
+        files = [root] if root.is_file() else sorted(root.rglob("*_data.hdf5"))
+        if not files:
+            raise AssetError("no *_data.hdf5", where=str(root))
+        self.dt, self._index, self._sequences = dt, [], []
+        for path in files:
+            self._sequences.append(s := _MvsecSequence(path))
+            i0, i1 = np.searchsorted(s.image_us, (s.flow_us[0], s.flow_us[-1]))  # flow must cover [image i, image i + dt]
+            self._index += [(s, i) for i in range(max(int(i0), dt), min(int(i1), len(s.image_us)) - dt)]
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __getitem__(self, index: int) -> RawSample:
+        s, i = self._index[index]
+        t_old, t, t_new = (int(s.image_us[j]) for j in (i - self.dt, i, i + self.dt))
+        old, new = s.window(t_old, t, i - self.dt, i), s.window(t, t_new, i, i + self.dt)
+        flow, valid = s.flow_between(t, t_new)
+        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask[new.y, new.x] = True
+        inside = np.zeros_like(mask)
+        top, left = (HEIGHT - CROP) // 2, (WIDTH - CROP) // 2
+        inside[top:top + CROP, left:left + CROP] = True
+        if "outdoor" in s.name:
+            inside[HOOD_ROW:] = False
+        return RawSample(old, new, HEIGHT, WIDTH, f"{s.name}/{i:06d}", s.name, flow=flow, valid=valid, mask=mask & inside)
+
+
+class _MvsecSequence:
+    def __init__(self, path: Path):
+        self.path, self.name = path, path.name.removesuffix("_data.hdf5")
+        with open_hdf5(path) as file:
+            for name in (DATASET, "davis/left/image_raw_ts", "davis/left/image_raw_event_inds"):
+                if name not in file:
+                    raise AssetError(f"no dataset '{name}'", where=str(path))
+            stamps = file["davis/left/image_raw_ts"][()]
+            self._inds = file["davis/left/image_raw_event_inds"][()].astype(np.int64)
+        flow = path.with_name(f"{self.name}_gt_flow_dist.npz")
+        if not flow.is_file():
+            raise AssetError("no such file", where=str(flow), accepted="ground truth beside the events")
+        self._flow = NpzRows(flow, ("timestamps", "x_flow_dist", "y_flow_dist"))
+        self.t0_s = float(stamps[0])
+        self.image_us = np.rint((stamps - self.t0_s) * 1e6).astype(np.int64)
+        self.flow_us = np.rint((self._flow.read("timestamps") - self.t0_s) * 1e6).astype(np.int64)
+        self._file, self._pid = None, None
+        self._rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def window(self, t0: int, t1: int, image0: int, image1: int) -> Window:
+        """Events of [t0, t1) µs; the images' event indices say where to look, the times decide."""
+        if self._pid != os.getpid():  # HDF5 handles do not survive a fork
+            self._file, self._pid = h5py.File(self.path, "r"), os.getpid()
+        table = self._file[DATASET]
+        low, high = int(self._inds[image0]), int(self._inds[image1])
+        margin = 4096
+        while True:
+            i, j = max(low - margin, 0), min(high + margin, len(table))
+            try:
+                rows = table[i:j]
+            except OSError as error:
+                raise AssetError(f"events from {i} cannot be read: {' '.join(str(error).split())}", where=str(self.path)) from error
+            t = np.rint((rows[:, 2] - self.t0_s) * 1e6).astype(np.int64)
+            enough = len(t) and (i == 0 or t[0] < t0) and (j == len(table) or t[-1] >= t1)
+            if enough or (i == 0 and j == len(table)):
+                break
+            margin *= 4
+        a, b = np.searchsorted(t, (t0, t1), side="left")
+        rows = rows[a:b]
+        return Window(rows[:, 0].astype(np.uint16), rows[:, 1].astype(np.uint16), t[a:b], (rows[:, 3] > 0).astype(np.uint8), t0, t1)
+
+    def flow_between(self, t0: int, t1: int) -> tuple[np.ndarray, np.ndarray]:
+        """flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`."""
+        k = int(np.clip(np.searchsorted(self.flow_us, t0, side="right") - 1, 0, len(self.flow_us) - 2))
+        pieces = []
+        while k < len(self.flow_us) - 1 and self.flow_us[k] < t1:
+            a, b = int(self.flow_us[k]), int(self.flow_us[k + 1])
+            pieces.append((self._field(k), (min(b, t1) - max(a, t0)) / (b - a)))
+            k += 1
+        return propagate(pieces)
+
+    def _field(self, k: int) -> np.ndarray:
+        if k not in self._rows:
+            while len(self._rows) > 8:
+                self._rows.pop(next(iter(self._rows)))
+            self._rows[k] = np.stack([self._flow.read(n, k).astype(np.float32) for n in ("x_flow_dist", "y_flow_dist")], axis=-1)
+        return self._rows[k]
+
+
+def propagate(pieces: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Displacement of every pixel followed through successive flow fields, each over a fraction of its interval.
+
+    pieces : (flow (H, W, 2) px over the field's whole interval, fraction in (0, 1]); 0, 0 means invalid. The field is read at
+    the pixel nearest to where the point has got to. Returns flow (H, W, 2) float32 and valid (H, W): False where any piece
+    was invalid or NaN, or the point left the image before the last piece."""
+    height, width = pieces[0][0].shape[:2]
+    start = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+    at, valid = start.copy(), np.ones((height, width), bool)
+    for flow, fraction in pieces:
+        x, y = (np.rint(at[..., c]).astype(np.int64) for c in (0, 1))
+        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        step = flow[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(np.float64)
+        valid &= inside & np.isfinite(step).all(-1) & (step != 0).any(-1)
+        at = np.where(valid[..., None], at + step * fraction, at)
+    return np.where(valid[..., None], at - start, 0).astype(np.float32), valid

@@ -1,0 +1,84 @@
+"""Events to the tensor a network eats. A representation is a frozen value: ``representation(window, height, width)``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from blinkgl.errors import EventDataError
+from eflow.data.window import Window
+from eflow.ops import voxel
+
+
+class Representation(Protocol):
+    @property
+    def channels(self) -> int: ...
+
+    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+        """(channels, height, width) float32. Raises EventDataError: events outside the window or the sensor."""
+        ...
+
+
+@dataclass(frozen=True)
+class VoxelGrid:
+    """See :func:`eflow.ops.voxel.voxel_grid`. bounds "window": bins span [t0, t1]; "events": first to last event (E-RAFT's)."""
+
+    bins: int = 15
+    normalise: str = "nonzero"
+    bounds: str = "window"
+
+    @property
+    def channels(self) -> int:
+        return self.bins
+
+    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+        t0, t1 = window.t0, window.t1
+        if self.bounds == "events" and len(window):
+            t0, t1 = int(window.t[0]), int(window.t[-1])
+        return _guarded(voxel.voxel_grid, window, window.x, window.y, window.t, window.p, t0, t1, self.bins, height, width,
+                        normalise=self.normalise)
+
+
+@dataclass(frozen=True)
+class CountSlices:
+    """Per-polarity counts in slices of equal duration: channel 2 s + p of slice s and polarity p (0 OFF, 1 ON)."""
+
+    slices: int
+
+    @property
+    def channels(self) -> int:
+        return 2 * self.slices
+
+    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+        w = _on_pixels(window, height, width)
+        counts = _guarded(voxel.count_slices, w, w.x, w.y, w.t, w.p, w.t0, w.t1, self.slices, height, width)
+        return counts.reshape(-1, height, width)
+
+
+@dataclass(frozen=True)
+class CountsAndTimes:
+    """EV-FlowNet's four channels."""
+
+    channels: int = 4
+
+    def __call__(self, window: Window, height: int, width: int) -> np.ndarray:
+        w = _on_pixels(window, height, width)
+        return _guarded(voxel.counts_and_times, w, w.x, w.y, w.t, w.p, w.t0, w.t1, height, width)
+
+
+def _on_pixels(window: Window, height: int, width: int) -> Window:
+    """Rectified coordinates rounded to the nearest pixel; those outside the sensor are left out, as the splat does."""
+    if window.x.dtype.kind == "u":
+        return window
+    x, y = np.rint(window.x), np.rint(window.y)
+    keep = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    return Window(x[keep].astype(np.uint16), y[keep].astype(np.uint16), window.t[keep], window.p[keep], window.t0, window.t1)
+
+
+def _guarded(function, window: Window, *args, **kw) -> np.ndarray:
+    try:
+        return function(*args, **kw)
+    except ValueError as error:
+        raise EventDataError(str(error), where=f"window [{window.t0}, {window.t1}) µs") from None

@@ -1,0 +1,301 @@
+"""Data sets on disk as lists of samples: BlinkGL's sequence directories, DSEC, BlinkFlow. (MVSEC: :mod:`eflow.data.mvsec`.)
+
+All three are an event file beside one flow file per label, so one reader serves them; what differs is where the files lie.
+
+| layout | events | flow | times |
+|---|---|---|---|
+| blinkgl | events.h5 | flow/{forward,backward}/*.png | flow/*_timestamps.txt |
+| dsec | events/left/events.h5, rectify_map.h5 | flow/forward/*.png | flow/forward_timestamps.txt, or the test CSV |
+| blinkflow | events_left/events.h5 | forward_flow/*.npy, backward_flow/*.npy | index / fps (config.yaml) |
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections import OrderedDict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import h5py
+import numpy as np
+import yaml
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io.dsec import DsecEventReader, open_hdf5
+from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.images import read_npy
+from eflow.data.window import RawSample, Window
+
+FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow")
+_OPEN_FILES = 16
+
+
+class Source(Protocol):
+    """A finite list of samples. ``has_backward``: samples carry backward flow, so time reversal is possible."""
+
+    has_backward: bool
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, index: int) -> RawSample: ...
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One label: flow from ``from_us`` to ``to_us`` (image clock). ``index``: the file's number, kept for submissions."""
+
+    index: int
+    from_us: int
+    to_us: int
+    forward: Path | None = None
+    backward: Path | None = None
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """One recording. ``scene``: what averages are taken over first."""
+
+    name: str
+    scene: str
+    events: Path
+    entries: tuple[Entry, ...]
+    rectify_map: Path | None = None
+
+
+class FolderSource:
+    """Samples of :class:`Sequence` objects, in order. Files are opened on first use in each process (HDF5 handles do not
+    survive a fork) and at most 16 stay open."""
+
+    def __init__(self, sequences: list[Sequence]):
+        self.sequences = sequences
+        self._index = [(s, e) for s in sequences for e in s.entries]
+        self.has_backward = bool(self._index) and all(e.backward is not None for _, e in self._index)
+        self._readers: OrderedDict[Path, DsecEventReader] = OrderedDict()
+        self._maps: dict[Path, np.ndarray] = {}
+        self._pid = os.getpid()
+
+    def __len__(self) -> int:
+        return len(self._index)
+
+    def __getitem__(self, index: int) -> RawSample:
+        sequence, entry = self._index[index]
+        flow = valid = backward = backward_valid = None
+        if entry.forward is not None:
+            flow, valid = read_flow(entry.forward)
+        if entry.backward is not None:
+            backward, backward_valid = read_flow(entry.backward)
+        reader = self._reader(sequence.events)
+        rectify = self._map(sequence.rectify_map) if sequence.rectify_map else None
+        height, width = self._size(sequence, reader, flow, rectify)
+        span = entry.to_us - entry.from_us
+        return RawSample(
+            old=self._window(reader, entry.from_us - span, entry.from_us, rectify), new=self._window(reader, entry.from_us, entry.to_us, rectify),
+            height=height, width=width, name=f"{sequence.name}/{entry.index:06d}", scene=sequence.scene,
+            flow=flow, valid=valid, backward=backward, backward_valid=backward_valid)
+
+    def entry(self, index: int) -> tuple[Sequence, Entry]:
+        """The sequence and label of sample ``index``."""
+        return self._index[index]
+
+    def _reader(self, path: Path) -> DsecEventReader:
+        if self._pid != os.getpid():
+            self._readers, self._pid = OrderedDict(), os.getpid()
+        if path not in self._readers:
+            self._readers[path] = DsecEventReader(path)
+            if len(self._readers) > _OPEN_FILES:
+                self._readers.popitem(last=False)[1].close()
+        self._readers.move_to_end(path)
+        return self._readers[path]
+
+    def _map(self, path: Path) -> np.ndarray:
+        if path not in self._maps:
+            with open_hdf5(path) as file:
+                if "rectify_map" not in file or not isinstance(file["rectify_map"], h5py.Dataset) or file["rectify_map"].ndim != 3:
+                    raise AssetError("no (H, W, 2) dataset 'rectify_map'", where=str(path))
+                self._maps[path] = file["rectify_map"][()].astype(np.float32)
+        return self._maps[path]
+
+    @staticmethod
+    def _window(reader: DsecEventReader, t0: int, t1: int, rectify: np.ndarray | None) -> Window:
+        e = reader.slice(t0, t1)
+        if rectify is None:
+            return Window(e.x, e.y, e.t, e.p, t0, t1)
+        if len(e) and (e.y.max() >= rectify.shape[0] or e.x.max() >= rectify.shape[1]):
+            raise EventDataError("event outside the rectification map", where=str(reader.path), value=(int(e.x.max()), int(e.y.max())),
+                                 accepted=f"x < {rectify.shape[1]}, y < {rectify.shape[0]}")
+        xy = rectify[e.y, e.x]
+        return Window(np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1]), e.t, e.p, t0, t1)
+
+    @staticmethod
+    def _size(sequence: Sequence, reader: DsecEventReader, flow, rectify) -> tuple[int, int]:
+        sizes = {tuple(map(int, s)) for s in ((reader.height, reader.width) if reader.height else None,
+                 flow.shape[:2] if flow is not None else None, rectify.shape[:2] if rectify is not None else None) if s is not None}
+        if len(sizes) > 1:
+            raise AssetError("event file, flow and rectification map differ in size", where=str(sequence.events), value=sorted(sizes))
+        return sizes.pop() if sizes else (480, 640)  # DSEC's and BlinkFlow's sensor; their files do not say
+
+
+def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """flow (H, W, 2) float32 px, valid (H, W) bool, of a DSEC PNG or a BlinkFlow .npy (u, v, validity).
+
+    Raises AssetError: missing, corrupt, wrong shape, or NaN / infinity in a valid pixel."""
+    if path.suffix != ".npy":
+        return read_flow_png(path)
+    data = read_npy(path)
+    if data.ndim != 3 or data.shape[2] not in (2, 3) or data.dtype.kind != "f":
+        raise AssetError("not a flow field", where=str(path), value=f"{data.dtype} {data.shape}", accepted="float (H, W, 2) or (H, W, 3)")
+    flow = data[..., :2].astype(np.float32)
+    valid = data[..., 2] > 0 if data.shape[2] == 3 else np.ones(data.shape[:2], bool)
+    bad = valid & ~np.isfinite(flow).all(-1)
+    if bad.any():
+        y, x = np.argwhere(bad)[0]
+        raise AssetError(f"flow is NaN or infinite at pixel ({x}, {y}) and marked valid", where=str(path))
+    return np.where(valid[..., None], flow, np.float32(0)), valid
+
+
+# ---- where files lie -------------------------------------------------------------------------------------------------
+
+
+def find_blinkgl(root: Path) -> list[Sequence]:
+    """Sequence directories at or below ``root``. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
+    found = []
+    for manifest in sorted(root.rglob("manifest.json")):
+        folder = manifest.parent
+        if any(part.startswith(".") for part in folder.relative_to(root).parts) or not (folder / "events.h5").is_file():
+            continue
+        times = read_times(folder / "flow/forward_timestamps.txt")
+        forward, backward = sorted((folder / "flow/forward").glob("*.png")), sorted((folder / "flow/backward").glob("*.png"))
+        _same_count(folder / "flow/forward", forward, times)
+        if backward:
+            _same_count(folder / "flow/backward", backward, times)
+        entries = tuple(Entry(int(f.stem), t0, t1, f, backward[i] if backward else None)
+                        for i, (f, (t0, t1)) in enumerate(zip(forward, times, strict=True)))
+        name = folder.relative_to(root).as_posix()
+        name = folder.name if name == "." else name
+        found.append(Sequence(name, name, folder / "events.h5", entries))
+    return found
+
+
+def find_dsec(root: Path) -> list[Sequence]:
+    """DSEC sequences at or below ``root``; events and flow may lie in one tree, or in the archives' own ``train_events`` and
+    ``train_optical_flow``. A ``test_forward_flow_timestamps.csv`` or ``<sequence>.csv`` gives a test sequence its times."""
+    found = []
+    for events in sorted(root.rglob("events.h5")):
+        if events.parent.name not in ("left", "events_left") or "forward_flow" in {p.name for p in events.parent.parent.iterdir()}:
+            continue
+        folder = events.parent.parent.parent if events.parent.name == "left" else events.parent.parent
+        flow_folder = next((f for f in (folder / "flow", root / "train_optical_flow" / folder.name / "flow") if f.is_dir()), None)
+        rectify = events.parent / "rectify_map.h5"
+        test = next((c for c in (folder / "test_forward_flow_timestamps.csv", folder / f"{folder.name}.csv",
+                                 root / "test_forward_optical_flow_timestamps" / f"{folder.name}.csv") if c.is_file()), None)
+        if flow_folder is not None:
+            times, files = read_times(flow_folder / "forward_timestamps.txt"), sorted((flow_folder / "forward").glob("*.png"))
+            _same_count(flow_folder / "forward", files, times)
+            entries = tuple(Entry(int(f.stem), t0, t1, f) for f, (t0, t1) in zip(files, times, strict=True))
+        elif test is not None:
+            entries = tuple(Entry(i, t0, t1) for t0, t1, i in read_submission_times(test))
+        else:
+            continue
+        if not rectify.is_file():
+            raise AssetError("no rectification map beside the events", where=str(rectify))
+        found.append(Sequence(folder.name, folder.name, events, entries, rectify))
+    return found
+
+
+def find_blinkflow(root: Path) -> list[Sequence]:
+    """BlinkFlow's published layout: ``[<split>/]<scene>/<seq>/{events_left/events.h5, forward_flow, config.yaml}``. Label 0
+    has no events before it and is left out."""
+    found = []
+    for folder in sorted(p.parent for p in root.rglob("forward_flow") if p.is_dir()):
+        fps = _fps(folder / "config.yaml")
+        files = sorted((folder / "forward_flow").glob("*.npy"))
+        backward = {int(f.stem): f for f in (folder / "backward_flow").glob("*.npy")}
+        at = lambda i: round(i * 1e6 / fps)  # noqa: E731
+        # backward_flow/k belongs to frames k+1 -> k in the published sets, so the one that starts at label i is file i - 1.
+        entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in ((int(f.stem), f) for f in files) if i > 0)
+        parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)
+        name = "/".join(parts[-2:])
+        found.append(Sequence(name, parts[-2] if len(parts) > 1 else name, folder / "events_left/events.h5", entries))
+    return found
+
+
+def _fps(path: Path) -> float:
+    if not path.is_file():
+        return 10.0
+    try:
+        tree = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        fps = float(tree.get("fps", 10.0))
+    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError):
+        raise AssetError("no readable 'fps'", where=str(path), accepted="duration and fps as YAML") from None
+    if not 0 < fps < 1e6:
+        raise AssetError("impossible fps", where=str(path), value=fps)
+    return fps
+
+
+def read_times(path: Path) -> list[tuple[int, int]]:
+    """``from_us, to_us`` lines under ``#`` headers. Raises AssetError: missing, not numbers, or not forward in time."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        times = [tuple(int(v) for v in line.split(",")) for line in lines if line.strip() and not line.startswith("#")]
+    except FileNotFoundError:
+        raise AssetError("no such file", where=str(path)) from None
+    except (OSError, ValueError):
+        raise AssetError("not a list of 'from_us, to_us'", where=str(path)) from None
+    for line in times:
+        if len(line) != 2 or line[0] >= line[1]:
+            raise AssetError("not an interval", where=str(path), value=line, accepted="from_us, to_us with from < to")
+    return times
+
+
+def read_submission_times(path: Path) -> list[tuple[int, int, int]]:
+    """DSEC's test CSV: (from_us, to_us, file_index) rows. Raises AssetError."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            rows = [tuple(int(v) for v in row[:3]) for row in csv.reader(file) if row and not row[0].lstrip().startswith(("#", "from"))]
+    except (OSError, ValueError):
+        raise AssetError("not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index") from None
+    if not rows or any(len(r) != 3 for r in rows):
+        raise AssetError("not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index")
+    return rows
+
+
+def _same_count(folder: Path, files: list, times: list) -> None:
+    if len(files) != len(times):
+        raise AssetError("flow files and time stamps differ in number", where=str(folder), value=(len(files), len(times)))
+
+
+def detect_format(root: Path) -> str:
+    """Which layout ``root`` holds. Raises AssetError when it is none."""
+    if root.is_file() and root.name.endswith("_data.hdf5"):
+        return "mvsec"
+    if not root.is_dir():
+        raise AssetError("no such data set", where=str(root), accepted="a folder")
+    if next(root.rglob("manifest.json"), None):
+        return "blinkgl"
+    if next(root.rglob("forward_flow"), None):
+        return "blinkflow"
+    if next(root.rglob("*_data.hdf5"), None):
+        return "mvsec"
+    if next(root.rglob("events.h5"), None):
+        return "dsec"
+    raise AssetError("no data set found", where=str(root), accepted="a folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences")
+
+
+def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1) -> Source:
+    """The data set at ``path``; ``dt``: MVSEC's interval in images, 1 or 4.
+
+    Raises AssetError: nothing there, or a damaged index; files of single samples are only looked at when they are asked for."""
+    root = Path(path)
+    format = detect_format(root) if format == "auto" else format
+    if format == "mvsec":
+        from eflow.data.mvsec import MvsecSource
+
+        return MvsecSource(root, dt)
+    if not root.is_dir():
+        raise AssetError("no such data set", where=str(root), accepted="a folder")
+    sequences = {"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[format](root)
+    source = FolderSource(sequences)
+    if not len(source):
+        raise AssetError(f"no {format} sequence with flow labels", where=str(root))
+    return source

@@ -1,0 +1,126 @@
+"""One window of events, and the transforms of a (old window, new window, flow) sample that are exact.
+
+Everything acts on the events themselves, before any grid exists, so that each transform is right for every representation;
+that it equals the transform of the voxel grid is what the tests show.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Events of [t0, t1). x, y: (N,) uint16 px, or float32 rectified px; t: (N,) int64 µs; p: (N,) uint8 {0, 1}."""
+
+    x: np.ndarray
+    y: np.ndarray
+    t: np.ndarray
+    p: np.ndarray
+    t0: int
+    t1: int
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def take(self, keep: np.ndarray) -> "Window":
+        """Events chosen by mask or index, in order."""
+        return replace(self, x=self.x[keep], y=self.y[keep], t=self.t[keep], p=self.p[keep])
+
+    def flipped(self, axis: str, size: int) -> "Window":
+        """Mirrored: axis "x" or "y", ``size`` the sensor's width or height."""
+        column = getattr(self, axis)
+        return replace(self, **{axis: (column.dtype.type(size - 1) - column).astype(column.dtype)})
+
+    def inverted(self) -> "Window":
+        """Polarity swapped (a copy: windows may be shared)."""
+        return replace(self, p=1 - self.p)
+
+    def reversed(self) -> "Window":
+        """The film backwards: t -> t0 + t1 - t, order and polarity turned (what brightened now darkens). Times then lie in (t0, t1];
+        voxel(reversed) = -flip(bins) of voxel exactly."""
+        return replace(self, x=self.x[::-1], y=self.y[::-1], t=(self.t0 + self.t1) - self.t[::-1], p=(1 - self.p)[::-1])
+
+    def with_events(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> "Window":
+        """Further events merged in, time order kept."""
+        columns = [np.concatenate([a, b.astype(a.dtype)]) for a, b in ((self.x, x), (self.y, y), (self.t, t), (self.p, p))]
+        order = np.argsort(columns[2], kind="stable")
+        return Window(*(c[order] for c in columns), self.t0, self.t1)
+
+
+@dataclass(frozen=True, eq=False)
+class RawSample:
+    """What a source gives, before augmentation and grids.
+
+    old, new : events of [t - Δ, t) and [t, t + Δ). height, width : sensor, px.
+    flow : (H, W, 2) float32 px t -> t + Δ at reference t; valid : (H, W) bool. None where there is no ground truth.
+    backward, backward_valid : the same for t -> t - Δ, where the source has it.
+    mask : (H, W) bool further restriction for evaluation (MVSEC: event pixels inside the crop), else None.
+    name : "sequence/000012", unique in the data set. scene : what evaluation averages over.
+    """
+
+    old: Window
+    new: Window
+    height: int
+    width: int
+    name: str
+    scene: str
+    flow: np.ndarray | None = None
+    valid: np.ndarray | None = None
+    backward: np.ndarray | None = None
+    backward_valid: np.ndarray | None = None
+    mask: np.ndarray | None = None
+
+    def flip(self, axis: str) -> "RawSample":
+        """Mirror image: horizontal for axis "x", vertical for "y"."""
+        size, image_axis, component = (self.width, 1, 0) if axis == "x" else (self.height, 0, 1)
+        turn = lambda a: None if a is None else np.flip(a, image_axis)  # noqa: E731
+        sign = np.ones(2, np.float32)
+        sign[component] = -1
+        signed = lambda f: None if f is None else turn(f) * sign  # noqa: E731 - a fresh array: sources may share theirs
+        return replace(self, old=self.old.flipped(axis, size), new=self.new.flipped(axis, size), flow=signed(self.flow),
+                       backward=signed(self.backward), valid=turn(self.valid), backward_valid=turn(self.backward_valid),
+                       mask=turn(self.mask))
+
+    def invert(self) -> "RawSample":
+        """Contrast inverted: every polarity swapped, the flow unchanged."""
+        return replace(self, old=self.old.inverted(), new=self.new.inverted())
+
+    def reverse(self) -> "RawSample":
+        """Time reversed about the reference time: the windows swap places and run backwards, and the target becomes the
+        *backward* flow (not minus the forward flow: that would be right only for constant velocity).
+
+        Raises ValueError without backward flow."""
+        if self.backward is None:
+            raise ValueError("time reversal needs the backward flow")
+        t = self.new.t0  # mirrored about the reference: [t, t + Δ) becomes (t - Δ, t]
+        move = lambda w: replace(w.reversed(), t=2 * t - w.t[::-1], t0=2 * t - w.t1, t1=2 * t - w.t0)  # noqa: E731
+        return replace(self, old=move(self.new), new=move(self.old), flow=self.backward, valid=self.backward_valid,
+                       backward=self.flow, backward_valid=self.valid)
+
+    def drop(self, fraction: float, rng: np.random.Generator) -> "RawSample":
+        """Each event lost with probability ``fraction``."""
+        thin = lambda w: w.take(rng.random(len(w)) >= fraction)  # noqa: E731
+        return replace(self, old=thin(self.old), new=thin(self.new))
+
+    def hot_pixels(self, count: int, rate_hz: float, rng: np.random.Generator) -> "RawSample":
+        """``count`` pixels, the same in both windows, fire ON events at ``rate_hz`` (a Poisson process)."""
+        x, y = rng.integers(0, self.width, count), rng.integers(0, self.height, count)
+
+        def burn(w: Window) -> Window:
+            n = rng.poisson(rate_hz * (w.t1 - w.t0) * 1e-6, count)
+            t = rng.integers(w.t0, w.t1, n.sum())
+            return w.with_events(np.repeat(x, n), np.repeat(y, n), t, np.ones(n.sum(), np.uint8))
+
+        return replace(self, old=burn(self.old), new=burn(self.new))
+
+    def noise(self, rate_hz: float, rng: np.random.Generator) -> "RawSample":
+        """Background activity: uniform Poisson events of either polarity, ``rate_hz`` per pixel."""
+        def add(w: Window) -> Window:
+            n = rng.poisson(rate_hz * (w.t1 - w.t0) * 1e-6 * self.height * self.width)
+            return w.with_events(rng.integers(0, self.width, n), rng.integers(0, self.height, n), rng.integers(w.t0, w.t1, n),
+                                 rng.integers(0, 2, n).astype(np.uint8))
+
+        return replace(self, old=add(self.old), new=add(self.new))

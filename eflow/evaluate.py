@@ -1,0 +1,127 @@
+"""Scores of a network on a data set: table, JSON, pictures; beside it two answers that need no network."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from blinkgl.errors import AssetError
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.sequence_dir import refuse_existing
+from eflow.data.dataset import FlowDataset, collate
+from eflow.data.sources import Source
+from eflow.infer import predict
+from eflow.metrics import Tally, frame_metrics
+from eflow.models import FlowModel, parameters_of
+from eflow.pictures import comparison, events_of, write_picture
+
+MEDIAN_FRAMES = 64
+BASELINES = ("zero flow", "median of the set", "median of the frame")
+"""Zero; one constant flow, the component-wise median of the set's own ground truth; and, frame by frame, the median of that frame's
+ground truth: the best a network could say that saw only the global motion. The medians know the answer, so they are no methods."""
+
+
+def evaluate(model: FlowModel, source: Source, out: str | os.PathLike | None = None, *, pictures: int = 12, empty: str = "error",
+             precision: str = "fp32", limit: int | None = None, progress: Callable[[int, int, float], None] | None = None) -> dict[str, Any]:
+    """Scores ``model`` on every labelled sample of ``source``.
+
+    out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error map); None:
+    nothing is written. limit : score only so many samples, evenly spaced. progress : called with (done, of, AEE so far).
+    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics as in
+    :mod:`eflow.metrics`.
+
+    Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events (unless ``empty="skip"``)."""
+    if out is not None:
+        refuse_existing(out)
+    out = Path(out) if out is not None else None
+    dataset = FlowDataset([source], model.representation, empty=empty)
+    indices = [int(i) for i in np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round()]
+    shown = {indices[int(i)] for i in np.linspace(0, len(indices) - 1, min(pictures, len(indices))).round()} if pictures else set()
+    median = _set_median(dataset, indices)
+    tallies = {name: Tally() for name in ("network", *BASELINES)}
+    spent, sum_aee, scored = 0.0, 0.0, 0
+    for done, i in enumerate(indices, 1):
+        batch = collate([dataset[i]])
+        began = time.perf_counter()
+        flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
+        spent += time.perf_counter() - began
+        truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
+        scene = batch["scene"][0]
+        metrics = frame_metrics(flow, truth, valid)
+        tallies["network"].add(scene, metrics)
+        for name, constant in zip(BASELINES, (np.zeros(2), median, np.median(truth[valid], axis=0) if valid.any() else np.zeros(2)), strict=True):
+            tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
+        if metrics:
+            sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
+        if progress is not None:
+            progress(done, len(indices), sum_aee / max(scored, 1))
+        if out is not None and i in shown:
+            name = batch["name"][0].replace("/", "_")
+            write_picture(out / "pictures" / f"{name}.png", comparison(events_of(batch["new"][0].numpy()), flow, truth, valid))
+    if not scored:
+        raise AssetError("no sample has a valid ground-truth pixel", accepted="a labelled data set")
+    result = {
+        "model": json.loads(model.config.model_dump_json()), "parameters": parameters_of(model), "samples": len(indices),
+        "skipped": tallies["network"].skipped, "ms": 1000 * spent / len(indices), "device": _device_name(model),
+        "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
+    }
+    if out is not None:
+        write_json(out / "results.json", result)
+    return result
+
+
+def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:
+    """Component-wise median of the ground truth, over at most 64 samples and every 8th pixel."""
+    rows = []
+    for i in indices[:: -(-len(indices) // MEDIAN_FRAMES)]:
+        sample = dataset[i]
+        if "flow" not in sample:
+            raise AssetError("no ground truth", where=sample["name"], accepted="a labelled data set")
+        keep = (sample["valid"] & sample["mask"])[::8, ::8]
+        rows.append(sample["flow"][:, ::8, ::8][:, keep].numpy())
+    values = np.concatenate(rows, axis=1)
+    return np.median(values, axis=1) if values.size else np.zeros(2)
+
+
+def _device_name(model: FlowModel) -> str:
+    device = next(model.parameters()).device
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu, {torch.get_num_threads()} threads"
+
+
+def write_json(path: Path, tree: dict) -> None:
+    """Whole or not at all."""
+    with atomic_file(path) as temporary, output_errors(path):
+        Path(temporary).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
+
+
+def show(result: dict[str, Any], console: Console | None = None) -> None:
+    """The table: network and baselines, then the network per scene."""
+    console = console or Console()
+    columns = ("AEE", "outlier", "1PE", "2PE", "3PE", "AE2D", "AE3D", "cosine")
+    units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
+    table = Table(title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on {result['device']}")
+    table.add_column("")
+    for c in columns:
+        table.add_column(f"{c} {units.get(c, '%')}".strip(), justify="right")
+    row = lambda name, m: table.add_row(name, *(f"{m[c]:.3f}" for c in columns))  # noqa: E731
+    for name, scores in result["methods"].items():
+        row(name, scores["total"])
+    scenes = result["methods"]["network"]["scenes"]
+    if len(scenes) > 1:
+        table.add_section()
+        for scene, scores in scenes.items():
+            row(f"{scene} ({scores['frames']})", scores)
+    console.print(table)
+    if result["skipped"]:
+        console.print(f"{result['skipped']} samples without a valid pixel were left out")
+
+

@@ -1,0 +1,208 @@
+"""Flow from events with a trained network: padding, windows of a stream, warm start, files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.atomic import output_errors, remove_stale, temporary_beside
+from blinkgl.io.flow_png import write_flow_png
+from blinkgl.io.formats import EventFile, open_events
+from blinkgl.io.images import encode_npy
+from blinkgl.io.sequence_dir import refuse_existing
+from eflow.data.window import Window
+from eflow.models import FlowModel, FlowPrediction
+from eflow.ops.warp import forward_warp
+from eflow.pictures import comparison, events_of, write_picture
+
+
+def pad_batch(batch: dict, divisor: int) -> dict:
+    """old and new padded at the bottom and right with empty pixels to multiples of ``divisor``. Less than one low-resolution token is
+    added on a side, so no token of padding alone enters the network."""
+    height, width = batch["new"].shape[-2:]
+    pad = (0, -width % divisor, 0, -height % divisor)
+    return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}
+
+
+@torch.inference_mode()
+def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPrediction:
+    """The model's prediction in evaluation mode at the batch's own size; any height and width >= the model's least.
+
+    batch : old, new (N, C, H, W), optional flow_init. Raises EventDataError: too small."""
+    height, width = batch["new"].shape[-2:]
+    if min(height, width) < model.least:
+        raise EventDataError("input is too small for the network", where=type(model).__name__, value=(height, width),
+                             accepted=f"at least {model.least} px a side")
+    device = next(model.parameters()).device
+    batch = {k: v.to(device) if torch.is_tensor(v) else v for k, v in batch.items()}
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
+            out = model(pad_batch(batch, model.divisor))
+    finally:
+        model.train(was_training)
+    return FlowPrediction([f[..., :height, :width].float() for f in out.flows], out.kind, out.has_match, out.low, out.backward_match)
+
+
+@dataclass(frozen=True)
+class StreamWindow:
+    """Reference time and the two windows round it."""
+
+    t_us: int
+    old: Window
+    new: Window
+
+
+def windows(file: EventFile, span_us: int, *, start_us: int | None = None, end_us: int | None = None) -> Iterator[StreamWindow]:
+    """Successive windows of an event file: reference times start + Δ, start + 2Δ, … while both windows lie inside [start, end).
+
+    start_us, end_us : default the first event's time and the last's + 1. Streams; holds two windows and a chunk."""
+    pending, t = Events.empty(), None
+    last = None
+    for chunk in file.chunks():
+        pending = Events.concatenate([pending, chunk])
+        if t is None:
+            start_us = int(pending.t[0]) if start_us is None else start_us
+            t = start_us + span_us
+        last = int(chunk.t[-1])
+        while last >= t + span_us and (end_us is None or t + span_us <= end_us):
+            yield _pair(pending, t, span_us)
+            pending = pending.window(t, last + 1)
+            t += span_us
+        if end_us is not None and last >= end_us:
+            return
+    if t is not None and last + 1 >= t + span_us and (end_us is None or t + span_us <= end_us):
+        yield _pair(pending, t, span_us)
+
+
+def whole_file(file: EventFile) -> tuple[StreamWindow, float]:
+    """The file as one pair: its first half is the old window, its second the new. Also gives the factor from the flow over the
+    second half to the flow over the whole file at constant image velocity."""
+    events = file.read()
+    if len(events) < 2:
+        raise EventDataError("no events", where=str(file.path))
+    t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
+    t = (t0 + t1) // 2
+    cut = lambda a, b: Window(*(getattr(w := events.window(a, b), k) for k in "xytp"), a, b)  # noqa: E731
+    return StreamWindow(t, cut(t0, t), cut(t, t1)), (t1 - t0) / (t1 - t)
+
+
+def _pair(events: Events, t: int, span: int) -> StreamWindow:
+    old, new = events.window(t - span, t), events.window(t, t + span)
+    return StreamWindow(t, Window(old.x, old.y, old.t, old.p, t - span, t), Window(new.x, new.y, new.t, new.p, t, t + span))
+
+
+class Predictor:
+    """A model over a stream of windows. ``warm_start`` carries each flow along itself to the next reference time (networks with an
+    iterated low-resolution flow only). empty : "error", or "zero" flow for a window without events."""
+
+    def __init__(self, model: FlowModel, height: int, width: int, *, warm_start: bool = False, precision: str = "fp32", empty: str = "error"):
+        self.model, self.height, self.width = model, height, width
+        self.warm_start, self.precision, self.empty = warm_start, precision, empty
+        self._low: torch.Tensor | None = None
+
+    def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
+        """flow (H, W, 2) float32 px t -> t + Δ, and the new window's event tensor (C, H, W)."""
+        for name in ("old", "new"):
+            w = getattr(window, name)
+            if not len(w) and self.empty == "error":
+                raise EventDataError(f"no events in the {name} window [{w.t0}, {w.t1}) µs", accepted="use --empty zero to write zero flow there")
+        new = self.model.representation(window.new, self.height, self.width)
+        if not (len(window.old) and len(window.new)):
+            self._low = None
+            return np.zeros((self.height, self.width, 2), np.float32), new
+        old = self.model.representation(window.old, self.height, self.width)
+        batch = {"old": torch.from_numpy(old)[None], "new": torch.from_numpy(new)[None]}
+        if self.warm_start and self._low is not None:
+            batch["flow_init"] = forward_warp(self._low)
+        prediction = predict(self.model, batch, precision=self.precision)
+        self._low = prediction.low
+        return prediction.flow[0].permute(1, 2, 0).cpu().numpy(), new
+
+
+def open_sized(path: str | os.PathLike, size: tuple[int, int] | None = None) -> EventFile:
+    """The event file with its sensor size: given, stored, or the smallest known sensor that holds its events."""
+    from dataclasses import replace
+
+    file = open_events(path)
+    return replace(file, height=size[0], width=size[1]) if size else file.sized()
+
+
+def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
+    """Ground truth of one window: .npy (H, W, 2), (2, H, W) or (1, 2, H, W), .png (DSEC), .flo. Returns (H, W, 2) with NaN where
+    there is none. Raises AssetError."""
+    path = Path(path)
+    if path.suffix == ".npy":
+        from blinkgl.io.images import read_npy
+
+        flow = read_npy(path)
+        flow = flow[0] if flow.ndim == 4 and flow.shape[0] == 1 else flow
+        flow = np.moveaxis(flow, 0, -1) if flow.ndim == 3 and flow.shape[0] == 2 else flow
+        flow = flow.astype(np.float32) if flow.ndim == 3 and flow.dtype.kind == "f" else flow
+    elif path.suffix == ".flo":
+        from blinkgl.io.flo import read_flo
+
+        flow, valid = read_flo(path)
+        flow = np.where(valid[..., None], flow, np.nan)
+    else:
+        from blinkgl.io.flow_png import read_flow_png
+
+        flow, valid = read_flow_png(path)
+        flow = np.where(valid[..., None], flow, np.nan)
+    if flow.shape != (height, width, 2):
+        raise AssetError("ground truth of another size", where=str(path), value=flow.shape, accepted=f"({height}, {width}, 2)")
+    return flow
+
+
+class FlowWriter:
+    """A folder of flow that appears whole or not at all: ``%06d.png`` (DSEC's 16 bits), optional ``npy/%06d.npy``,
+    ``pictures/%06d.png``, and ``timestamps.txt`` (from_us, to_us). Existing folders are refused."""
+
+    def __init__(self, final: str | os.PathLike, *, npy: bool = False, pictures: bool = True):
+        self.final, self.npy, self.pictures, self.count = Path(final), npy, pictures, 0
+        self._lines = ["# from_timestamp_us, to_timestamp_us"]
+
+    def __enter__(self) -> "FlowWriter":
+        refuse_existing(self.final)
+        with output_errors(self.final):
+            self.final.parent.mkdir(parents=True, exist_ok=True)
+            remove_stale(self.final.parent)
+            self._tmp = temporary_beside(self.final)
+            for folder in [self._tmp, *([self._tmp / "npy"] if self.npy else []), *([self._tmp / "pictures"] if self.pictures else [])]:
+                folder.mkdir()
+        return self
+
+    def add(self, window: StreamWindow, flow: np.ndarray, tensor: np.ndarray, truth: np.ndarray | None = None) -> None:
+        name = f"{self.count:06d}"
+        write_flow_png(self._tmp / f"{name}.png", flow, np.isfinite(flow).all(-1))
+        with output_errors(self.final):
+            if self.npy:
+                (self._tmp / "npy" / f"{name}.npy").write_bytes(encode_npy(flow.astype(np.float32)))
+            if self.pictures:
+                valid = None if truth is None else np.isfinite(truth).all(-1)
+                write_picture(self._tmp / "pictures" / f"{name}.png", comparison(events_of(tensor), flow, truth, valid))
+        self._lines.append(f"{window.new.t0}, {window.new.t1}")
+        self.count += 1
+
+    def __exit__(self, kind, *_) -> None:
+        if kind is not None:
+            shutil.rmtree(self._tmp, ignore_errors=True)
+            return
+        try:
+            with output_errors(self.final):
+                (self._tmp / "timestamps.txt").write_text("\n".join(self._lines) + "\n", encoding="utf-8")
+                refuse_existing(self.final)
+                os.rename(self._tmp, self.final)
+        except BaseException:
+            shutil.rmtree(self._tmp, ignore_errors=True)
+            raise

@@ -1,0 +1,90 @@
+"""Error measures, defined once. NumPy, float64 sums.
+
+Averages follow BlinkFlow: over the valid pixels of a frame, over the frames of a scene, over scenes. A frame without a valid pixel
+is left out and counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+NAMES = {
+    "AEE": "end-point error, px",
+    "outlier": "share of pixels with EPE > 3 px and > 5 % of |gt|, %",
+    "1PE": "share of pixels with EPE > 1 px, %",
+    "2PE": "share of pixels with EPE > 2 px, %",
+    "3PE": "share of pixels with EPE > 3 px, %",
+    "AE2D": "angle between the 2-D flow vectors (BlinkFlow's angular error), degrees",
+    "AE3D": "angle between (u, v, 1) vectors (DSEC's angular error), degrees",
+    "cosine": "mean cosine between the 2-D flow vectors",
+}
+MAX_FLOW = 400.0
+
+
+def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float] | None:
+    """All of :data:`NAMES` of one frame.
+
+    predicted, truth : (H, W, 2) px. valid : (H, W) bool; pixels with |gt| >= 400 are left out too, occluded ones are not.
+    Returns None when no pixel is left. A NaN prediction gives NaN, not a better mean.
+    """
+    gt = np.asarray(truth, np.float64)[valid]
+    pr = np.asarray(predicted, np.float64)[valid]
+    keep = np.hypot(gt[:, 0], gt[:, 1]) < MAX_FLOW
+    gt, pr = gt[keep], pr[keep]
+    if not len(gt):
+        return None
+    epe = np.hypot(*(pr - gt).T)
+    size = np.hypot(*gt.T)
+    angle = angle_2d(pr, gt)
+    share = lambda mask: float(100 * np.mean(mask)) if np.isfinite(epe).all() else float("nan")  # noqa: E731
+    return {
+        "AEE": float(epe.mean()),
+        "outlier": share((epe > 3) & (epe > 0.05 * size)),
+        **{f"{n}PE": share(epe > n) for n in (1, 2, 3)},
+        "AE2D": float(np.degrees(angle).mean()),
+        "AE3D": float(np.degrees(angle_3d(pr, gt)).mean()),
+        "cosine": float(np.cos(angle).mean()),
+    }
+
+
+def angle_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle in radians between vectors (..., 2), by atan2(|cross|, dot): exact where arccos of a rounded cosine is not. Where one
+    is zero no direction is right: 90 degrees; where both are, 0."""
+    cross, dot = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(-1)
+    angle = np.arctan2(np.abs(cross), dot)
+    zero_a, zero_b = (a == 0).all(-1), (b == 0).all(-1)
+    return np.where(zero_a & zero_b, 0.0, np.where(zero_a | zero_b, np.pi / 2, angle))
+
+
+def angle_3d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angle in radians between (u, v, 1) and (u', v', 1)."""
+    a3, b3 = (np.concatenate([f, np.ones_like(f[..., :1])], -1) for f in (a, b))
+    return np.arctan2(np.linalg.norm(np.cross(a3, b3), axis=-1), (a3 * b3).sum(-1))
+
+
+@dataclass
+class Tally:
+    """Collects frames; ``table()`` averages."""
+
+    frames: dict[str, list[dict[str, float]]] = field(default_factory=dict)
+    skipped: int = 0
+
+    def add(self, scene: str, metrics: dict[str, float] | None) -> None:
+        if metrics is None:
+            self.skipped += 1
+        else:
+            self.frames.setdefault(scene, []).append(metrics)
+
+    def scenes(self) -> dict[str, dict[str, float]]:
+        """Per scene, the mean over its frames, and their number."""
+        return {scene: {**{k: float(np.mean([f[k] for f in rows])) for k in rows[0]}, "frames": len(rows)}
+                for scene, rows in sorted(self.frames.items())}
+
+    def total(self) -> dict[str, float]:
+        """Mean over scenes; empty when nothing was scored."""
+        scenes = list(self.scenes().values())
+        if not scenes:
+            return {}
+        return {**{k: float(np.mean([s[k] for s in scenes])) for k in scenes[0] if k != "frames"}, "frames": sum(s["frames"] for s in scenes)}

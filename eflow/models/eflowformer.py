@@ -1,0 +1,79 @@
+"""E-FlowFormer (Li et al., "BlinkFlow", IROS 2023): E-RAFT with transformer-enhanced features and a supervised matching layer."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from eflow.config import EFlowFormerConfig
+from eflow.models.contract import initialise
+from eflow.models.eraft import FEATURES, Eraft
+from eflow.ops.attention import ConditionalPosition, GlobalAttention, WindowAttention, sine_position
+from eflow.ops.upsample import bilinear_upsample
+
+LAYERS = {"base": 4, "small": 2, "twins": 2}
+HEADS, WINDOW, REDUCTION, MLP_RATIO = 8, 10, 4, 4
+
+
+def _mlp() -> nn.Sequential:
+    return nn.Sequential(nn.LayerNorm(FEATURES), nn.Linear(FEATURES, MLP_RATIO * FEATURES), nn.GELU(), nn.Linear(MLP_RATIO * FEATURES, FEATURES))
+
+
+class EnhancementLayer(nn.Module):
+    """Pre-norm: local self-attention, conditional position, global self-attention, MLP, global cross-attention, MLP.
+    ``twins`` puts an MLP after the local attention too and reduces keys by a dense convolution, as Twins-SVT does."""
+
+    def __init__(self, twins: bool):
+        super().__init__()
+        self.norm_local, self.local = nn.LayerNorm(FEATURES), WindowAttention(FEATURES, HEADS, WINDOW)
+        self.mlp_local = _mlp() if twins else None
+        self.position = ConditionalPosition(FEATURES)
+        self.norm_global, self.globally = nn.LayerNorm(FEATURES), GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins)
+        self.mlp_global = _mlp()
+        self.norm_cross, self.cross = nn.LayerNorm(FEATURES), GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins)
+        self.mlp_cross = _mlp()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x: (2N, h, w, C), the old windows' features, then the new ones'; each half's cross-attention queries the other."""
+        x = x + self.local(self.norm_local(x))
+        if self.mlp_local is not None:
+            x = x + self.mlp_local(x)
+        x = self.position(x)
+        y = self.norm_global(x)
+        x = x + self.globally(y, y)
+        x = x + self.mlp_global(x)
+        y = self.norm_cross(x)
+        x = x + self.cross(y, torch.cat(y.chunk(2)[::-1]))
+        return x + self.mlp_cross(x)
+
+
+class EFlowFormer(Eraft):
+    """With ``layers=0`` and ``init="zero"`` it is E-RAFT, parameter names included."""
+
+    def __init__(self, config: EFlowFormerConfig):
+        super().__init__(config)
+        count = LAYERS[config.variant] if config.layers is None else config.layers
+        self.layers = nn.ModuleList([EnhancementLayer(config.variant == "twins") for _ in range(count)])
+        self.norm = nn.LayerNorm(FEATURES) if count else None
+        initialise(self.layers)
+
+    def enhance(self, f1: Tensor, f2: Tensor) -> tuple[Tensor, Tensor]:
+        if not len(self.layers):
+            return f1, f2
+        x = torch.cat([f1, f2])
+        x = (x + sine_position(*x.shape[-2:], FEATURES, x).to(x.dtype)).permute(0, 2, 3, 1)
+        for layer in self.layers:
+            x = layer(x)
+        return self.norm(x).permute(0, 3, 1, 2).chunk(2)
+
+    def start(self, correlation, warm: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor | None]:
+        if self.config.init == "zero":
+            return super().start(correlation, warm, like)
+        matched = correlation.match()
+        return (matched if warm is None else matched * 0 + warm), bilinear_upsample(matched) if self.training else None
+
+    def backward(self, correlation) -> Tensor | None:
+        return correlation.match_backward() if self.want_backward else None
+
+    want_backward = False
+    """True: the prediction carries ``backward_match`` (a second softmax over the same volume)."""

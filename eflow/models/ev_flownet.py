@@ -1,0 +1,49 @@
+"""EV-FlowNet (Zhu et al., "EV-FlowNet: Self-Supervised Optical Flow Estimation for Event-based Cameras", RSS 2018), supervised here."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from eflow.config import EvFlowNetConfig
+from eflow.data.representation import CountsAndTimes, VoxelGrid
+from eflow.models.contract import FlowModel, FlowPrediction, initialise
+from eflow.models.unets import CHANNELS, Residual, ScaledTanh, double, to_size
+
+
+class EvFlowNet(FlowModel):
+    """U-Net on one window: four stride-2 convolutions, two residual blocks, four nearest-x2 decoders with skips and a tanh flow
+    head each; every decoder also sees the flow of the one before."""
+
+    divisor, least = 16, 32
+
+    def __init__(self, config: EvFlowNetConfig):
+        super().__init__()
+        self.config = config
+        self.representation = CountsAndTimes() if config.input == "counts" else VoxelGrid(config.bins)
+        widths = (self.representation.channels, *CHANNELS)
+        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(widths, widths[1:])])
+        self.residuals = nn.Sequential(Residual(512), Residual(512))
+        self.decoders = nn.ModuleList([nn.Conv2d(c, c_out, 3, padding=1) for c, c_out in
+                                       ((512 + 512, 256), (256 + 256 + 2, 128), (128 + 128 + 2, 64), (64 + 64 + 2, 32))])
+        self.heads = nn.ModuleList([ScaledTanh(c) for c in (256, 128, 64, 32)])
+        initialise(self)
+        for head in self.heads:
+            head.calm()
+
+    def forward(self, batch: dict) -> FlowPrediction:
+        self.check_input(batch)
+        x = batch["new"]
+        height, width = x.shape[-2:]
+        skips = []
+        for encoder in self.encoders:
+            x = F.relu(encoder(x))
+            skips.append(x)
+        x, flows = self.residuals(x), []
+        for decoder, head in zip(self.decoders, self.heads, strict=True):
+            parts = [x, skips.pop()] + ([flows[-1].to(x.dtype) / head.largest] if flows else [])
+            x = F.relu(decoder(double(torch.cat(parts, 1))))
+            flows.append(head(x))
+        full = [to_size(f, height, width) for f in (flows if self.training else flows[-1:])]
+        return FlowPrediction(full, kind="scales")

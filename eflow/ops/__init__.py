@@ -1,0 +1,1 @@
+"""Kernels of the networks, each fast path beside a slow, obvious twin it is tested against."""

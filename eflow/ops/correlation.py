@@ -1,0 +1,217 @@
+"""All-pairs correlation, its lookup, and the matching layer.
+
+The volume of feature maps f1, f2 (N, D, h, w) is C[i, j] = <f1_i, f2_j> / sqrt(D); its pyramid average-pools the target axis; a
+lookup reads (2r+1)^2 bilinear taps round a target coordinate on each level (RAFT, Teed & Deng, ECCV 2020, sec. 3.2).
+
+Three implementations give the same taps:
+- dense, one (2r+2)^2 integer gather per token and level: all taps share one sub-pixel fraction, so they are one 2-D lerp of the patch.
+  Differentiable, any device. On the CPU without gradients a numba kernel does the same.
+- on demand: the patch's correlations are computed from pooled features when they are looked up; memory linear in tokens.
+- ``lookup_slow``: RAFT's 81 grid samples, the twin.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from eflow.ops.precision import fp32
+
+RADIUS, LEVELS = 4, 4
+CHANNELS = LEVELS * (2 * RADIUS + 1) ** 2
+DENSE_TOKENS = 8192
+_CHUNK = 2048
+
+
+def pixel_grid(h: int, w: int, like: Tensor) -> Tensor:
+    """(1, 2, h, w) float32 coordinates (x, y)."""
+    y, x = torch.meshgrid(torch.arange(h, device=like.device, dtype=torch.float32), torch.arange(w, device=like.device, dtype=torch.float32), indexing="ij")
+    return torch.stack([x, y])[None]
+
+
+class DenseCorrelation:
+    """The whole volume in memory: (N h w, h, w) fp32 and three pooled levels."""
+
+    def __init__(self, f1: Tensor, f2: Tensor, *, slow: bool = False):
+        n, d, h, w = f1.shape
+        volume = torch.bmm(f1.flatten(2).transpose(1, 2) * (1 / math.sqrt(d)), f2.flatten(2))
+        self.shape, self.slow = (n, h, w), slow
+        with fp32(f1):
+            self.volume = volume.float()
+            self.levels = [self.volume.view(n * h * w, 1, h, w)]
+            for _ in range(LEVELS - 1):
+                self.levels.append(F.avg_pool2d(self.levels[-1], 2))
+        self.levels = [v.squeeze(1) for v in self.levels]
+
+    def lookup(self, coords: Tensor) -> Tensor:
+        """coords (N, 2, h, w) fp32 target coordinates -> (N, 324, h, w) fp32; channel level*81 + 9*dy + dx, zero outside."""
+        if self.slow:
+            return lookup_slow(self.levels, coords)
+        if coords.device.type == "cpu" and not torch.is_grad_enabled():
+            return _lookup_cpu(self.levels, coords)
+        n, h, w = self.shape
+        flat = coords.permute(0, 2, 3, 1).reshape(-1, 2)
+        taps = []
+        for level, volume in enumerate(self.levels):
+            index, inside, fraction = patch_index(flat / 2**level, *volume.shape[-2:])
+            patch = volume.flatten(1).gather(1, index.flatten(1)).view_as(inside) * inside
+            taps.append(lerp_patch(patch, fraction))
+        return torch.cat(taps, 1).view(n, h, w, CHANNELS).permute(0, 3, 1, 2)
+
+    def match(self) -> Tensor:
+        """The matching layer, see :func:`expected_flow`."""
+        n, h, w = self.shape
+        return expected_flow(self.volume, h, w)
+
+    def match_backward(self) -> Tensor:
+        """The same volume's match from f2's pixels to f1, at no further product."""
+        n, h, w = self.shape
+        return expected_flow(self.volume.transpose(1, 2), h, w)
+
+
+class OnDemandCorrelation:
+    """No volume: memory linear in the number of tokens, arithmetic per lookup 100 dot products per token and level."""
+
+    def __init__(self, f1: Tensor, f2: Tensor):
+        n, d, h, w = f1.shape
+        self.shape = (n, h, w)
+        with fp32(f1):
+            self.f1 = f1.float().flatten(2).transpose(1, 2) / math.sqrt(d)  # (N, hw, D)
+            pooled, self.levels = f2.float(), []
+            for level in range(LEVELS):
+                pooled = F.avg_pool2d(pooled, 2) if level else pooled
+                self.levels.append(pooled)  # pooling is linear: <f1, pool f2> = pool <f1, f2>
+
+    def lookup(self, coords: Tensor) -> Tensor:
+        """As :meth:`DenseCorrelation.lookup`."""
+        n, h, w = self.shape
+        flat = coords.permute(0, 2, 3, 1).reshape(n, h * w, 2)
+        with fp32(coords):
+            rows = []
+            for start in range(0, h * w, _CHUNK):
+                part, taps = slice(start, start + _CHUNK), []
+                for level, f2 in enumerate(self.levels):
+                    index, inside, fraction = patch_index(flat[:, part].reshape(-1, 2) / 2**level, *f2.shape[-2:])
+                    tokens = f2.flatten(2).transpose(1, 2)  # (N, cells, D)
+                    picked = torch.stack([t[i] for t, i in zip(tokens, index.view(n, -1, index.shape[-1] * index.shape[-2]), strict=True)])
+                    patch = torch.einsum("ntd,ntkd->ntk", self.f1[:, part], picked)
+                    taps.append(lerp_patch(patch.reshape(inside.shape) * inside, fraction))
+                rows.append(torch.cat(taps, 1).view(n, -1, CHANNELS))
+            return torch.cat(rows, 1).view(n, h, w, CHANNELS).permute(0, 3, 1, 2)
+
+    def match(self) -> Tensor:
+        n, h, w = self.shape
+        with fp32(self.f1):
+            target = self.levels[0].flatten(2)
+            parts = [expected_position(self.f1[:, s:s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
+            return torch.cat(parts, 2).view(n, 2, h, w) - pixel_grid(h, w, target)
+
+    def match_backward(self) -> Tensor:
+        n, h, w = self.shape
+        with fp32(self.f1):
+            target, source = self.f1.transpose(1, 2), self.levels[0].flatten(2).transpose(1, 2)
+            parts = [expected_position(source[:, s:s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
+            return torch.cat(parts, 2).view(n, 2, h, w) - pixel_grid(h, w, target)
+
+
+def expected_flow(volume: Tensor, h: int, w: int) -> Tensor:
+    """Matching layer: V0 = E_P[coords] - grid, P = softmax of each row of ``volume`` (N, hw, hw) over the targets.
+    Returns (N, 2, h, w) low-resolution px, fp32."""
+    with fp32(volume):
+        return expected_position(volume, h, w).view(-1, 2, h, w) - pixel_grid(h, w, volume)
+
+
+def expected_position(logits: Tensor, h: int, w: int) -> Tensor:
+    """(N, rows, h*w) logits -> (N, 2, rows) expected (x, y). By the marginals: sums, which TF32 and bf16 products do not touch."""
+    p = logits.float().softmax(-1).unflatten(-1, (h, w))
+    x = torch.arange(w, device=p.device, dtype=torch.float32)
+    y = torch.arange(h, device=p.device, dtype=torch.float32)
+    return torch.stack([(p.sum(-2) * x).sum(-1), (p.sum(-1) * y).sum(-1)], 1)
+
+
+def patch_index(coords: Tensor, h: int, w: int) -> tuple[Tensor, Tensor, Tensor]:
+    """coords (M, 2) -> flat indices (M, 10, 10) of the patch floor(c) - r … floor(c) + r + 1 clamped into h x w, which of them are
+    inside (M, 10, 10) bool, and the fraction (M, 2)."""
+    limit = torch.tensor([w, h], device=coords.device, dtype=coords.dtype)
+    # Beyond this every tap is outside; also keeps the conversion to integer defined for diverging flow.
+    coords = torch.minimum(coords.clamp(min=-(RADIUS + 2.0)), limit + RADIUS + 1)
+    base = coords.floor()
+    offsets = torch.arange(-RADIUS, RADIUS + 2, device=coords.device)
+    ix, iy = (base[:, k].long()[:, None] + offsets for k in (0, 1))
+    inside = ((iy >= 0) & (iy < h))[:, :, None] & ((ix >= 0) & (ix < w))[:, None, :]
+    return iy.clamp(0, h - 1)[:, :, None] * w + ix.clamp(0, w - 1)[:, None, :], inside, coords - base
+
+
+def lerp_patch(patch: Tensor, fraction: Tensor) -> Tensor:
+    """(M, 10, 10) integer taps and (M, 2) fractions -> (M, 81) bilinear taps."""
+    fx, fy = fraction[:, 0, None, None], fraction[:, 1, None, None]
+    rows = torch.lerp(patch[:, :-1], patch[:, 1:], fy)
+    return torch.lerp(rows[:, :, :-1], rows[:, :, 1:], fx).flatten(1)
+
+
+def lookup_slow(levels: list[Tensor], coords: Tensor) -> Tensor:
+    """RAFT's lookup: 81 bilinear grid samples per token and level. (Its normalisation divides by the level's size - 1: levels
+    of one cell, inputs under 128 px, would be NaN; the models refuse those.)"""
+    n, _, h, w = coords.shape
+    d = torch.arange(-RADIUS, RADIUS + 1, device=coords.device, dtype=coords.dtype)
+    dy, dx = torch.meshgrid(d, d, indexing="ij")
+    taps = []
+    for level, volume in enumerate(levels):
+        centre = coords.permute(0, 2, 3, 1).reshape(-1, 1, 1, 2) / 2**level
+        at = centre + torch.stack([dx, dy], -1)[None]
+        size = torch.tensor([volume.shape[-1] - 1, volume.shape[-2] - 1], device=coords.device, dtype=coords.dtype)
+        sampled = F.grid_sample(volume[:, None], 2 * at / size - 1, align_corners=True)
+        taps.append(sampled.view(n, h, w, -1))
+    return torch.cat(taps, -1).permute(0, 3, 1, 2).contiguous()
+
+
+def _lookup_cpu(levels: list[Tensor], coords: Tensor) -> Tensor:
+    n, _, h, w = coords.shape
+    flat = coords.detach().permute(0, 2, 3, 1).reshape(-1, 2).contiguous().numpy()
+    out = np.empty((len(flat), CHANNELS), np.float32)
+    for level, volume in enumerate(levels):
+        _taps(volume.numpy(), flat, np.float32(0.5**level), level * (2 * RADIUS + 1) ** 2, out)
+    return torch.from_numpy(out).view(n, h, w, CHANNELS).permute(0, 3, 1, 2)
+
+
+@numba.njit(cache=True, nogil=True)
+def _taps(volume, coords, scale, first, out):
+    _, h, w = volume.shape
+    side = 2 * RADIUS + 1
+    patch = np.empty((side + 1, side + 1), np.float32)
+    for m in range(len(coords)):
+        x = min(max(coords[m, 0] * scale, np.float32(-RADIUS - 2)), np.float32(w + RADIUS + 1))
+        y = min(max(coords[m, 1] * scale, np.float32(-RADIUS - 2)), np.float32(h + RADIUS + 1))
+        if not (np.isfinite(x) and np.isfinite(y)):
+            out[m, first:first + side * side] = np.nan
+            continue
+        bx, by = np.floor(x), np.floor(y)
+        fx, fy = x - bx, y - by
+        left, top = int(bx) - RADIUS, int(by) - RADIUS
+        if left >= 0 and top >= 0 and left + side < w and top + side < h:
+            for j in range(side + 1):
+                for i in range(side + 1):
+                    patch[j, i] = volume[m, top + j, left + i]
+        else:
+            for j in range(side + 1):
+                for i in range(side + 1):
+                    yy, xx = top + j, left + i
+                    patch[j, i] = volume[m, yy, xx] if 0 <= yy < h and 0 <= xx < w else np.float32(0)
+        for j in range(side):
+            for i in range(side):
+                a = patch[j, i] + fy * (patch[j + 1, i] - patch[j, i])
+                b = patch[j, i + 1] + fy * (patch[j + 1, i + 1] - patch[j, i + 1])
+                out[m, first + j * side + i] = a + fx * (b - a)
+
+
+def local_correlation(f1: Tensor, f2: Tensor, radius: int = 4) -> Tensor:
+    """<f1(x), f2(x + d)> / D for |d| <= radius: (N, (2r+1)^2, h, w), rows of dy, zero outside; STE-FlowNet's 9x9 cost."""
+    h, w = f1.shape[-2:]
+    padded = F.pad(f2, (radius,) * 4)
+    side = 2 * radius + 1
+    return torch.stack([(f1 * padded[..., dy:dy + h, dx:dx + w]).mean(1) for dy in range(side) for dx in range(side)], 1)

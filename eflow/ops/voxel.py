@@ -1,0 +1,175 @@
+"""Events to dense tensors in one pass (numba), with slow NumPy twins.
+
+The kernels are serial and release the GIL: loader workers are the parallelism.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+def voxel_grid(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, bins: int, height: int, width: int, *,
+               normalise: str = "nonzero") -> np.ndarray:
+    """Signed event voxel grid with a linear kernel in time (Zhu et al., CVPR 2019, eq. 1), bin coordinate (B-1)(t-t0)/(t1-t0).
+
+    x, y : uint16 px, or float32 rectified px, which are splatted bilinearly (corners outside the sensor are dropped).
+    t : int64 µs, t0 <= t <= t1; subtracted as integers. p : uint8 {0, 1}, counted as -1 and +1.
+    normalise : "nonzero" (zero mean, unit standard deviation over cells that are not 0), "all", "none".
+    Returns (bins, height, width) float32.
+
+    Raises ValueError: an integer pixel or a time outside the grid (bad data must not become a quiet blur).
+    """
+    grid = np.zeros((bins, height, width), np.float32)
+    if len(t):
+        scale = (bins - 1) / (int(t1) - int(t0)) if t1 > t0 else 0.0
+        kernel = _splat_t if x.dtype.kind == "u" else _splat_xyt
+        outside = kernel(x, y, t, p, np.int64(t0), scale, grid)
+        if outside:
+            raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
+    if normalise != "none":
+        _normalise(grid.reshape(-1), normalise == "all")
+    return grid
+
+
+@numba.njit(cache=True, nogil=True)
+def _splat_t(x, y, t, p, t0, scale, grid):
+    bins, height, width = grid.shape
+    outside = 0
+    for i in range(len(t)):
+        c = np.float64(t[i] - t0) * scale
+        b = int(c)
+        if x[i] >= width or y[i] >= height or c < 0 or b > bins - 1:
+            outside += 1
+            continue
+        b = min(b, max(bins - 2, 0))  # t == t1 belongs wholly to the last bin
+        w = np.float32(c - b)
+        s = np.float32(1) if p[i] else np.float32(-1)
+        grid[b, y[i], x[i]] += s * (np.float32(1) - w)
+        if bins > 1:
+            grid[b + 1, y[i], x[i]] += s * w
+    return outside
+
+
+@numba.njit(cache=True, nogil=True)
+def _splat_xyt(x, y, t, p, t0, scale, grid):
+    bins, height, width = grid.shape
+    outside = 0
+    for i in range(len(t)):
+        c = np.float64(t[i] - t0) * scale
+        b = int(c)
+        if c < 0 or b > bins - 1:
+            outside += 1
+            continue
+        b = min(b, max(bins - 2, 0))
+        wt = np.float32(c - b)
+        s = np.float32(1) if p[i] else np.float32(-1)
+        fx, fy = np.floor(x[i]), np.floor(y[i])
+        if not (fx >= -1 and fx < width and fy >= -1 and fy < height):  # also drops NaN
+            continue
+        ix, iy = int(fx), int(fy)
+        wx, wy = np.float32(x[i] - fx), np.float32(y[i] - fy)
+        for dy in range(2):
+            for dx in range(2):
+                xx, yy = ix + dx, iy + dy
+                if xx < 0 or xx >= width or yy < 0 or yy >= height:
+                    continue
+                v = s * (wx if dx else np.float32(1) - wx) * (wy if dy else np.float32(1) - wy)
+                grid[b, yy, xx] += v * (np.float32(1) - wt)
+                if bins > 1:
+                    grid[b + 1, yy, xx] += v * wt
+    return outside
+
+
+@numba.njit(cache=True, nogil=True)
+def _normalise(cells, everything):
+    n, total = 0, 0.0
+    for v in cells:
+        if everything or v != 0:
+            n += 1
+            total += v
+    if n == 0:
+        return
+    mean = total / n
+    square = 0.0
+    for v in cells:
+        if everything or v != 0:
+            square += (v - mean) ** 2
+    std = np.sqrt(square / (n - 1)) if n > 1 else 0.0
+    scale = 1.0 / std if std > 0 else 1.0
+    for i in range(len(cells)):
+        if everything or cells[i] != 0:
+            cells[i] = np.float32((cells[i] - mean) * scale)
+
+
+def count_slices(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, slices: int, height: int,
+                 width: int) -> np.ndarray:
+    """Events counted per slice of equal duration and polarity: (slices, 2, height, width) float32, channel 0 OFF, 1 ON.
+
+    x, y : uint16 px. t in [t0, t1]; t == t1 falls into the last slice. Raises ValueError as :func:`voxel_grid`."""
+    counts = np.zeros((slices, 2, height, width), np.float32)
+    outside = _count(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), counts)
+    if outside:
+        raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
+    return counts
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(x, y, t, p, t0, span, counts):
+    slices, _, height, width = counts.shape
+    outside = 0
+    for i in range(len(t)):
+        d = t[i] - t0
+        if x[i] >= width or y[i] >= height or d < 0 or d > span:
+            outside += 1
+            continue
+        counts[min(d * slices // span, slices - 1), p[i], y[i], x[i]] += np.float32(1)
+    return outside
+
+
+def counts_and_times(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, height: int,
+                     width: int) -> np.ndarray:
+    """EV-FlowNet's image (Zhu et al., RSS 2018): (4, height, width) float32 = OFF count, ON count, latest OFF time, latest ON
+    time; times as fractions of the window, 0 where no event was. Raises ValueError as :func:`voxel_grid`."""
+    out = np.zeros((4, height, width), np.float32)
+    outside = _latest(x, y, t, p, np.int64(t0), 1.0 / max(int(t1) - int(t0), 1), out)
+    if outside:
+        raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _latest(x, y, t, p, t0, scale, out):
+    _, height, width = out.shape
+    outside = 0
+    for i in range(len(t)):
+        c = np.float64(t[i] - t0) * scale
+        if x[i] >= width or y[i] >= height or c < 0 or c > 1:
+            outside += 1
+            continue
+        out[p[i], y[i], x[i]] += np.float32(1)
+        out[2 + p[i], y[i], x[i]] = np.float32(c)
+    return outside
+
+
+# ---- slow twins ------------------------------------------------------------------------------------------------------
+
+
+def voxel_grid_slow(x, y, t, p, t0, t1, bins, height, width, *, normalise="nonzero") -> np.ndarray:
+    """:func:`voxel_grid` event by event in Python: every cell of the grid asks the tent kernel for its weight."""
+    grid = np.zeros((bins, height, width), np.float64)
+    for xi, yi, ti, pi in zip(x.astype(float), y.astype(float), t.tolist(), p.tolist(), strict=True):
+        c = (bins - 1) * (ti - t0) / (t1 - t0)
+        for b in range(bins):
+            wt = max(0.0, 1 - abs(b - c))
+            for yy in range(int(np.floor(yi)), int(np.floor(yi)) + 2):
+                for xx in range(int(np.floor(xi)), int(np.floor(xi)) + 2):
+                    if 0 <= yy < height and 0 <= xx < width:
+                        grid[b, yy, xx] += (2 * pi - 1) * wt * max(0.0, 1 - abs(xx - xi)) * max(0.0, 1 - abs(yy - yi))
+    grid = grid.astype(np.float32)
+    cells = grid != 0 if normalise == "nonzero" else np.full(grid.shape, normalise == "all")
+    if cells.any():
+        values = grid[cells].astype(np.float64)
+        std = values.std(ddof=1) if len(values) > 1 else 0.0
+        grid[cells] = (values - values.mean()) / (std if std > 0 else 1.0)
+    return grid

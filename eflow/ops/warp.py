@@ -1,0 +1,37 @@
+"""Warping by a flow field."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from eflow.ops.correlation import pixel_grid
+from eflow.ops.precision import fp32
+
+
+def backward_warp(image: Tensor, flow: Tensor) -> Tensor:
+    """image (N, C, h, w) read at x + flow(x), bilinear, zero outside. flow (N, 2, h, w) px of this resolution."""
+    h, w = image.shape[-2:]
+    with fp32(image):
+        at = (pixel_grid(h, w, flow) + flow.float()).permute(0, 2, 3, 1)
+        size = torch.tensor([w, h], device=flow.device, dtype=torch.float32)
+        return F.grid_sample(image.float(), (2 * at + 1) / size - 1, align_corners=False)
+
+
+def forward_warp(flow: Tensor) -> Tensor:
+    """A flow field carried along itself to the next reference time (warm start): every vector splatted bilinearly to where it
+    points, averaged where several land, zero where none does. (N, 2, h, w) px."""
+    n, _, h, w = flow.shape
+    at = (pixel_grid(h, w, flow) + flow).flatten(2)
+    base = at.floor()
+    total = flow.new_zeros(n, 3, h * w)
+    values = torch.cat([flow.flatten(2), torch.ones_like(at[:, :1])], 1)
+    for dx in (0, 1):
+        for dy in (0, 1):
+            corner = base + torch.tensor([dx, dy], device=flow.device, dtype=flow.dtype)[:, None]
+            weight = (1 - (at - corner).abs()).prod(1, keepdim=True)
+            inside = (corner[:, :1] >= 0) & (corner[:, :1] < w) & (corner[:, 1:] >= 0) & (corner[:, 1:] < h)
+            x, y = corner[:, :1].clamp(0, w - 1).long(), corner[:, 1:].clamp(0, h - 1).long()
+            total.scatter_add_(2, (y * w + x).expand(-1, 3, -1), values * weight * inside)
+    return (total[:, :2] / total[:, 2:].clamp(min=1e-6) * (total[:, 2:] > 1e-6)).view(n, 2, h, w)

@@ -1,0 +1,62 @@
+"""Progress of training on the terminal: a live line on a TTY, one line now and then otherwise."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+_QUIET_S = 15.0
+
+
+class TrainProgress:
+    """Shows step, loss, EPE (smoothed), samples/s and time left. ``rate``: samples/s over the last steps."""
+
+    def __init__(self, steps: int, start: int, batch: int, enabled: bool):
+        self.steps, self.batch, self.enabled = steps, batch, enabled
+        self.rate, self._loss, self._epe = 0.0, None, None
+        self._step, self._time, self._said = start, time.monotonic(), 0.0
+        self._console = Console(file=sys.stderr)
+
+    def __enter__(self) -> "TrainProgress":
+        self._live = None
+        if self.enabled and self._console.is_terminal:
+            self._live = Progress(TextColumn("step {task.completed}/{task.total}"), BarColumn(), TextColumn("{task.fields[text]}"), console=self._console)
+            self._task = self._live.add_task("train", total=self.steps, completed=self._step, text="")
+            self._live.start()
+        return self
+
+    def update(self, step: int, loss: float, epe: float) -> None:
+        now = time.monotonic()
+        speed = (step - self._step) * self.batch / max(now - self._time, 1e-9)
+        self.rate = speed if self.rate == 0 else 0.9 * self.rate + 0.1 * speed
+        self._loss = loss if self._loss is None else 0.95 * self._loss + 0.05 * loss
+        self._epe = epe if self._epe is None else 0.95 * self._epe + 0.05 * epe
+        self._step, self._time = step, now
+        if not self.enabled:
+            return
+        left = (self.steps - step) * self.batch / max(self.rate, 1e-9)
+        text = f"loss {self._loss:.2f}  EPE {self._epe:.2f} px  {self.rate:.2f} samples/s  {_hms(left)} left"
+        if self._live is not None:
+            self._live.update(self._task, completed=step, text=text)
+        elif now - self._said > _QUIET_S or step == self.steps:
+            self._said = now
+            print(f"step {step}/{self.steps}  {text}", file=sys.stderr, flush=True)
+
+    def note(self, step: int, scores: dict[str, float]) -> None:
+        """A validation result."""
+        self._time = time.monotonic()  # validation is not training time
+        if self.enabled:
+            line = f"step {step}  " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items())
+            self._live.console.print(line) if self._live is not None else print(line, file=sys.stderr, flush=True)
+
+    def __exit__(self, *_) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+
+def _hms(seconds: float) -> str:
+    seconds = int(min(seconds, 10**7))
+    return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"

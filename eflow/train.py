@@ -1,0 +1,363 @@
+"""The training loop. Reads top to bottom; runs on the CPU, one GPU, or several:
+
+    eflow train configs/eflow/smoke.yaml --out out/smoke
+    torchrun --nproc-per-node 8 -m eflow.cli train configs/eflow/eflowformer.yaml --out out/base
+
+A run folder holds config.yaml, log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and SIGTERM end the current
+step, write a checkpoint and exit 0; ``--resume`` goes on from the newest one and is, on the CPU, bit for bit what the
+uninterrupted run would have been: data order and augmentation are functions of (seed, step), the rate of the step alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.distributed as dist
+import yaml
+from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
+
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.sequence_dir import refuse_existing
+from eflow import checkpoint as ckpt
+from eflow.config import SourceConfig, TrainConfig
+from eflow.data.dataset import FlowDataset, Mixture, StepSampler, collate, loader
+from eflow.data.sources import open_source
+from eflow.infer import predict
+from eflow.losses import sequence_loss
+from eflow.metrics import frame_metrics
+from eflow.models import FlowModel, build_model
+from eflow.pictures import comparison, events_of, write_picture
+from eflow.progress import TrainProgress
+
+
+class TrainingError(BlinkGLError):
+    """Training cannot go on (loss not finite)."""
+
+
+@dataclass
+class TrainResult:
+    """How a run ended: ``reason`` is "finished", "signal", "time limit" or "stop"."""
+
+    step: int
+    reason: str
+    checkpoint: Path
+    loss: float
+
+
+def learning_rate(step: int, steps: int, peak: float, warmup: float) -> float:
+    """One cycle, linear: from peak / 25 up to ``peak`` over the first ``warmup`` of the steps, then down to 1e-4 of the start."""
+    start, end, top = peak / 25, peak / 25e4, max(warmup * steps, 1)
+    if step < top:
+        return start + (peak - start) * step / top
+    return peak + (end - peak) * min((step - top) / max(steps - top, 1), 1)
+
+
+def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, stop_after: int | None = None, quiet: bool = False) -> TrainResult:
+    """Trains to ``config.optim.steps``. ``stop_after``: leave after this many steps of this call, as a signal would.
+
+    Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not finite: the batch's
+    sample names are in ``nan_batch.json``)."""
+    out = Path(out)
+    rank, world, device = _setup(config)
+    lead = rank == 0
+    if lead and not resume:
+        refuse_existing(out)
+
+    torch.manual_seed(config.seed)
+    model = build_model(config.model)
+    if config.init_from and not resume:
+        ckpt.load_weights(model, *_weights_of(config))
+    model.to(device)
+    if config.run.channels_last:
+        model.to(memory_format=torch.channels_last)
+    decay, no_decay = [], []
+    for p in model.parameters():
+        (decay if p.ndim > 1 else no_decay).append(p)
+    optimizer = torch.optim.AdamW([{"params": decay}, {"params": no_decay, "weight_decay": 0.0}], lr=config.optim.lr,
+                                  weight_decay=config.optim.weight_decay)
+    ema = {k: v.detach().clone() for k, v in model.state_dict().items()} if config.optim.ema else None
+    start = _resume(out, config, model, optimizer, ema) if resume else 0
+
+    sources = [open_source(s.path, s.format, dt=s.dt) for s in config.data.train]
+    dataset = FlowDataset(sources, model.representation, seed=config.seed, augment=config.data.augment, crop=config.data.crop, empty=config.data.empty)
+    validation = _validation(config, model) if lead else []
+    mixture = Mixture([len(s) for s in sources], [s.weight for s in config.data.train], config.seed)
+    if config.data.batch % world:
+        raise ConfigError("not a multiple of the number of processes", where="data.batch", value=config.data.batch, accepted=f"a multiple of {world}")
+    steps = config.optim.steps
+    stop = steps if stop_after is None else min(steps, start + stop_after)
+    sampler = StepSampler(mixture, config.data.batch, start, stop, rank, world)
+
+    if config.run.compile and hasattr(model, "update"):
+        model.update.compile()
+    net = DistributedDataParallel(model, device_ids=[device.index] if device.type == "cuda" else None) if world > 1 else model
+    net.train()
+    if lead:
+        _write_config(out, config)
+    step, reason, loss_value, began = start, "finished", float("nan"), time.monotonic()
+
+    def save() -> Path:
+        return ckpt.save_checkpoint(out, step, model, ema, optimizer, {"config": json.loads(config.model_dump_json())}, config.run.keep_checkpoints)
+
+    with _Signals() as signals, _Log(out, start, enabled=lead) as log, TrainProgress(steps, start, config.data.batch, enabled=lead and not quiet) as progress:
+        for batch in loader(dataset, sampler, config.data.workers, pin=device.type == "cuda"):
+            rate = learning_rate(step, steps, config.optim.lr, config.optim.warmup)
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            optimizer.zero_grad(set_to_none=True)
+            batch = _to_device(batch, device, config.run.channels_last)
+            loss, epe, flow = _forward(net, batch, config, world)
+            loss.backward()
+            norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.optim.clip)
+            loss_value = float(loss.detach())
+            if not (np.isfinite(loss_value) and torch.isfinite(norm)):
+                _stop_on_nan(out, step, batch, loss_value, float(norm))
+            optimizer.step()
+            step += 1
+            if ema is not None:
+                _average(ema, model, min(config.optim.ema, step / (step + 10)))
+
+            progress.update(step, loss_value, epe)
+            last = step == stop
+            if lead and (step % config.run.log_every == 0 or last):
+                log.write(step, "train", loss=loss_value, epe=epe, lr=rate, grad_norm=float(norm), samples_per_s=progress.rate)
+            if lead and step % config.run.picture_every == 0:
+                _picture(out / "pictures" / f"{step:09d}.png", batch, flow)
+            if lead and validation and (step % config.run.validate_every == 0 or step == steps):
+                scores = validate(model, ema, validation, config.run.precision)
+                log.write(step, "validation", **scores)
+                progress.note(step, scores)
+            reason = signals.reason or ("time limit" if _over(began, config.run.time_limit) else None) or ("stop" if last and step < steps else reason)
+            if world > 1 and not last:
+                reason = _agree(reason, device)
+            if lead and (step % config.run.checkpoint_every == 0 or last or reason != "finished"):
+                path = save()
+            if reason != "finished":
+                break
+        else:
+            if lead and step == start:  # nothing was left to do
+                path = ckpt.newest(out) or save()
+    if world > 1:
+        dist.barrier()
+        dist.destroy_process_group()
+    return TrainResult(step, reason, path if lead else out, loss_value)
+
+
+def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, float, Tensor]:
+    """loss, end-point error of the last field, and that field."""
+    kind = batch["new"].device.type
+    with torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"):
+        prediction = net({k: batch[k] for k in ("old", "new")})
+    count = None
+    if world > 1:  # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels
+        count = batch["valid"].sum().float()
+        dist.all_reduce(count)
+        count = count / world
+    loss = sequence_loss(prediction, batch["flow"], batch["valid"], gamma=config.optim.gamma, match_weight=config.optim.match_weight, count=count)
+    with torch.no_grad():
+        error = (prediction.flow - torch.where(batch["valid"][:, None], batch["flow"], 0)).norm(dim=1)
+        epe = float(error[batch["valid"]].mean()) if batch["valid"].any() else 0.0
+    return loss, epe, prediction.flow.detach()
+
+
+@torch.no_grad()
+def validate(model: FlowModel, ema: dict[str, Tensor] | None, validation: list[tuple[str, FlowDataset, list[int]]], precision: str) -> dict[str, float]:
+    """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples."""
+    own = {k: v.detach().clone() for k, v in model.state_dict().items()} if ema is not None else None
+    if ema is not None:
+        model.load_state_dict(ema)
+    try:
+        scores = {}
+        for name, dataset, indices in validation:
+            rows = []
+            for i in indices:
+                batch = collate([dataset[i]])
+                flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
+                truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
+                metrics, zero = frame_metrics(flow, truth, valid), frame_metrics(np.zeros_like(flow), truth, valid)
+                if metrics:
+                    rows.append((metrics["AEE"], zero["AEE"]))
+            scores[f"{name}/AEE"], scores[f"{name}/zero"] = (float(v) for v in np.mean(rows, axis=0)) if rows else (float("nan"),) * 2
+        return scores
+    finally:
+        if own is not None:
+            model.load_state_dict(own)
+
+
+def _setup(config: TrainConfig) -> tuple[int, int, torch.device]:
+    """(rank, world, device); joins torchrun's process group where there is one."""
+    rank, world, local = (int(os.environ.get(k, d)) for k, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0)))
+    kind = config.run.device
+    if kind == "auto":
+        kind = "cuda" if torch.cuda.is_available() else "cpu"
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("no CUDA device on this machine", where="run.device", value="cuda", accepted="cpu or auto")
+    device = torch.device("cuda", local) if kind == "cuda" else torch.device("cpu")
+    if kind == "cuda":
+        torch.cuda.set_device(device)
+    if config.run.threads:
+        torch.set_num_threads(config.run.threads)
+    if world > 1 and not dist.is_initialized():
+        dist.init_process_group("nccl" if kind == "cuda" else "gloo")
+    return rank, world, device
+
+
+def _weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
+    model = ckpt.load_model(config.init_from, expected=None)
+    if model.config.name != config.model.name:
+        raise AssetError("checkpoint of another model", where=f"init_from: {config.init_from}", value=model.config.name, accepted=config.model.name)
+    return model.state_dict(), config.init_from
+
+
+_FREE = {"run"}
+"""Parts of the configuration that may change between a run and its resumption (how it runs, not what it computes)."""
+
+
+def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> int:
+    """Restores everything from the newest checkpoint; returns its step."""
+    folder = ckpt.newest(out)
+    if folder is None:
+        raise AssetError("no checkpoint to resume from", where=str(out), accepted="a run folder of eflow train")
+    state = ckpt.read_state(folder)
+    saved, now = state.get("config", {}), json.loads(config.model_dump_json())
+    for path in sorted(set(_leaves(saved)) | set(_leaves(now))):
+        if path.split(".")[0] not in _FREE and path != "data.workers" and _leaves(saved).get(path) != _leaves(now).get(path):
+            raise ConfigError("differs from the run that is resumed", where=path, value=_leaves(now).get(path),
+                              accepted=f"{_leaves(saved).get(path)!r}, or a new run with init_from")
+    weights, _ = ckpt.read_tensors(folder / "weights.safetensors")
+    averaged = ckpt.read_tensors(folder / "ema.safetensors")[0] if ema is not None else {}
+    ckpt.load_weights(model, weights, str(folder / "weights.safetensors"))
+    ckpt.load_optimizer(folder / "optimizer.safetensors", model, optimizer)
+    for k in ema or ():
+        if k not in averaged or averaged[k].shape != ema[k].shape:
+            raise AssetError(f"lacks the tensor '{k}' of this model", where=str(folder / "ema.safetensors"))
+        ema[k].copy_(averaged[k])
+    return state["step"]
+
+
+def _leaves(tree, prefix: str = "") -> dict[str, object]:
+    if isinstance(tree, dict) and tree:
+        return {k: v for key, node in tree.items() for k, v in _leaves(node, f"{prefix}.{key}" if prefix else key).items()}
+    if isinstance(tree, list) and tree and isinstance(tree[0], dict):
+        return {k: v for i, node in enumerate(tree) for k, v in _leaves(node, f"{prefix}.{i}").items()}
+    return {prefix: tree}
+
+
+def _validation(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDataset, list[int]]]:
+    sets = []
+    for s in config.data.validate_on:
+        dataset = FlowDataset([open_source(s.path, s.format, dt=s.dt)], model.representation, empty=config.data.empty)
+        count = min(config.data.validate_samples, len(dataset))
+        sets.append((_title(s), dataset, [int(i) for i in np.linspace(0, len(dataset) - 1, count).round()]))
+    return sets
+
+
+def _title(s: SourceConfig) -> str:
+    return Path(s.path).name + (f"_dt{s.dt}" if s.dt != 1 else "")
+
+
+def _to_device(batch: dict, device: torch.device, channels_last: bool) -> dict:
+    out = {k: v.to(device, non_blocking=True) if torch.is_tensor(v) else v for k, v in batch.items()}
+    if channels_last:
+        out.update({k: out[k].contiguous(memory_format=torch.channels_last) for k in ("old", "new")})
+    return out
+
+
+@torch.no_grad()
+def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
+    for k, v in model.state_dict().items():
+        ema[k].lerp_(v, 1 - decay) if v.is_floating_point() else ema[k].copy_(v)
+
+
+def _stop_on_nan(out: Path, step: int, batch: dict, loss: float, norm: float) -> None:
+    path = out / "nan_batch.json"
+    with output_errors(path):
+        path.write_text(json.dumps({"step": step, "loss": str(loss), "grad_norm": str(norm), "samples": batch["name"]}, indent=1) + "\n")
+    raise TrainingError(f"loss or gradient is not finite at step {step}", where=str(path), value=(loss, norm),
+                        accepted="see the samples named there; the last checkpoint is unharmed")
+
+
+def _picture(path: Path, batch: dict, flow: Tensor) -> None:
+    first = lambda k: batch[k][0].detach().float().cpu().numpy()  # noqa: E731
+    write_picture(path, comparison(events_of(first("new")), flow[0].float().cpu().numpy().transpose(1, 2, 0), first("flow").transpose(1, 2, 0),
+                                   batch["valid"][0].cpu().numpy()))
+
+
+def _over(began: float, minutes: float | None) -> bool:
+    return minutes is not None and time.monotonic() - began > 60 * minutes
+
+
+def _agree(reason: str, device: torch.device) -> str:
+    """All ranks stop at the same step: the first reason any of them has."""
+    codes = ["finished", "signal", "time limit", "stop"]
+    code = torch.tensor(codes.index(reason), device=device)
+    dist.all_reduce(code, op=dist.ReduceOp.MAX)
+    return codes[int(code)]
+
+
+def _write_config(out: Path, config: TrainConfig) -> None:
+    with atomic_file(out / "config.yaml") as path, output_errors(path):
+        Path(path).write_text(yaml.safe_dump(json.loads(config.model_dump_json()), sort_keys=False), encoding="utf-8")
+
+
+class _Signals:
+    """SIGINT and SIGTERM become a flag that the loop reads between steps; a second SIGINT interrupts at once."""
+
+    reason: str | None = None
+
+    def __enter__(self) -> "_Signals":
+        self._old = {}
+        with contextlib.suppress(ValueError):  # not the main thread: the caller's business
+            for s in (signal.SIGINT, signal.SIGTERM):
+                self._old[s] = signal.signal(s, self._note)
+        return self
+
+    def _note(self, number: int, _) -> None:
+        if self.reason and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self.reason = "signal"
+
+    def __exit__(self, *_) -> None:
+        for s, handler in self._old.items():
+            signal.signal(s, handler)
+
+
+class _Log:
+    """log.jsonl, one object per line, and tensorboard. On resuming, lines past the checkpoint are dropped: those steps run again."""
+
+    def __init__(self, out: Path, start: int, enabled: bool):
+        self.path, self.start, self.enabled = out / "log.jsonl", start, enabled
+
+    def __enter__(self) -> "_Log":
+        if self.enabled:
+            with output_errors(self.path):
+                lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
+                kept = [line for line in lines if line.startswith("{") and line.endswith("}") and json.loads(line)["step"] <= self.start]
+                self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+                self._file = open(self.path, "a", encoding="utf-8")  # noqa: SIM115
+            from torch.utils.tensorboard import SummaryWriter
+
+            self._board = SummaryWriter(str(self.path.parent / "tb"), purge_step=self.start + 1 if self.start else None)
+        return self
+
+    def write(self, step: int, kind: str, **values: float) -> None:
+        with output_errors(self.path):
+            self._file.write(json.dumps({"step": step, "kind": kind, **values}) + "\n")
+            self._file.flush()
+        for k, v in values.items():
+            self._board.add_scalar(f"{kind}/{k}", v, step)
+
+    def __exit__(self, *_) -> None:
+        if self.enabled:
+            self._file.close()
+            self._board.close()

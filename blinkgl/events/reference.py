@@ -123,7 +123,7 @@ class ReferenceV2e:
         index = 0
         while True:
             gap, pick = v2e.shot_draw(self.seed, b, np.uint64(index), rate)
-            place = int(np.sum(self.shot_table[block] <= np.float32(pick * whole)))
+            place = min(int(np.sum(self.shot_table[block] <= np.float32(pick * whole))), 2 * v2e.BLOCK - 1)
             yield int(t), place % v2e.BLOCK, int(place < v2e.BLOCK), index
             t, index = t + gap, index + 1
 

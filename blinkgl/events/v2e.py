@@ -293,7 +293,12 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
     t_ns, index = p.clock_ns[block], p.clock_index[block]
     while t_ns <= end_ns:
         gap, pick = shot_draw(v.seed, np.uint64(block), np.uint64(index), v.shot_unit_per_ns * whole)
-        place = np.searchsorted(table, np.float32(pick * whole), side="right")
+        # How many entries are <= weight. Weights are much alike, so the proportional guess is a cache line away.
+        weight, place = np.float32(pick * whole), np.int64(pick * table.size)
+        while place > 0 and table[place - 1] > weight:
+            place -= 1
+        while place < table.size - 1 and table[place] <= weight:
+            place += 1
         offset, on = place & (BLOCK - 1), place < BLOCK
         if offset < pixels_in_block:
             i = first + offset

@@ -1,0 +1,79 @@
+"""The read-out bus: what becomes of events when a sensor makes more than it can send.
+
+One bus, first come first served. An event that finds ``queue_events`` others waiting is lost; the others are stamped
+when they leave the bus, ``1 / events_per_second`` (and ``row_ns`` more where the row changes or the bus was idle) after
+the one before. Below the limit events are late by less than a microsecond; above it time stamps lag by up to
+``queue_events / events_per_second`` and the output rate is the bus's. Events of one microsecond are served in raster
+order, as a row arbiter would, so in overload the upper rows of that microsecond come first.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.errors import EventDataError
+from blinkgl.events.packing import JIT
+from blinkgl.events.types import Events
+
+_PS_PER_US = 1_000_000
+
+
+@numba.njit(**JIT)
+def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
+    """``waiting``: ring of the times (ps) at which the last accepted events left. ``state``: accepted, bus free (ps), row."""
+    kept, size = 0, waiting.size
+    accepted, free_ps, row = state[0], state[1], state[2]
+    for i in range(t_us.size):
+        arrival = t_us[i] * _PS_PER_US
+        slot = accepted % size
+        if accepted >= size and waiting[slot] > arrival:
+            continue  # the event ``size`` places ahead has not left: the queue is full
+        start = max(arrival, free_ps)
+        if row_ps and (np.int64(y[i]) != row or start > free_ps):
+            start += row_ps
+        row, free_ps = np.int64(y[i]), start + event_ps
+        waiting[slot] = free_ps
+        accepted += 1
+        keep[kept] = i
+        out_us[kept] = free_ps // _PS_PER_US
+        kept += 1
+    state[0], state[1], state[2] = accepted, free_ps, row
+    return kept
+
+
+class Readout:
+    """Events of an emulator, in order, chunk by chunk -> the events the sensor sends.
+
+    Time stamps may lie beyond the end of the chunk they came in with; they never decrease from chunk to chunk.
+    ``dropped`` counts the lost events.
+    """
+
+    def __init__(self, config: ReadoutConfig):
+        self.config = config
+        self.dropped = 0
+        self._event_ps = max(1, round(1e12 / config.events_per_second))
+        self._row_ps = round(config.row_ns * 1000)
+        self._waiting = np.zeros(config.queue_events, np.int64)
+        self._state = np.array([0, -(2**62), -1], np.int64)
+
+    def step(self, events: Events) -> Events:
+        """Raises EventDataError for times beyond 100 days, which picoseconds in int64 cannot hold."""
+        if not len(events):
+            return events
+        if max(abs(int(events.t[0])), abs(int(events.t[-1]))) > 2**43:
+            raise EventDataError("event time too large for the read-out model", value=int(events.t[-1]), accepted="at most 100 days")
+        keep, out_us = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
+        kept = _serve(events.t, events.y, self._event_ps, self._row_ps, self._waiting, self._state, keep, out_us)
+        self.dropped += len(events) - kept
+        keep = keep[:kept]
+        return Events(events.x[keep], events.y[keep], out_us[:kept].copy(), events.p[keep])
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        return {"waiting": self._waiting.copy(), "state": self._state.copy(), "dropped": np.array([self.dropped], np.int64)}
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        if set(state) != {"waiting", "state", "dropped"} or state["waiting"].shape != self._waiting.shape:
+            raise EventDataError("saved state is of another read-out", value=sorted(state))
+        self._waiting[...], self._state[...], self.dropped = state["waiting"], state["state"], int(state["dropped"][0])

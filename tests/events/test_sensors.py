@@ -1,0 +1,99 @@
+"""Sensors and the read-out bus."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from blinkgl.config.sensor import ReadoutConfig, load_sensor, sensor_names
+from blinkgl.errors import ConfigError
+from blinkgl.events import Events, make_emulator
+from blinkgl.events.readout import Readout
+from tests.events.clips import assert_same
+
+
+def random_events(rng, n, span_us):
+    t = np.sort(rng.integers(0, span_us, n))
+    x, y = (rng.integers(0, 100, n).astype(np.uint16) for _ in range(2))
+    return Events(x, y, t, rng.integers(0, 2, n).astype(np.uint8))
+
+
+def slow_bus(events, config):
+    """A list of departure times, nothing clever."""
+    event, row_cost = max(1, round(1e12 / config.events_per_second)), round(config.row_ns * 1000)
+    free, row, queue, out = -(2**62), -1, deque(), []
+    for i in range(len(events)):
+        now = int(events.t[i]) * 10**6
+        while queue and queue[0] <= now:
+            queue.popleft()
+        if len(queue) == config.queue_events:
+            continue
+        start = max(now, free)
+        if row_cost and (int(events.y[i]) != row or start > free):
+            start += row_cost
+        row, free = int(events.y[i]), start + event
+        queue.append(free)
+        out.append((i, free // 10**6))
+    index, t = np.array(out, np.int64).reshape(-1, 2).T
+    return Events(events.x[index], events.y[index], np.ascontiguousarray(t), events.p[index])
+
+
+@pytest.mark.parametrize("config", [ReadoutConfig(events_per_second=2e6, queue_events=50), ReadoutConfig(events_per_second=1e8),
+                                    ReadoutConfig(events_per_second=1e7, row_ns=400, queue_events=7)])
+def test_bus_equals_slow_twin_at_any_chunking(config):
+    events = random_events(np.random.default_rng(0), 5000, 1000)
+    readout = Readout(config)
+    edges = [0, 10, 11, 700, 3000, 5000]
+    parts = [readout.step(Events(*(getattr(events, c)[a:b] for c in "xytp"))) for a, b in zip(edges, edges[1:])]
+    expected = slow_bus(events, config)
+    assert_same(Events.concatenate(parts), expected)
+    assert readout.dropped == 5000 - len(expected)
+
+
+def test_below_the_limit_nothing_changes_but_a_microsecond():
+    events = random_events(np.random.default_rng(1), 2000, 1_000_000)
+    out = Readout(ReadoutConfig(events_per_second=1e9)).step(events)
+    assert_same(out, events)
+
+
+def test_above_the_limit_the_rate_is_the_bus_rate_and_the_lag_is_bounded():
+    events = random_events(np.random.default_rng(2), 50_000, 5_000)  # 10 M events/s into 4 M events/s
+    config = ReadoutConfig(events_per_second=4e6, queue_events=200)
+    readout = Readout(config)
+    out = readout.step(events)
+    assert abs(len(out) / (out.t[-1] - out.t[0]) - 4.0) < 0.02
+    assert readout.dropped == 50_000 - len(out)
+    assert out.t[-1] - events.t[-1] <= 200 / 4 + 1 and (np.diff(out.t) >= 0).all()
+
+
+def test_state_resumes():
+    events = random_events(np.random.default_rng(3), 4000, 500)
+    config = ReadoutConfig(events_per_second=3e6, row_ns=50, queue_events=64)
+    whole = Readout(config).step(events)
+    a, b = Readout(config), Readout(config)
+    head = a.step(Events(*(getattr(events, c)[:1500] for c in "xytp")))
+    b.load_state_dict(a.state_dict())
+    assert_same(whole, Events.concatenate([head, b.step(Events(*(getattr(events, c)[1500:] for c in "xytp")))]))
+
+
+def test_five_sensors_serve_every_emulator():
+    assert len(sensor_names()) >= 5
+    for name in sensor_names():
+        sensor = load_sensor(name)
+        for emulator in ("esim", "v2e", "voltmeter"):
+            make_emulator(sensor.emulator(emulator), 4, 5, 0)
+    assert (load_sensor("Davis-346").width, load_sensor("DAVIS346").height) == (346, 260)
+    assert load_sensor("imx636").emulator("voltmeter").k1 == pytest.approx(1 / 0.22)
+    assert load_sensor("davis240c").emulator("voltmeter").k1 == 4.424
+    assert load_sensor("davis346").emulator("v2e", cutoff_hz=50).cutoff_hz == 50
+
+
+def test_unknown_names_are_told():
+    with pytest.raises(ConfigError, match="davis346"):
+        load_sensor("davis999")
+    with pytest.raises(ConfigError, match="events.emulator"):
+        load_sensor("davis346").emulator("dvs")
+    with pytest.raises(ConfigError, match="cutoff_hz"):
+        load_sensor("davis346").emulator("v2e", cutof_hz=1)

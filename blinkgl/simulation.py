@@ -24,7 +24,7 @@ from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.frames import open_frames
-from blinkgl.io.images import linear_from_srgb
+from blinkgl.srgb import linear_from_srgb
 from blinkgl.timeline import interpolate as between
 
 EMULATORS: dict[str, type[Config]] = {"esim": EsimConfig, "v2e": V2eConfig, "voltmeter": VoltmeterConfig}

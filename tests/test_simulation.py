@@ -18,7 +18,7 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
-from blinkgl.io.images import linear_from_srgb
+from blinkgl.srgb import DECODE_8BIT
 from blinkgl.io.video import VideoReader, VideoWriter
 from blinkgl.simulation import Decoder, SimulationReport, simulate, simulate_file
 from tests.shared_data import shared
@@ -49,7 +49,7 @@ def test_generator_equals_the_emulator_by_hand():
     frames = frames8()
     config = EsimConfig(contrast_threshold=0.3)
     emulator = make_emulator(config, H, W, 5)
-    by_hand = Events.concatenate([emulator.step(linear_from_srgb(f / np.float32(255)), i * 10_000_000) for i, f in enumerate(frames)])
+    by_hand = Events.concatenate([emulator.step(DECODE_8BIT[f], i * 10_000_000) for i, f in enumerate(frames)])
     assert len(by_hand) > 1000
     report = SimulationReport()
     ours = all_of((f for f in frames), fps=100, emulator=config, seed=5, report=report)

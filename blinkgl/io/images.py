@@ -1,4 +1,4 @@
-"""Images, masks, ids, depth and normals of a sequence, and the sRGB transfer curve (IEC 61966-2-1)."""
+"""Images, masks, ids, depth and normals of a sequence."""
 
 from __future__ import annotations
 
@@ -11,25 +11,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.io.flow_png import encode_png, read_png
-
-
-def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """sRGB OETF. linear: any shape, float; clipped to [0, 1] (NaN becomes 0). Returns float32 in [0, 1]."""
-    x = np.clip(np.nan_to_num(np.asarray(linear, np.float32), nan=0.0), 0, 1)
-    return np.where(x <= np.float32(0.0031308), x * np.float32(12.92),
-                    np.float32(1.055) * np.power(x, np.float32(1 / 2.4)) - np.float32(0.055))
-
-
-def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
-    """Inverse of :func:`srgb_from_linear`; encoded in [0, 1], float32 out."""
-    x = np.asarray(encoded, np.float32)
-    return np.where(x <= np.float32(0.04045), x / np.float32(12.92),
-                    np.power((np.maximum(x, 0) + np.float32(0.055)) / np.float32(1.055), np.float32(2.4)))
-
-
-def to_srgb8(linear: np.ndarray) -> np.ndarray:
-    """8-bit sRGB codes, rounded to nearest, of linear light in [0, 1]."""
-    return (srgb_from_linear(linear) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+from blinkgl.srgb import to_srgb8
 
 
 def encode_image(image: np.ndarray) -> bytes:

@@ -9,9 +9,9 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from blinkgl.events.types import Events
-from blinkgl.io import images
 from blinkgl.io.colour import count_events, event_colour, flow_colour, flow_wheel
 from blinkgl.io.video import VideoWriter
+from blinkgl.srgb import to_srgb8
 
 _BAR = 30
 _GAP = 4
@@ -89,7 +89,7 @@ class PreviewWriter:
         if not self.due(t_us):
             return
         small = self._fit(image)  # first: cheaper, and averages linear light where it is given
-        small = images.to_srgb8(small) if small.dtype.kind == "f" else small
+        small = to_srgb8(small) if small.dtype.kind == "f" else small
         self._panel_view(0)[:] = small[..., None] if small.ndim == 2 else small
         self._panel_view(1)[:] = self._fit(event_colour(self._counts))
         self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms   slowed {self._slow:g}x")

@@ -23,8 +23,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.images import content_hash, decode_image, srgb_to_linear
+from blinkgl.scene.images import content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
+from blinkgl.srgb import linear_from_srgb
 
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
@@ -322,7 +323,7 @@ def buffer_contents(path: Path, data: bytes) -> list[bytes]:
 
 
 def to_linear(srgb) -> tuple[float, float, float]:
-    return tuple(float(c) for c in srgb_to_linear(np.clip(np.asarray(srgb, float), 0, 1)))
+    return tuple(float(c) for c in linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1)))
 
 
 def _parse(data: bytes, where: str) -> tuple[dict, bytes]:

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from blinkgl.errors import AssetError
+from blinkgl.srgb import DECODE_8BIT, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr")
 MAX_PIXELS = 120_000_000
@@ -29,18 +30,6 @@ def content_hash(*chunks: bytes) -> str:
     for chunk in chunks:
         digest.update(chunk)
     return digest.hexdigest()
-
-
-def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
-    """float32 linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
-    srgb = np.asarray(srgb, np.float32)
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
-    """float32 sRGB values of linear light in [0, 1]."""
-    linear = np.clip(np.asarray(linear, np.float32), 0, 1)
-    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 def photographs() -> dict[str, Path]:
@@ -122,11 +111,7 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     if image.dtype == np.float32:
         return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    linear = _DECODE[image]
-    return np.round(linear_to_srgb(cv2.resize(linear, size, interpolation=cv2.INTER_AREA)) * 255).astype(np.uint8)
-
-
-_DECODE = srgb_to_linear(np.arange(256) / 255)
+    return to_srgb8(cv2.resize(DECODE_8BIT[image], size, interpolation=cv2.INTER_AREA))
 
 
 def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.ndarray]:

@@ -349,7 +349,7 @@ def _chained(R: np.ndarray, turns: np.ndarray) -> Rotation:
 def _rotations(R, turns, times, t0_ns, t1_ns, rate) -> Rotation:
     """Key rotations from ``R`` by ``turns``, all scaled so that the spline's mean angular rate over [t0, t1] is
     ``rate`` (to 0.1 %, unless turns would pass 150 degrees)."""
-    if rate == 0.0:
+    if rate == 0.0 or not turns.any():
         return _chained(R, 0.0 * turns)
     most = 2.6 / np.linalg.norm(turns, axis=1).max()
     middle = (np.arange(_SAMPLES * len(times)) + 0.5) / (_SAMPLES * len(times)) * ((t1_ns - t0_ns) * 1e-9)

@@ -43,6 +43,10 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
 
     T_cam, target = _viewpoint(config, rng, floor)
     clearance = max(config.camera_clearance, 1.01 * near_corner(camera))
+    if clearance > config.region.height:
+        raise ConfigError("the region is too low for a camera that keeps this far from everything", where="scene.region.height",
+                          value=config.region.height, accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
+                          "distance of the near plane's corners: camera.near and camera.fov)")
     backdrop = []
     if config.sky:
         parts = _sky(config.sky, textures, rng_texture, split, base, log)

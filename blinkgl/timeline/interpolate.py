@@ -13,6 +13,8 @@ import cv2
 import numba
 import numpy as np
 
+from blinkgl.srgb import to_srgb8
+
 Timed = tuple[np.ndarray, int]
 _EPS = np.float32(1e-3)
 
@@ -143,5 +145,4 @@ def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 
 def _to8(luminance: np.ndarray) -> np.ndarray:
-    from blinkgl.io.images import to_srgb8
     return to_srgb8(luminance)

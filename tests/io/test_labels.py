@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from blinkgl import srgb
 from blinkgl.errors import AssetError
 from blinkgl.io import flo, flow_png, images, pfm
 from tests.shared_data import shared
@@ -102,18 +103,18 @@ def test_pickled_arrays_are_refused(tmp_path):
 def test_srgb_curve():
     x = np.linspace(0, 1, 10001)
     exact = np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
-    assert np.abs(images.srgb_from_linear(x) - exact).max() < 2e-6
+    assert np.abs(srgb.srgb_from_linear(x) - exact).max() < 2e-6
     codes = np.arange(256, dtype=np.uint8)
-    assert np.array_equal(images.to_srgb8(images.linear_from_srgb(codes / 255)), codes)
-    assert images.to_srgb8(np.array([-1, np.nan, 2, np.inf], np.float32)).tolist() == [0, 0, 255, 255]
+    assert np.array_equal(srgb.to_srgb8(srgb.linear_from_srgb(codes / 255)), codes)
+    assert srgb.to_srgb8(np.array([-1, np.nan, 2, np.inf], np.float32)).tolist() == [0, 0, 255, 255]
 
 
 def test_images_masks_ids(tmp_path):
     rng = np.random.default_rng(0)
     linear = rng.random((9, 11, 3), dtype=np.float32)
     (tmp_path / "i.png").write_bytes(images.encode_image(linear))
-    assert np.array_equal(cv2.imread(str(tmp_path / "i.png"))[..., ::-1], images.to_srgb8(linear))
-    assert np.array_equal(images.read_image(tmp_path / "i.png"), images.to_srgb8(linear))
+    assert np.array_equal(cv2.imread(str(tmp_path / "i.png"))[..., ::-1], srgb.to_srgb8(linear))
+    assert np.array_equal(images.read_image(tmp_path / "i.png"), srgb.to_srgb8(linear))
     mask = rng.random((9, 11)) > 0.5
     (tmp_path / "m.png").write_bytes(images.encode_mask(mask))
     assert np.array_equal(images.read_mask(tmp_path / "m.png"), mask)

@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
+from blinkgl import srgb
 from blinkgl.errors import BlinkGLError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io import flo, images
@@ -71,7 +72,7 @@ def test_contents_read_back_independently(tmp_path):
     assert (seq / "flow/backward_timestamps.txt").read_text().startswith("# from_timestamp_us, to_timestamp_us\n100000, 0\n")
     rng = np.random.default_rng(1)
     image, flow = rng.random((H, W, 3)).astype(np.float32), rng.normal(size=(H, W, 2)).astype(np.float32)
-    assert np.array_equal(cv2.imread(str(seq / "images/000001.png"))[..., ::-1], images.to_srgb8(image))
+    assert np.array_equal(cv2.imread(str(seq / "images/000001.png"))[..., ::-1], srgb.to_srgb8(image))
     rgb = cv2.imread(str(seq / "flow/forward/000001.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(float)
     assert not rgb[0, 0, 2] and rgb[1:, :, 2].all()
     assert np.abs((rgb[1:, :, :2] - 2**15) / 128 - flow[1:]).max() <= 0.5 / 128

@@ -1,0 +1,34 @@
+"""The sRGB transfer curve (IEC 61966-2-1), both ways. Every picture that comes in or goes out passes through here."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1]. Any shape; float64 stays float64, everything else becomes float32."""
+    x = _floating(encoded)
+    one = x.dtype.type
+    return np.where(x <= one(0.04045), x / one(12.92), np.power((np.maximum(x, 0) + one(0.055)) / one(1.055), one(2.4)))
+
+
+def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    """sRGB values in [0, 1] of linear light, which is clipped to [0, 1] (NaN becomes 0). Any shape; dtype as above."""
+    x = _floating(linear)
+    one = x.dtype.type
+    x = np.clip(np.nan_to_num(x, nan=0.0), 0, 1)
+    return np.where(x <= one(0.0031308), x * one(12.92), one(1.055) * np.power(x, one(1 / 2.4)) - one(0.055))
+
+
+def to_srgb8(linear: np.ndarray) -> np.ndarray:
+    """uint8 sRGB codes, rounded to nearest, of linear light in [0, 1]."""
+    return (srgb_from_linear(linear) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
+
+
+def _floating(x: np.ndarray) -> np.ndarray:
+    x = np.asarray(x)
+    return x if x.dtype == np.float64 else x.astype(np.float32, copy=False)
+
+
+DECODE_8BIT = linear_from_srgb(np.arange(256) / 255.0).astype(np.float32)
+"""(256,) float32: linear light of each 8-bit code."""

@@ -139,4 +139,4 @@ def serve(
     from blinkgl.tools.shader_debugger.server import serve as run_server
 
     subject = _subject(config, seed, sequence, overrides)
-    run_server(subject, _when(subject, time, step), shaders, host, port)
+    run_server(subject, _when(subject, time, step), shaders, host, port, step)

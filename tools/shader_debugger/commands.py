@@ -43,7 +43,7 @@ def _meaningful(moment, info) -> np.ndarray | None:
     """Where a buffer's values mean something: where something is hit, or where the flow is valid."""
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    return moment["id"] != 0 if info.kind in ("scalar", "signed", "motion") and info.name not in ("luminance", "log_luminance", "dL_dt") else None
+    return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and info.name not in ("luminance", "log_luminance", "dL_dt") else None
 
 
 def _folder(out: str) -> Path:

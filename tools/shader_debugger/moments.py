@@ -18,7 +18,7 @@ from blinkgl.tools.shader_debugger.session import DebugRenderer, When
 
 @dataclass(frozen=True)
 class Pass:
-    """kind : how it is shown: scalar, signed, ids, mask, light (linear rgb), unit (vectors), uv, motion.
+    """kind : how it is shown: scalar, depth (on a logarithmic scale), signed, ids, mask, light (linear rgb), unit (vectors), uv, motion.
     source : the program and output that write it."""
 
     name: str
@@ -33,11 +33,11 @@ PASSES = {p.name: p for p in (
     Pass("albedo", "albedo", "linear", "light", "debug.glsl OUT_ALBEDO"),
     Pass("irradiance", "irradiance factor", "1", "scalar", "debug.glsl OUT_SHADE"),
     Pass("normals", "normals", "camera axes", "unit", "label.glsl OUT_NORMAL"),
-    Pass("depth", "depth", "world units", "scalar", "label.glsl OUT_DEPTH"),
+    Pass("depth", "depth", "world units", "depth", "label.glsl OUT_DEPTH"),
     Pass("id", "instance id", "0: nothing hit", "ids", "label.glsl OUT_ID"),
     Pass("triangle", "triangle of its part", "0: nothing hit", "ids", "debug.glsl OUT_TRIANGLE"),
     Pass("uv", "uv", "texture repeats", "uv", "debug.glsl OUT_UV"),
-    Pass("mip_level", "mip level", "log2(texels per px)", "signed", "debug.glsl OUT_LOD"),
+    Pass("mip_level", "mip level", "log2(texels per px)", "scalar", "debug.glsl OUT_LOD"),
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),

@@ -14,7 +14,7 @@ from PIL import Image
 from blinkgl.errors import ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.colour import flow_colour, flow_wheel
-from blinkgl.render.colour import linear_to_srgb
+from blinkgl.srgb import srgb_from_linear
 from blinkgl.tools.shader_debugger.moments import PASSES, Pass
 
 SCALAR_MAP, SIGNED_MAP, ERROR_MAP = "viridis", "RdBu_r", "inferno"
@@ -37,8 +37,11 @@ def finite_range(values: np.ndarray, signed: bool = False, share: float = 0.005)
     return low, high
 
 
-def map_scalar(values: np.ndarray, name: str, low: float, high: float) -> np.ndarray:
-    """(H, W, 3) uint8; not finite: dark grey."""
+def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool = False) -> np.ndarray:
+    """(H, W, 3) uint8; not finite: dark grey. log : equal ratios get equal steps of colour."""
+    if log and low > 0:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return map_scalar(np.log(values), name, float(np.log(low)), float(np.log(high)))
     if name not in MAPS:
         raise ConfigError("unknown colour map", where="map", value=name, accepted="one of " + ", ".join(MAPS))
     with np.errstate(invalid="ignore", over="ignore"):
@@ -73,7 +76,7 @@ def component(array: np.ndarray, which: str) -> np.ndarray:
 
 def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str | None = None, low: float | None = None,
             high: float | None = None, hit: np.ndarray | None = None) -> tuple[np.ndarray, dict]:
-    """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high"}, {"kind": "wheel", "high"} or {"kind": kind}.
+    """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high", "log"}, {"kind": "wheel", "high"} or {"kind": kind}.
 
     kind : as in :class:`Pass`.   which : component of a vector; "auto" takes the kind's own way.
     hit : (H, W) bool, where scalars mean something (they set the range, the rest is dark grey)."""
@@ -84,7 +87,7 @@ def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str |
             return id_colours(array), {"kind": "ids"}
         if kind == "light":
             top = high if high is not None else 1.0
-            return (linear_to_srgb(array / top) * 255).round().astype(np.uint8), {"kind": "light", "high": top}
+            return (srgb_from_linear(array / top) * 255).round().astype(np.uint8), {"kind": "light", "high": top}
         if kind == "unit":
             rgb = np.clip(127.5 + 127.5 * array, 0, 255).round().astype(np.uint8)
             rgb[(array == 0).all(axis=-1)] = EMPTY
@@ -99,13 +102,14 @@ def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str |
             top = high if high is not None else finite_range(speed if hit is None or not hit.any() else speed[hit])[1]
             return flow_colour(array, top, hit), {"kind": "wheel", "high": float(top)}
     values = component(np.asarray(array), which).astype(np.float64)
-    if hit is not None and kind != "error":
+    if hit is not None:
         values = np.where(hit, values, np.nan)
     signed = kind == "signed" or (kind in ("motion", "unit") and which in ("x", "y", "z"))
     name = colours or (SIGNED_MAP if signed else SCALAR_MAP)
     auto = finite_range(values, signed)
     low, high = auto[0] if low is None else low, auto[1] if high is None else high
-    return map_scalar(values, name, low, high), {"kind": "bar", "map": name, "low": float(low), "high": float(high)}
+    log = kind == "depth" and low > 0
+    return map_scalar(values, name, low, high, log), {"kind": "bar", "map": name, "low": float(low), "high": float(high), "log": log}
 
 
 def png_bytes(rgb: np.ndarray) -> bytes:
@@ -123,14 +127,27 @@ def _style(axes) -> None:
         spine.set_color("#cbd5e1"), spine.set_linewidth(0.6)
 
 
+def _disc() -> np.ndarray:
+    """The flow wheel without its corners, RGBA."""
+    wheel = flow_wheel()
+    v, u = np.mgrid[-1:1:len(wheel) * 1j, -1:1:len(wheel) * 1j]
+    return np.dstack([wheel, np.where(np.hypot(u, v) <= 1, 255, 0).astype(np.uint8)])
+
+
 def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict, size: float) -> None:
     """Draws the colour bar, or what stands for it, into box (x, y, w, h in figure fractions)."""
     kind = legend["kind"]
     if kind == "bar":
         axes = figure.add_axes(box)
-        axes.imshow(np.linspace(0, 1, 256)[None], aspect="auto", cmap=legend["map"], extent=(legend["low"], legend["high"], 0, 1))
-        axes.set_yticks([])
-        axes.locator_params(axis="x", nbins=5)
+        low, high = legend["low"], legend["high"]
+        axes.pcolormesh(np.geomspace(low, high, 257) if legend["log"] else np.linspace(low, high, 257), [0, 1], np.linspace(0, 1, 256)[None],
+                        cmap=legend["map"], rasterized=True)
+        axes.set_xlim(low, high), axes.set_yticks([])
+        if legend["log"]:
+            ticks = [float(f"{v:.1g}") for v in np.geomspace(low, high, 5)[1:-1]]
+            axes.set_xscale("log"), axes.set_xticks(ticks, [f"{v:g}" for v in ticks]), axes.minorticks_off()
+        else:
+            axes.locator_params(axis="x", nbins=5)
         axes.tick_params(axis="x", labelsize=size, colors=MUTED, length=2, pad=1)
         for spine in axes.spines.values():
             spine.set_visible(False)
@@ -142,7 +159,7 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
         ratio = figure.get_figheight() / figure.get_figwidth()
         side = 2.1 * h
         axes = figure.add_axes((x, y + h - side, side * ratio, side))
-        axes.imshow(flow_wheel()), _style(axes)
+        axes.imshow(_disc()), _style(axes)
         axes.set_frame_on(False)
         figure.text(x + side * ratio * 1.25, y + h / 2, f"rim = {legend['high']:.3g}; hue is the direction", fontsize=size, color=MUTED, va="center")
         return
@@ -150,13 +167,15 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
 
 
 def _save(figure: Figure, path: Path, dpi: int = 100, palette: bool = False) -> None:
-    """palette : 256 colours, a third of the size."""
+    """palette : 256 colours, dithered; a third of the size."""
     FigureCanvasAgg(figure)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=dpi, facecolor=PAPER)
     image = Image.open(io.BytesIO(out.getvalue())).convert("RGB")
     with atomic_file(path) as temporary, output_errors(path):
-        (image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE) if palette else image).save(temporary, "PNG", optimize=True)
+        if palette:
+            image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)  # Pillow dithers to given palettes only
+        image.save(temporary, "PNG", optimize=True)
 
 
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:
@@ -178,7 +197,7 @@ def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption
 def save_contact_sheet(path: Path, tiles: list[tuple[Pass, np.ndarray, dict]], caption: str, columns: int = 5) -> None:
     """All buffers on one page."""
     height, width = tiles[0][1].shape[:2]
-    w = 250
+    w = 232
     h = round(w * height / width)
     rows = -(-len(tiles) // columns)
     gap, head, foot, top = 14, 20, 32, 44

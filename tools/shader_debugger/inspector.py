@@ -1,0 +1,273 @@
+"""What the page asks for, computed in one thread: OpenGL contexts belong to the thread that made them."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections import OrderedDict
+from concurrent.futures import Future
+from typing import Any
+
+import numpy as np
+
+from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.gl import ShaderLoader
+from blinkgl.gl.shader import STAGES, ShaderError, expand
+from blinkgl.tools.shader_debugger import picture
+from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
+from blinkgl.tools.shader_debugger.compare import Comparison
+from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
+from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass
+from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
+from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, files_of, moment, open_folder, open_renderer
+
+POLL_S = 0.15  # between two looks at the shader files
+KEPT = 6  # moments in memory
+SOURCES = ("gpu", "reference")
+
+
+class _Loader(ShaderLoader):
+    """Remembers what it was asked for last, to find the sources of an error."""
+
+    asked: tuple[str, dict] = ("", {})
+
+    def program(self, name, defines=None):
+        self.asked = (name, dict(defines or {}))
+        return super().program(name, defines)
+
+
+class Inspector:
+    """Buffers, pictures and probes of one subject. Every method but the constructor belongs to the worker's thread."""
+
+    def __init__(self, subject: Subject, when: When, shaders: str | None, step_us: float | None = None):
+        self.subject, self.first, self.step_us = subject, when, step_us
+        self.folder = open_folder(shaders)
+        self._shaders = shaders
+        self.generation = 1
+        self.errors: list[Diagnostic] = []
+        self._gpu: OrderedDict[tuple[int, int], GpuMoment] = OrderedDict()
+        self._reference: OrderedDict[int, ReferenceMoment] = OrderedDict()
+        self._shown = when
+
+    def open(self) -> None:
+        """Makes the context and draws once. Raises GLError."""
+        self._context = open_renderer(self.subject, self._shaders)
+        self.renderer = self._context.__enter__()
+        try:
+            self.renderer.use_shaders(_Loader(self.renderer.gl.ctx, self.folder))
+            self._draw_all(when=self.first)
+        except BaseException as error:
+            self._context.__exit__(type(error), error, None)
+            raise
+
+    def close(self) -> None:
+        self._context.__exit__(None, None, None)
+
+    # ---- moments -----------------------------------------------------------------------------------------------
+
+    def _draw_all(self, when: When) -> GpuMoment:
+        made = GpuMoment(self.renderer, when, self.subject.log_eps)
+        for name in PASSES:
+            made[name]
+        return made
+
+    def _when(self, text: str) -> When:
+        try:
+            seconds = float(text) if text else None
+        except ValueError:
+            raise ConfigError("not a time", where="t", value=text, accepted="seconds") from None
+        self._shown = moment(self.subject, seconds, self.step_us) if seconds is not None else self.first
+        return self._shown
+
+    def gpu(self, when: When) -> GpuMoment:
+        key = (self.generation, when.t_ns)
+        return _kept(self._gpu, key, lambda: GpuMoment(self.renderer, when, self.subject.log_eps))
+
+    def reference(self, when: When) -> ReferenceMoment:
+        return _kept(self._reference, when.t_ns, lambda: ReferenceMoment(self.subject.scene, when, self.subject.log_eps))
+
+    def _moment(self, source: str, when: When):
+        if source not in SOURCES:
+            raise ConfigError("unknown source", where="source", value=source, accepted="gpu or reference")
+        return self.gpu(when) if source == "gpu" else self.reference(when)
+
+    # ---- answers -----------------------------------------------------------------------------------------------
+
+    def state(self) -> dict:
+        """What the page shows around the pictures."""
+        scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
+        return {"config": self.subject.path, "sequence": self.subject.index, "seed": config.seed, "renderer": gl.renderer,
+                "width": scene.camera.width, "height": scene.camera.height, "t0": scene.t0_ns * 1e-9, "t1": scene.t1_ns * 1e-9,
+                "t": self.first.t_ns * 1e-9, "labels": [t * 1e-9 for t in config.time.label_times_ns],
+                "interval": config.time.interval_ns * 1e-9, "maps": picture.MAPS, "folder": str(getattr(self.folder, "path", self.folder)),
+                "passes": [{"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source} for p in PASSES.values()]}
+
+    def shaders(self) -> dict:
+        return {"generation": self.generation, "errors": [d.as_dict() | {"where": d.where} for d in self.errors]}
+
+    def image(self, q: dict[str, str]) -> tuple[bytes, dict]:
+        """PNG and legend of one buffer. q : pass, source, t, component, map, low, high."""
+        when, name = self._when(q.get("t", "")), check_pass(q.get("pass", ""), where="pass")
+        source = self._moment(q.get("source", "gpu"), when)
+        info, array = PASSES[name], source[name]
+        rgb, legend = picture.picture(info.kind, array, which=q.get("component") or "auto", colours=q.get("map") or None,
+                                      low=_number(q, "low"), high=_number(q, "high"), hit=_meaningful(source, info))
+        return picture.png_bytes(rgb), legend | {"unit": info.unit}
+
+    def difference(self, q: dict[str, str]) -> tuple[bytes, dict]:
+        """PNG and legend of |A - B|. q : a, b (each "pass:source"), t, component, map, low, high."""
+        when = self._when(q.get("t", ""))
+        arrays = []
+        for key in ("a", "b"):
+            name, _, source = q.get(key, "").partition(":")
+            arrays.append(np.asarray(self._moment(source, when)[check_pass(name, where=key)], np.float64))
+        a, b = arrays
+        if a.shape != b.shape:
+            raise ConfigError("have different numbers of components", where="a, b", value=f"{q.get('a')}, {q.get('b')}", accepted="two of the same kind")
+        which = q.get("component") or "length"
+        with np.errstate(invalid="ignore"):
+            change = np.where(a == b, 0.0, a - b)
+        values = np.abs(picture.component(change, "length" if which == "auto" else which))
+        rgb, legend = picture.picture("error", values, which="length", colours=q.get("map") or picture.ERROR_MAP, low=_number(q, "low", 0.0),
+                                      high=_number(q, "high", float(np.nanmax(np.where(np.isfinite(values), values, 0.0))) or 1e-12))
+        return picture.png_bytes(rgb), legend | {"unit": PASSES[name].unit}
+
+    def probe(self, q: dict[str, str]) -> dict:
+        """The CLI's probe, with the CLI's text of every number."""
+        when = self._when(q.get("t", ""))
+        x, y = check_pixel(self.subject.scene, f"{q.get('x', '')},{q.get('y', '')}")
+        gpu, ref = self.gpu(when), self.reference(when)
+        if not hasattr(ref, "comparison") or ref.comparison.gpu is not gpu:
+            ref.comparison = Comparison(gpu, ref)
+        found = probe(gpu, ref, x, y, ref.comparison)
+        for row in found["buffers"]:
+            row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
+        for row in found["positions"]:
+            row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
+        found["surface_text"] = {side: _surface_text(found["surface"][side]) for side in SOURCES}
+        return _finite(found)
+
+    # ---- reloading ---------------------------------------------------------------------------------------------
+
+    def reload(self) -> None:
+        """Takes the edited shaders when all of them compile and draw; otherwise keeps the old ones and :attr:`errors`."""
+        old = self.renderer.gl.shaders
+        new = _Loader(self.renderer.gl.ctx, self.folder)
+        self.renderer.use_shaders(new)
+        try:
+            self._draw_all(self._shown)
+        except ShaderError as error:
+            self.errors = [d for d in diagnose(error, self._sources(new), self.folder) if d.kind == "error"]
+        except Exception as error:  # an edit that compiles but cannot be drawn with: not the tool's end
+            self.errors = [Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")]
+        else:
+            self.errors = []
+            self.generation += 1
+            old.clear()
+            self._gpu.clear()
+            return
+        self.renderer.use_shaders(old)
+        new.clear()
+
+    def _sources(self, loader: _Loader) -> dict:
+        try:
+            return {stage: expand(loader.asked[0], stage, loader.asked[1], self.folder) for stage in STAGES}
+        except ShaderError:
+            return {}
+
+    def stamps(self) -> tuple:
+        """Changes whenever a shader file does. Safe in any thread."""
+        out = []
+        for path in files_of(self.folder):
+            try:
+                info = path.stat()
+                out.append((str(path), info.st_mtime_ns, info.st_size, info.st_ino))
+            except OSError:
+                pass
+        return tuple(out)
+
+
+def _kept(cache: OrderedDict, key, make):
+    if key not in cache:
+        cache[key] = make()
+        while len(cache) > KEPT:
+            cache.popitem(last=False)
+    cache.move_to_end(key)
+    return cache[key]
+
+
+def _number(q: dict[str, str], key: str, default: float | None = None) -> float | None:
+    if not q.get(key):
+        return default
+    try:
+        value = float(q[key])
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise ConfigError("not a number", where=key, value=q[key], accepted="a finite number, or nothing")
+    return value
+
+
+class Worker:
+    """Runs an Inspector in its own thread, and watches its files. ``call`` may come from any thread."""
+
+    def __init__(self, inspector: Inspector):
+        self.inspector = inspector
+        self._jobs: queue.Queue = queue.Queue()
+        self._stop = threading.Event()
+        self.changed = threading.Condition()
+        self.version = 1  # counts reloads, good and bad
+        opened: Future = Future()
+        self._thread = threading.Thread(target=self._run, args=(opened,), name="render", daemon=True)
+        self._thread.start()
+        opened.result()  # raises what opening raised
+        self._watcher = threading.Thread(target=self._watch, name="watch", daemon=True)
+        self._watcher.start()
+
+    def _run(self, opened: Future) -> None:
+        try:
+            self.inspector.open()
+        except BaseException as error:
+            opened.set_exception(error)
+            return
+        opened.set_result(None)
+        while (job := self._jobs.get()) is not None:
+            function, arguments, answer = job
+            try:
+                answer.set_result(function(*arguments))
+            except BaseException as error:
+                answer.set_exception(error)
+        self.inspector.close()
+
+    def call(self, function, *arguments) -> Any:
+        """The result of ``function`` in the render thread; raises what it raised."""
+        if self._stop.is_set():
+            raise BlinkGLError("the server is stopping")
+        answer: Future = Future()
+        self._jobs.put((function, arguments, answer))
+        return answer.result(timeout=120)
+
+    def _watch(self) -> None:
+        seen = self.inspector.stamps()
+        while not self._stop.wait(POLL_S):
+            stamps = self.inspector.stamps()
+            if stamps != seen:
+                seen = stamps
+                self.call(self.inspector.reload)
+                with self.changed:
+                    self.version += 1
+                    self.changed.notify_all()
+
+    def wait(self, version: int, timeout: float) -> int:
+        """The version, as soon as it differs from ``version`` or the time is over."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.version != version or self._stop.is_set(), timeout)
+            return self.version
+
+    def close(self) -> None:
+        self._stop.set()
+        with self.changed:
+            self.changed.notify_all()
+        self._watcher.join()
+        self._jobs.put(None)
+        self._thread.join()

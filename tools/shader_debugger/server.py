@@ -1,0 +1,191 @@
+"""``blinkgl shader serve``: the page and its few routes, over the standard library's HTTP server.
+
+Listens on 127.0.0.1 unless told otherwise, answers only GET and HEAD of the routes below, and only when the Host header is its own
+address, so that no web site can reach it through a name that resolves to 127.0.0.1 (DNS rebinding). No path is ever turned into
+a file name: the page's three files are read by their fixed names.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import socket
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+from urllib.parse import parse_qsl, urlsplit
+
+from blinkgl.errors import BlinkGLError, GLError
+from blinkgl.tools.shader_debugger.inspector import Inspector, Worker
+from blinkgl.tools.shader_debugger.session import Subject, When
+
+PAGE = {"/": ("index.html", "text/html; charset=utf-8"), "/app.js": ("app.js", "text/javascript; charset=utf-8"),
+        "/style.css": ("style.css", "text/css; charset=utf-8")}
+WAIT_S = 20.0  # a long poll's patience
+LOCAL = ("127.0.0.1", "localhost", "::1")
+HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "X-Frame-Options": "DENY",
+           "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
+                                      "base-uri 'none'; form-action 'none'"}
+
+
+def host_allowed(header: str | None, bound: str, port: int) -> bool:
+    """Whether a Host header names this server: a local name or the bound address, with its port if any.
+
+    Bound to every address, any literal IP address will do, but no name."""
+    if not header or len(header) > 255:
+        return False
+    try:
+        parts = urlsplit(f"//{header}")
+        name, given = (parts.hostname or "").lower(), parts.port
+    except ValueError:
+        return False
+    if parts.username is not None or parts.path or parts.query or parts.fragment or given not in (None, port):
+        return False
+    if name in LOCAL or name == bound.lower():
+        return bool(name)
+    if bound in ("0.0.0.0", "::"):
+        try:
+            ipaddress.ip_address(name)
+            return True
+        except ValueError:
+            return False
+    return False
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "BlinkGL", ""
+    timeout = 60
+    server: "_Server"
+
+    def do_GET(self) -> None:
+        if not host_allowed(self.headers.get("Host"), self.server.bound, self.server.server_address[1]):
+            return self._error(403, "this Host is not served here")
+        parts = urlsplit(self.path)
+        query = dict(parse_qsl(parts.query, keep_blank_values=True))
+        try:
+            if parts.path in PAGE:
+                name, kind = PAGE[parts.path]
+                return self._send(200, resources.files(__package__).joinpath("page", name).read_bytes(), kind)
+            answer = {"/state": self._state, "/image": self._image, "/difference": self._image, "/probe": self._probe, "/wait": self._wait}.get(parts.path)
+            if answer is None:
+                return self._error(404, "no such page")
+            answer(parts.path, query)
+        except BlinkGLError as error:
+            self._error(400, str(error))
+        except (BrokenPipeError, ConnectionResetError):
+            self.close_connection = True
+        except Exception as error:
+            self._error(500, f"{type(error).__name__}: {error}")
+
+    do_HEAD = do_GET
+
+    def _state(self, path, query) -> None:
+        worker = self.server.worker
+        self._json(worker.call(worker.inspector.state) | worker.call(worker.inspector.shaders) | {"version": worker.version})
+
+    def _image(self, path, query) -> None:
+        worker = self.server.worker
+        image = worker.inspector.image if path == "/image" else worker.inspector.difference
+        png, legend = worker.call(image, query)
+        self._send(200, png, "image/png", {"X-Legend": json.dumps(legend)})
+
+    def _probe(self, path, query) -> None:
+        worker = self.server.worker
+        self._json(worker.call(worker.inspector.probe, query))
+
+    def _wait(self, path, query) -> None:
+        worker, version = self.server.worker, query.get("version", "")
+        now = worker.wait(int(version) if version.isdigit() and len(version) < 19 else -1, WAIT_S)
+        self._json(worker.call(worker.inspector.shaders) | {"version": now})
+
+    def _json(self, value) -> None:
+        self._send(200, json.dumps(value).encode(), "application/json")
+
+    def _error(self, status: int, text: str) -> None:
+        self.close_connection = True
+        self._send(status, json.dumps({"error": text}).encode(), "application/json")
+
+    def _send(self, status: int, body: bytes, kind: str, more: dict[str, str] | None = None) -> None:
+        self.send_response(status)
+        for name, value in {"Content-Type": kind, "Content-Length": str(len(body)), **HEADERS, **(more or {})}.items():
+            self.send_header(name, value)
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    def log_message(self, *arguments) -> None:
+        """Quiet."""
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    worker: Worker
+    bound = ""
+
+    def server_bind(self) -> None:
+        socket.socket.bind(self.socket, self.server_address)  # HTTPServer's own would look up a host name
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = self.bound, self.server_address[1]
+
+    def handle_error(self, request, address) -> None:
+        """A browser that leaves in the middle is no news."""
+
+
+class DebugServer:
+    """The running page; ``with DebugServer(…) as server: server.url``. Raises GLError when it cannot start."""
+
+    def __init__(self, subject: Subject, when: When, shaders: str | None = None, host: str = "127.0.0.1", port: int = 0,
+                 step_us: float | None = None):
+        self._server = _listen(host, port)
+        try:
+            self._server.worker = Worker(Inspector(subject, when, shaders, step_us))
+        except BaseException:
+            self._server.server_close()
+            raise
+        self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, name="http", daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        return self._server.server_address[1]
+
+    @property
+    def url(self) -> str:
+        return f"http://{self._server.bound}:{self.port}/"
+
+    def __enter__(self) -> DebugServer:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._server.shutdown()
+        self._server.worker.close()
+        self._server.server_close()
+
+
+def _listen(host: str, port: int) -> _Server:
+    try:
+        server = _Server((host, port), _Handler, bind_and_activate=False)
+        server.bound = host
+        server.server_bind()
+        server.server_activate()
+        return server
+    except OSError as error:
+        raise GLError(f"cannot listen: {error.strerror or error}", where="serve", value=f"{host}:{port}",
+                      accepted="a free port of this machine; 0 takes any") from None
+
+
+def serve(subject: Subject, when: When, shaders: str | None, host: str, port: int, step_us: float | None = None) -> None:
+    """Serves until interrupted."""
+    with DebugServer(subject, when, shaders, host, port, step_us) as server:
+        folder = server._server.worker.inspector.folder
+        print(f"{server.url}  (Ctrl-C ends it; watching {getattr(folder, 'path', folder)})", flush=True)
+        if host not in LOCAL:
+            print("anybody who reaches this address can look: there is no password", flush=True)
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            print()

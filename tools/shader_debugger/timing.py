@@ -1,0 +1,220 @@
+"""GPU time of every pass that generation runs for this configuration, by timer queries (GL_TIMESTAMP before and after).
+
+A pass is timed as a whole, from clearing to the last draw, and waited for. Its *half-resolution twin* is the same pass of the same
+scene with a quarter of the pixels: with V the vertex work and F the fragment work, T = V + F and T_half = V + F / 4, hence
+F = 4/3 (T - T_half). "Vertex" is thus all that does not grow with the pixels: vertex work, clearing, draw calls, and on a software
+renderer, whose time stamps are the CPU's, the program that issues them. Program variants are timed draw by draw in a second run, each draw waited for, so that tiled and deferred
+rasterisers cannot put one draw's work into another's query; their sum is therefore larger than the pass.
+
+llvmpipe bins a whole frame and answers queries tile by tile: inside an open frame, GL_TIME_ELAPSED is that of the last tile (a few
+µs instead of some ms). On software renderers the work is therefore waited for around each time stamp; it then agrees with the
+wall clock.
+
+overdraw: fragments that passed the depth test per pixel (GL_SAMPLES_PASSED), 1 when every pixel is shaded once. The first run
+of everything is not counted: programs compile then.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from blinkgl.render.renderer import LabelRequest
+from blinkgl.scene.types import Scene
+from blinkgl.tools.shader_debugger.session import DebugRenderer, Subject, When, open_renderer
+
+HALF = 2
+
+
+def half_scene(scene: Scene) -> Scene:
+    """The same view at half the width and height (rounded down)."""
+    camera = scene.camera
+    width, height = max(1, camera.width // HALF), max(1, camera.height // HALF)
+    sx, sy = width / camera.width, height / camera.height
+    small = replace(camera, width=width, height=height, fx=camera.fx * sx, fy=camera.fy * sy, cx=(camera.cx + 0.5) * sx - 0.5,
+                    cy=(camera.cy + 0.5) * sy - 0.5)
+    return replace(scene, camera=small)
+
+
+@dataclass
+class Draws:
+    """Of one pass or variant in one run."""
+
+    gpu_ms: float = 0.0
+    wall_ms: float = 0.0
+    draws: int = 0
+    triangles: int = 0
+    fragments: int = 0
+    variants: dict[str, "Draws"] = field(default_factory=dict)
+
+
+class Stopwatch:
+    """GPU time between start and stop by two time stamp queries, and the fragments drawn between them."""
+
+    _TIMESTAMP, _RESULT = 0x8E28, 0x8866
+
+    def __init__(self, gl):
+        uint, pointer = ctypes.c_uint, ctypes.c_void_p
+        self._gl = gl
+        self._stamp = gl.function("glQueryCounter", None, uint, uint)
+        self._get = gl.function("glGetQueryObjectui64v", None, uint, uint, pointer)
+        self._delete = gl.function("glDeleteQueries", None, ctypes.c_int, pointer)
+        self._ids = (uint * 2)()
+        gl.function("glGenQueries", None, ctypes.c_int, pointer)(2, self._ids)
+        self._samples = gl.ctx.query(samples=True)
+
+    def _mark(self, which: int) -> None:
+        if self._gl.is_software:
+            self._gl.ctx.finish()
+        self._stamp(self._ids[which], self._TIMESTAMP)
+        if self._gl.is_software:
+            self._gl.ctx.finish()
+
+    def start(self) -> None:
+        self._gl.ctx.finish()
+        self._mark(0)
+        self._samples.__enter__()
+
+    def stop(self) -> tuple[float, int]:
+        """(ms, fragments) since :meth:`start`; waits for the GPU."""
+        self._samples.__exit__(None, None, None)
+        self._mark(1)
+        self._gl.ctx.finish()
+        times = []
+        for query in self._ids:
+            value = ctypes.c_uint64()
+            self._get(query, self._RESULT, ctypes.byref(value))
+            times.append(value.value)
+        return (times[1] - times[0]) * 1e-6, self._samples.samples
+
+    def release(self) -> None:
+        self._delete(2, self._ids)
+
+
+class TimedRenderer(DebugRenderer):
+    """Measures every pass that is drawn after :meth:`start`; draw by draw when ``each`` is set."""
+
+    def __init__(self, gl, scene, config):
+        super().__init__(gl, scene, config)
+        self._watch = Stopwatch(gl)
+        self.each, self.result, self._running, self._variant = False, Draws(), False, ""
+
+    def release(self) -> None:
+        self._watch.release()
+        super().release()
+
+    def start(self, each: bool) -> None:
+        self.each, self.result = each, Draws()
+
+    def _begin(self, target, moment, background):
+        if not self.each:
+            self._watch.start()
+            self._wall, self._running = time.perf_counter(), True
+        super()._begin(target, moment, background)
+
+    def _bind(self, name, item, moment, defines):
+        material = [word for word, on in (("TEXTURED", item.textured), ("LIT", item.lit), ("TWO_SIDED", item.two_sided)) if on]
+        self._variant = " ".join([name, *(d.removeprefix("OUT_") for d in defines), *material])
+        return super()._bind(name, item, moment, defines)
+
+    def _draw(self, uniforms, item):
+        triangles = len(item.mesh.faces)
+        if self.each:
+            self._watch.start()
+            super()._draw(uniforms, item)
+            ms, fragments = self._watch.stop()
+            one = self.result.variants.setdefault(self._variant, Draws())
+            one.gpu_ms, one.fragments = one.gpu_ms + ms, one.fragments + fragments
+            one.draws, one.triangles = one.draws + 1, one.triangles + triangles
+        else:
+            super()._draw(uniforms, item)
+        self.result.draws += 1
+        self.result.triangles += triangles
+
+    def _read(self, target, index, started, out):
+        if self._running:
+            ms, fragments = self._watch.stop()
+            self._running = False
+            self.result.gpu_ms += ms
+            self.result.fragments += fragments
+            self.result.wall_ms += (time.perf_counter() - self._wall) * 1e3
+        return super()._read(target, index, started, out)
+
+
+def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
+    """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that generation runs for this configuration."""
+    config = subject.config
+    labels, render = config.labels, config.render
+    out = {"luminance": (lambda r: r.luminance(when.t_ns), render.supersample)}
+    if config.timeline.kind == "displacement":
+        reduce = getattr(config.timeline, "sample_every", 1)
+        out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, reduce), 1 / reduce)
+    if labels.images or config.preview.enabled:
+        out["colour"] = (lambda r: r.colour(when.t_ns), render.image_supersample)
+    request = LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
+                           flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=False)
+    occlusion = labels.occlusion and (request.flow_forward or request.flow_backward)
+    if occlusion:
+        request = replace(request, ids=True)
+    if any(vars(request).values()):
+        out["labels"] = (lambda r: r.labels(when.t_ns, request, when.forward_ns, when.backward_ns), 1)
+    if occlusion:
+        out["occlusion, per direction"] = (lambda r: r.raw(when.forward_ns, "DEPTH", "ID"), 1)
+    return out
+
+
+def measure(subject: Subject, when: When, shaders: str | None = None, repeat: int = 15) -> dict:
+    """Plain data (JSON): renderer, resolution, and per pass the medians over ``repeat`` runs. Times in ms."""
+    with open_renderer(subject, shaders, as_configured=True) as opened:
+        gl, config = opened.gl, subject.config.render
+        out = {"config": subject.path, "sequence": subject.index, "t_s": when.t_ns * 1e-9, "renderer": gl.renderer, "version": gl.version,
+               "software": gl.is_software, "width": opened.width, "height": opened.height, "repeat": repeat, "passes": []}
+        with TimedRenderer(gl, subject.scene, config) as full, TimedRenderer(gl, half_scene(subject.scene), config) as half:
+            ratio = full.width * full.height / (half.width * half.height)
+            for name, (call, scale) in passes_of(subject, when).items():
+                out["passes"].append(_measure_pass(name, call, scale, full, half, ratio, repeat))
+    return out
+
+
+def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, ratio: float, repeat: int) -> dict:
+    runs: dict[str, list[Draws]] = {"full": [], "half": [], "each": []}
+    for k in range(repeat + 1):
+        for kind, renderer in (("full", full), ("half", half), ("each", full)):  # interleaved: drift of the machine hits all alike
+            renderer.start(each=kind == "each")
+            call(renderer)
+            if k:
+                runs[kind].append(renderer.result)
+
+    def median(kind, key="gpu_ms"):
+        return float(np.median([getattr(run, key) for run in runs[kind]]))
+
+    whole, small, first = median("full"), median("half"), runs["full"][0]
+    # noise may put the split outside [0, whole]
+    fragment = min(whole, max(0.0, (whole - small) * ratio / (ratio - 1))) if ratio > 1 else 0.0
+    pixels = int(full.width * scale) * int(full.height * scale)
+    fragments = first.fragments - (full.width * full.height if scale > 1 else 0)  # less those of the box filter
+    variants = []
+    for variant, one in runs["each"][0].variants.items():
+        ms = float(np.median([run.variants[variant].gpu_ms for run in runs["each"]]))
+        variants.append({"variant": variant, "gpu_ms": ms, "draws": one.draws, "triangles": one.triangles, "fragments": one.fragments})
+    variants.sort(key=lambda v: -v["gpu_ms"])
+    return {"pass": name, "gpu_ms": whole, "wall_ms": median("full", "wall_ms"), "half_gpu_ms": small, "fragment_ms": fragment,
+            "vertex_ms": whole - fragment, "draws": first.draws, "triangles": first.triangles, "fragments": fragments,
+            "overdraw": fragments / pixels, "variants": variants}
+
+
+def as_text(result: dict) -> str:
+    lines = [f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x {result['height']} px, "
+             f"{result['renderer']}, median of {result['repeat']}",
+             "", f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} {'fragments':>10} {'overdraw':>8}"]
+    for p in result["passes"]:
+        lines.append(f"{p['pass']:<26} {p['gpu_ms']:>8.3f} {p['wall_ms']:>8.3f} {p['vertex_ms']:>8.3f} {p['fragment_ms']:>8.3f} {p['draws']:>6} "
+                     f"{p['triangles']:>9} {p['fragments']:>10} {p['overdraw']:>8.2f}")
+    lines += ["", "per program variant, each draw waited for (the sum exceeds the pass):"]
+    for p in result["passes"]:
+        for v in p["variants"]:
+            lines.append(f"  {p['pass']:<24} {v['gpu_ms']:>8.3f} ms {v['draws']:>5} draws {v['triangles']:>8} triangles {v['fragments']:>9} fragments  {v['variant']}")
+    return "\n".join(lines)

@@ -1,0 +1,44 @@
+"""Every program in every variant that the renderer compiles for some configuration and scene.
+
+The table mirrors :class:`blinkgl.render.renderer.Renderer`; a test records what the renderer asks for and compares."""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+
+LABEL_OUTPUTS = ("DEPTH", "ID", "NORMAL", "VELOCITY", "FLOW_FORWARD", "FLOW_BACKWARD")
+MATERIALS = ("TEXTURED", "LIT", "TWO_SIDED")
+FACTORS = (2, 4)
+
+
+def materials() -> list[dict[str, int]]:
+    """Defines of every kind of material."""
+    return [{name: 1 for name, on in zip(MATERIALS, switches) if on} for switches in product((False, True), repeat=len(MATERIALS))]
+
+
+def label_outputs() -> list[dict[str, int]]:
+    """Defines of every combination of label buffers; colour is drawn alone because it is super-sampled."""
+    out = [{"OUT_COLOUR": 0}]
+    for count in range(1, len(LABEL_OUTPUTS) + 1):
+        out += [{f"OUT_{name}": i for i, name in enumerate(names)} for names in combinations(LABEL_OUTPUTS, count)]
+    return out
+
+
+def debug_outputs() -> dict[str, int]:
+    """Defines of the debugger's own pass."""
+    from blinkgl.tools.shader_debugger.session import DebugRenderer
+
+    return {f"OUT_{name}": i for i, (name, _) in enumerate(DebugRenderer.OUTPUTS)}
+
+
+def variants(program: str) -> list[dict[str, int]] | None:
+    """Defines of every variant of a program file; None for a file the renderer does not know."""
+    if program == "luminance.glsl":
+        return materials()
+    if program == "label.glsl":
+        return [outputs | material for outputs in label_outputs() for material in materials()]
+    if program == "downsample.glsl":
+        return [{"FACTOR": factor} for factor in FACTORS]
+    if program == "debug.glsl":
+        return [debug_outputs() | material for material in materials()]
+    return None

@@ -110,7 +110,6 @@ class ReferenceV2e:
         self.rebase_ns = int(v2e.REBASE / float(np.median(self.leak[self.leak > 0])) * 1e9) if self.leaks else 2**61
         self.shot_table = v2e.shot_tables(self.on, self.off, *nominal)
         self.refractory = round(config.refractory_us * 1000)
-        self.events_so_far = [0] * self.pixels
         self.release: list[int | None] = [None] * self.pixels
         self.t_ns: int | None = None
 
@@ -215,8 +214,7 @@ class ReferenceV2e:
             after, p, s, reference = event
             rows.append(((self.t_ns + after) // 1000, y, column, p))
             if self.leaks and self.config.leak_jitter:
-                self.events_so_far[i] += 1
-                n = rough_normal(self.seed, np.uint64(i), np.uint64(Stream.LEAK_JITTER), np.uint64(self.events_so_far[i]))
+                n = rough_normal(self.seed, np.uint64(i), np.uint64(Stream.LEAK_JITTER), np.uint64(self.t_ns + after))
                 self.leak[i] = np.float32(self.mean_leak[i] / max(0.1, 1.0 + self.config.leak_jitter * n))
                 change = f(self.leak[i]) - leak
                 leak += change

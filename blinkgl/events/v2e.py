@@ -10,7 +10,7 @@ continuous time, so that nothing but the accuracy of the interpolation depends o
   method), not on frame times.
 * After any event the reference is z at the end of the dead time: with no refractory period the level just passed,
   with one whatever the signal has become, so that change during the dead time never comes out as a backlog.
-* Leak is a drift of the reference; with jitter each event draws the length of the pixel's next leak interval.
+* Leak is a drift of the reference; with jitter each event draws the length of the pixel's next leak interval (keyed by its own time).
   Hot pixels are pixels with a large leak.
 * Shot noise is a Poisson process per block of 1024 pixels at its rate in the dark, thinned to
   each pixel's own rate (R/2)(1 - 0.75 (I + 20)/275) theta_nominal/theta per polarity at that instant.
@@ -197,11 +197,8 @@ class Pixels(NamedTuple):
     noise: np.ndarray  # float32 photoreceptor noise, standard normal; []
     upper: np.ndarray  # float32 levels; -inf and +inf in the dead time, so that the pixel is looked at
     lower: np.ndarray
-    on: np.ndarray  # float32 thresholds, constant
-    off: np.ndarray
-    leak: np.ndarray  # float32, per second; changes with jitter
-    leak_mean: np.ndarray
-    fired: np.ndarray  # int32 count of events, for the jitter's draws
+    constants: np.ndarray  # (N, 4) float32: ON threshold, OFF threshold, mean leak per second, 0
+    leak: np.ndarray  # (N,) float32, per second; changes with jitter
     release: np.ndarray  # int64 ns, end of the dead time or NEVER
     clock_ns: np.ndarray  # (blocks,) int64 time of the next shot-noise candidate; []
     clock_index: np.ndarray  # (blocks,) int64 its number
@@ -324,7 +321,7 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
 
 
 @numba.njit(**JIT)
-def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, begin):
+def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap, packed, begin):
     """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves levels.
 
     ``now``: (intensity, x, lag, noise) of the block at the interval's end. Returns (end of the events, cut)."""
@@ -334,6 +331,9 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
     start_ns, end_ns = v.t0_ns - 1000 * v.base_us, v.t0_ns + v.dt_ns
     y = first // v.width
     row_end = (y + 1) * v.width
+    for j in range(count):  # by themselves, so that the cache misses overlap
+        for c in range(3):
+            constants[j, c] = p.constants[active[j], c]
     for j in range(count):
         i = np.int64(active[j])
         o = i - first
@@ -358,9 +358,9 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
         if p.lag.size:
             end += np.float64(lag_now[o])
         up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
-        on, off = np.float64(p.on[i]), np.float64(p.off[i])
+        on, off = np.float64(constants[j, 0]), np.float64(constants[j, 1])
         s, now_ns, dead = 0.0, np.int64(0), False
-        if p.release.size and p.release[i] != NEVER_NS:
+        if p.release.size and up == -np.inf:
             if p.release[i] > end_ns:
                 dead = True
             else:
@@ -368,7 +368,6 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
                 s = now_ns / dt_ns
                 reference = signal_at(s, c, rise, fall, k)
                 up, down = reference + on, reference - off
-                p.release[i] = NEVER_NS
         while noise < noise_end and (keys[noise] >> 42) < o:
             noise += 1
         emitted = 0
@@ -400,10 +399,9 @@ def _emit_block(active, count, first, now, keys, noise_end, p, v, cap, packed, b
             else:
                 cut += 1
             s, now_ns = event_s, event_ns
-            if p.fired.size:
-                p.fired[i] += 1
-                a = rough_normal(v.seed, np.uint64(i), _LEAK_JITTER, np.uint64(p.fired[i]))
-                p.leak[i] = np.float32(p.leak_mean[i] / max(0.1, 1.0 + v.leak_jitter * a))
+            if v.leak_jitter > 0.0:
+                a = rough_normal(v.seed, np.uint64(i), _LEAK_JITTER, np.uint64(v.t0_ns + event_ns))
+                p.leak[i] = np.float32(constants[j, 2] / max(0.1, 1.0 + v.leak_jitter * a))
                 change = np.float64(p.leak[i]) - leak
                 leak += change
                 reference += change * (v.since_epoch_0 + s * dt)  # the same reference, seen from the new drift
@@ -434,7 +432,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
     z, intensity, x, lag, noise = (np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
                                    np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32))
-    keys = np.empty(BLOCK, np.int64)
+    keys, constants = np.empty(BLOCK, np.int64), np.empty((BLOCK, 3), np.float32)
     kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
     for block in range(first_block, stop_block):
         s = block * BLOCK
@@ -471,7 +469,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             if filled + count * cap > packed.size:
                 return block, filled, cut
             now = (intensity, x, lag, noise)
-            filled, cut_here = _emit_block(active, count, s, now, keys, shots, p, v, cap, packed, filled)
+            filled, cut_here = _emit_block(active, count, s, now, constants, keys, shots, p, v, cap, packed, filled)
             cut += cut_here
         copy_block(intensity[:n], p.intensity[s:e])
         copy_block(x[:n], p.x[s:e])
@@ -497,7 +495,7 @@ class V2e(Emulator):
     State: 16 bytes per pixel, 4 more with the low-pass, 8 with the dead time, 8 with leak and its jitter, 4 with
     photoreceptor noise; thresholds are constants."""
 
-    _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_fired", "_release", "_clock_ns",
+    _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",
               "_clock_index", "_epoch_ns", "_brightest")
 
     def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0):
@@ -511,10 +509,12 @@ class V2e(Emulator):
         self._intensity, self._x, self._upper, self._lower = (frame() for _ in range(4))
         self._lag, self._noise = frame(config.cutoff_hz > 0), frame(False)
 
-        self._leak_mean = draw_leaks(height, width, config, self._on, self.seed)
-        self._leak = self._leak_mean.copy()
-        jitters = bool(self._leak.size and config.leak_jitter)
-        self._fired = np.zeros(pixels if jitters else 0, np.int32)
+        self._leak = draw_leaks(height, width, config, self._on, self.seed)
+        self._constants = np.zeros((pixels, 4), np.float32)
+        self._constants[:, 0], self._constants[:, 1] = self._on, self._off
+        if self._leak.size:
+            self._constants[:, 2] = self._leak
+        self._leak_jitter = config.leak_jitter if self._leak.size else 0.0
         self._rebase_ns = 2**61
         if self._leak.size and self._leak.max() > 0:
             self._rebase_ns = int(REBASE / float(np.median(self._leak[self._leak > 0])) * 1e9)
@@ -559,15 +559,14 @@ class V2e(Emulator):
         if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > config.max_events_per_step:
             raise EventDataError("more shot noise than max_events_per_step in one interval", where=f"frame {self.frames}",
                                  value=f"{dt_ns} ns", accepted="a shorter interval or a lower shot_noise_rate_hz")
-        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._upper, self._lower, self._on, self._off,
-                        self._leak, self._leak_mean, self._fired, self._release, self._clock_ns, self._clock_index,
-                        self._shot_table)
+        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._upper, self._lower, self._constants,
+                        self._leak, self._release, self._clock_ns, self._clock_index, self._shot_table)
         base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
         brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
         gentle = kappa * (max(brightest, self._brightest[0]) + 20.0) < 0.499
         interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9, kappa, gentle, self._scale, self.seed, self.width,
-                            self._refractory_ns, config.leak_jitter, self._shot_unit, self._inverse_threshold,
+                            self._refractory_ns, self._leak_jitter, self._shot_unit, self._inverse_threshold,
                             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         events = self._run(_band, _bands, (*source, self._table, self._x_table, pixels, interval), base_us,

@@ -1,6 +1,6 @@
 """The ``blinkgl`` command: thin functions over the library, one line per error.
 
-Exit status: 0 done, 2 the user's input or machine (``error: …`` on stderr, one line), 130 interrupted. A traceback means a
+Exit status: 0 done, 3 done but for sequences that were set aside, 2 the user's input or machine (``error: …`` on stderr, one line), 130 interrupted. A traceback means a
 bug in BlinkGL, or ``--debug``. Commands import what they need inside the function, so that ``--help`` answers at once.
 """
 
@@ -65,11 +65,42 @@ def generate(
     seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
     overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+    workers: Annotated[Optional[int], typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
+    executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
+    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: a local one).")] = None,
+    gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
+    devices: Annotated[Optional[str], typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,
+    mixed: Annotated[bool, typer.Option("--mixed", help="Go on although recipe, assets or software have changed since the run began.")] = False,
+    time_limit: Annotated[float, typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers.")] = 3600.0,
 ) -> None:
-    """Generate event + optical-flow sequences from one YAML file."""
-    from blinkgl.dataset.show import generate_with_progress
+    """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but some sequences were set aside."""
+    from blinkgl.dataset.choose import choose_executor
+    from blinkgl.dataset.show import SET_ASIDE, generate_with_progress
 
-    generate_with_progress(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet)
+    chosen = choose_executor(executor, workers, address=address, gpus=gpus, devices=devices)
+    outcome = generate_with_progress(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet, executor=chosen, resume=resume,
+                                     mixed=mixed, time_limit_s=time_limit)
+    if outcome.set_aside:
+        if quiet:
+            for name, reason in sorted(outcome.set_aside.items()):
+                typer.echo(f"set aside: {name}: {reason}", err=True)
+        raise typer.Exit(SET_ASIDE)
+
+
+@app.command()
+def verify(
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, split or sequence.")],
+    deep: Annotated[bool, typer.Option("--deep", help="Also generate a sample of sequences again and compare bit by bit.")] = False,
+    sample: Annotated[int, typer.Option(min=1, help="How many sequences --deep makes again.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
+    base: Annotated[Optional[str], typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
+) -> None:
+    """Check a data set: manifests, checksums, contents. Exit status 2 when something is wrong."""
+    from blinkgl.dataset.check import verify_and_show
+
+    if not verify_and_show(folder, deep=sample if deep else 0, seed=seed, base=base):
+        raise typer.Exit(BlinkGLError.exit_status)
 
 
 @app.command()

@@ -140,6 +140,7 @@ def _manifest(config: SequenceConfig, index: int, folder: Path, files: list[Path
     import numba
 
     return {"blinkgl": blinkgl.__version__, "seed": config.seed, "sequence": index, "split": config.output.split,
+            "emulator": config.events.emulator,
             "versions": {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__, "opencv": cv2.__version__},
             "frames": report.frames, "labels": report.labels, "duration_us": end_ns // 1000,
             "source": {"folder": folder.name, "images": len(files), "first": files[0].name, "last": files[-1].name}}

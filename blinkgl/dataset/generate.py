@@ -178,6 +178,7 @@ def manifest_info(config: SequenceConfig, index: int, scene: Scene, gl: GLContex
         "seed": config.seed,
         "sequence": index,
         "split": config.output.split,
+        "emulator": config.events.emulator,
         "frames": report.frames,
         "labels": report.labels,
         "triangles": triangles,

@@ -33,6 +33,13 @@ def split_of(source_hash: str, test_fraction: float) -> str:
     return "test" if int(source_hash[:13], 16) < test_fraction * 16**13 else "train"
 
 
+class ChangedAsset(AssetError):
+    """A file is not what it was when the pool was listed: which scenes are drawn would depend on when it was looked at."""
+
+    def __init__(self, file: Path):
+        super().__init__("the file has changed while it was in use", where=str(file), accepted="the file as it was, or a new run")
+
+
 @dataclass(frozen=True)
 class Entry:
     """One mesh or texture that can be loaded. ``source`` is the folder or kind of source, ``file`` None for generated ones."""
@@ -98,6 +105,8 @@ class Pool:
             entry = entries[int(rng.integers(len(entries)))]
             try:
                 return self.load(entry)
+            except ChangedAsset:  # skipping it would quietly make another scene
+                raise
             except AssetError as error:
                 if self.bad_assets == "error":
                     raise
@@ -134,6 +143,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
             return Asset(entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)).normalised()
         asset = load_asset(entry.file, max_faces=config.max_faces, max_bytes=limit, keep_materials=config.keep_materials,
                            max_texture=max_texture, source_hash=entry.source_hash)
+        _same_content(entry, content_hash(entry.file.read_bytes(), *dependencies(entry.file)))
         return asset.normalised()
 
     return Pool(_listed(entries), load, config.test_fraction, where, "meshes", config.bad_assets)
@@ -160,9 +170,15 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
             data = entry.file.read_bytes()
         except OSError as error:
             raise AssetError(f"cannot read the image: {error.strerror or error}", where=str(entry.file)) from None
+        _same_content(entry, content_hash(data))
         return Texture(decode_image(data, config.max_size, str(entry.file)), entry.name, entry.source_hash)
 
     return Pool(_listed(entries), load, config.test_fraction, where, "textures", config.bad_assets)
+
+
+def _same_content(entry: Entry, found: str) -> None:
+    if found != entry.source_hash:
+        raise ChangedAsset(entry.file)
 
 
 def resolve(path: str, base: Path) -> Path:

@@ -1,0 +1,236 @@
+"""Who makes the sequences: this process, or a pool of processes on this machine. (Many machines: :mod:`blinkgl.dataset.cluster`.)
+
+All keep one contract, so that the loop in :mod:`blinkgl.dataset.run` does not know which it has:
+
+    open(job)               ready to work, or BlinkGLError. Returns the workers' hellos.
+    free()                  how many more tasks it would start on at once
+    submit(task, attempt)
+    poll(timeout_s)         messages that came in meanwhile; a worker that died is a "failed" of its task
+    kill(task, reason)      the task took too long
+    close()                 stops everything, waits, leaves no half sequence and no process
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol
+
+from blinkgl.dataset.work import RUN_FOLDER, Job, Maker, Message, thread_environment
+from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.gl.context import egl_devices
+
+_START_S = 600.0    # compiling every kernel for the first time on a slow machine
+_STOP_S = 20.0
+_BAD_STARTS = 3
+
+
+class Executor(Protocol):
+    listener: Callable[[Message], None]
+    """Called with progress that does not come by ``poll`` (:class:`Inline`)."""
+
+    def open(self, job: Job) -> list[Message]: ...
+    def free(self) -> int: ...
+    def submit(self, task: int, attempt: int) -> None: ...
+    def poll(self, timeout_s: float) -> list[Message]: ...
+    def kill(self, task: int, reason: str) -> None: ...
+    def close(self) -> None: ...
+
+
+class Inline:
+    """This process. No time limit: nobody is there to stop it."""
+
+    def __init__(self) -> None:
+        self.listener: Callable[[Message], None] = lambda message: None
+        self._maker: Maker | None = None
+        self._next: tuple[int, int] | None = None
+
+    def open(self, job: Job) -> list[Message]:
+        self._maker = Maker(job)
+        return [self._maker.open()]
+
+    def free(self) -> int:
+        return int(self._next is None)
+
+    def submit(self, task: int, attempt: int) -> None:
+        self._next = (task, attempt)
+
+    def poll(self, timeout_s: float) -> list[Message]:
+        if self._next is None:
+            return []
+        (task, attempt), self._next = self._next, None
+        return [self._maker.make(task, attempt, self.listener)]
+
+    def kill(self, task: int, reason: str) -> None:
+        raise AssertionError("a task of this process is over when poll returns")
+
+    def close(self) -> None:
+        if self._maker is not None:
+            self._maker.__exit__()
+
+
+class Local:
+    """``workers`` processes, each with its own OpenGL context and its share of the cores.
+
+    devices : EGL devices, dealt out to the workers in turn. Default: all graphics cards there are, if there are several
+        and the configuration asks for no other than the first; else the configuration's.
+
+    A worker that dies is replaced. Workers have sessions of their own, so that Ctrl-C reaches only the driver, and leave when
+    the driver's end of their standard input closes, however it died.
+    """
+
+    def __init__(self, workers: int, devices: list[int] | None = None):
+        if workers < 1:
+            raise ConfigError("too few", where="--workers", value=workers, accepted="1 or more")
+        self.listener: Callable[[Message], None] = lambda message: None
+        self._wanted, self._devices = workers, devices
+        self._processes: list[_Process] = []
+        self._selector = selectors.DefaultSelector()
+        self._bad_starts = 0
+
+    def open(self, job: Job) -> list[Message]:
+        self._job = job
+        if self._devices is None:
+            self._devices = several_cards(job)
+        self._environment = {**os.environ, **thread_environment(self._wanted, len(os.sched_getaffinity(0)))}
+        for slot in range(self._wanted):
+            self._start(slot)
+        hellos, deadline = [], time.monotonic() + _START_S
+        while len(hellos) < self._wanted:
+            hellos += [m for m in self.poll(1.0) if m["kind"] == "hello"]
+            if time.monotonic() > deadline:
+                raise BlinkGLError(f"workers did not start within {_START_S:.0f} s", where="--workers",
+                                   accepted=f"see {self._log(0)}")
+        return hellos
+
+    def free(self) -> int:
+        return sum(p.ready and p.task is None for p in self._processes)
+
+    def submit(self, task: int, attempt: int) -> None:
+        process = next(p for p in self._processes if p.ready and p.task is None)
+        process.task = task
+        process.send({"task": task, "attempt": attempt})
+
+    def poll(self, timeout_s: float) -> list[Message]:
+        messages: list[Message] = []
+        for key, _ in self._selector.select(timeout_s):
+            process: _Process = key.data
+            lines, ended = process.read()
+            for message in lines:
+                if message["kind"] == "refused":
+                    raise BlinkGLError(message["error"])
+                if message["kind"] == "hello":
+                    process.ready, self._bad_starts = True, 0
+                if message["kind"] in ("done", "failed"):
+                    process.task = None
+                messages.append(message)
+            if ended:
+                messages += self._bury(process)
+        return messages
+
+    def kill(self, task: int, reason: str) -> None:
+        for process in self._processes:
+            if process.task == task:
+                process.reason = reason
+                process.popen.kill()
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.stop()
+        deadline = time.monotonic() + _STOP_S
+        for process in self._processes:
+            try:
+                process.popen.wait(max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.popen.kill()
+                process.popen.wait()
+            process.close()
+        self._processes.clear()
+        self._selector.close()
+
+    def _start(self, slot: int) -> None:
+        device = self._devices[slot % len(self._devices)] if self._devices else None
+        process = _Process(slot, self._log(slot), self._environment)
+        self._processes.append(process)
+        self._selector.register(process.channel, selectors.EVENT_READ, process)
+        process.send({"job": self._job.to_dict(), "device": device})
+
+    def _bury(self, process: "_Process") -> list[Message]:
+        """The process ended by itself: its task failed, and another takes its place."""
+        self._selector.unregister(process.channel)
+        self._processes.remove(process)
+        status = process.popen.wait()
+        process.close()
+        how = process.reason or (f"the worker was ended by {signal.Signals(-status).name}" if status < 0 else f"the worker ended with status {status}")
+        if not process.ready:
+            self._bad_starts += 1
+            if self._bad_starts >= _BAD_STARTS:
+                raise BlinkGLError(f"workers cannot start: {how}", where="--workers", accepted=f"see {process.log}")
+        self._start(process.slot)
+        return [] if process.task is None else [{"kind": "failed", "task": process.task, "error": how, "final": False, "stop": False}]
+
+    def _log(self, slot: int) -> Path:
+        return Path(self._job.out) / RUN_FOLDER / "logs" / f"worker-{slot}.log"
+
+
+class _Process:
+    """One worker process and the two pipes to it."""
+
+    def __init__(self, slot: int, log: Path, environment: dict[str, str]):
+        self.slot, self.log = slot, log
+        self.ready, self.task, self.reason = False, None, ""
+        self._rest = b""
+        self.channel, write_end = os.pipe()
+        try:
+            log.parent.mkdir(parents=True, exist_ok=True)
+            output = open(log, "ab")
+        except OSError:
+            output = open(os.devnull, "ab")
+        with output:
+            self.popen = subprocess.Popen([sys.executable, "-m", "blinkgl.dataset.worker", str(write_end)], stdin=subprocess.PIPE,
+                                          stdout=output, stderr=output, pass_fds=(write_end,), env=environment, start_new_session=True)
+        os.close(write_end)
+
+    def send(self, order: dict) -> None:
+        try:
+            self.popen.stdin.write(json.dumps(order).encode() + b"\n")
+            self.popen.stdin.flush()
+        except OSError:  # it died this moment; the end of its channel tells
+            pass
+
+    def read(self) -> tuple[list[Message], bool]:
+        """Whole messages that have come, and whether the channel has ended."""
+        data = os.read(self.channel, 1 << 16)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        return [json.loads(line) for line in lines if line], not data
+
+    def stop(self) -> None:
+        if self.popen.poll() is None:
+            self.popen.terminate()
+        try:
+            self.popen.stdin.close()
+        except OSError:
+            pass
+
+    def close(self) -> None:
+        try:
+            self.popen.stdin.close()
+        except OSError:
+            pass
+        os.close(self.channel)
+
+
+def several_cards(job: Job) -> list[int] | None:
+    """The machine's graphics cards as EGL devices, when there are several and the configuration leaves the choice open."""
+    wanted = [group.template.check().gl for group in job.plan().used]
+    if any(gl.backend == "osmesa" or gl.device != 0 for gl in wanted) or os.environ.get("GLCONTEXT_DEVICE_INDEX"):
+        return None
+    cards = [number for number, text in enumerate(egl_devices()) if "software" not in text.lower()]
+    return cards if len(cards) > 1 else None

@@ -1,0 +1,190 @@
+"""The hidden folder ``.run`` of a data set: which recipe it is made of, what was logged, what it cost.
+
+    .run/run.json       groups' hashes, versions, OpenGL, where the recipe's relative paths start
+    .run/recipe.yaml    the recipe with all overrides      .run/assets.json   content hashes of the pools' files
+    .run/costs.jsonl    one line per sequence made: wall seconds by stage, bytes, memory, attempts
+    .run/failed.json    sequences that were set aside, and why
+    .run/logs/          one log per sequence, one per worker
+    .run/damaged/       what was found under a sequence's name and was not whole
+
+Times and paths of machines live here and nowhere else in a data set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import re
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from blinkgl.dataset.plan import Plan, Task
+from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
+from blinkgl.errors import OutputError
+from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
+from blinkgl.io.sequence_dir import verify_sequence
+
+FORMAT = "blinkgl-run"
+_FORSAKEN_S = 3600.0
+_TEMPORARY = re.compile(r"^\.(.+)\.blinkgl-tmp-")
+
+
+class RunFolder:
+    """``.run`` below ``out``. Reading is free; writing needs :meth:`locked`, then :meth:`begin`."""
+
+    def __init__(self, out: Path):
+        self.out, self.path = out, out / RUN_FOLDER
+        self.begun = False
+        self.environment: dict[str, str] = {}
+
+    # ---- may this run go on here? ---------------------------------------------------------------------------------
+
+    def check(self, plan: Plan, assets: dict[str, str], mixed: bool) -> None:
+        """OutputError when the folder holds a run of another recipe or of other assets, unless ``mixed``."""
+        known = self.read("run.json")
+        if known is None or mixed:
+            return
+        if known.get("groups") != plan.identity:
+            ours, theirs = plan.identity, known.get("groups") or {}
+            names = sorted(n or "the configuration" for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n))
+            raise OutputError(f"holds the run of another recipe (different: {', '.join(names)})", where=str(self.out),
+                              accepted="another --out, or --mixed to add to it all the same")
+        before = self.read("assets.json")
+        if before is not None and before != assets:
+            changed = sorted(n for n in before.keys() | assets.keys() if before.get(n) != assets.get(n))
+            how = ["changed" if n in before and n in assets else "gone" if n in before else "new" for n in changed]
+            said = ", ".join(f"{n} ({h})" for n, h in list(zip(changed, how))[:3]) + (" …" if len(changed) > 3 else "")
+            raise OutputError(f"the pools are not those the run began with: {said}", where=str(self.out),
+                              accepted="the same files, or --mixed to go on with these")
+
+    def check_environment(self, environment: dict[str, str], mixed: bool) -> None:
+        """OutputError when the run began with other versions or another OpenGL, unless ``mixed``."""
+        known = (self.read("run.json") or {}).get("environment") or {}
+        if not mixed and (different := [f"{k} {known[k]}, now {v}" for k, v in environment.items() if k in known and known[k] != v]):
+            raise OutputError("the run began with another installation: " + "; ".join(different), where=str(self.out),
+                              accepted="the same, or --mixed to go on with this one (bytes may differ)")
+
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """One run at a time per folder; the lock goes when the process does. Makes the folder."""
+        with output_errors(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)
+            handle = os.open(self.out, os.O_RDONLY)
+        try:
+            if not os.access(self.out, os.W_OK | os.X_OK):
+                raise OutputError("cannot be written", where=str(self.out), accepted="a folder you may write to")
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise OutputError("another run is at work in this folder", where=str(self.out)) from None
+            except OSError:  # a file system without locks
+                pass
+            yield
+        finally:
+            os.close(handle)
+
+    # ---- sequences ------------------------------------------------------------------------------------------------
+
+    def state(self, name: str) -> str | None:
+        """None: not there. "": whole, as far as file sizes tell. Else what is wrong with it."""
+        path = self.out / name
+        if not path.exists() and not path.is_symlink():
+            return None
+        if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
+            return None
+        if path.is_symlink() or not path.is_dir():
+            return "not a folder"
+        return "; ".join(verify_sequence(path, checksums=False)[:1])
+
+    def put_away(self, name: str) -> None:
+        """Moves what lies at a sequence's name, and is not whole, to ``damaged/``: it is not ours to delete."""
+        target = self.path / "damaged" / name
+        with output_errors(target):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            number = 0
+            while (final := target.with_name(f"{target.name}-{number}")).exists() or final.is_symlink():
+                number += 1
+            os.rename(self.out / name, final)
+
+    def sweep(self, plan: Plan) -> None:
+        """Removes what dead writers of this run left. Those of another machine or an earlier boot cannot be asked whether they
+        live: theirs go when nothing has touched them for an hour."""
+        names = {self.out / task.name for task in plan.tasks}
+        for folder in {name.parent for name in names} | {self.out, self.path}:
+            with contextlib.suppress(OSError):
+                remove_stale(folder)
+                for path in folder.iterdir() if folder.is_dir() else ():
+                    match = _TEMPORARY.match(path.name)
+                    if match and folder / match.group(1) in names and not path.is_symlink() and _untouched_s(path) > _FORSAKEN_S:
+                        shutil.rmtree(path, ignore_errors=True)
+
+    # ---- records --------------------------------------------------------------------------------------------------
+
+    def begin(self, plan: Plan, assets: dict[str, str], environment: dict[str, str], num: int | None) -> None:
+        """Writes what identifies the run. Its record of the beginning stays: ``mixed`` does not launder a data set."""
+        self.environment = environment
+        known = self.read("run.json") or {"environment": environment, "groups": plan.identity}
+        later = known.get("mixed", [])
+        if (known["environment"], known["groups"]) != (environment, plan.identity):
+            later = [*later, {"environment": environment, "groups": plan.identity}]
+        self._write("run.json", {"format": FORMAT, "format_version": 1, "groups": known["groups"], "environment": known["environment"],
+                                 "mixed": later, "base": str(plan.template.base.resolve()), "num": num})
+        self._write("assets.json", assets)
+        with atomic_file(self.path / "recipe.yaml") as path, output_errors(path):
+            path.write_text(plan.recipe_text(), encoding="utf-8")
+        self.begun = True
+
+    def add_cost(self, task: Task, message: Message, attempt: int) -> None:
+        line = {"name": task.name, "group": task.group, **{k: v for k, v in message["report"].items() if k not in ("path", "index")},
+                "bytes": message["bytes"], "peak_rss_kib": message["peak_rss_kib"], "attempts": attempt, "when": time.time()}
+        with contextlib.suppress(OSError), open(self.path / "costs.jsonl", "a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def log(self, name: str, text: str) -> None:
+        SequenceLog(self.out, name).write(text)
+
+    def write_failures(self, set_aside: dict[str, str], plan: Plan) -> None:
+        """Those of this run, and of runs before it that are still not whole."""
+        before = self.read("failed.json") or {}
+        still = {name: reason for name, reason in {**before, **set_aside}.items() if self.state(name) != ""}
+        with contextlib.suppress(OutputError):
+            if still or before:
+                self._write("failed.json", still)
+
+    def costs(self) -> list[dict[str, Any]]:
+        """The last line of each sequence; a line cut by a crash is left out."""
+        found: dict[str, dict[str, Any]] = {}
+        with contextlib.suppress(OSError, UnicodeDecodeError):
+            for line in (self.path / "costs.jsonl").read_text(encoding="utf-8").splitlines():
+                with contextlib.suppress(ValueError, KeyError, TypeError):
+                    entry = json.loads(line)
+                    found[entry["name"]] = entry
+        return list(found.values())
+
+    def read(self, name: str) -> dict[str, Any] | None:
+        """A JSON file of the folder; None when there is none. OutputError when it is damaged."""
+        path = self.path / name
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            if not isinstance(data, dict):
+                raise ValueError
+            return data
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise OutputError("the run's record is damaged", where=str(path), accepted="a readable file; without it the run cannot be told "
+                              "from another recipe's") from error
+
+    def _write(self, name: str, data: dict[str, Any]) -> None:
+        with atomic_file(self.path / name) as path, output_errors(path):
+            path.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _untouched_s(path: Path) -> float:
+    newest = max((p.lstat().st_mtime for p in (path, *path.rglob("*"))), default=0.0)
+    return time.time() - newest

@@ -1,0 +1,178 @@
+"""What every worker does, whoever started it: one process, one OpenGL context, one set of numba threads, one sequence after another.
+
+A :class:`Job` says what the run is; a :class:`Maker` turns task numbers into sequence directories and plain-data messages
+(dicts that JSON can carry):
+
+    {"kind": "hello", "pid", "environment", "assets"}          ready
+    {"kind": "progress", "task", "frames", "events", "fraction"}
+    {"kind": "done", "task", "report": {…}, "bytes", "peak_rss_kib"}
+    {"kind": "failed", "task", "error": one line, "final": no use trying again, "stop": nor anything else}
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import platform
+import resource
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from blinkgl import __version__
+from blinkgl.config.sequence import RunTemplate, parse_yaml
+from blinkgl.dataset.generate import generate_sequence
+from blinkgl.dataset.plan import Plan, digest
+from blinkgl.dataset.report import SequenceReport
+from blinkgl.errors import BlinkGLError, ConfigError, OutputError
+from blinkgl.gl import GLContext, create_context
+
+Message = dict[str, Any]
+RUN_FOLDER = ".run"
+"""Below the data set: recipe, logs, costs. Readers of the data set skip hidden folders, and nothing in it is compared."""
+_NEWS_EVERY_S = 0.25
+
+
+@dataclass(frozen=True)
+class Job:
+    """A run, in plain data. ``recipe``: YAML text (it keeps what JSON would not, such as integer keys)."""
+
+    out: str
+    base: str
+    recipe: str
+    num: int | None = None
+
+    def plan(self) -> Plan:
+        return Plan.of(RunTemplate(parse_yaml(self.recipe, "recipe"), Path(self.base)), self.num)
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.environ) -> dict[str, str]:
+    """Variables of each of ``workers`` processes on ``cores`` cores: cores are divided, not oversubscribed. What the user has set
+    stays. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) as soon as there are two workers: two processes
+    then draw 1.2-1.35 times as fast as one with two threads."""
+    share = max(1, cores // max(1, workers))
+    wanted = {"NUMBA_NUM_THREADS": str(share), "OMP_NUM_THREADS": str(share), "OPENBLAS_NUM_THREADS": str(share)}
+    if workers > 1:
+        wanted["LP_NUM_THREADS"] = "0" if share == 1 else str(share)
+    return {key: value for key, value in wanted.items() if key not in given}
+
+
+class Maker:
+    """Makes the job's sequences in this process. Use as a context manager; ``open`` before ``make``."""
+
+    def __init__(self, job: Job, device: int | None = None):
+        self.job, self.device = job, device
+        self.plan = job.plan()
+        self.gl: GLContext | None = None
+
+    def open(self) -> Message:
+        """Looks at the assets, makes the OpenGL context, and says hello. Raises BlinkGLError."""
+        assets = self.plan.check_assets()
+        rendered = [group.template.check() for group in self.plan.used]
+        rendered = [config.gl for config in rendered if config.frames is None]
+        if rendered:
+            if any(gl != rendered[0] for gl in rendered):
+                raise ConfigError("the groups ask for different OpenGL", where="gl", accepted="one gl section at the top level")
+            self.gl = create_context(rendered[0].backend, rendered[0].device if self.device is None else self.device)
+        return {"kind": "hello", "pid": os.getpid(), "environment": environment(self.gl), "assets": digest(assets)}
+
+    def make(self, number: int, attempt: int, tell: Callable[[Message], None]) -> Message:
+        """The ``number``-th task of the plan. Returns "done" or "failed"; only KeyboardInterrupt and SystemExit get out."""
+        task = self.plan.tasks[number]
+        log = SequenceLog(self.job.out, task.name)
+        log.write(f"attempt {attempt}, pid {os.getpid()} on {platform.node()}")
+        last = 0.0
+
+        def progress(report: SequenceReport, fraction: float) -> None:
+            nonlocal last
+            if (now := time.monotonic()) - last > _NEWS_EVERY_S:
+                last = now
+                tell({"kind": "progress", "task": number, "frames": report.frames, "events": report.events, "fraction": fraction})
+
+        try:
+            config = self.plan.config(task)
+            report = generate_sequence(config, task.index, self.job.out, self.gl, base=Path(self.job.base), progress=progress)
+        except (KeyboardInterrupt, SystemExit):
+            log.write("interrupted")
+            raise
+        except Exception as error:  # noqa: BLE001 - whatever it is, the other sequences go on
+            line = str(error) if isinstance(error, BlinkGLError) else f"{type(error).__name__}: {' '.join(str(error).split())}"
+            log.write("failed: " + line)
+            log.write(traceback.format_exc())
+            return {"kind": "failed", "task": number, "error": line, "final": isinstance(error, ConfigError), "stop": _disk_is_full(error)}
+        size = sum(p.stat().st_size for p in report.path.rglob("*") if p.is_file())
+        log.write(f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} labels, {size} bytes; "
+                  + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items()))
+        return {"kind": "done", "task": number, "bytes": size, "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+                "report": {**asdict(report), "path": str(report.path)}}
+
+    def __enter__(self) -> "Maker":
+        return self
+
+    def __exit__(self, *_) -> None:
+        if self.gl is not None:
+            self.gl.release()
+            self.gl = None
+
+
+def report_of(message: Message) -> SequenceReport:
+    """The report in a "done" message."""
+    return SequenceReport(**{**message["report"], "path": Path(message["report"]["path"])})
+
+
+def environment(gl: GLContext | None) -> dict[str, str]:
+    """Everything that has a say in the bytes: two machines that agree in it make the same sequences."""
+    import numba
+    import numpy
+    import scipy
+
+    return {"blinkgl": f"{__version__} ({_source_hash()})", "python": platform.python_version(), "machine": platform.machine(), "numpy": numpy.__version__,
+            "scipy": scipy.__version__, "numba": numba.__version__,
+            "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used"}
+
+
+@lru_cache(maxsize=1)
+def _source_hash() -> str:
+    """12 hex digits of the code and shaders that are running: a version number says little about a checkout."""
+    found = hashlib.sha256()
+    for package in ("blinkgl", "blinkgl.shaders"):
+        root = resources.files(package)
+        for path in sorted(Path(str(root)).rglob("*")):
+            if path.suffix in (".py", ".glsl") and not {"configs", "tools", "report"} & set(path.parts):
+                found.update(path.name.encode() + b"\0" + path.read_bytes())
+    return found.hexdigest()[:12]
+
+
+def _disk_is_full(error: BaseException) -> bool:
+    """Whether the next sequence would meet the same end: no space, no permission, a file system that went read-only."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+            return True
+        if isinstance(error, OutputError) and "no space" in error.problem:
+            return True
+        error = error.__cause__
+    return False
+
+
+class SequenceLog:
+    """``.run/logs/<split>/<sequence>.log``, appended to. A log that cannot be written stops nothing."""
+
+    def __init__(self, out: str | Path, name: str):
+        self.path = Path(out) / RUN_FOLDER / "logs" / f"{name}.log"
+
+    def write(self, text: str) -> None:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.path, "a", encoding="utf-8") as file:
+                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text.rstrip()}\n")
+        except OSError:
+            pass

@@ -1,0 +1,82 @@
+"""A recipe small enough to be made many times, and helpers to look at what came of it."""
+
+import hashlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import yaml
+
+RECIPE = {
+    "seed": 11,
+    "camera": {"width": 64, "height": 48},
+    "time": {"duration": 0.2, "label_rate": 20},
+    "timeline": {"kind": "uniform", "fps": 300},
+    "scene": {"kind": "random", "objects": {"count": 3},
+              "pool": {"primitives": ["cuboid", "sphere"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
+              "textures": {"procedural": ["checks", "fbm"], "variants": 12, "photographs": False, "max_size": 64, "test_fraction": 0.3}},
+    "labels": {"flow": ["forward"], "ids": True},
+    "preview": {"enabled": False},
+    "groups": {
+        "fly": {"output": {"sequences": 4}, "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.3]}}},
+        "probe": {"output": {"split": "test", "sequences": 2}, "events": {"emulator": "v2e"}},
+    },
+}
+NAMES = [*(f"train/fly_{i:06d}" for i in range(4)), *(f"test/probe_{i:06d}" for i in range(2))]
+
+
+def recipe_file(folder: Path, **changes) -> Path:
+    path = folder / "recipe.yaml"
+    path.write_text(yaml.safe_dump({**RECIPE, **changes}))
+    return path
+
+
+def tree(out: Path) -> dict[str, str]:
+    """Hash of every file of a data set but those of ``.run``, temporaries included."""
+    return {p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+            for p in sorted(out.rglob("*")) if p.is_file() and p.relative_to(out).parts[0] != ".run"}
+
+
+def command(*arguments) -> list[str]:
+    return [sys.executable, "-m", "blinkgl.cli", "generate", *map(str, arguments)]
+
+
+def start(*arguments) -> subprocess.Popen:
+    return subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def temporaries(out: Path) -> list[Path]:
+    return [p for p in out.rglob(".*blinkgl-tmp-*") if p.is_dir()] if out.is_dir() else []
+
+
+def wait_for(condition, timeout_s: float = 90.0):
+    """The first true value of ``condition()``."""
+    deadline = time.monotonic() + timeout_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "it did not come to that"
+        time.sleep(0.005)
+    return value
+
+
+def children(pid: int) -> list[int]:
+    """Worker processes of a driver."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+                if int(fields[1]) == pid and b"blinkgl.dataset.worker" in (entry / "cmdline").read_bytes():
+                    found.append(int(entry.name))
+            except OSError:
+                continue
+    return sorted(found)
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]

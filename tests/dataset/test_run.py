@@ -1,0 +1,321 @@
+"""Many workers, any interruption, the same bytes: faults are injected into real runs, and what is left is compared."""
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset import run as run_module
+from blinkgl.dataset.executor import Inline, Local
+from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.index import read_index
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.dataset.work import thread_environment
+from blinkgl.errors import BlinkGLError, ConfigError, OutputError
+from blinkgl.scene import primitives, world
+from runs import NAMES, alive, children, recipe_file, start, temporaries, tree, wait_for
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> Path:
+    """The uninterrupted run, by the plainest loop there is."""
+    folder = tmp_path_factory.mktemp("reference")
+    reports = list(generate_run(load_run(recipe_file(folder)), folder / "out"))
+    assert [r.path.relative_to(folder / "out").as_posix() for r in reports] == NAMES
+    return folder / "out"
+
+
+def assert_same(out: Path, reference: Path) -> None:
+    made = tree(out)
+    made.pop("index.jsonl")
+    assert made == tree(reference)
+    assert temporaries(out) == []
+
+
+class Sabotage:
+    """A display that does something to the run as soon as there is progress."""
+
+    def __init__(self, act, times: int = 1):
+        self.act, self.times, self.messages = act, times, []
+
+    def begin(self, plan, outcome) -> None: ...
+    def end(self, outcome) -> None: ...
+
+    def message(self, name, message) -> None:
+        self.messages.append((name, message))
+        if message["kind"] == "progress" and self.times:
+            self.times -= 1
+            self.act(name, message)
+
+
+def worker_of(executor: Local, message) -> int:
+    return next(p.popen.pid for p in executor._processes if p.task == message["task"])
+
+
+# ---- workers -----------------------------------------------------------------------------------------------------
+
+
+def test_killed_workers_leave_no_trace(reference, tmp_path):
+    """Two workers; one is killed with -9 in the middle of a sequence."""
+    executor = Local(2)
+    sabotage = Sabotage(lambda name, message: os.kill(worker_of(executor, message), signal.SIGKILL))
+    outcome = run_dataset(load_run(recipe_file(tmp_path)), tmp_path / "out", executor, listener=sabotage)
+    failed = [m["error"] for _, m in sabotage.messages if m["kind"] == "failed"]
+    assert failed == ["the worker was ended by SIGKILL"] and not outcome.set_aside and len(outcome.made) == 6
+    assert_same(tmp_path / "out", reference)
+    costs = [json.loads(line) for line in (tmp_path / "out/.run/costs.jsonl").read_text().splitlines()]
+    assert sorted(c["attempts"] for c in costs) == [1, 1, 1, 1, 1, 2] and all(c["peak_rss_kib"] > 1e4 for c in costs)
+    assert [line["path"] for line in read_index(tmp_path / "out")] == sorted(NAMES)
+    assert "attempt 1 failed: the worker was ended by SIGKILL" in "".join(p.read_text() for p in (tmp_path / "out/.run/logs").rglob("*.log"))
+    assert run(["verify", str(tmp_path / "out"), "--deep", "--sample", "2"]) == 0
+
+
+def test_a_worker_that_hangs_is_replaced_and_a_hopeless_sequence_set_aside(reference, tmp_path, monkeypatch):
+    """One sequence's worker is stopped each time it is tried: after the last attempt (two here) the run does without it."""
+    monkeypatch.setattr(run_module, "ATTEMPTS", 2)
+    executor = Local(1)
+
+    def stop(name, message):
+        sabotage.times += 1
+        if name == NAMES[1]:
+            os.kill(worker_of(executor, message), signal.SIGSTOP)
+
+    sabotage = Sabotage(stop)
+    template = load_run(recipe_file(tmp_path))
+    outcome = run_dataset(template, tmp_path / "out", executor, num=2, listener=sabotage, time_limit_s=3.0)
+    assert outcome.set_aside == {NAMES[1]: "took longer than the limit of 3 s"}
+    assert len(outcome.made) == 3
+    found = verify_dataset(tmp_path / "out")
+    assert found.problems == {NAMES[1]: ["set aside: took longer than the limit of 3 s"]}
+    again = run_dataset(template, tmp_path / "out", Inline(), resume=True)  # and the two that --num had left out
+    assert (again.found, len(again.made), again.set_aside) == (3, 3, {})
+    assert_same(tmp_path / "out", reference)
+    assert verify_dataset(tmp_path / "out").clean
+
+
+def test_threads_are_divided_among_workers():
+    assert thread_environment(2, 2, {}) == {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
+    assert thread_environment(1, 8, {})["NUMBA_NUM_THREADS"] == "8" and "LP_NUM_THREADS" not in thread_environment(1, 8, {})
+    assert thread_environment(4, 16, {})["LP_NUM_THREADS"] == "4"
+    assert "LP_NUM_THREADS" not in thread_environment(2, 2, {"LP_NUM_THREADS": "3"}), "what the user says, goes"
+
+
+# ---- the driver --------------------------------------------------------------------------------------------------
+
+
+def in_the_middle(out: Path) -> bool:
+    """One sequence is whole, another being written."""
+    return any((out / name).is_dir() for name in NAMES) and bool(temporaries(out))
+
+
+def test_driver_killed_then_terminated_then_resumed(reference, tmp_path, capfd):
+    recipe, out = recipe_file(tmp_path), tmp_path / "out"
+    driver = start(recipe, "--out", out, "--workers", 2)
+    wait_for(lambda: in_the_middle(out))
+    workers = children(driver.pid)
+    driver.kill()
+    driver.communicate()
+    assert len(workers) == 2
+    wait_for(lambda: not any(alive(pid) for pid in workers), 30)
+    half = [p for p in out.rglob("*") if p.name in {Path(n).name for n in NAMES}]
+    assert 1 <= len(half) < 6 and all((p / "manifest.json").is_file() for p in half)
+
+    driver = start(recipe, "--out", out, "--resume")  # in one process this time
+    wait_for(lambda: temporaries(out) and "fly" in temporaries(out)[0].name or driver.poll() is not None)
+    driver.send_signal(signal.SIGTERM)
+    said, _ = driver.communicate()
+    assert driver.returncode in (0, 130) and "Traceback" not in said
+
+    assert run(["generate", str(recipe), "--out", str(out), "--resume", "--quiet"]) == 0
+    assert_same(out, reference)
+    assert verify_dataset(out, deep=1).clean
+
+
+def test_ctrl_c_stops_the_workers_and_leaves_only_whole_sequences(reference, tmp_path):
+    recipe, out = recipe_file(tmp_path), tmp_path / "out"
+    driver = start(recipe, "--out", out, "--workers", 2)
+    wait_for(lambda: in_the_middle(out))
+    workers = children(driver.pid)
+    driver.send_signal(signal.SIGINT)
+    said, _ = driver.communicate()
+    assert driver.returncode == 130 and "Traceback" not in said
+    assert not any(alive(pid) for pid in workers) and temporaries(out) == []
+    found = verify_dataset(out)
+    assert set(found.problems) and all(lines == ["missing: the recipe asks for it"] for lines in found.problems.values())
+    outcome = run_dataset(load_run(recipe), out, resume=True)
+    assert outcome.found == found.sequences
+    assert_same(out, reference)
+
+
+# ---- the disk ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of a megabyte; sizes are changed by remounting."""
+    mount = tmp_path / "disk"
+    mount.mkdir()
+    made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", mount], capture_output=True, text=True)
+    if made.returncode:
+        pytest.skip(f"this machine does not let tests mount a small disk: {made.stderr.strip()}")
+    yield mount
+    subprocess.run(["umount", mount], check=True)
+
+
+def test_full_disk_stops_the_run_and_a_larger_one_goes_on(reference, small_disk, tmp_path, capsys):
+    recipe, out = recipe_file(tmp_path), small_disk / "out"
+    size = sum(p.stat().st_size for p in reference.rglob("*") if p.is_file())
+    subprocess.run(["mount", "-o", f"remount,size={size // 2 // 4096 * 4096}", small_disk], check=True)
+    assert run(["generate", str(recipe), "--out", str(out), "--workers", "2", "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert "no space left" in error and "--resume" in error and error.count("\n") == 1
+    assert temporaries(out) == [] and 0 < sum((out / name).is_dir() for name in NAMES) < 6
+    subprocess.run(["mount", "-o", "remount,size=64m", small_disk], check=True)
+    assert run(["generate", str(recipe), "--out", str(out), "--resume", "--quiet"]) == 0
+    assert_same(out, reference)
+
+
+# ---- assets ------------------------------------------------------------------------------------------------------
+
+
+def forget_pools() -> None:
+    """A process keeps its pools; a driver started on another day would not have them."""
+    world._object_pool.cache_clear()
+    world._texture_pool.cache_clear()
+
+
+def mesh_recipe(tmp_path: Path) -> tuple[Path, list[Path]]:
+    """Two groups less: sequences drawn from eight mesh files."""
+    folder = tmp_path / "meshes"
+    folder.mkdir(exist_ok=True)
+    for k in range(8):
+        mesh = primitives.cuboid(extents=(1.0, 1.0 + k, 1.0))
+        lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces]
+        (folder / f"box{k}.obj").write_text("\n".join(lines) + "\n")
+    scene = {"kind": "random", "objects": {"count": 2}, "pool": {"primitives": [], "folders": ["meshes"], "test_fraction": 0.0},
+             "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 64, "test_fraction": 0.0}}
+    return recipe_file(tmp_path, scene=scene, groups={"fly": {"output": {"sequences": 4}}}), sorted(folder.iterdir())
+
+
+def test_an_asset_that_changes_during_a_run(tmp_path):
+    """Files rot while the run is on: sequences that would use them are set aside, and nothing else changes."""
+    recipe, files = mesh_recipe(tmp_path)
+    good = [f.read_bytes() for f in files]
+    list(generate_run(load_run(recipe), tmp_path / "reference"))
+    forget_pools()
+
+    def rot(name, message):
+        for file in files:
+            file.write_bytes(b"v 0 0 0\nthis is no mesh\n")
+
+    outcome = run_dataset(load_run(recipe), tmp_path / "out", listener=Sabotage(rot))
+    assert len(outcome.made) >= 1 and outcome.set_aside
+    assert all("mesh" in reason or "has changed" in reason for reason in outcome.set_aside.values())
+    forget_pools()
+    with pytest.raises(OutputError, match=r"pools are not those the run began with: meshes/box0.obj \(changed\)"):
+        run_dataset(load_run(recipe), tmp_path / "out", resume=True)
+    for file, data in zip(files, good, strict=True):
+        file.write_bytes(data)
+    forget_pools()
+    assert not run_dataset(load_run(recipe), tmp_path / "out", resume=True).set_aside
+    assert_same(tmp_path / "out", tmp_path / "reference")
+
+
+def test_a_corrupt_asset_costs_the_sequences_that_need_it(tmp_path, capsys):
+    recipe, files = mesh_recipe(tmp_path)
+    files[0].write_text("v 0 0 0\nf 1 2 9\n")
+    status = run(["generate", str(recipe), "--out", str(tmp_path / "out"), "--quiet", "--set", "groups.fly.output.sequences=8"])
+    said = capsys.readouterr().err
+    assert status == 3 and "set aside: train/fly_" in said and "box0.obj" in said
+    failed = json.loads((tmp_path / "out/.run/failed.json").read_text())
+    made = [line["path"] for line in read_index(tmp_path / "out")]
+    assert set(made) | set(failed) == {f"train/fly_{i:06d}" for i in range(8)} and made and failed
+    log = (tmp_path / "out/.run/logs" / f"{min(failed)}.log").read_text()
+    assert log.count("attempt 3, pid") == 1 and "Traceback" in log
+
+
+# ---- what may go on where ----------------------------------------------------------------------------------------
+
+
+def test_another_recipe_is_refused(tmp_path):
+    recipe = load_run(recipe_file(tmp_path))
+    run_dataset(recipe, tmp_path / "out", num=1)
+    before = tree(tmp_path / "out")
+    other = load_run(recipe_file(tmp_path), ["groups.probe.camera.width=80"])
+    for resume in (False, True):
+        with pytest.raises(OutputError, match=r"holds the run of another recipe \(different: probe\); expected .*--mixed"):
+            run_dataset(other, tmp_path / "out", resume=resume)
+    with pytest.raises(OutputError, match="exists; expected a new folder name, or --resume"):
+        run_dataset(recipe, tmp_path / "out", num=1)
+    assert tree(tmp_path / "out") == before
+    outcome = run_dataset(other, tmp_path / "out", num=2, resume=True, mixed=True)
+    assert (outcome.found, len(outcome.made)) == (2, 2)
+    assert len(json.loads((tmp_path / "out/.run/run.json").read_text())["mixed"]) == 1, "the record says so"
+
+
+def test_another_installation_is_refused(tmp_path):
+    recipe = load_run(recipe_file(tmp_path))
+    run_dataset(recipe, tmp_path / "out", num=1)
+    record = tmp_path / "out/.run/run.json"
+    record.write_text(record.read_text().replace('"numpy": "', '"numpy": "0.'))
+    with pytest.raises(OutputError, match=r"another installation: numpy 0\..*--mixed"):
+        run_dataset(recipe, tmp_path / "out", num=2, resume=True)
+
+
+def test_one_run_at_a_time(tmp_path):
+    recipe = load_run(recipe_file(tmp_path))
+
+    def second(name, message):
+        with pytest.raises(OutputError, match="another run is at work in this folder"):
+            run_dataset(recipe, tmp_path / "out", resume=True)
+        second.tried = True
+
+    run_dataset(recipe, tmp_path / "out", num=1, listener=Sabotage(second))
+    assert second.tried
+
+
+def test_damaged_sequence_is_put_away_and_made_again(reference, tmp_path):
+    recipe = load_run(recipe_file(tmp_path))
+    run_dataset(recipe, tmp_path / "out")
+    (tmp_path / "out" / NAMES[2] / "poses.npz").unlink()
+    (tmp_path / "out" / NAMES[3] / "mine.txt").write_text("notes of a user")
+    outcome = run_dataset(recipe, tmp_path / "out", resume=True)
+    assert set(outcome.damaged) == {NAMES[2], NAMES[3]} and "poses.npz: missing" in outcome.damaged[NAMES[2]]
+    assert (tmp_path / "out/.run/damaged" / f"{NAMES[3]}-0" / "mine.txt").read_text() == "notes of a user"
+    assert_same(tmp_path / "out", reference)
+    assert verify_dataset(tmp_path / "out").clean
+
+
+@pytest.mark.parametrize("arguments, message", [
+    (["--executor", "slurm"], "--executor: unknown executor (got 'slurm'); expected local or ray"),
+    (["--address", "head:6379"], "--address: belongs to --executor ray"),
+    (["--devices", "a"], "--devices: not a list of device numbers"),
+    (["--workers", "0"], "--workers"),
+])
+def test_bad_options(tmp_path, capsys, arguments, message):
+    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_workers_without_opengl_say_so(tmp_path):
+    with pytest.raises(BlinkGLError, match="no such EGL device|no usable OpenGL"):
+        run_dataset(load_run(recipe_file(tmp_path, gl={"backend": "egl", "device": 99})), tmp_path / "out", Local(1))
+    assert not [p for p in (tmp_path / "out").rglob("*") if p.is_file() and p.suffix != ".log"]
+
+
+def test_workers_that_differ_are_refused(tmp_path):
+    class Odd(Inline):
+        def open(self, job):
+            hello = super().open(job)[0]
+            return [hello, {**hello, "environment": {**hello["environment"], "numba": "0.1"}}]
+
+    with pytest.raises(ConfigError, match=r"workers differ in version or hardware: numba 0\.1 and"):
+        run_dataset(load_run(recipe_file(tmp_path)), tmp_path / "out", Odd())
+    assert not [p for p in (tmp_path / "out").rglob("*") if p.is_file()]

@@ -76,7 +76,7 @@ class V2eConfig(Config):
     shot_noise_rate_hz: float = Field(0.001, ge=0, le=1e4, description="Noise events per second and pixel in the dark, ON and "
                                       "OFF together (v2e: 0.001); at full scale a quarter of it.")
     photoreceptor_noise: bool = Field(False, description="Make the noise events by low-passed noise before the comparator, "
-                                      "at the rate shot_noise_rate_hz, instead of drawing events.")
+                                      "at the rate shot_noise_rate_hz, instead of drawing events; needs cutoff_hz > 0.")
     refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
@@ -86,6 +86,12 @@ class V2eConfig(Config):
     @classmethod
     def _preset(cls, data: Any) -> Any:
         return _fill_preset(data, V2E_PRESETS)
+
+    @model_validator(mode="after")
+    def _noise_needs_bandwidth(self) -> V2eConfig:
+        if self.photoreceptor_noise and self.cutoff_hz == 0:
+            raise ValueError("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
+        return self
 
 
 VOLTMETER_PRESETS = {

@@ -41,6 +41,8 @@ class Emulator(ABC):
     then untouched and the next good frame goes on.
     """
 
+    _still_pixels_sleep = False
+    """Whether a pixel whose luminance does not change has no events and no changing state."""
     _state: tuple[str, ...] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
 
@@ -72,10 +74,15 @@ class Emulator(ABC):
     def _tables_changed(self) -> None:
         pass
 
-    def step(self, luminance: np.ndarray, t_ns: int) -> Events:
-        """Events since the last frame; see the class."""
+    def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None) -> Events:
+        """Events since the last frame; see the class.
+
+        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ).
+        Emulators whose still pixels do nothing skip those rows; the events are the same."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
+        first, stop = (0, self.height) if rows is None or self.t_ns is None else rows
+        self._changed = (max(0, first) * self.width, min(self.height, stop) * self.width)
         self._check_intensity(frame)
         events = self._start(frame, t_ns) if self.t_ns is None else self._advance(frame, t_ns)
         self.t_ns = t_ns
@@ -104,7 +111,8 @@ class Emulator(ABC):
 
     def _check_intensity(self, frame: np.ndarray) -> None:
         """Before anything changes. One pass over bit patterns; the slow look only where that finds something."""
-        if frame.dtype == np.uint8 or frame.view(np.uint32).max() <= INTENSITY_LIMIT_BITS:
+        first, stop = self._changed
+        if frame.dtype == np.uint8 or first >= stop or frame[first:stop].view(np.uint32).max() <= INTENSITY_LIMIT_BITS:
             return
         bad = np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))  # -0.0 is not bad
         if bad.size:
@@ -126,8 +134,12 @@ class Emulator(ABC):
         through whole blocks and stops early when ``packed`` might not hold the next one; it then goes on from
         there in a larger buffer. ``share`` is the number of events a block may emit.
         """
-        bands = min(numba.get_num_threads(), self._blocks)
-        edges = self._blocks * np.arange(bands + 1, dtype=np.int64) // bands
+        first, stop = self._changed if self._still_pixels_sleep else (0, self.height * self.width)
+        first_block, stop_block = first // BLOCK, -(-stop // BLOCK)
+        if first >= stop:
+            return Events.empty()
+        bands = min(numba.get_num_threads(), stop_block - first_block)
+        edges = first_block + (stop_block - first_block) * np.arange(bands + 1, dtype=np.int64) // bands
         share = max(BLOCK, self.config.max_events_per_step // self._blocks)
         progress = np.zeros((bands, 3), np.int64)  # next block, events so far, events cut
         progress[:, 0] = edges[:-1]

@@ -216,6 +216,7 @@ class Esim(Emulator):
     (constant) and the refractory period add 8 each, jitter 4, when these are on."""
 
     _state = ("_log", "_upper", "_lower", "_fired", "_last_ns")
+    _still_pixels_sleep = True
 
     def __init__(self, height: int, width: int, config: EsimConfig | None = None, seed: int = 0):
         super().__init__(height, width, seed)

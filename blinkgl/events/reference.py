@@ -14,6 +14,7 @@ import numpy as np
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
+from blinkgl.events.noise import noise_table
 from blinkgl.events.philox import Stream, normal2, normal_and_uniform, pixel_counters, rough_normal, uniform2
 from blinkgl.events.types import Events
 
@@ -136,7 +137,14 @@ class ReferenceV2e:
             reference = x - phase.astype(np.float32) * self.on if self.leaks else x
             self.upper, self.lower = reference + self.on, reference - self.off
             lag = np.zeros(self.pixels, np.float32)
-            if self.config.shot_noise_rate_hz:
+            if self.config.photoreceptor_noise:
+                start = v2e.draw_start_noise(intensity, self.config, self.seed)
+                self.hum = start
+                reference = x + start
+                if self.leaks:
+                    reference = reference - phase.astype(np.float32) * self.on
+                self.upper, self.lower = reference + self.on, reference - self.off
+            elif self.config.shot_noise_rate_hz:
                 self.clocks = [self.shot_times(b) for b in range(-(-self.pixels // v2e.BLOCK))]
                 self.pending = [next(clock) for clock in self.clocks]
         else:
@@ -144,9 +152,13 @@ class ReferenceV2e:
             lag = self.lag
             if self.config.cutoff_hz:
                 lag = v2e.relax(self.lag, self.x, x, self.intensity, intensity, np.float32(kappa))
-            noise = self.noise(intensity, t_ns)
+            noise, hum = self.noise(intensity, t_ns), np.zeros(self.pixels, np.float32)
+            if self.config.photoreceptor_noise:
+                hum = self.photoreceptor_noise(intensity, np.float32(kappa), (t_ns - self.t_ns) * 1e-9)
             for i in range(self.pixels):
-                rows += self.pixel(i, x, lag, intensity, kappa, t_ns, noise[i])
+                rows += self.pixel(i, x, lag, intensity, kappa, t_ns, noise[i], hum[i])
+            self.hum = hum
+        self.frame = getattr(self, "frame", 0) + 1
         self.x, self.intensity, self.lag, self.t_ns = x, intensity, lag, t_ns
         if t_ns - self.epoch >= self.rebase_ns:
             gone = self.leak * np.float32((t_ns - self.epoch) * 1e-9)
@@ -170,12 +182,23 @@ class ReferenceV2e:
                     accepted[i].append((after, p))
         return [sorted(events) for events in accepted]
 
-    def pixel(self, i, x, lag, intensity, kappa, t_ns, noise) -> list[tuple[int, int, int, int]]:
+    def photoreceptor_noise(self, intensity: np.ndarray, kappa: np.float32, dt_s: float) -> np.ndarray:
+        """The noise at the interval's end, ln units."""
+        f, c = np.float32, self.config
+        pairs = normal2(self.seed, np.arange((self.pixels + 1) // 2, dtype=np.uint64), np.uint64(Stream.NOISE), np.uint64(self.frame))
+        normals = np.stack(pairs, axis=1).ravel()[: self.pixels].astype(f)
+        k = kappa * (f(0.5) * (self.intensity + intensity) + f(20))
+        sizes = noise_table(c.shot_noise_rate_hz, dt_s, c.contrast_threshold)
+        below, part = v2e.noise_place(k)
+        return v2e.next_noise(self.hum, k, sizes[below] + part * (sizes[below + 1] - sizes[below]), normals)
+
+    def pixel(self, i, x, lag, intensity, kappa, t_ns, noise, hum) -> list[tuple[int, int, int, int]]:
         f = np.float64
         dt_ns, (y, column) = t_ns - self.t_ns, divmod(i, self.width)
         since = (self.t_ns - self.epoch) * 1e-9, (t_ns - self.epoch) * 1e-9
         z_now = x[i] + lag[i] if self.config.cutoff_hz else x[i]
         z_now = z_now + self.leak[i] * np.float32(since[1]) if self.leaks else z_now
+        z_now = z_now + hum if self.config.photoreceptor_noise else z_now
         waiting = self.release[i] is not None
         if not (waiting or noise or z_now >= self.upper[i] or z_now <= self.lower[i]):
             return []
@@ -184,7 +207,10 @@ class ReferenceV2e:
         if self.config.cutoff_hz:
             curve_lag, k = f(self.lag[i]), kappa * (0.5 * (f(self.intensity[i]) + f(intensity[i])) + 20.0)
         leak = f(self.leak[i])
-        base, drift = x0 + leak * since[0], leak * (dt_ns * 1e-9)
+        change_of_hum = 0.0
+        if self.config.photoreceptor_noise:
+            x0, change_of_hum = x0 + f(self.hum[i]), f(hum) - f(self.hum[i])
+        base, drift = x0 + leak * since[0], change_of_hum + leak * (dt_ns * 1e-9)
         c, rise, fall = v2e.curve_of(base, drift, dx, curve_lag, k)
         z = lambda s: v2e.signal_at(s, c, rise, fall, k)
         end = base + drift + dx

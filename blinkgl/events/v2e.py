@@ -31,6 +31,7 @@ from blinkgl.errors import EventDataError
 from blinkgl.events.arith import exp_f32, exp_f64, log_f32, log_f64, select
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import copy_block, draw_thresholds
+from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, noise_table, start_sizes
 from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
 from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
 from blinkgl.events.types import Events
@@ -42,6 +43,8 @@ _SHOT, _LEAK_JITTER = np.uint64(Stream.SHOT), np.uint64(Stream.LEAK_JITTER)
 _U2, _U1, _U1000, _MASK41 = np.uint64(2), np.uint64(1), np.uint64(1000), 2**41 - 1
 _INSERTION_LIMIT = 32
 _FARTHEST, _FAR_BELOW = np.float32(1e6), np.int32(-(2**31))
+_NOISE, _SMALLEST_K = np.uint64(Stream.NOISE), _F(1e-6)
+_TABLE_LOW, _TABLE_PER, _TABLE_LAST = _F(TABLE_LOW), _F(1 / TABLE_STEP), _F(TABLE_SIZE - 2)
 REBASE = 0.02
 """Leak (ln units) after which the leak clock starts anew: small beside a threshold, so that float32 does."""
 
@@ -188,13 +191,29 @@ def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: flo
     return np.cumsum(weights.reshape(blocks, 2 * BLOCK), axis=1).astype(np.float32)
 
 
+@register_jitable
+def next_noise(noise, k, size, normal):
+    """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
+    a, _ = decay(k)
+    return noise * a + size * np.sqrt(_ONE - a * a) * normal
+
+
+@register_jitable
+def noise_place(k):
+    """Place in the table of sizes: (entry below, fraction)."""
+    place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
+    below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))
+    return below, _F(np.minimum(place, _TABLE_LAST) - _F(below))
+
+
 class Pixels(NamedTuple):
     """Per-pixel arrays, flat; size 0 when the feature is off. What the photoreceptor holds is of the frame before."""
 
     intensity: np.ndarray  # float32 DN
     x: np.ndarray  # float32 lin-log
     lag: np.ndarray  # float32 y - x; [] without low-pass
-    noise: np.ndarray  # float32 photoreceptor noise, standard normal; []
+    noise: np.ndarray  # float32 photoreceptor noise, ln units; []
+    noise_sizes: np.ndarray  # see noise.noise_table, for this frame spacing; []
     upper: np.ndarray  # float32 levels; -inf and +inf in the dead time, so that the pixel is looked at
     lower: np.ndarray
     constants: np.ndarray  # (N, 4) float32: ON threshold, OFF threshold, mean leak per second, 0
@@ -215,6 +234,7 @@ class Interval(NamedTuple):
     gentle: bool  # k < 1/2 at every pixel
     scale: np.float32
     seed: np.uint64
+    step: int
     width: int
     refractory_ns: int
     leak_jitter: float
@@ -265,6 +285,20 @@ def _relax_block_gently(lag, before, now, intensity_before, intensity_now, kappa
 def _add_scaled_block(a, scale, out):
     for i in range(a.size):
         out[i] += a[i] * scale
+
+
+@numba.njit(**JIT)
+def _noise_block(noise, intensity_before, intensity_now, kappa, sizes, seed, step, first, normals, out, z):
+    for j in range((out.size + 1) // 2):  # pixels 2j and 2j + 1 share a draw
+        a, b = normal2(seed, np.uint64(first // 2 + j), _NOISE, np.uint64(step))
+        normals[2 * j], normals[2 * j + 1] = np.float32(a), np.float32(b)
+    for i in range(out.size):
+        k = np.float32(kappa * (_HALF * (intensity_before[i] + intensity_now[i]) + _JOINT))
+        below, part = noise_place(k)
+        size = np.float32(sizes[below] + part * (sizes[below + 1] - sizes[below]))
+        value = np.float32(next_noise(noise[i], k, size, normals[i]))
+        out[i] = value
+        z[i] += value
 
 
 @numba.njit(**JIT)
@@ -430,8 +464,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     """Band kernel, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.x.size
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
-    z, intensity, x, lag, noise = (np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32),
-                                   np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32))
+    z, intensity, x = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    lag, noise, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     keys, constants = np.empty(BLOCK, np.int64), np.empty((BLOCK, 3), np.float32)
     kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
     for block in range(first_block, stop_block):
@@ -452,6 +486,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 _relax_block(p.lag[s:e], p.x[s:e], x[:n], p.intensity[s:e], intensity[:n], kappa, lag[:n], z[:n])
         if p.leak.size:
             _add_scaled_block(p.leak[s:e], since, z[:n])
+        if p.noise.size:
+            _noise_block(p.noise[s:e], p.intensity[s:e], intensity[:n], kappa, p.noise_sizes, v.seed, v.step, s, normals,
+                         noise[:n], z[:n])
         farthest = _flag_block(z[:n], p.upper[s:e], p.lower[s:e], flags)
         shots, clock_ns, clock_index = 0, np.int64(0), np.int64(0)
         if p.clock_ns.size:
@@ -475,6 +512,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         copy_block(x[:n], p.x[s:e])
         if p.lag.size:
             copy_block(lag[:n], p.lag[s:e])
+        if p.noise.size:
+            copy_block(noise[:n], p.noise[s:e])
         if p.clock_ns.size:
             p.clock_ns[block], p.clock_index[block] = clock_ns, clock_index
     return stop_block, filled, cut
@@ -507,7 +546,9 @@ class V2e(Emulator):
         self._on, self._off = (c.astype(np.float32) for c in
                                draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed))
         self._intensity, self._x, self._upper, self._lower = (frame() for _ in range(4))
-        self._lag, self._noise = frame(config.cutoff_hz > 0), frame(False)
+        noisy = config.photoreceptor_noise and config.shot_noise_rate_hz > 0
+        self._lag, self._noise = frame(config.cutoff_hz > 0), frame(noisy)
+        self._noise_sizes, self._sizes_dt_ns = np.empty(0, np.float32), -1
 
         self._leak = draw_leaks(height, width, config, self._on, self.seed)
         self._constants = np.zeros((pixels, 4), np.float32)
@@ -543,6 +584,9 @@ class V2e(Emulator):
             self._intensity[...] = frame * self._scale
             self._x[...] = lin_log(self._intensity)
         reference = self._x
+        if self._noise.size:
+            self._noise[...] = draw_start_noise(self._intensity, self.config, self.seed)
+            reference = reference + self._noise
         if self._leak.size:  # else every pixel's first leak event would come at the same time
             phase, _ = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))
             reference = reference - phase.astype(np.float32) * self._on
@@ -559,13 +603,16 @@ class V2e(Emulator):
         if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > config.max_events_per_step:
             raise EventDataError("more shot noise than max_events_per_step in one interval", where=f"frame {self.frames}",
                                  value=f"{dt_ns} ns", accepted="a shorter interval or a lower shot_noise_rate_hz")
-        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._upper, self._lower, self._constants,
+        if self._noise.size and dt_ns != self._sizes_dt_ns:
+            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, config.contrast_threshold)
+            self._sizes_dt_ns = dt_ns
+        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._noise_sizes, self._upper, self._lower, self._constants,
                         self._leak, self._release, self._clock_ns, self._clock_index, self._shot_table)
         base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
         brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
         gentle = kappa * (max(brightest, self._brightest[0]) + 20.0) < 0.499
-        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9, kappa, gentle, self._scale, self.seed, self.width,
+        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9, kappa, gentle, self._scale, self.seed, self.frames, self.width,
                             self._refractory_ns, self._leak_jitter, self._shot_unit, self._inverse_threshold,
                             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
@@ -578,6 +625,13 @@ class V2e(Emulator):
             self._lower -= gone
             self._epoch_ns[0] = t_ns
         return events
+
+
+def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
+    """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
+    corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
+    _, normal = normal2(seed, np.arange(len(intensity), dtype=np.uint64), np.uint64(Stream.START), np.uint64(1))
+    return (start_sizes(config.shot_noise_rate_hz, corner, config.contrast_threshold) * normal).astype(np.float32)
 
 
 def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:

@@ -24,6 +24,8 @@ VARIANTS = {
     "filter only": dict(preset="clean", cutoff_hz=40.0),
     "long dead time, noise, hot pixels": dict(shot_noise_rate_hz=50.0, leak_rate_hz=3.0, hot_pixel_fraction=0.05,
                                               refractory_us=20_000.0),
+    "photoreceptor noise": dict(shot_noise_rate_hz=20.0, photoreceptor_noise=True, leak_rate_hz=0.0, cutoff_hz=30.0),
+    "photoreceptor noise, leak": dict(preset="noisy", shot_noise_rate_hz=30.0, photoreceptor_noise=True),
     "noise without dead time": dict(shot_noise_rate_hz=80.0, leak_rate_hz=2.0, refractory_us=0.0, contrast_threshold_off=0.3),
 }
 
@@ -182,6 +184,20 @@ def test_leak_rate_and_jitter(frame_ms):
     assert abs(gaps.mean() * rate - 1) < 0.01 and abs(gaps.std() * rate / jitter - 1) < 0.1
     counts = np.bincount(pixel, minlength=400)
     assert stats.chi2.sf(((counts - seconds * rate) ** 2).sum() / (seconds * rate), 400) > 0.99  # far more regular than Poisson
+
+
+@pytest.mark.parametrize("frame_ms", [0.1, 1, 10, 100])
+def test_photoreceptor_noise_holds_its_rate_at_any_frame_rate(frame_ms):
+    """5 Hz asked for, 5 Hz given, whether frames are 100 times faster or 10 times slower than the photoreceptor."""
+    rate, pixels = 5.0, 60
+    seconds = 0.6 if frame_ms < 1 else 4.0
+    config = V2eConfig(**{**QUIET, "shot_noise_rate_hz": rate}, photoreceptor_noise=True, cutoff_hz=30.0)
+    emulator = V2e(pixels, pixels, config, seed=1)
+    frame = np.full((pixels, pixels), 0.4, np.float32)
+    events = run(emulator, [frame] * (round(seconds * 1000 / frame_ms) + 1),
+                 [round(k * frame_ms * 1e6) for k in range(round(seconds * 1000 / frame_ms) + 1)])
+    assert abs(len(events) / (seconds * pixels**2) / rate - 1) < 0.1
+    assert abs(events.p.mean() - 0.5) < 0.03
 
 
 def test_leak_spread_over_pixels():

@@ -120,7 +120,8 @@ void main()
     id = instance_id;
 #endif
 #ifdef OUT_NORMAL
-    camera_normal = vec4(normalize(camera_from_local * facing), 0.0);
+    vec3 turned = camera_from_local * facing;
+    camera_normal = vec4(turned * inversesqrt(max(dot(turned, turned), 1e-30)), 0.0); // zero stays zero, not NaN
 #endif
 #ifdef OUT_VELOCITY
     image_velocity = velocity(rate, local, image_size);

@@ -5,7 +5,8 @@
 1. Event pass: frames/s of the luminance pass, clear and read-back included, for three scene sizes and resolutions,
    beside the rate that a throw-away probe of the same scene class reached on this kind of machine (the floor).
 2. A whole sequence of each shipped configuration: seconds per simulated second and the split by stage.
-3. --peer pyrender: colour + depth of the same world through pyrender (extra [check]), and the ratio.
+3. A still camera: drawing only what moves against drawing all.
+4. --peer pyrender: colour + depth of the same world through pyrender (extra [check]), and the ratio.
 
 Everything is the median of many after a warm-up. On a shared machine the minimum is shown as well; ratios taken in one
 run are worth more than absolute times.
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from dataclasses import replace
 from importlib import resources
 from types import SimpleNamespace
 
@@ -25,9 +27,11 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from blinkgl import bench
+from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.show import STAGES, summary
+from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene import primitives
@@ -92,6 +96,30 @@ def event_pass(gl, kind: str, width: int, height: int, lit: bool, repeat: int) -
                 "ratio_one_process": fps / floor[0] if floor[0] else None, "ratio_two_processes": fps / floor[1] if floor[1] else None}
 
 
+def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
+    """Full redraw against redrawing only what moves: luminance and ESIM together, the same events."""
+    scene = probe_scene(kind, 640, 480)
+    objects = tuple(o if i < movers else replace(o, path=StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
+    scene = replace(scene, objects=objects, camera=replace(scene.camera, path=StaticPath(scene.camera.path.pose(0))))
+    result = {"scene": kind, "movers": movers}
+    events = {}
+    for name in ("full redraw", "what moves"):
+        with Renderer(gl, scene, PLAIN) as renderer:
+            renderer._still = name == "what moves"
+            emulator, out, moment = make_emulator(EsimConfig(), 480, 640, seed=1), np.empty((480, 640), np.float32), iter(range(1 << 30))
+            made = events[name] = []
+
+            def frame():
+                t = next(moment) * 2_000_000
+                renderer.luminance(t, out=out)
+                made.append(len(emulator.step(out, t, renderer.changed_rows)))
+
+            result[name] = 1 / bench.seconds(frame, repeat, warm_up=8)["median"]
+    assert events["full redraw"] == events["what moves"]
+    result["ratio"] = result["what moves"] / result["full redraw"]
+    return result
+
+
 def sequence(name: str, quick: bool) -> dict:
     """One sequence of a shipped configuration; the first, unmeasured one compiles kernels and shaders."""
     overrides = ["time.duration=0.2"] if quick else []
@@ -141,6 +169,10 @@ def main() -> None:
         result["event_pass"] = [event_pass(gl, *case, lit=False, repeat=repeat) for case in cases]
         result["event_pass"] += [event_pass(gl, *case, lit=True, repeat=repeat) for case in cases[:2]]
         _show_event_pass(console, result["event_pass"])
+        result["still_camera"] = [still_camera(gl, kind, movers, repeat) for kind in ("tri/16", "full") for movers in (1, 3)]
+        for r in result["still_camera"]:
+            console.print(f"still camera, {r['scene']}, {r['movers']} of 10 objects moving: {r['full redraw']:.0f} frames/s drawn whole, "
+                          f"{r['what moves']:.0f} where something moves: {r['ratio']:.1f}x (luminance and ESIM, same events)", highlight=False, soft_wrap=True)
         if options.peer:
             result["peer"] = peer(gl, options.quick)
             console.print("pyrender:", result["peer"])

@@ -24,7 +24,6 @@ from blinkgl.events import make_emulator
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.render.statistics import largest_speed
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
@@ -97,16 +96,14 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
     timeline = config.timeline
 
     def speed(t_ns: int) -> float:
-        velocity = renderer.velocity(t_ns, timeline.sample_every)
-        with clock("timeline"):
-            return largest_speed(velocity, timeline.percentile)
+        return renderer.speed(t_ns, timeline.sample_every, timeline.percentile)
 
     luminance = np.empty((camera.height, camera.width), np.float32)
     with PreviewRecorder(config, renderer, writer, clock) as preview:
         for t_ns in frame_times(timeline, t0_ns, t1_ns, speed):
             renderer.luminance(t_ns, out=luminance)
             with clock("events"):
-                events = emulator.step(luminance, t_ns)
+                events = emulator.step(luminance, t_ns, renderer.changed_rows)
             with clock("write"):
                 writer.append_events(events)
             preview.add_events(events)

@@ -17,7 +17,7 @@ from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 
-STAGES = ("scene", "render", "read-back", "timeline", "events", "write", "preview")
+STAGES = ("scene", "render", "read-back", "events", "write", "preview")
 SET_ASIDE = 3
 """Exit status of a run that is over but lacks sequences."""
 

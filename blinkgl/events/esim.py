@@ -25,8 +25,9 @@ from numba.extending import register_jitable
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events.arith import Q_ONE, log_q25
+from blinkgl.events.blocks import compact_flags, copy_block, lookup_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
+from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters
 from blinkgl.events.types import Events
 
@@ -71,18 +72,6 @@ def log_block(intensity, eps, out):
     """ln(intensity + eps) into ``out``, int32, 2^-25."""
     for i in range(intensity.size):
         out[i] = log_q25(np.float32(intensity[i] + eps))
-
-
-@numba.njit(**JIT)
-def lookup_block(codes, table, out):
-    for i in range(codes.size):
-        out[i] = table[codes[i]]
-
-
-@numba.njit(**JIT)
-def copy_block(source, target):
-    for i in range(source.size):  # a loop over slices: vectorised, which indices with an offset are not
-        target[i] = source[i]
 
 
 @numba.njit(**JIT)

@@ -308,10 +308,9 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         corners = part.mesh.faces[hits.triangle[rows]]
         bary = hits.bary[rows]
         blend = np.einsum("nc,nck->nk", bary, part.mesh.normals[corners].astype(np.float64))
-        length = np.linalg.norm(blend, axis=1, keepdims=True)
+        length = np.maximum(np.linalg.norm(blend, axis=1, keepdims=True), 1e-15)  # a zero normal stays zero
         sign = np.where(hits.front[rows], 1.0, -1.0)[:, None]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T
+        normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T
         uv[rows] = np.einsum("nc,nck->nk", bary, part.mesh.uvs[corners].astype(np.float64))
         albedo[rows] = sample_albedo(part.material, uv[rows])
         colour[rows] = albedo[rows] * (1.0 if part.material.unlit else irradiance(scene, normal[rows])[:, None])

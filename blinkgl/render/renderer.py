@@ -19,6 +19,8 @@ import numpy as np
 from blinkgl.render.matrices import (cam_from_obj, cam_from_obj_rate, mat4_bytes, projection, rows_xyw_bytes)
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
+from blinkgl.render.statistics import largest_speed
+from blinkgl.render.still import Backdrop, Rectangle, screen_rectangle
 from blinkgl.scene.types import PosePath, Scene
 
 
@@ -89,6 +91,7 @@ class Renderer:
     """Draws one scene. Holds GL resources: use it as a context manager or call :meth:`release`.
 
     gl : blinkgl.gl.GLContext.   config : blinkgl.config.sequence.RenderConfig (anti-aliasing, anisotropy).
+    changed : rectangles in which the last :meth:`luminance` may differ from the one before it; None: anywhere.
     """
 
     def __init__(self, gl, scene: Scene, config):
@@ -102,6 +105,11 @@ class Renderer:
         self._targets: dict = {}
         self._uniforms: dict = {}
         self._last_moment: tuple[int, _Moment] | None = None
+        self._moves = np.array([not p.is_static for p in self._paths], bool)
+        # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
+        self._still = scene.camera.path.is_static and not self._moves.all()
+        self._backdrop: Backdrop | None = None
+        self.changed: list[Rectangle] | None = None
         self._surfaces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._resources = SceneResources(gl.ctx, scene, config.anisotropy)
         items = self._resources.items
@@ -124,6 +132,13 @@ class Renderer:
         self._resources.release()
 
     @property
+    def changed_rows(self) -> tuple[int, int] | None:
+        """(y0, y1): outside these rows the last luminance frame equals the one before it; None: it may differ anywhere."""
+        if self.changed is None:
+            return None
+        return (min(r.y0 for r in self.changed), max(r.y1 for r in self.changed)) if self.changed else (0, 0)
+
+    @property
     def triangles(self) -> int:
         """Of the whole scene, before culling."""
         return self._resources.triangles
@@ -131,32 +146,39 @@ class Renderer:
     # ---- passes ------------------------------------------------------------------------------------------------
 
     def luminance(self, t_ns: int, out: np.ndarray | None = None) -> np.ndarray:
-        """Linear luminance at t_ns, (H, W) float32, into ``out`` when given (C-contiguous)."""
+        """Linear luminance at t_ns, (H, W) float32, into ``out`` when given (C-contiguous).
+
+        With a still camera only what moves is drawn, and when ``out`` is the array of the call before, only what has
+        changed is written: leave it as it was returned. ``changed`` then says where."""
         started = time.perf_counter()
         factor = self.config.supersample
         target = self._target("luminance", factor, ("R32F",))
         moment = self._moment(t_ns)
+        if self._still:
+            return self._mend_luminance(moment, target, started, out)
         self._begin(target, moment, self.scene.background)
-        for item in self._visible(moment):
-            uniforms = self._bind("luminance.glsl", item, moment, {})
-            if item.textured:
-                self._resources.luminance_texture(item.material).use(0)
-            else:
-                uniforms["albedo"].value = self._resources.albedo_luminance(item.material)
-            self._draw(uniforms, item)
+        self._draw_luminance(moment, self._visible(moment))
         if factor > 1:
             target = self._downsample(target, "luminance", "R32F", factor)
         return self._read(target, 0, started, out)
 
-    def velocity(self, t_ns: int, reduce: int = 1) -> np.ndarray:
+    def speed(self, t_ns: int, sample_every: int = 1, percentile: float = 100.0) -> float:
+        """Largest image speed at t_ns, px/s (or a percentile of the pixels' speeds), on every n-th pixel in x and y.
+        With a still camera the moving objects alone are drawn, those behind something included: still a bound."""
+        return largest_speed(self.velocity(t_ns, sample_every, moving_only=self._still), percentile)
+
+    def velocity(self, t_ns: int, reduce: int = 1, moving_only: bool = False) -> np.ndarray:
         """Image velocity at t_ns in px/s (of the full-size image), (H // reduce, W // reduce, 2) float32, 0 where
-        nothing is hit. ``reduce`` samples every n-th pixel: enough to find the largest motion, at 1/n² the cost."""
+        nothing is hit. ``reduce`` samples every n-th pixel: enough to find the largest motion, at 1/n² the cost.
+        ``moving_only`` leaves out objects that stand still, also where they hide something."""
         started = time.perf_counter()
         target = self._target("velocity", 1 / reduce, ("RG32F",))
         moment = self._moment(t_ns)
         rate = self._rates(t_ns, moment)
         self._begin(target, moment, 0.0)
         for item in self._visible(moment):
+            if moving_only and not self._moves[item.object_index]:
+                continue
             uniforms = self._bind("label.glsl", item, moment, {"OUT_VELOCITY": 0})
             self._set_motion(uniforms, "rate", rate, item, target)
             self._draw(uniforms, item)
@@ -213,6 +235,61 @@ class Renderer:
         if factor > 1:
             target = self._downsample(target, "colour", "RGBA32F", factor)
         return np.ascontiguousarray(self._read(target, 0, started, None)[..., :3])
+
+    # ---- parts of the event pass -------------------------------------------------------------------------------
+
+    def _draw_luminance(self, moment: _Moment, items: list[DrawItem]) -> None:
+        for item in items:
+            uniforms = self._bind("luminance.glsl", item, moment, {})
+            if item.textured:
+                self._resources.luminance_texture(item.material).use(0)
+            else:
+                uniforms["albedo"].value = self._resources.albedo_luminance(item.material)
+            self._draw(uniforms, item)
+
+    def _mend_luminance(self, moment: _Moment, target, started: float, out: np.ndarray | None) -> np.ndarray:
+        """:meth:`luminance` for a still camera; see ``still.py``."""
+        factor, ctx = self.config.supersample, self.gl.ctx
+        visible = self._visible(moment)
+        movers = [(item, screen_rectangle(item, moment.T_cam_obj[item.object_index], self.scene.camera))
+                  for item in visible if self._moves[item.object_index]]
+        movers = [(item, rectangle) for item, rectangle in movers if rectangle is not None]
+        whole = Rectangle(0, 0, self.width, self.height)
+        if self._backdrop is None:
+            picture = self._target("backdrop", factor, ("R32F",))
+            self._begin(picture, moment, self.scene.background)
+            self._draw_luminance(moment, [item for item in visible if not self._moves[item.object_index]])
+            self._backdrop = Backdrop(self.gl, picture, target)
+            stale = self._backdrop.stale([whole])
+            self._backdrop.stale([r for _, r in movers])
+        else:
+            stale = self._backdrop.stale([r for _, r in movers])
+        self._prepare(target)
+        for rectangle in stale:
+            fine = rectangle.scaled(factor)
+            ctx.scissor = (fine.x0, fine.y0, fine.x1 - fine.x0, fine.y1 - fine.y0)
+            self._backdrop.restore(fine)
+            self._draw_luminance(moment, [item for item, r in movers if r.meets(rectangle)])
+        ctx.scissor = None
+        self.stats.frames += 1
+        result = self._downsample(target, "luminance", "R32F", factor) if factor > 1 and stale else target
+        if factor > 1:
+            result = self._targets[("luminance", "mean")]
+        image = np.empty((self.height, self.width), np.float32) if out is None else out
+        self.changed = stale
+        if image is not self._backdrop.image:
+            stale = [whole]
+            self._backdrop.image = image
+        ctx.finish()
+        drawn = time.perf_counter()
+        for r in stale:
+            if r == whole:
+                result.read(0, out=image)
+            else:
+                image[r.y0:r.y1, r.x0:r.x1] = result.read(0, region=(r.x0, r.y0, r.x1 - r.x0, r.y1 - r.y0))
+        self.stats.render_s += drawn - started
+        self.stats.readback_s += time.perf_counter() - drawn
+        return image
 
     # ---- parts of the label pass -------------------------------------------------------------------------------
 
@@ -308,6 +385,11 @@ class Renderer:
         return self._targets[key]
 
     def _begin(self, target, moment: _Moment, background: float) -> None:
+        self._prepare(target)
+        target.clear((background, background, background, 0.0)[: target.formats[0].components], depth=0.0)
+        self.stats.frames += 1
+
+    def _prepare(self, target) -> None:
         ctx = self.gl.ctx
         target.fbo.use()
         ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
@@ -315,9 +397,7 @@ class Renderer:
         ctx.depth_func = ">"  # reversed-Z
         ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down
         ctx.cull_face = "back"
-        target.clear((background, background, background, 0.0)[: target.formats[0].components], depth=0.0)
         self._culling = False
-        self.stats.frames += 1
 
     def _bind(self, name: str, item: DrawItem, moment: _Moment, defines: dict) -> dict:
         """Uniforms of the program variant for ``item``, with the matrices and the light set."""

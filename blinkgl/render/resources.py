@@ -19,7 +19,7 @@ _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f
 class DrawItem:
     """One part of one object, ready to draw.
 
-    object_index : row of the frame's matrices.   centre, radius : bounding sphere, object frame.
+    object_index : row of the frame's matrices.   centre, radius; low, high : bounding sphere and box, object frame.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.
     """
@@ -29,6 +29,8 @@ class DrawItem:
     material: Material
     centre: np.ndarray
     radius: float
+    low: np.ndarray
+    high: np.ndarray
     layer: int
     two_sided: bool
     lit: bool
@@ -38,6 +40,8 @@ class DrawItem:
         return self.material.texture is not None
 
 
+MAX_RADIUS = 1e18
+"""Times the largest focal length, 1e9 px, still far below float32's 3e38."""
 _LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
 
 
@@ -139,5 +143,8 @@ def _draw_item(index: int, mesh: Mesh, material: Material, category: str) -> Dra
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
+    if not radius <= MAX_RADIUS:  # NaN too
+        raise AssetError("mesh is too large to be drawn in float32", where=mesh.name or f"object {index}", value=radius,
+                         accepted=f"at most {MAX_RADIUS:g} units from its centre, all coordinates finite")
     two_sided = material.double_sided or not mesh.closed
-    return DrawItem(index, mesh, material, centre, radius, _LAYER[category], two_sided, lit=not material.unlit)
+    return DrawItem(index, mesh, material, centre, radius, low, high, _LAYER[category], two_sided, lit=not material.unlit)

@@ -7,7 +7,8 @@ uniform vec2 light_strength; // (sun, sky)
 
 float irradiance(vec3 normal)
 {
-    vec3 n = normalize(normal);
+    // normalize(), except that the normal of a degenerate triangle, zero, stays zero instead of becoming NaN.
+    vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));
     return light_strength.x * max(0.0, dot(n, sun_direction))
          + light_strength.y * (0.5 + 0.5 * dot(n, up_direction));
 }

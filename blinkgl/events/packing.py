@@ -22,39 +22,6 @@ JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
 JIT_PARALLEL = dict(parallel=True, **JIT)
 
 
-_BYTES_TO_BITS, _S56 = np.uint64(0x0102040810204080), np.uint64(56)
-_BIT_POSITIONS = np.zeros((256, 8), np.int32)
-for _mask in range(256):
-    _set = [_bit for _bit in range(8) if _mask >> _bit & 1]
-    _BIT_POSITIONS[_mask, : len(_set)] = _set
-_BIT_COUNTS = np.array([_mask.bit_count() for _mask in range(256)], np.int64)
-
-
-@numba.njit(**JIT)
-def compact_flags(flags, scratch, first_pixel, out):
-    """Numbers ``first_pixel + i`` of the set flags into ``out``; returns how many.
-
-    flags : (n,) uint8 of 0 and 1, n a multiple of 8. scratch : (n / 8,) int64. out : int32 with room for 8 more than
-    are set. Eight flags are one word, squeezed to a byte by a multiplication and looked up: which pixels fire is
-    unpredictable, so a branch per pixel would cost several times more.
-    """
-    words = flags.view(np.uint64)
-    used = 0
-    for k in range(words.size):
-        scratch[used] = k
-        used += np.int64(words[k] != np.uint64(0))
-    count = 0
-    for j in range(used):
-        k = scratch[j]
-        # Byte b of the (little-endian) word lands on bit b of the top byte.
-        mask = np.int64((words[k] * _BYTES_TO_BITS) >> _S56)
-        base = np.int32(first_pixel + 8 * k)
-        for b in range(8):
-            out[count + b] = np.int32(base + _BIT_POSITIONS[mask, b])
-        count += _BIT_COUNTS[mask]
-    return count
-
-
 @numba.njit(**JIT)
 def _count_digits(packed, start, stop, shift, mask, histogram):
     histogram[:] = 0

@@ -10,10 +10,10 @@ continuous time, so that nothing but the accuracy of the interpolation depends o
   method), not on frame times.
 * After any event the reference is z at the end of the dead time: with no refractory period the level just passed,
   with one whatever the signal has become, so that change during the dead time never comes out as a backlog.
-* Leak is a drift of the reference; with jitter each event draws the length of the pixel's next leak interval (keyed by its own time).
-  Hot pixels are pixels with a large leak.
-* Shot noise is a Poisson process per block of 1024 pixels at its rate in the dark, thinned to
-  each pixel's own rate (R/2)(1 - 0.75 (I + 20)/275) theta_nominal/theta per polarity at that instant.
+* Leak is a drift of the reference; with jitter each event draws the length of the pixel's next leak interval
+  (keyed by the event's time). Hot pixels are pixels with a large leak.
+* Shot noise is a Poisson process per block of 1024 pixels at its rate in the dark, thinned to each pixel's own rate
+  (R/2)(1 - 0.75 (I + 20)/275) theta_nominal/theta per polarity at that instant.
 * Photoreceptor noise (instead of shot noise) is the stationary noise of the same low-pass, added before the
   comparator; :mod:`blinkgl.events.noise` sets its size so that the rate holds at any frame spacing.
 """
@@ -24,186 +24,27 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numba.extending import register_jitable
 
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events.arith import exp_f32, exp_f64, log_f32, log_f64, select
+from blinkgl.events.arith import select
+from blinkgl.events.blocks import compact_flags, copy_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.esim import copy_block, draw_thresholds
-from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, noise_table, start_sizes
-from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
+from blinkgl.events.esim import draw_thresholds
+from blinkgl.events.noise import noise_table
+from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
 from blinkgl.events.types import Events
+from blinkgl.events.v2e_model import (DARKEST, REBASE, crossing_fraction, curve_of, draw_leaks, draw_start_noise, lin_log,
+                                      next_noise, noise_place, relax, relax_gently, shot_draw, shot_factor, shot_tables,
+                                      signal_at)
 
 _F = np.float32
-_ZERO, _ONE, _HALF, _JOINT, _SLOPE = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.log(20.0) / 20.0)
-_INF = np.float32(np.inf)
-_SHOT, _LEAK_JITTER = np.uint64(Stream.SHOT), np.uint64(Stream.LEAK_JITTER)
+_ZERO, _ONE, _HALF, _JOINT, _INF = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.inf)
+_SHOT, _LEAK_JITTER, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.LEAK_JITTER), np.uint64(Stream.NOISE)
 _U2, _U1, _U1000, _MASK41 = np.uint64(2), np.uint64(1), np.uint64(1000), 2**41 - 1
 _INSERTION_LIMIT = 32
-_FARTHEST, _FAR_BELOW = np.float32(1e6), np.int32(-(2**31))
-_NOISE, _SMALLEST_K = np.uint64(Stream.NOISE), _F(1e-6)
-_TABLE_LOW, _TABLE_PER, _TABLE_LAST = _F(TABLE_LOW), _F(1 / TABLE_STEP), _F(TABLE_SIZE - 2)
-REBASE = 0.02
-"""Leak (ln units) after which the leak clock starts anew: small beside a threshold, so that float32 does."""
-
-
-# --- the photoreceptor, shared with the slow twin (elementwise) --------------------------------------------
-@register_jitable
-def lin_log(intensity):
-    """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
-    return select(intensity <= _JOINT, intensity * _SLOPE, log_f32(np.maximum(intensity, _JOINT)))
-
-
-_P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040))
-
-
-@register_jitable
-def decay(k):
-    """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
-    small = np.minimum(k, _HALF)
-    p = _gentle_growth(small)
-    large = np.maximum(k, _HALF)
-    e = exp_f32(-large)
-    return select(k < _HALF, _ONE - small * p, e), select(k < _HALF, p, (_ONE - e) / large)
-
-
-@register_jitable
-def _gentle_growth(k):
-    """(1 - e^-k)/k for k < 1/2, Taylor."""
-    p = k * _P6 + _P5
-    p = p * k + _P4
-    p = p * k + _P3
-    p = p * k + _P2
-    p = p * k + _P1
-    return p * k + _P0
-
-
-@register_jitable
-def relax(lag, before, now, intensity_before, intensity_now, kappa):
-    """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
-    a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
-    return lag * a - (now - before) * g
-
-
-@register_jitable
-def relax_gently(lag, before, now, intensity_before, intensity_now, kappa):
-    """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
-    k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
-    g = _gentle_growth(k)
-    return lag * (_ONE - k * g) - (now - before) * g
-
-
-@register_jitable
-def curve_of(base, drift, dx, lag, k):
-    """(c, rise, fall) of z(s) = c + rise s + fall e^{-k s} over an interval, s in [0, 1], float64.
-
-    base: lin-log intensity and leak at the start; drift: change by leak and noise; dx: change of the lin-log
-    intensity; lag: y - x at the start; k: time constants in the interval, negative for no low-pass.
-    """
-    if k < 0:
-        return base, drift + dx, 0.0
-    behind = dx / k
-    return base - behind, drift + dx, lag + behind
-
-
-@register_jitable
-def signal_at(s, c, rise, fall, k):
-    """z at fraction s of the interval."""
-    if k < 0:
-        return c + rise * s
-    return c + rise * s + fall * exp_f64(-k * s)
-
-
-@register_jitable
-def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
-    """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
-
-    The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
-    1e-6 of the interval unless the curve is flat there."""
-    if k < 0:
-        return min(max((target - c) / rise, start), 1.0)
-    sign = 1.0 if polarity else -1.0
-    low, high = start, 1.0
-    e_low = 1.0 if start == 0.0 else exp_f64(-k * start)
-    f_low = sign * (c + rise * start + fall * e_low - target)
-    if f_low >= 0:
-        return start
-    f_high = sign * (end - target)
-    # z' at both ends; at the end fall e^-k follows from z itself.
-    v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
-    width, height = high - low, f_high - f_low
-    u = -f_low / height
-    s = low + width * u
-    if v_low > 0 and v_high > 0:
-        stretch = height / (width * v_low * v_high)
-        guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
-        if 0.0 < guess < 1.0:
-            s = low + width * guess
-    for _ in range(60):
-        e = fall * exp_f64(-k * s)
-        f = sign * (c + rise * s + e - target)
-        if f < 0:
-            low = s
-        else:
-            high = s
-        slope = sign * (rise - k * e)
-        following = s - f / slope if slope > 0 else -1.0
-        if not (low <= following <= high):
-            following = 0.5 * (low + high)
-        moved = abs(following - s)
-        s = following
-        if moved * (1.0 + k) < 1e-3:  # the error after a Newton step is about its square
-            break
-    return s
-
-
-# --- shot noise --------------------------------------------------------------------------------------------
-DARKEST = 1.0 - 0.75 * 20.0 / 275.0
-"""Shot-noise factor at intensity 0, the largest."""
-
-
-@register_jitable
-def shot_factor(intensity):
-    """Noise falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR 0.25)."""
-    return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
-
-
-@register_jitable
-def shot_draw(seed, block, index, rate_per_ns):
-    """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
-    u, v = uniform2(seed, block, _SHOT, index * _U2)
-    return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), v
-
-
-def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: float) -> np.ndarray:
-    """Cumulative noise of the pixels of each block of 1024, ON pixels then OFF pixels, (blocks, 2048) float32.
-
-    One unit is a pixel with nominal threshold and one polarity; the last entry of a block is its whole noise.
-    """
-    blocks = -(-len(on) // BLOCK)
-    weights = np.zeros((blocks, 2, BLOCK))
-    for polarity, (nominal, theta) in enumerate(((theta_on, on), (theta_off, off))):
-        padded = np.zeros(blocks * BLOCK)
-        padded[: len(on)] = nominal / theta.astype(np.float64)
-        weights[:, polarity] = padded.reshape(blocks, BLOCK)
-    return np.cumsum(weights.reshape(blocks, 2 * BLOCK), axis=1).astype(np.float32)
-
-
-@register_jitable
-def next_noise(noise, k, size, normal):
-    """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
-    a, _ = decay(k)
-    return noise * a + size * np.sqrt(_ONE - a * a) * normal
-
-
-@register_jitable
-def noise_place(k):
-    """Place in the table of sizes: (entry below, fraction)."""
-    place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
-    below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))
-    return below, _F(np.minimum(place, _TABLE_LAST) - _F(below))
+_FARTHEST, _FAR_BELOW = _F(1e6), np.int32(-(2**31))
 
 
 class Pixels(NamedTuple):
@@ -241,12 +82,6 @@ class Interval(NamedTuple):
     shot_unit_per_ns: float  # rate of a dark pixel with nominal threshold, one polarity
     inverse_threshold: float
     bound_per_pixel: int
-
-
-@numba.njit(**JIT)
-def _scale_block(frame, scale, out):
-    for i in range(frame.size):
-        out[i] = frame[i] * scale
 
 
 @numba.njit(**JIT)
@@ -477,7 +312,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         if codes.size:
             _lookup_block(codes[s:e], table, x_table, intensity[:n], x[:n], z[:n])
         else:
-            _scale_block(frame[s:e], v.scale, intensity[:n])
+            scale_block(frame[s:e], v.scale, intensity[:n])
             _lin_log_block(intensity[:n], x[:n], z[:n])
         if p.lag.size:
             if v.gentle:
@@ -531,8 +366,8 @@ def _bands(edges, progress, share, packed, frame, codes, table, x_table, p, v):
 class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
-    State: 16 bytes per pixel, 4 more with the low-pass, 8 with the dead time, 8 with leak and its jitter, 4 with
-    photoreceptor noise; thresholds are constants."""
+    State: 16 bytes per pixel; the low-pass, leak and photoreceptor noise add 4 each, the dead time 8. Constants:
+    16 bytes per pixel, 8 more with shot noise."""
 
     _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",
               "_clock_index", "_epoch_ns", "_brightest")
@@ -625,26 +460,3 @@ class V2e(Emulator):
             self._lower -= gone
             self._epoch_ns[0] = t_ns
         return events
-
-
-def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
-    """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
-    corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
-    _, normal = normal2(seed, np.arange(len(intensity), dtype=np.uint64), np.uint64(Stream.START), np.uint64(1))
-    return (start_sizes(config.shot_noise_rate_hz, corner, config.contrast_threshold) * normal).astype(np.float32)
-
-
-def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:
-    """Drift of the comparator by leak, ln units per second, (H*W,) float32; empty when there is none.
-
-    Log-normal over the pixels (v2e: 10^(cov N)); hot pixels: exponential around their mean rate.
-    """
-    if config.leak_rate_hz == 0 and config.hot_pixel_fraction == 0:
-        return np.empty(0, np.float32)
-    pixels = pixel_counters(height, width)
-    spread, _ = normal2(seed, pixels, np.uint64(Stream.LEAK), np.uint64(0))
-    rate = config.leak_rate_hz * exp_f64(np.log(10.0) * config.leak_cov_decades * spread)
-    if config.hot_pixel_fraction:
-        u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
-        rate = np.where(u < config.hot_pixel_fraction, -log_f64(v) * config.hot_pixel_rate_hz, rate)
-    return (rate * on).astype(np.float32)

@@ -25,9 +25,9 @@ from numba.extending import register_jitable
 
 from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events.arith import exp_f64, select
+from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.esim import copy_block
-from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT, compact_flags
+from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT
 from blinkgl.events.philox import Stream, normal_and_uniform, uniform2
 from blinkgl.events.types import Events
 
@@ -151,18 +151,6 @@ class Interval(NamedTuple):
 
 
 @numba.njit(**JIT)
-def _scale_block(frame, scale, out):
-    for i in range(frame.size):
-        out[i] = frame[i] * scale
-
-
-@numba.njit(**JIT)
-def _lookup_block(codes, table, out):
-    for i in range(codes.size):
-        out[i] = table[codes[i]]
-
-
-@numba.njit(**JIT)
 def _sense_block(before, now, v, interval, v_end, flags):
     """V at the end into ``v_end``, flags of pixels that may fire; returns the largest mean number of events."""
     dt_us = interval.dt_ns * 1e-3
@@ -258,9 +246,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         if n < BLOCK:
             flags[:] = 0
         if codes.size:
-            _lookup_block(codes[s:e], table, now[:n])
+            lookup_block(codes[s:e], table, now[:n])
         else:
-            _scale_block(frame[s:e], v.scale, now[:n])
+            scale_block(frame[s:e], v.scale, now[:n])
         most = _sense_block(p.intensity[s:e], now[:n], p.v[s:e], v, v_end, flags)
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)

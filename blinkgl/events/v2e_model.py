@@ -1,0 +1,206 @@
+"""The elements of V2E, elementwise: photoreceptor, crossing times, noise. Kernel and slow twin are built on these.
+
+Formulas and sources are in :mod:`blinkgl.events.v2e`. Functions marked ``register_jitable`` take scalars inside a
+kernel and arrays from Python.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba.extending import register_jitable
+
+from blinkgl.config.events import V2eConfig
+from blinkgl.events.arith import exp_f32, exp_f64, log_f32, log_f64, select
+from blinkgl.events.emulator import BLOCK
+from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_sizes
+from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
+
+_F = np.float32
+_ZERO, _ONE, _HALF, _JOINT, _SLOPE = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.log(20.0) / 20.0)
+_SHOT, _U2, _SMALLEST_K = np.uint64(Stream.SHOT), np.uint64(2), _F(1e-6)
+_TABLE_LOW, _TABLE_PER, _TABLE_LAST = _F(TABLE_LOW), _F(1 / TABLE_STEP), _F(TABLE_SIZE - 2)
+REBASE = 0.02
+"""Leak (ln units) after which the leak clock starts anew: small beside a threshold, so that float32 does."""
+
+
+# --- photoreceptor -----------------------------------------------------------------------------------------
+@register_jitable
+def lin_log(intensity):
+    """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
+    return select(intensity <= _JOINT, intensity * _SLOPE, log_f32(np.maximum(intensity, _JOINT)))
+
+
+_P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 1 / 120, -1 / 720, 1 / 5040))
+
+
+@register_jitable
+def decay(k):
+    """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
+    small = np.minimum(k, _HALF)
+    p = _gentle_growth(small)
+    large = np.maximum(k, _HALF)
+    e = exp_f32(-large)
+    return select(k < _HALF, _ONE - small * p, e), select(k < _HALF, p, (_ONE - e) / large)
+
+
+@register_jitable
+def _gentle_growth(k):
+    """(1 - e^-k)/k for k < 1/2, Taylor."""
+    p = k * _P6 + _P5
+    p = p * k + _P4
+    p = p * k + _P3
+    p = p * k + _P2
+    p = p * k + _P1
+    return p * k + _P0
+
+
+@register_jitable
+def relax(lag, before, now, intensity_before, intensity_now, kappa):
+    """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
+    a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
+    return lag * a - (now - before) * g
+
+
+@register_jitable
+def relax_gently(lag, before, now, intensity_before, intensity_now, kappa):
+    """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
+    k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
+    g = _gentle_growth(k)
+    return lag * (_ONE - k * g) - (now - before) * g
+
+
+# --- where the signal meets a level ------------------------------------------------------------------------
+@register_jitable
+def curve_of(base, drift, dx, lag, k):
+    """(c, rise, fall) of z(s) = c + rise s + fall e^{-k s} over an interval, s in [0, 1], float64.
+
+    base: lin-log intensity and leak at the start; drift: change by leak and noise; dx: change of the lin-log
+    intensity; lag: y - x at the start; k: time constants in the interval, negative for no low-pass.
+    """
+    if k < 0:
+        return base, drift + dx, 0.0
+    behind = dx / k
+    return base - behind, drift + dx, lag + behind
+
+
+@register_jitable
+def signal_at(s, c, rise, fall, k):
+    """z at fraction s of the interval."""
+    if k < 0:
+        return c + rise * s
+    return c + rise * s + fall * exp_f64(-k * s)
+
+
+@register_jitable
+def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
+    """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
+
+    The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
+    1e-6 of the interval unless the curve is flat there."""
+    if k < 0:
+        return min(max((target - c) / rise, start), 1.0)
+    sign = 1.0 if polarity else -1.0
+    low, high = start, 1.0
+    e_low = 1.0 if start == 0.0 else exp_f64(-k * start)
+    f_low = sign * (c + rise * start + fall * e_low - target)
+    if f_low >= 0:
+        return start
+    f_high = sign * (end - target)
+    # z' at both ends; at the end fall e^-k follows from z itself.
+    v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
+    width, height = high - low, f_high - f_low
+    u = -f_low / height
+    s = low + width * u
+    if v_low > 0 and v_high > 0:
+        stretch = height / (width * v_low * v_high)
+        guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
+        if 0.0 < guess < 1.0:
+            s = low + width * guess
+    for _ in range(60):
+        e = fall * exp_f64(-k * s)
+        f = sign * (c + rise * s + e - target)
+        if f < 0:
+            low = s
+        else:
+            high = s
+        slope = sign * (rise - k * e)
+        following = s - f / slope if slope > 0 else -1.0
+        if not (low <= following <= high):
+            following = 0.5 * (low + high)
+        moved = abs(following - s)
+        s = following
+        if moved * (1.0 + k) < 1e-3:  # the error after a Newton step is about its square
+            break
+    return s
+
+
+# --- shot noise --------------------------------------------------------------------------------------------
+DARKEST = 1.0 - 0.75 * 20.0 / 275.0
+"""Shot-noise factor at intensity 0, the largest."""
+
+
+@register_jitable
+def shot_factor(intensity):
+    """Noise falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR 0.25)."""
+    return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
+
+
+@register_jitable
+def shot_draw(seed, block, index, rate_per_ns):
+    """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
+    u, v = uniform2(seed, block, _SHOT, index * _U2)
+    return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), v
+
+
+def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: float) -> np.ndarray:
+    """Cumulative noise of the pixels of each block of 1024, ON pixels then OFF pixels, (blocks, 2048) float32.
+
+    One unit is a pixel with nominal threshold and one polarity; the last entry of a block is its whole noise.
+    """
+    blocks = -(-len(on) // BLOCK)
+    weights = np.zeros((blocks, 2, BLOCK))
+    for polarity, (nominal, theta) in enumerate(((theta_on, on), (theta_off, off))):
+        padded = np.zeros(blocks * BLOCK)
+        padded[: len(on)] = nominal / theta.astype(np.float64)
+        weights[:, polarity] = padded.reshape(blocks, BLOCK)
+    return np.cumsum(weights.reshape(blocks, 2 * BLOCK), axis=1).astype(np.float32)
+
+
+# --- photoreceptor noise -----------------------------------------------------------------------------------
+@register_jitable
+def next_noise(noise, k, size, normal):
+    """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
+    a, _ = decay(k)
+    return noise * a + size * np.sqrt(_ONE - a * a) * normal
+
+
+@register_jitable
+def noise_place(k):
+    """Place in the table of sizes: (entry below, fraction)."""
+    place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
+    below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))
+    return below, _F(np.minimum(place, _TABLE_LAST) - _F(below))
+
+
+# --- what is drawn once ------------------------------------------------------------------------------------
+def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
+    """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
+    corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
+    _, normal = normal2(seed, np.arange(len(intensity), dtype=np.uint64), np.uint64(Stream.START), np.uint64(1))
+    return (start_sizes(config.shot_noise_rate_hz, corner, config.contrast_threshold) * normal).astype(np.float32)
+
+
+def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:
+    """Drift of the comparator by leak, ln units per second, (H*W,) float32; empty when there is none.
+
+    Log-normal over the pixels (v2e: 10^(cov N)); hot pixels: exponential around their mean rate.
+    """
+    if config.leak_rate_hz == 0 and config.hot_pixel_fraction == 0:
+        return np.empty(0, np.float32)
+    pixels = pixel_counters(height, width)
+    spread, _ = normal2(seed, pixels, np.uint64(Stream.LEAK), np.uint64(0))
+    rate = config.leak_rate_hz * exp_f64(np.log(10.0) * config.leak_cov_decades * spread)
+    if config.hot_pixel_fraction:
+        u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
+        rate = np.where(u < config.hot_pixel_fraction, -log_f64(v) * config.hot_pixel_rate_hz, rate)
+    return (rate * on).astype(np.float32)

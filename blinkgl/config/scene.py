@@ -58,17 +58,22 @@ def _number_or_three(value: Any) -> Any:
 
 
 def _greater_than_zero(value: Any) -> Any:
-    if min(value if isinstance(value, tuple) else (value,)) <= 0:
-        raise ValueError("must be greater than 0")
+    values = value if isinstance(value, tuple) else (value,)
+    if min(values) <= 0 or max(values) > 1e9:
+        raise ValueError("must be greater than 0 and at most 1e9")
     return value
 
 
-Positive = Annotated[float, Field(gt=0)]
-Unsigned = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0, le=1e9)]
+Radiance = Annotated[float, Field(ge=0, le=1e9)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_as_pair), AfterValidator(_ordered)]
 Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
 Vector3 = tuple[float, float, float]
+# At 1e9 units float64 still tells 1e-7 units apart; beyond, a unit was mistaken, and float32 matrices would overflow in the end.
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+Position = tuple[Coordinate, Coordinate, Coordinate]
+Repeats = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
 class ObjectsConfig(Config):
@@ -154,8 +159,8 @@ class RegionConfig(Config):
 class LightConfig(Config):
     """One white sun and a sky: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)."""
 
-    sun: float = Field(0.9, ge=0, description="strength of the sun, radiance of a white facing surface")
-    sky: float = Field(0.6, ge=0, description="strength of the sky")
+    sun: float = Field(0.9, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
+    sky: float = Field(0.6, ge=0, le=1e9, description="strength of the sky")
     sun_elevation: float | None = Field(None, ge=-90, le=90, description="degrees above the horizon; null: random in [25, 80] "
                                         "(60 where nothing is random)")
     sun_azimuth: float | None = Field(None, ge=-360, le=360, description="degrees from +x towards +y; null: random "
@@ -179,7 +184,7 @@ class RandomSceneConfig(Config):
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
     camera_clearance: float = Field(0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m")
-    background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
+    background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
 
     @model_validator(mode="after")
     def _fits(self):
@@ -196,10 +201,10 @@ class RandomSceneConfig(Config):
 class PoseConfig(Config):
     """Position, and at most one way to say the orientation."""
 
-    position: Vector3 = Field((0.0, 0.0, 0.0), description="m")
+    position: Position = Field((0.0, 0.0, 0.0), description="m")
     quaternion: tuple[float, float, float, float] | None = Field(None, description="[w, x, y, z], need not be normalised")
     euler: Vector3 | None = Field(None, description="degrees about the fixed x, y, z axes, applied in this order")
-    look_at: Vector3 | None = Field(None, description="point that the camera's z axis, or an object's x axis, is turned to")
+    look_at: Position | None = Field(None, description="point that the camera's z axis, or an object's x axis, is turned to")
 
     @model_validator(mode="after")
     def _one_orientation(self):
@@ -262,8 +267,8 @@ class MaterialConfig(Config):
     seed: int = Field(0, ge=0, description="which procedural texture of that kind")
     photograph: str | None = Field(None, description="name of a photograph bundled with scikit-image, such as astronaut")
     max_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
-    color: tuple[Unsigned, Unsigned, Unsigned] = Field((1.0, 1.0, 1.0), description="linear factor")
-    uv_scale: tuple[float, float] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
+    color: tuple[Radiance, Radiance, Radiance] = Field((1.0, 1.0, 1.0), description="linear factor")
+    uv_scale: tuple[Repeats, Repeats] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
     unlit: bool = Field(False, description="radiance = albedo, whatever the light")
     double_sided: bool = Field(False, description="draw back faces, with the normal turned round")
 
@@ -296,7 +301,7 @@ class ExplicitSceneConfig(Config):
     collisions: bool = Field(False, description="true: find collisions along the trajectories and stop what collides there")
     camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
     light: LightConfig = LightConfig()
-    background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
+    background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
 
 
@@ -310,7 +315,7 @@ class FileSceneConfig(Config):
     intrinsics: Literal["config", "file"] = Field("config", description="focal length from the YAML's camera or from the file's (yfov)")
     animation: str | int | None = Field(0, description="name or index of the animation played; null: none")
     light: LightConfig = LightConfig()
-    background: float = Field(0.2, ge=0, description="linear radiance where nothing is hit")
+    background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")
     max_texture_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
 

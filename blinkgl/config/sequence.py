@@ -32,10 +32,10 @@ class CameraConfig(Config):
     width: int = Field(346, ge=1, le=16384, description="columns, px")
     height: int = Field(260, ge=1, le=16384, description="rows, px")
     fov: float | None = Field(None, gt=0.01, lt=179.9, description="horizontal field of view, degrees; default 60")
-    focal: float | None = Field(None, gt=0, description="focal length, px (fx = fy)")
-    cx: float | None = Field(None, description="principal point x, px; default the image centre, (width - 1) / 2")
-    cy: float | None = Field(None, description="principal point y, px; default (height - 1) / 2")
-    near: float = Field(0.05, gt=0, description="near plane: nothing nearer is drawn, world units")
+    focal: float | None = Field(None, ge=1e-3, le=1e9, description="focal length, px (fx = fy)")
+    cx: float | None = Field(None, ge=-1e6, le=1e6, description="principal point x, px; default the image centre, (width - 1) / 2")
+    cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point y, px; default (height - 1) / 2")
+    near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane: nothing nearer is drawn, world units")
 
     @model_validator(mode="after")
     def _one_of(self):

@@ -190,6 +190,10 @@ def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) 
     return (start_sizes(config.shot_noise_rate_hz, corner, config.contrast_threshold) * normal).astype(np.float32)
 
 
+MAX_LEAK_HZ = 1e6
+"""One event per microsecond, the resolution of event times."""
+
+
 def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:
     """Drift of the comparator by leak, ln units per second, (H*W,) float32; empty when there is none.
 
@@ -199,7 +203,8 @@ def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed:
         return np.empty(0, np.float32)
     pixels = pixel_counters(height, width)
     spread, _ = normal2(seed, pixels, np.uint64(Stream.LEAK), np.uint64(0))
-    rate = config.leak_rate_hz * exp_f64(np.log(10.0) * config.leak_cov_decades * spread)
+    # Log-normal tails of several decades ask for more events than there are microseconds: that is noise without end.
+    rate = np.minimum(config.leak_rate_hz * exp_f64(np.log(10.0) * config.leak_cov_decades * spread), MAX_LEAK_HZ)
     if config.hot_pixel_fraction:
         u, v = uniform2(seed, pixels, np.uint64(Stream.HOT), np.uint64(0))
         rate = np.where(u < config.hot_pixel_fraction, -log_f64(v) * config.hot_pixel_rate_hz, rate)

@@ -132,7 +132,7 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
     ({"objects": [{"mesh": "box", "material": "m"}]}, "scene.objects.0.material: no such name under scene.materials (got 'm')"),
     ({"objects": [{"mesh": "box", "name": "a"}, {"mesh": "box", "name": "a"}]}, "scene.objects.1.name: the name is given to two objects (got 'a')"),
     ({"objects": []}, "scene.objects: "),
-    ({"objects": [{"mesh": "box", "scale": 0}]}, "scene.objects.0.scale: must be greater than 0 (got 0)"),
+    ({"objects": [{"mesh": "box", "scale": 0}]}, "scene.objects.0.scale: must be greater than 0 and at most 1e9 (got 0)"),
     ({"objects": [{"mesh": "box", "scale": [1, 2]}]}, "scene.objects.0.scale: must be a number or a list of three (got [1, 2])"),
     ({"meshes": {"box": {"primitve": "cuboid"}}}, "scene.meshes.box.primitve: unknown key; expected 'primitive' (nearest)"),
     ({"meshes": {"box": {"file": "gone.obj"}}}, "scene.meshes.box.file: no such file (got 'gone.obj'); expected a mesh file"),

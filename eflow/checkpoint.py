@@ -31,8 +31,9 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Tensors and metadata of a safetensors file. Raises AssetError: missing, truncated, or something else, e.g. a pickle."""
     try:
         with open(path, "rb") as file:
-            head = file.read(8)
-        if head[:2] == b"PK" or head[:1] == b"\x80":
+            head = file.read(9)
+        # Eight bytes of header length, then JSON: a length may begin like a pickle, so the brace decides.
+        if head[8:] != b"{" and (head[:2] == b"PK" or head[:1] == b"\x80"):
             raise AssetError("is a PyTorch pickle, which could run any code when loaded; refused", where=str(path), accepted="a .safetensors file")
         with safe_open(path, framework="pt") as file:
             return {k: file.get_tensor(k) for k in file.keys()}, dict(file.metadata() or {})
@@ -178,7 +179,7 @@ def load_optimizer(path: Path, model: FlowModel, optimizer: torch.optim.Optimize
         if any(v.shape not in ((), p.shape) for v in found.values()):
             raise AssetError(f"optimiser state of '{name}' has another shape", where=str(path))
         if found:  # AdamW keeps its step counter on the CPU
-            optimizer.state[p] = {k: v.clone() if k == "step" else v.to(p.device) for k, v in found.items()}
+            optimizer.state[p] = {k: v.clone() if k == "step" else v.to(p.device, copy=True) for k, v in found.items()}
     if "/rng/cpu" not in tensors:
         raise AssetError("no generator state", where=str(path))
     torch.set_rng_state(tensors["/rng/cpu"])

@@ -210,5 +210,5 @@ def collate(samples: list[dict]) -> dict:
 def loader(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool = False) -> DataLoader:
     """Batches in the sampler's order; the same ones for any number of workers."""
     return DataLoader(dataset, batch_sampler=sampler, num_workers=workers, collate_fn=collate, pin_memory=pin,
-                      persistent_workers=workers > 0, prefetch_factor=4 if workers else None,
+                      persistent_workers=workers > 0, prefetch_factor=4 if workers else None, generator=torch.Generator(),  # else each start would draw from torch's global one
                       multiprocessing_context="forkserver" if workers else None)

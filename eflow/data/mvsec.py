@@ -116,6 +116,9 @@ class _MvsecSequence:
         self._file, self._pid = None, None
         self._rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
+    def __getstate__(self) -> dict:
+        return {**self.__dict__, "_file": None, "_pid": None}
+
     def window(self, t0: int, t1: int, image0: int, image1: int) -> Window:
         """Events of [t0, t1) µs; the images' event indices say where to look, the times decide."""
         if self._pid != os.getpid():  # HDF5 handles do not survive a fork

@@ -64,8 +64,8 @@ class Sequence:
 
 
 class FolderSource:
-    """Samples of :class:`Sequence` objects, in order. Files are opened on first use in each process (HDF5 handles do not
-    survive a fork) and at most 16 stay open."""
+    """Samples of :class:`Sequence` objects, in order. Files are opened on first use in each process (HDF5 handles survive
+    neither a fork nor a pickle) and at most 16 stay open."""
 
     def __init__(self, sequences: list[Sequence]):
         self.sequences = sequences
@@ -74,6 +74,9 @@ class FolderSource:
         self._readers: OrderedDict[Path, DsecEventReader] = OrderedDict()
         self._maps: dict[Path, np.ndarray] = {}
         self._pid = os.getpid()
+
+    def __getstate__(self) -> dict:
+        return {**self.__dict__, "_readers": OrderedDict()}  # handles stay in their process
 
     def __len__(self) -> int:
         return len(self._index)

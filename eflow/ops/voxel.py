@@ -24,7 +24,7 @@ def voxel_grid(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: i
     if len(t):
         scale = (bins - 1) / (int(t1) - int(t0)) if t1 > t0 else 0.0
         kernel = _splat_t if x.dtype.kind == "u" else _splat_xyt
-        outside = kernel(x, y, t, p, np.int64(t0), scale, grid)
+        outside = kernel(x, y, t, p, np.int64(t0), np.int64(t1), scale, grid)
         if outside:
             raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
     if normalise != "none":
@@ -33,16 +33,15 @@ def voxel_grid(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: i
 
 
 @numba.njit(cache=True, nogil=True)
-def _splat_t(x, y, t, p, t0, scale, grid):
+def _splat_t(x, y, t, p, t0, t1, scale, grid):
     bins, height, width = grid.shape
     outside = 0
     for i in range(len(t)):
-        c = np.float64(t[i] - t0) * scale
-        b = int(c)
-        if x[i] >= width or y[i] >= height or c < 0 or b > bins - 1:
+        if x[i] >= width or y[i] >= height or t[i] < t0 or t[i] > t1:
             outside += 1
             continue
-        b = min(b, max(bins - 2, 0))  # t == t1 belongs wholly to the last bin
+        c = np.float64(t[i] - t0) * scale
+        b = min(int(c), max(bins - 2, 0))  # t == t1 belongs wholly to the last bin
         w = np.float32(c - b)
         s = np.float32(1) if p[i] else np.float32(-1)
         grid[b, y[i], x[i]] += s * (np.float32(1) - w)
@@ -52,16 +51,15 @@ def _splat_t(x, y, t, p, t0, scale, grid):
 
 
 @numba.njit(cache=True, nogil=True)
-def _splat_xyt(x, y, t, p, t0, scale, grid):
+def _splat_xyt(x, y, t, p, t0, t1, scale, grid):
     bins, height, width = grid.shape
     outside = 0
     for i in range(len(t)):
-        c = np.float64(t[i] - t0) * scale
-        b = int(c)
-        if c < 0 or b > bins - 1:
+        if t[i] < t0 or t[i] > t1:
             outside += 1
             continue
-        b = min(b, max(bins - 2, 0))
+        c = np.float64(t[i] - t0) * scale
+        b = min(int(c), max(bins - 2, 0))
         wt = np.float32(c - b)
         s = np.float32(1) if p[i] else np.float32(-1)
         fx, fy = np.floor(x[i]), np.floor(y[i])
@@ -132,23 +130,23 @@ def counts_and_times(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray,
     """EV-FlowNet's image (Zhu et al., RSS 2018): (4, height, width) float32 = OFF count, ON count, latest OFF time, latest ON
     time; times as fractions of the window, 0 where no event was. Raises ValueError as :func:`voxel_grid`."""
     out = np.zeros((4, height, width), np.float32)
-    outside = _latest(x, y, t, p, np.int64(t0), 1.0 / max(int(t1) - int(t0), 1), out)
+    outside = _latest(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), out)
     if outside:
         raise ValueError(f"{outside} events outside the window or the {width}x{height} sensor")
     return out
 
 
 @numba.njit(cache=True, nogil=True)
-def _latest(x, y, t, p, t0, scale, out):
+def _latest(x, y, t, p, t0, span, out):
     _, height, width = out.shape
     outside = 0
     for i in range(len(t)):
-        c = np.float64(t[i] - t0) * scale
-        if x[i] >= width or y[i] >= height or c < 0 or c > 1:
+        d = t[i] - t0
+        if x[i] >= width or y[i] >= height or d < 0 or d > span:
             outside += 1
             continue
         out[p[i], y[i], x[i]] += np.float32(1)
-        out[2 + p[i], y[i], x[i]] = np.float32(c)
+        out[2 + p[i], y[i], x[i]] = np.float32(d / span)
     return outside
 
 

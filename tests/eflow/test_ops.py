@@ -1,0 +1,180 @@
+"""Fast operations against their slow twins and against closed forms."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from eflow.ops import attention, correlation  # noqa: E402
+from eflow.ops.correlation import DenseCorrelation, OnDemandCorrelation, local_correlation, lookup_slow, pixel_grid  # noqa: E402
+from eflow.ops.upsample import bilinear_upsample, convex_upsample, convex_upsample_slow  # noqa: E402
+from eflow.ops.warp import backward_warp, forward_warp  # noqa: E402
+
+H, W = 17, 21
+
+
+@pytest.fixture
+def maps():
+    torch.manual_seed(0)
+    return torch.randn(2, 32, H, W), torch.randn(2, 32, H, W)
+
+
+def targets() -> torch.Tensor:
+    """Coordinates inside, across every edge, far outside, on integers."""
+    torch.manual_seed(1)
+    coords = pixel_grid(H, W, torch.zeros(1)) + 6 * torch.randn(2, 2, H, W)
+    coords[0, :, 0] = coords[0, :, 0].round()
+    coords[1, :, 1] = torch.tensor([[-60.0], [500.0]])
+    return coords
+
+
+def test_lookup_gather_cpu_and_on_demand_equal_rafts(maps):
+    coords = targets()
+    dense = DenseCorrelation(*maps)
+    slow = lookup_slow(dense.levels, coords)
+    assert slow.shape == (2, 324, H, W)
+    with torch.enable_grad():
+        gather = dense.lookup(coords)
+    with torch.no_grad():
+        kernel = dense.lookup(coords)
+    on_demand = OnDemandCorrelation(*maps).lookup(coords)
+    for taps in (gather, kernel, on_demand):
+        assert (taps - slow).abs().max() < 4e-5
+
+
+def test_lookup_gradients_equal_rafts(maps):
+    coords, weights = targets(), torch.randn(2, 324, H, W)
+    gradients = []
+    for make in (lambda a, b: DenseCorrelation(a, b), lambda a, b: DenseCorrelation(a, b, slow=True), OnDemandCorrelation):
+        f1, f2 = (m.clone().requires_grad_() for m in maps)
+        (make(f1, f2).lookup(coords) * weights).sum().backward()
+        gradients.append((f1.grad, f2.grad))
+    for other in gradients[1:]:
+        for a, b in zip(gradients[0], other):
+            assert (a - b).abs().max() < 1e-3 * a.abs().max()
+
+
+def test_diverging_coordinates_do_not_read_out_of_bounds(maps):
+    dense = DenseCorrelation(*maps)
+    for value in (1e9, -1e9, float("inf")):
+        coords = torch.full((2, 2, H, W), value)
+        with torch.no_grad():
+            assert torch.equal(dense.lookup(coords), torch.zeros(2, 324, H, W))
+    with torch.no_grad():
+        assert dense.lookup(torch.full((2, 2, H, W), float("nan"))).isnan().all()
+
+
+def test_matching_finds_a_shift():
+    """Features of the target are the source's, shifted by (3, -2), and loud: the softmax is sharp."""
+    torch.manual_seed(2)
+    f1 = 8 * torch.randn(1, 64, 16, 24)
+    f2 = torch.roll(f1, (-2, 3), (2, 3))
+    dense = DenseCorrelation(f1, f2)
+    inner = (slice(None), slice(None), slice(3, -3), slice(4, -4))
+    expected = torch.tensor([3.0, -2.0])[None, :, None, None]
+    for correlator in (dense, OnDemandCorrelation(f1, f2)):
+        assert (correlator.match()[inner] - expected).abs().max() < 1e-3
+        assert (correlator.match_backward()[inner] + expected).abs().max() < 1e-3
+
+
+def test_matching_dense_equals_on_demand_equals_the_definition(maps):
+    h, w = H, W
+    dense, on_demand = DenseCorrelation(*maps), OnDemandCorrelation(*maps)
+    volume = torch.einsum("ndi,ndj->nij", maps[0].flatten(2).double(), maps[1].flatten(2).double()) / np.sqrt(32)
+    grid = pixel_grid(h, w, volume).double().flatten(2)
+    expected = (volume.softmax(-1) @ grid[0].T).transpose(1, 2).view(2, 2, h, w) - grid.view(1, 2, h, w)
+    for flow in (dense.match(), on_demand.match()):
+        assert (flow - expected).abs().max() < 1e-4
+    assert (dense.match_backward() - on_demand.match_backward()).abs().max() < 1e-4
+
+
+def test_convex_upsampling_equals_its_twin_and_keeps_constants():
+    torch.manual_seed(3)
+    flow, mask = torch.randn(2, 2, 7, 9), torch.randn(2, 576, 7, 9)
+    assert (convex_upsample(flow, mask) - convex_upsample_slow(flow, mask)).abs().max() < 1e-5
+    constant = torch.full((1, 2, 7, 9), 3.0)
+    for upsample in (convex_upsample, convex_upsample_slow):
+        assert torch.allclose(upsample(constant, mask[:1]), torch.tensor(24.0))  # edges and corners too
+    assert torch.allclose(bilinear_upsample(constant), torch.tensor(24.0))
+
+
+def test_convex_upsampling_places_sub_pixels():
+    """A mask that picks the centre neighbour repeats each value over its 8x8 block."""
+    flow = torch.arange(12.0).view(1, 1, 3, 4).repeat(1, 2, 1, 1)
+    mask = torch.full((1, 9, 64, 3, 4), -100.0)
+    mask[:, 4] = 100
+    out = convex_upsample(flow, mask.view(1, 576, 3, 4))
+    assert torch.equal(out[0, 0], 8 * flow[0, 0].repeat_interleave(8, 0).repeat_interleave(8, 1))
+
+
+def test_upsampling_is_fp32_under_autocast():
+    torch.manual_seed(4)
+    flow, mask = 50 * torch.randn(1, 2, 8, 8), torch.randn(1, 576, 8, 8)
+    exact = convex_upsample(flow, mask)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(convex_upsample(flow, mask), exact)
+        assert torch.equal(bilinear_upsample(flow), bilinear_upsample(flow.clone()))
+
+
+@pytest.mark.parametrize("size", [(20, 30), (23, 17), (8, 41)])
+def test_window_attention_with_masked_padding_equals_unpadded(size):
+    """Against attention computed window by window on the real tokens alone."""
+    torch.manual_seed(5)
+    layer, x = attention.WindowAttention(32, 4, 10), torch.randn(2, *size, 32)
+    expected = torch.empty_like(x)
+    for top in range(0, size[0], 10):
+        for left in range(0, size[1], 10):
+            part = x[:, top:top + 10, left:left + 10]
+            tokens = part.reshape(2, -1, 32)
+            q, k, v = layer.qkv(tokens).chunk(3, -1)
+            heads = lambda t: t.view(2, -1, 4, 8).transpose(1, 2)  # noqa: E731
+            p = (heads(q) @ heads(k).transpose(-1, -2) / np.sqrt(8)).softmax(-1)
+            expected[:, top:top + 10, left:left + 10] = layer.proj((p @ heads(v)).transpose(1, 2).reshape(2, -1, 32)).view(part.shape)
+    assert (layer(x) - expected).abs().max() < 1e-5
+
+
+def test_global_attention_sees_no_token_of_padding_alone():
+    """21x18 tokens, reduced by 4: as many keys as cells that hold a real token, and 60x80 has the 300 of the blueprint."""
+    layer = attention.GlobalAttention(32, 4, 4, dense=False)
+    seen = []
+    layer.kv.register_forward_hook(lambda m, inputs, out: seen.append(inputs[0].shape[1]))
+    for size in ((21, 18), (60, 80)):
+        x = torch.randn(1, *size, 32)
+        assert layer(x, x).shape == x.shape
+    assert seen == [6 * 5, 300]
+
+
+def test_position_code_does_not_depend_on_the_size():
+    small, large = (attention.sine_position(h, w, 64, torch.zeros(1)) for h, w in ((8, 9), (30, 40)))
+    assert small.shape == (1, 64, 8, 9) and torch.equal(small, large[:, :, :8, :9])
+    flat = large[0].flatten(1)
+    assert torch.unique((flat * 1e4).round(), dim=1).shape[1] == 1200  # every position its own code
+
+
+def test_local_correlation_and_warping():
+    torch.manual_seed(6)
+    f1 = torch.randn(1, 16, 12, 14)
+    f2 = torch.roll(f1, (2, -1), (2, 3))
+    taps = local_correlation(f1, f2)
+    assert taps.shape == (1, 81, 12, 14)
+    best = taps[0, :, 5, 7].argmax()
+    assert (int(best) // 9 - 4, int(best) % 9 - 4) == (2, -1)
+    flow = torch.tensor([-1.0, 2.0])[None, :, None, None].expand(1, 2, 12, 14)
+    assert torch.allclose(backward_warp(f2, flow)[..., 1:9, 2:12], f1[..., 1:9, 2:12], atol=1e-5)
+    assert torch.allclose(backward_warp(f2, torch.zeros_like(flow)), f2, atol=1e-5)
+
+
+def test_forward_warp_carries_flow_along():
+    flow = torch.zeros(1, 2, 10, 12)
+    flow[..., 4, 5] = torch.tensor([2.0, -1.0])
+    moved = forward_warp(flow)
+    assert moved[0, :, 3, 7].tolist() == [1.0, -0.5]  # average with the still pixel it lands on
+    assert moved[0, :, 4, 5].tolist() == [0.0, 0.0]
+    constant = torch.tensor([1.5, 0.25])[None, :, None, None].expand(1, 2, 10, 12)
+    assert torch.allclose(forward_warp(constant)[..., 2:, 3:], constant[..., 2:, 3:], atol=1e-6)
+
+
+def test_patch_index_shares_one_fraction():
+    index, inside, fraction = correlation.patch_index(torch.tensor([[2.25, 3.5]]), 30, 40)
+    assert torch.allclose(fraction, torch.tensor([[0.25, 0.5]]))
+    assert int(index[0, 4, 4]) == 3 * 40 + 2 and bool(inside[0, 4, 4]) and not bool(inside[0, 0, 0])

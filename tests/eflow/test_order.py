@@ -1,0 +1,147 @@
+"""The order of training samples: a function of (seed, epoch, position), whatever the workers and wherever the run was cut."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from blinkgl.errors import BlinkGLError, ConfigError  # noqa: E402
+from eflow.config import AugmentConfig  # noqa: E402
+from eflow.data.dataset import FlowDataset, Key, Mixture, StepSampler, collate, cropped, loader, scaled  # noqa: E402
+from eflow.data.representation import VoxelGrid  # noqa: E402
+from eflow.data.sources import open_source  # noqa: E402
+from flow_data import blinkgl_set, blinkflow_set  # noqa: E402
+
+STRONG = AugmentConfig(vertical_flip=0.5, time_reversal=0.5, drop_probability=1, hot_probability=1, noise_probability=1, scale_probability=0.5)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory):
+    return open_source(blinkgl_set(tmp_path_factory.mktemp("set")))
+
+
+def test_every_sample_once_per_epoch_in_a_new_order():
+    mixture = Mixture([5, 7], [5, 7], seed=3)
+    epochs = [mixture.epoch(e) for e in range(3)]
+    for keys in epochs:
+        assert sorted((k.source, k.index) for k in keys) == [(s, i) for s, n in enumerate((5, 7)) for i in range(n)]
+    assert epochs[0] != [Key(0, k.position, k.source, k.index) for k in epochs[1]]
+    assert Mixture([5, 7], [5, 7], seed=4).epoch(0) != epochs[0]
+    again = Mixture([5, 7], [5, 7], seed=3)
+    assert [again.key(n) for n in (30, 2, 13)] == [epochs[2][6], epochs[0][2], epochs[1][1]]  # any order of asking
+
+
+def test_weights_are_shares_and_small_sets_are_gone_through_evenly():
+    mixture = Mixture([4, 16], [1, 1], seed=0)
+    drawn = [k for e in range(4) for k in mixture.epoch(e)]
+    assert sum(k.source == 0 for k in drawn) == 40 and len(drawn) == 80
+    counts = np.bincount([k.index for k in drawn if k.source == 0])
+    assert counts.tolist() == [10] * 4
+
+
+def test_steps_resume_and_ranks_partition():
+    mixture = Mixture([11], [1], seed=1)
+    whole = list(StepSampler(mixture, 4, 0, 9))
+    assert list(StepSampler(mixture, 4, 5, 9)) == whole[5:]
+    ranks = [list(StepSampler(mixture, 4, 0, 9, r, 2)) for r in range(2)]
+    for step, batch in enumerate(whole):
+        assert sorted(ranks[0][step] + ranks[1][step], key=lambda k: (k.epoch, k.position)) == batch
+
+
+def equal(a: dict, b: dict) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) if torch.is_tensor(a[k]) else a[k] == b[k] for k in a)
+
+
+def test_a_sample_is_a_function_of_its_key(source):
+    make = lambda seed=0: FlowDataset([source], VoxelGrid(), seed=seed, augment=STRONG, crop=(96, 112))  # noqa: E731
+    key = Key(2, 5, 0, 3)
+    a = make()[key]
+    assert a["new"].shape == (15, 96, 112) and a["flow"].shape == (2, 96, 112) and a["valid"].dtype == torch.bool
+    assert equal(a, make()[key])
+    assert not equal(a, make(1)[key]) and not equal(a, make()[Key(3, 5, 0, 3)])  # a new epoch, new augmentation
+
+
+def test_workers_change_nothing(source):
+    dataset = FlowDataset([source], VoxelGrid(), augment=STRONG, crop=(96, 112))
+    sampler = StepSampler(Mixture([len(source)], [1], 0), 3, 1, 4)
+    alone, with_workers = list(loader(dataset, sampler, 0)), list(loader(dataset, sampler, 2))
+    assert len(alone) == 3 and all(equal(a, b) for a, b in zip(alone, with_workers, strict=True))
+
+
+def test_augmented_flow_still_explains_the_events(source):
+    """Events of the fabricated set move with exactly its flow: warped to one time they form sharp points, in augmented samples too."""
+    from eflow.data.dataset import augmented
+
+    rng = np.random.default_rng(0)
+    moves = AugmentConfig(vertical_flip=0.5, time_reversal=0.5, drop_probability=0, hot_probability=0, noise_probability=0)
+    raw = source[1]
+    for _ in range(8):
+        s = augmented(raw, moves, rng)
+        u, v = s.flow[60, 60] / (s.new.t1 - s.new.t0)
+
+        def sharpness(sign, w=s.new, u=u, v=v):
+            image = np.zeros((400, 400))
+            x = np.rint(w.x - sign * u * (w.t - w.t0)).astype(int) + 100
+            y = np.rint(w.y - sign * v * (w.t - w.t0)).astype(int) + 100
+            np.add.at(image, (y, x), 1)
+            return (image**2).sum()
+
+        assert sharpness(1) > 1.3 * max(sharpness(0), sharpness(-1))
+
+
+def test_scale_scales_flow_by_the_true_factor():
+    h, w = 40, 60
+    flow = torch.stack([torch.full((h, w), 3.0), torch.full((h, w), -2.0)])
+    valid = torch.ones(h, w, dtype=torch.bool)
+    valid[:10] = False
+    flow[:, :10] = 1e6
+    sample = {"old": torch.rand(15, h, w), "new": torch.rand(15, h, w), "flow": flow, "valid": valid, "mask": torch.ones(h, w, dtype=torch.bool)}
+    out = scaled(sample, 1.31)
+    assert out["new"].shape == (15, 52, 79)
+    got = out["flow"][:, out["valid"]]
+    assert torch.allclose(got[0], torch.tensor(3.0 * 79 / 60)) and torch.allclose(got[1], torch.tensor(-2.0 * 52 / 40))
+    assert not out["valid"][:13].any() and out["valid"][15:].all()
+    assert scaled(sample, 0.5, least=(32, 32))["new"].shape == (15, 32, 32)
+
+
+def test_refusals(source, tmp_path):
+    sample = FlowDataset([source], VoxelGrid())[0]
+    with pytest.raises(BlinkGLError, match="data.crop, .*: sample is smaller than the crop"):
+        cropped(sample, (256, 256), np.random.default_rng(0), sample["name"])
+    with pytest.raises(BlinkGLError, match="differ in size"):
+        collate([sample, FlowDataset([open_source(blinkflow_set(tmp_path / "b"))], VoxelGrid())[0]])
+    forward_only = open_source(blinkgl_set(tmp_path / "f", sequences=1, backward=False))
+    with pytest.raises(ConfigError, match="data.augment.time_reversal: time reversal needs backward flow"):
+        FlowDataset([forward_only], VoxelGrid(), augment=STRONG)
+
+
+def test_windows_without_events(tmp_path):
+    from blinkgl.io.sequence_dir import SequenceWriter
+    from flow_data import SPAN, constant_flow, moving_events
+
+    with SequenceWriter(tmp_path / "still", 128, 128, config_yaml="") as writer:
+        writer.append_events(moving_events(128, 128, 0, 2 * SPAN))
+        for k in range(3):
+            writer.flow("forward", k, constant_flow(128, 128), np.ones((128, 128), bool), SPAN * (k + 1), SPAN * (k + 2))
+        writer.t_end_us = 4 * SPAN
+    source = open_source(tmp_path)
+    with pytest.raises(BlinkGLError, match=r"still/000001: no events in the new window \[200000, 300000\) µs"):
+        FlowDataset([source], VoxelGrid())[1]
+    skipping = FlowDataset([source], VoxelGrid(), empty="skip")
+    assert skipping[1]["name"] == "still/000000"
+
+
+def test_flow_from_400_px_on_is_not_supervised(source):
+    from dataclasses import replace
+
+    class Fast:
+        has_backward = True
+        __len__ = lambda self: 1  # noqa: E731
+
+        def __getitem__(self, i):
+            flow = source[0].flow.copy()
+            flow[50, 50], flow[51, 51] = (400, 0), (399, 0)
+            return replace(source[0], flow=flow)
+
+    sample = FlowDataset([Fast()], VoxelGrid())[0]
+    assert not sample["valid"][50, 50] and sample["valid"][51, 51]

@@ -1,0 +1,172 @@
+"""Every layout read from files of that layout; damaged ones refused by name."""
+
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError, BlinkGLError
+from eflow.data.mvsec import HOOD_ROW, MvsecSource, NpzRows, propagate
+from eflow.data.sources import detect_format, open_source, read_flow
+from flow_data import SPAN, blinkflow_set, blinkgl_set, constant_flow, dsec_set, moving_events, mvsec_set
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    root = tmp_path_factory.mktemp("sets")
+    return {"blinkgl": blinkgl_set(root / "blinkgl"), "dsec": dsec_set(root / "dsec"), "blinkflow": blinkflow_set(root / "blinkflow"),
+            "mvsec": mvsec_set(root / "mvsec")}
+
+
+@pytest.mark.parametrize("name", ["blinkgl", "dsec", "blinkflow", "mvsec"])
+def test_detected_and_consistent(sets, name):
+    assert detect_format(sets[name]) == name
+    source = open_source(sets[name])
+    for i in range(len(source)):
+        s = source[i]
+        assert s.old.t1 == s.new.t0 and s.new.t1 - s.new.t0 > 0
+        for w in (s.old, s.new):
+            assert len(w) and w.t.dtype == np.int64 and w.t0 <= w.t[0] and w.t[-1] < w.t1 and (np.diff(w.t) >= 0).all()
+        assert s.flow.shape == (s.height, s.width, 2) and s.flow.dtype == np.float32 and s.valid.dtype == bool
+
+
+def test_blinkgl(sets):
+    source = open_source(sets["blinkgl"])
+    assert len(source) == 6 and source.has_backward
+    s = source[4]
+    assert s.name == "train/seq_000001/000001" and s.scene == "train/seq_000001"
+    assert (s.new.t0, s.new.t1) == (2 * SPAN, 3 * SPAN)
+    e = moving_events(128, 144, 0, 4 * SPAN, (50.0, -20.0), 16000, 1).window(2 * SPAN, 3 * SPAN)
+    np.testing.assert_array_equal(s.new.t, e.t)
+    np.testing.assert_array_equal(s.new.x, e.x)
+    np.testing.assert_allclose(s.flow[10, 10], (5.0, -2.0), atol=1 / 256)
+    np.testing.assert_allclose(s.backward[10, 10], (-5.0, 2.0), atol=1 / 256)
+    assert not s.valid[:4].any() and s.valid[4:].all()
+
+
+def test_dsec_rectified_and_beyond_32_bits(sets):
+    s = open_source(sets["dsec"])[1]
+    assert s.name == "thun_00_a/000004" and s.new.t0 == 49_000_000_000 + 2 * SPAN
+    e = moving_events(480, 640, 49_000_000_000, 49_000_000_000 + 3 * SPAN, n=6000).window(s.new.t0, s.new.t1)
+    np.testing.assert_array_equal(s.new.t, e.t)
+    np.testing.assert_allclose(s.new.x, e.x + 0.25)
+    assert s.new.x.dtype == np.float32
+
+
+def test_blinkflow_label_0_has_no_past(sets):
+    source = open_source(sets["blinkflow"])
+    assert [source[i].name for i in range(len(source))] == ["scene_a/seq_0/000001", "scene_a/seq_0/000002"]
+    assert source[0].scene == "scene_a" and (source[0].new.t0, source[0].new.t1) == (SPAN, 2 * SPAN)
+    e = moving_events(480, 640, 0, 3 * SPAN, n=6000)
+    assert len(source[1].new) == len(e.window(2 * SPAN, 3 * SPAN))  # past the end of ms_to_idx
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("dt", [1, 4])
+def test_mvsec(tmp_path, dt, compressed):
+    source = MvsecSource(mvsec_set(tmp_path, compressed=compressed), dt)
+    s = source[0]
+    assert s.name == f"indoor_flying1/{dt:06d}"
+    e = moving_events(260, 346, 0, int(12 / 31 * 1e6), n=20000)
+    assert abs(len(s.new) - len(e.window(s.new.t0, s.new.t1))) <= 1  # float64 seconds since 1970 resolve 0.2 µs
+    inside = s.valid & (np.arange(346)[None] > 40) & (np.arange(260)[:, None] > 40) & (np.arange(260)[:, None] < 200) & (np.arange(346)[None] < 300)
+    span = (s.new.t1 - s.new.t0) * 20e-6
+    np.testing.assert_allclose(s.flow[inside], np.broadcast_to((span, -0.5 * span), (inside.sum(), 2)), rtol=1e-4)
+    assert not s.valid[:18, :18].any()
+    assert not s.mask[:2].any() and not s.mask[:, :45].any() and s.mask[2:258, 45:301].any()
+    hits = np.zeros_like(s.mask)
+    hits[s.new.y, s.new.x] = True
+    assert not (s.mask & ~hits).any()
+
+
+def test_mvsec_hood(tmp_path):
+    assert not open_source(mvsec_set(tmp_path, "outdoor_day1"), "mvsec")[0].mask[HOOD_ROW:].any()
+
+
+def test_propagation_through_successive_fields():
+    """A shear: u = y in the first field; then v = 1. The second field is read where the point has got to."""
+    h, w = 8, 30
+    first, second = np.zeros((h, w, 2), np.float32), np.ones((h, w, 2), np.float32)
+    first[..., 0] = np.arange(h)[:, None]
+    first[0] = (0, 0)
+    second[..., 0] = np.arange(w)[None]
+    flow, valid = propagate([(first, 1.0), (second, 0.5)])
+    assert not valid[0].any()  # 0, 0 is invalid
+    x, y = 5, 4
+    np.testing.assert_allclose(flow[y, x], (4 + 0.5 * 9, 0.5))
+    assert valid[4, 25] and not valid[4, 26]  # x + 4 leaves the image
+    assert (flow[~valid] == 0).all()
+
+
+# ---- damaged and missing ---------------------------------------------------------------------------------------------
+
+
+def refused(match: str, call) -> None:
+    with pytest.raises(BlinkGLError, match=match) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_and_corrupt_event_files(tmp_path):
+    root = blinkgl_set(tmp_path / "set", sequences=1)
+    path = root / "train" / "seq_000000" / "events.h5"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    refused(r"events\.h5: truncated", lambda: open_source(root)[0])
+    path.write_bytes(b"no hdf5 at all" * 100)
+    refused(r"events\.h5: not an HDF5 file", lambda: open_source(root)[0])
+    path.unlink()
+    refused("no blinkgl sequence", lambda: open_source(root))
+    refused("no such data set", lambda: open_source(tmp_path / "nowhere"))
+    (tmp_path / "empty").mkdir()
+    refused("no data set found", lambda: open_source(tmp_path / "empty"))
+
+
+def test_bad_times_and_counts(tmp_path):
+    root = blinkgl_set(tmp_path, sequences=1)
+    folder = root / "train" / "seq_000000" / "flow"
+    times = folder / "forward_timestamps.txt"
+    text = times.read_text()
+    times.write_text(text.replace("100000, 200000", "200000, 100000"))
+    refused("forward_timestamps.txt: not an interval", lambda: open_source(root))
+    times.write_text("# header\nnonsense\n")
+    refused("forward_timestamps.txt: not a list", lambda: open_source(root))
+    times.write_text(text + "400000, 500000\n")
+    refused("differ in number", lambda: open_source(root))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_nan_or_infinite_flow(tmp_path, value):
+    flow = np.dstack([constant_flow(8, 9), np.ones((8, 9), np.float32)])
+    flow[2, 3, 0] = value
+    np.save(tmp_path / "a.npy", flow)
+    refused(r"a\.npy: flow is NaN or infinite at pixel \(3, 2\)", lambda: read_flow(tmp_path / "a.npy"))
+    flow[2, 3, 2] = 0  # marked invalid: may hold anything
+    np.save(tmp_path / "a.npy", flow)
+    assert read_flow(tmp_path / "a.npy")[0][2, 3].tolist() == [0, 0]
+
+
+def test_pickles_are_not_loaded(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "sprung"), "w"))
+
+    np.save(tmp_path / "a.npy", np.array([Trap()], object), allow_pickle=True)
+    refused("a.npy: cannot read.*allow_pickle=False", lambda: read_flow(tmp_path / "a.npy"))
+    np.savez(tmp_path / "b.npz", timestamps=np.array([Trap()], object))
+    with pytest.raises(AssetError, match="not a plain"):
+        NpzRows(tmp_path / "b.npz", ("timestamps",))
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_mvsec_without_ground_truth(tmp_path):
+    mvsec_set(tmp_path)
+    path = tmp_path / "indoor_flying1_gt_flow_dist.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+    refused("not a readable .npz", lambda: open_source(tmp_path))
+    path.unlink()
+    refused("gt_flow_dist.npz: no such file", lambda: open_source(tmp_path))
+
+
+def test_dsec_without_rectification_map(tmp_path):
+    root = dsec_set(tmp_path)
+    (root / "thun_00_a/events/left/rectify_map.h5").unlink()
+    refused("rectify_map.h5: no rectification map", lambda: open_source(root))

@@ -1,0 +1,276 @@
+"""Training: exactly resumable, stops cleanly, never leaves half a checkpoint, refuses what it cannot use."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+torch = pytest.importorskip("torch")
+
+from safetensors.torch import load_file  # noqa: E402
+
+from blinkgl.errors import BlinkGLError, ConfigError, OutputError  # noqa: E402
+from eflow import checkpoint as ckpt  # noqa: E402
+from eflow.cli import run  # noqa: E402
+from eflow.config import load_train_config  # noqa: E402
+from eflow.train import TrainingError, learning_rate, train  # noqa: E402
+from flow_data import blinkgl_set  # noqa: E402
+
+FAST = {"name": "ev_flownet", "input": "voxel", "bins": 5}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return blinkgl_set(tmp_path_factory.mktemp("train"), sequences=2, labels=2)
+
+
+def config_file(folder: Path, data: Path, model=FAST, steps=6, crop=(64, 64), **changes) -> Path:
+    tree = {"seed": 5, "model": model, "data": {"train": [{"path": str(data)}], "batch": 2, "crop": list(crop), "augment": {"time_reversal": 0.3}},
+            "optim": {"steps": steps, "lr": 1e-3}, "run": {"device": "cpu", "log_every": 1}}
+    for dotted, value in changes.items():
+        part, key = dotted.split("__")
+        tree[part][key] = value
+    path = folder / "train.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return path
+
+
+def tensors(run_folder: Path) -> dict:
+    folder = ckpt.newest(run_folder)
+    return {f"{p.stem}/{k}": v for p in sorted(folder.glob("*.safetensors")) for k, v in load_file(p).items()}
+
+
+def log(run_folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (run_folder / "log.jsonl").read_text().splitlines()]
+
+
+TINY = {"name": "eflowformer", "layers": 1, "train_iterations": 1, "input": {"bins": 3}}
+
+
+def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path, data):
+    k, n = 2, 2
+    config = load_train_config(config_file(tmp_path, data, TINY, steps=k + n, crop=(128, 128)))
+    whole = train(config, tmp_path / "whole", quiet=True)
+    assert (whole.step, whole.reason) == (k + n, "finished")
+    stopped = train(config, tmp_path / "parts", stop_after=k, quiet=True)
+    assert (stopped.step, stopped.reason) == (k, "stop")
+    torch.manual_seed(123)  # another process would have another state
+    train(config, tmp_path / "parts", resume=True, quiet=True)
+    a, b = tensors(tmp_path / "whole"), tensors(tmp_path / "parts")
+    assert a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+    assert any(key.endswith("exp_avg") for key in a) and any(key.startswith("ema/") for key in a)
+    losses = [[(r["step"], r["loss"], r["lr"], r["epe"]) for r in log(tmp_path / d)] for d in ("whole", "parts")]
+    assert losses[0] == losses[1] and len(losses[0]) == k + n
+
+
+def test_it_learns_a_constant_flow(tmp_path, data):
+    """Sixteen steps on four samples of constant flow: the error falls to less than half."""
+    config = load_train_config(config_file(tmp_path, data, steps=16, data__augment=None, optim__lr=2e-3, optim__ema=0))
+    train(config, tmp_path / "run", quiet=True)
+    epe = [r["epe"] for r in log(tmp_path / "run")]
+    assert np.mean(epe[-4:]) < 0.5 * np.mean(epe[:4])
+
+
+def test_a_run_folder_is_complete_and_not_overwritten(tmp_path, data, capsys):
+    path = config_file(tmp_path, data, steps=2, run__picture_every=2, run__validate_every=2, data__validate_on=[{"path": str(data)}],
+                       data__validate_samples=2)
+    out = tmp_path / "run"
+    assert run(["train", str(path), "--out", str(out)]) == 0
+    err = capsys.readouterr().err
+    assert "step 2/2" in err and "samples/s" in err and "left" in err and "finished at step 2" in err
+    assert (out / "config.yaml").is_file() and list((out / "tb").glob("events.*")) and (out / "pictures/000000002.png").is_file()
+    kinds = [r["kind"] for r in log(out)]
+    assert kinds == ["train", "train", "validation"]
+    assert {f"{data.name}/AEE", f"{data.name}/zero"} <= log(out)[-1].keys()
+    assert sorted(p.name for p in ckpt.newest(out).iterdir()) == ["ema.safetensors", "optimizer.safetensors", "state.json", "weights.safetensors"]
+    before = (out / "log.jsonl").read_bytes()
+    assert run(["train", str(path), "--out", str(out)]) == 2
+    assert "output folder exists" in capsys.readouterr().err and (out / "log.jsonl").read_bytes() == before
+    # the run's own config.yaml is a configuration
+    assert load_train_config(out / "config.yaml") == load_train_config(path)
+
+
+def test_resuming_with_another_configuration_names_the_key(tmp_path, data):
+    path = config_file(tmp_path, data, steps=4)
+    train(load_train_config(path), tmp_path / "run", stop_after=1, quiet=True)
+    for option, key in (("optim.lr=0.5", r"optim\.lr"), ("model.bins=7", r"model\.bins"), ("data.batch=1", r"data\.batch")):
+        with pytest.raises(ConfigError, match=f"^{key}: differs from the run"):
+            train(load_train_config(path, [option]), tmp_path / "run", resume=True, quiet=True)
+    train(load_train_config(path, ["run.log_every=2"]), tmp_path / "run", resume=True, stop_after=1, quiet=True)  # how it runs may change
+    with pytest.raises(BlinkGLError, match="no checkpoint to resume from"):
+        train(load_train_config(path), tmp_path / "other", resume=True, quiet=True)
+
+
+def test_old_checkpoints_are_deleted(tmp_path, data):
+    train(load_train_config(config_file(tmp_path, data, steps=4, run__checkpoint_every=1, run__keep_checkpoints=2)), tmp_path / "run", quiet=True)
+    assert sorted(p.name for p in (tmp_path / "run/checkpoints").iterdir()) == ["000000003", "000000004"]
+
+
+def test_fine_tuning_starts_from_the_weights(tmp_path, data):
+    first = train(load_train_config(config_file(tmp_path, data, steps=2)), tmp_path / "first", quiet=True)
+    path = config_file(tmp_path, data, steps=3, optim__lr=1e-12)
+    config = load_train_config(path, [f"init_from={first.checkpoint}"])
+    tuned = train(config, tmp_path / "tuned", stop_after=1, quiet=True)
+    a, b = (load_file(c / f) for c, f in ((first.checkpoint, "ema.safetensors"), (tuned.checkpoint, "weights.safetensors")))
+    assert all(torch.allclose(a[k], b[k], atol=1e-6) for k in a)
+    with pytest.raises(BlinkGLError, match="checkpoint of another model"):
+        train(load_train_config(path, [f"init_from={first.checkpoint}", "model={name: spike_flownet}"]), tmp_path / "x", quiet=True)
+
+
+def test_nan_stops_and_names_the_samples(tmp_path, data, monkeypatch):
+    import eflow.train as module
+
+    calls = []
+    original = module.sequence_loss
+
+    def poisoned(*args, **kw):
+        calls.append(1)
+        return original(*args, **kw) * (float("nan") if len(calls) == 2 else 1)
+
+    monkeypatch.setattr(module, "sequence_loss", poisoned)
+    config = load_train_config(config_file(tmp_path, data, run__checkpoint_every=1))
+    with pytest.raises(TrainingError, match="nan_batch.json: loss or gradient is not finite at step 1"):
+        train(config, tmp_path / "run", quiet=True)
+    saved = json.loads((tmp_path / "run/nan_batch.json").read_text())
+    assert saved["step"] == 1 and len(saved["samples"]) == 2 and all(s.startswith("train/seq_") for s in saved["samples"])
+    weights = load_file(ckpt.newest(tmp_path / "run") / "weights.safetensors")
+    assert ckpt.newest(tmp_path / "run").name == "000000001" and all(v.isfinite().all() for v in weights.values())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_writes_a_checkpoint_and_exits_0(tmp_path, data, number, monkeypatch):
+    import eflow.train as module
+
+    calls = []
+    original = module.sequence_loss
+
+    def interrupted(*args, **kw):
+        calls.append(1)
+        if len(calls) == 2:
+            os.kill(os.getpid(), number)
+        return original(*args, **kw)
+
+    monkeypatch.setattr(module, "sequence_loss", interrupted)
+    before = signal.getsignal(number)
+    assert run(["train", str(config_file(tmp_path, data, steps=1000)), "--out", str(tmp_path / "run"), "--quiet"]) == 0
+    assert signal.getsignal(number) is before
+    folder = ckpt.newest(tmp_path / "run")  # the step that was under way is finished first
+    assert folder.name == "000000002" and ckpt.read_state(folder)["step"] == 2
+
+
+def test_time_limit(tmp_path, data):
+    result = train(load_train_config(config_file(tmp_path, data, steps=1000, run__time_limit=1e-6)), tmp_path / "run", quiet=True)
+    assert (result.step, result.reason) == (1, "time limit")
+
+
+def test_learning_rate_is_one_linear_cycle():
+    rates = [learning_rate(s, 1000, 2e-4, 0.05) for s in range(1001)]
+    assert max(rates) == rates[50] == 2e-4
+    assert rates[0] == pytest.approx(2e-4 / 25) and rates[-1] < 1e-8
+    assert np.allclose(np.diff(rates[:51], 2), 0, atol=1e-18) and np.allclose(np.diff(rates[50:], 2), 0, atol=1e-18)
+
+
+@pytest.mark.slow
+def test_data_parallel_equals_one_process(tmp_path, data):
+    """Two processes over gloo, one sample each, against one process with both: the loss is the mean over all valid pixels."""
+    path = config_file(tmp_path, data, steps=2, optim__ema=0)
+    train(load_train_config(path), tmp_path / "one", quiet=True)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
+    done = subprocess.run([sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "eflow.cli", "train",
+                           str(path), "--out", str(tmp_path / "two"), "--quiet"], capture_output=True, text=True, timeout=300, env=environment)
+    assert done.returncode == 0, done.stderr[-3000:]
+    a, b = tensors(tmp_path / "one"), tensors(tmp_path / "two")
+    weights = [k for k in a if k.startswith("weights/")]
+    assert weights and all(torch.allclose(a[k], b[k], atol=2e-5) for k in weights)
+
+
+# ---- configurations and checkpoints that cannot be used --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("override, message", [
+    ("optim.stepz=3", r"optim\.stepz: unknown key; expected 'steps'"), ("model.name=raft", r"model\.name: unknown or missing choice"),
+    ("data.augment.horizontal_flip=2", r"data\.augment\.horizontal_flip"), ("model.variant=base", r"variant: unknown key"),
+    ("data.train=[]", r"data\.train"), ("optim.lr=fast", r"optim\.lr")])
+def test_bad_configurations(tmp_path, data, override, message, capsys):
+    assert run(["train", str(config_file(tmp_path, data)), "--out", str(tmp_path / "run"), "--set", override]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and err.count("\n") == 1
+    import re
+
+    assert re.search(message, err), err
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_data_leaves_nothing(tmp_path, data, capsys):
+    assert run(["train", str(config_file(tmp_path, tmp_path / "nowhere")), "--out", str(tmp_path / "run")]) == 2
+    assert "nowhere: no such data set" in capsys.readouterr().err and not (tmp_path / "run").exists()
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory, data) -> Path:
+    folder = tmp_path_factory.mktemp("trained")
+    return train(load_train_config(config_file(folder, data, steps=1)), folder / "run", quiet=True).checkpoint
+
+
+def test_checkpoint_reads_back(trained):
+    a = ckpt.load_model(trained)
+    b = ckpt.load_model(trained.parent.parent)  # the run folder
+    c = ckpt.load_model(trained / "ema.safetensors")
+    assert all(torch.equal(x, y) and torch.equal(x, z) for x, y, z in zip(*(m.state_dict().values() for m in (a, b, c))))
+    raw = ckpt.load_model(trained, averaged=False)
+    assert not all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), raw.state_dict().values()))
+
+
+def test_truncated_checkpoint(trained, tmp_path):
+    data_ = (trained / "weights.safetensors").read_bytes()
+    for size in (0, 4, 100, len(data_) // 2):
+        (tmp_path / "cut.safetensors").write_bytes(data_[:size])
+        with pytest.raises(BlinkGLError, match=r"cut\.safetensors: truncated or not a safetensors file"):
+            ckpt.load_model(tmp_path / "cut.safetensors")
+
+
+def test_a_pickle_is_refused_and_never_opened(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (open, (str(tmp_path / "sprung"), "w"))
+
+    torch.save({"weights": Trap()}, tmp_path / "model.safetensors")
+    torch.save({"weights": Trap()}, tmp_path / "old.safetensors", _use_new_zipfile_serialization=False)
+    for name in ("model", "old"):
+        with pytest.raises(BlinkGLError, match=rf"{name}\.safetensors: is a PyTorch pickle.*refused"):
+            ckpt.load_model(tmp_path / f"{name}.safetensors")
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_checkpoint_of_another_model(trained, tmp_path):
+    from eflow.models import build_model, model_config
+
+    with pytest.raises(BlinkGLError, match=r"checkpoint of another model: model\.name differs \(got 'ev_flownet'\); expected 'eraft'"):
+        ckpt.load_model(trained, expected=model_config({"name": "eraft"}))
+    tensors_, metadata = ckpt.read_tensors(trained / "weights.safetensors")
+    forged = {**metadata, "model": json.dumps({"name": "ev_flownet", "input": "voxel", "bins": 7})}
+    ckpt.write_tensors(tmp_path / "forged.safetensors", tensors_, forged)
+    with pytest.raises(BlinkGLError, match=r"forged\.safetensors: tensor 'encoders\.0\.weight' has another shape"):
+        ckpt.load_model(tmp_path / "forged.safetensors")
+    ckpt.write_tensors(tmp_path / "bare.safetensors", tensors_, {})
+    with pytest.raises(BlinkGLError, match=r"bare\.safetensors: safetensors file without a model configuration"):
+        ckpt.load_model(tmp_path / "bare.safetensors")
+    model = build_model(model_config({**FAST}))
+    with pytest.raises(BlinkGLError, match="x: lacks the tensor"):
+        ckpt.load_weights(model, {}, "x")
+
+
+def test_a_full_disk_leaves_no_checkpoint(tmp_path, data, monkeypatch):
+    def full(*args, **kw):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ckpt, "save_file", full)
+    with pytest.raises(OutputError, match="no space left"):
+        train(load_train_config(config_file(tmp_path, data, steps=1)), tmp_path / "run", quiet=True)
+    assert not list((tmp_path / "run/checkpoints").iterdir())

@@ -1,0 +1,94 @@
+"""Events to grids: the numba kernels against their slow twin and against what a grid must conserve."""
+
+import numpy as np
+import pytest
+
+from blinkgl.errors import EventDataError
+from eflow.data.representation import CountsAndTimes, CountSlices, VoxelGrid
+from eflow.data.window import Window
+from eflow.ops import voxel
+
+H, W = 13, 17
+
+
+def window(n=400, seed=0, rectified=False, t0=49_000_000_000, span=100_000) -> Window:
+    rng = np.random.default_rng(seed)
+    x, y = rng.integers(0, W, n).astype(np.uint16), rng.integers(0, H, n).astype(np.uint16)
+    if rectified:
+        x, y = (x + rng.uniform(-2, 2, n)).astype(np.float32), (y + rng.uniform(-2, 2, n)).astype(np.float32)
+    return Window(x, y, np.sort(rng.integers(t0, t0 + span, n)), rng.integers(0, 2, n).astype(np.uint8), t0, t0 + span)
+
+
+@pytest.mark.parametrize("rectified", [False, True])
+@pytest.mark.parametrize("normalise", ["none", "nonzero", "all"])
+def test_voxel_equals_its_slow_twin(rectified, normalise):
+    w = window(rectified=rectified)
+    args = (w.x, w.y, w.t, w.p, w.t0, w.t1, 15, H, W)
+    fast, slow = voxel.voxel_grid(*args, normalise=normalise), voxel.voxel_grid_slow(*args, normalise=normalise)
+    np.testing.assert_allclose(fast, slow, atol=2e-5)
+
+
+def test_voxel_conserves_signed_events_and_their_mean_time():
+    w = window(5000)
+    grid = voxel.voxel_grid(w.x, w.y, w.t, w.p, w.t0, w.t1, 15, H, W, normalise="none").astype(float)
+    sign = 2.0 * w.p - 1
+    assert grid.sum() == pytest.approx(sign.sum(), abs=1e-2)
+    moment = (grid.sum((1, 2)) * np.arange(15)).sum()
+    assert moment == pytest.approx((sign * 14 * (w.t - w.t0) / (w.t1 - w.t0)).sum(), abs=0.1)
+
+
+def test_normalised_over_nonzero_cells():
+    grid = VoxelGrid()(window(), H, W)
+    cells = grid[grid != 0]
+    assert abs(cells.mean()) < 1e-5 and cells.std(ddof=1) == pytest.approx(1, abs=1e-5)
+    every = VoxelGrid(normalise="all")(window(), H, W)
+    assert abs(every.mean()) < 1e-5 and every.std(ddof=1) == pytest.approx(1, abs=1e-5)
+
+
+def test_times_far_beyond_float32_are_subtracted_as_integers():
+    here, far = window(t0=0), window(t0=2**52)
+    np.testing.assert_array_equal(VoxelGrid()(here, H, W), VoxelGrid()(far, H, W))
+
+
+def test_bounds_of_the_window_or_of_the_events():
+    t = np.array([30_000, 50_000, 70_000])
+    w = Window(np.zeros(3, np.uint16), np.zeros(3, np.uint16), t, np.ones(3, np.uint8), 0, 100_000)
+    by_window = VoxelGrid(11, "none")(w, 1, 1).ravel()
+    by_events = VoxelGrid(11, "none", "events")(w, 1, 1).ravel()
+    np.testing.assert_allclose(by_window, np.eye(11)[[3, 5, 7]].sum(0), atol=1e-6)
+    np.testing.assert_allclose(by_events, np.eye(11)[[0, 5, 10]].sum(0), atol=1e-6)
+
+
+@pytest.mark.parametrize("representation", [VoxelGrid(), CountSlices(5), CountsAndTimes()])
+def test_an_event_off_the_sensor_or_out_of_the_window_is_an_error(representation):
+    for x, t in ((W, 5), (0, 101), (0, -1)):
+        w = Window(np.array([x], np.uint16), np.zeros(1, np.uint16), np.array([t]), np.ones(1, np.uint8), 0, 100)
+        with pytest.raises(EventDataError, match="1 events outside the window or the 17x13 sensor"):
+            representation(w, H, W)
+
+
+@pytest.mark.parametrize("representation", [VoxelGrid(), CountSlices(10), CountsAndTimes()])
+def test_no_events_give_zeros_and_rectified_ones_work(representation):
+    empty = window().take(np.zeros(400, bool))
+    out = representation(empty, H, W)
+    assert out.shape == (representation.channels, H, W) and out.dtype == np.float32 and not out.any()
+    assert np.isfinite(representation(window(rectified=True), H, W)).all()
+
+
+def test_counts_against_a_histogram():
+    w = window(3000)
+    counts = CountSlices(5)(w, H, W).reshape(5, 2, H, W)
+    slice_ = (w.t - w.t0) * 5 // (w.t1 - w.t0)
+    expected, _ = np.histogramdd(np.stack([slice_, w.p, w.y, w.x], 1), bins=[np.arange(n + 1) for n in (5, 2, H, W)])
+    np.testing.assert_array_equal(counts, expected)
+
+
+def test_counts_and_latest_times():
+    w = window(3000)
+    image = CountsAndTimes()(w, H, W)
+    for polarity in (0, 1):
+        for y, x in ((0, 0), (5, 7), (12, 16)):
+            hits = w.t[(w.x == x) & (w.y == y) & (w.p == polarity)]
+            assert image[polarity, y, x] == len(hits)
+            latest = (hits[-1] - w.t0) / (w.t1 - w.t0) if len(hits) else 0
+            assert image[2 + polarity, y, x] == pytest.approx(latest, abs=1e-6)

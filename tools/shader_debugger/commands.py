@@ -118,7 +118,8 @@ def diff_text(reports: list[Report]) -> str:
     for s in summaries:
         if s["passed"] and len(summaries) > 1:
             continue
-        lines += ["", f"{s['buffer']}: {s['off_silhouettes']['over_tolerance']} of {s['off_silhouettes']['pixels']} graded pixels over {s['tolerance']:g} {s['unit']}"]
+        lines += ["", f"{s['buffer']}: {s['off_silhouettes']['over_tolerance']} of {s['off_silhouettes']['pixels']} graded pixels "
+                  + (f"over {s['tolerance']:g} {s['unit']}" if s["statistic"] == "max" else "differ")]
         lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
         top = max([1, *s["histogram"].values()])
         lines += [f"  {name:>6} {count:>8} {'#' * max(1, round(40 * np.log1p(count) / np.log1p(top)))}" for name, count in s["histogram"].items() if count]

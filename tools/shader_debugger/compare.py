@@ -134,8 +134,8 @@ class Report:
         inside, band = self.errors[self.graded], self.errors[self.band & ~np.isnan(self.errors)]
 
         def stats(e):
-            return {"pixels": int(e.size), "median": _at(e, 0.5), "p99": _at(e, 0.99), "max": _at(e, 1.0),
-                    "over_tolerance": int((e > self.tolerance).sum())}
+            limit = self.tolerance if self.quantity.statistic == "max" else 0.0  # a fraction says nothing about one pixel
+            return {"pixels": int(e.size), "median": _at(e, 0.5), "p99": _at(e, 0.99), "max": _at(e, 1.0), "over_tolerance": int((e > limit).sum())}
 
         return {"buffer": self.quantity.name, "unit": self.quantity.unit, "statistic": self.quantity.statistic, "value": self.value,
                 "tolerance": self.tolerance, "passed": self.passed, "off_silhouettes": stats(inside), "silhouette_band": stats(band),

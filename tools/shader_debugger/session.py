@@ -173,6 +173,7 @@ class DebugRenderer(Renderer):
     def __init__(self, gl: GLContext, scene: Scene, config):
         super().__init__(gl, scene, config)
         self._uniforms = _Variants()
+        self._still = False  # always whole frames: what is kept from an earlier frame may be other shaders' work
         parts = [(index, part) for index, thing in enumerate(scene.objects) for part in thing.parts]
         numbers = list(range(len(parts)))
         self.part_of: dict[int, int] = {}  # id of a draw item -> index into reference.scene_parts
@@ -186,6 +187,7 @@ class DebugRenderer(Renderer):
         """Draw with another loader's programs from now on."""
         self.gl.shaders = loader
         self._uniforms.clear()
+        self._surfaces.clear()
         self._resources.forget_vertex_arrays()
 
     def inspect(self, t_ns: int) -> dict[str, np.ndarray]:

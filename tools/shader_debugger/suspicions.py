@@ -19,11 +19,11 @@ def suspicions(name: str, gpu: np.ndarray, ref: np.ndarray, graded: np.ndarray, 
         return []
     g = gpu.astype(np.float64)[graded]
     r = np.asarray(ref, np.float64)[graded]
-    wrong = ~_close(g, r, tolerance)
-    if not wrong.any():
-        return []
     found = []
     with np.errstate(all="ignore"):
+        wrong = ~_close(g, r, tolerance)
+        if not wrong.any():
+            return []
         for text, candidate in _candidates(name, r, g, graded, gpu_moment, ref_moment):
             share = _close(g, candidate, 10 * tolerance)[wrong].mean()
             if share >= EXPLAINED:

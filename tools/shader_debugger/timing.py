@@ -10,6 +10,7 @@ llvmpipe bins a whole frame and answers queries tile by tile: inside an open fra
 µs instead of some ms). On software renderers the work is therefore waited for around each time stamp; it then agrees with the
 wall clock.
 
+Frames are drawn whole; under a still camera generation redraws only what moves, which takes less.
 overdraw: fragments that passed the depth test per pixel (GL_SAMPLES_PASSED), 1 when every pixel is shaded once. The first run
 of everything is not counted: programs compile then.
 """

@@ -82,7 +82,7 @@ function drawLegend(box, legend) {
   text.textContent = {
     bar: legend.unit + (legend.log ? ", logarithmic" : ""), mask: "white: yes, black: no", ids: "one colour per number",
     unit: "r, g, b = x, y, z; grey is 0", uv: "r, g = fractional part of u, v", light: "sRGB, white = " + number(legend.high || 1),
-    wheel: "hue: direction (+x red, +y yellow-green, −x blue-green), saturated at " + number(legend.high || 0) + " " + legend.unit,
+    wheel: "hue: direction (+x red, +y yellow, −x blue, −y violet), saturated at " + number(legend.high || 0) + " " + legend.unit,
   }[legend.kind] || "";
   if (legend.kind !== "bar") return;
   const context = canvas.getContext("2d"), stops = STOPS[legend.map].split(" ");

@@ -1,0 +1,73 @@
+"""A small scene with everything the debugger has to explain, and a copy of the shaders to break."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from blinkgl.gl.shader import shader_folder
+
+WIDTH, HEIGHT = 96, 72
+YAML = """
+seed: 3
+camera: {width: 96, height: 72, fov: 60}
+time: {duration: 0.3, label_rate: 10}
+timeline: {kind: uniform, fps: 50}
+labels: {flow: [forward, backward], depth: true, ids: true}
+preview: {enabled: false}
+scene:
+  kind: explicit
+  meshes:
+    floor: {primitive: grid, parameters: {width: 12, depth: 12, subdivisions: 6}}
+    ball: {primitive: icosphere, parameters: {radius: 0.6, subdivisions: 4}}
+    box: {primitive: cuboid, parameters: {extents: [0.8, 0.8, 0.8]}}
+    pane: {primitive: grid, parameters: {width: 0.3, depth: 0.3}}
+  materials:
+    stone: {procedural: bricks, color: [0.8, 0.7, 0.6], uv_scale: [5, 5]}
+    paint: {procedural: fbm, seed: 1}
+    red: {color: [0.9, 0.3, 0.2]}
+    lamp: {color: [0.9, 0.9, 0.5], unlit: true, double_sided: true}
+  objects:
+    - {mesh: floor, material: stone, category: ground, name: floor, position: [0, 5, 0]}
+    - mesh: ball
+      material: paint
+      name: ball
+      keyframes: [{time: 0, position: [-1.2, 4, 0.9]}, {time: 0.4, position: [0.2, 4.4, 1.1], euler: [20, 30, 40]}]
+    - mesh: box
+      material: red
+      name: box
+      keyframes: [{time: 0, position: [1.1, 3.4, 0.6]}, {time: 0.4, position: [-0.3, 3.0, 0.7], euler: [0, 0, 60]}]
+    - mesh: pane
+      material: lamp
+      name: passing
+      interpolation: linear
+      keyframes: [{time: 0, position: [-0.5, 3.3, 1.4], euler: [90, 0, 0]}, {time: 0.4, position: [-0.5, -3.9, 1.4], euler: [90, 0, 0]}]
+  camera:
+    keyframes: [{time: 0, position: [0, 0, 1], look_at: [0, 4, 0.9]}, {time: 0.4, position: [0.1, 0.1, 1.05], look_at: [0.1, 4, 0.9]}]
+"""
+
+
+def write_config(folder: Path) -> str:
+    path = folder / "scene.yaml"
+    path.write_text(YAML)
+    return str(path)
+
+
+def copy_shaders(folder: Path) -> Path:
+    """A copy of the shipped shaders in ``folder``/shaders."""
+    copy = folder / "shaders"
+    shutil.copytree(Path(str(shader_folder())), copy, ignore=shutil.ignore_patterns("__pycache__", "*.py"))
+    return copy
+
+
+def edit(path: Path, right: str, wrong: str) -> None:
+    text = path.read_text()
+    assert right in text, f"{path.name} has changed: break it in another way"
+    path.write_text(text.replace(right, wrong))
+
+
+MISTAKES = {
+    "sign of the flow": ("include/motion.glsl", "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next", "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next"),
+    "no perspective division": ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
+    "depth off by near": ("label.glsl", "depth = 1.0 / gl_FragCoord.w", "depth = 1.0 / gl_FragCoord.w - 0.05"),
+}

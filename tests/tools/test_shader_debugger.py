@@ -1,0 +1,313 @@
+"""passes, probe and diff: what they show is what generation renders, and broken shaders are found."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from debugger_scene import HEIGHT, MISTAKES, WIDTH, edit
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.sequence import RenderConfig, load_run
+from blinkgl.gl import create_context
+from blinkgl.render import reference
+from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.scene.build import build_scene
+from blinkgl.scene.paths import KeyframePath, StaticPath
+from blinkgl.scene.primitives import grid
+from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject, Texture
+from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, suspicions
+from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
+
+T, T_NEXT, T_LAST = 100_000_000, 200_000_000, 0
+
+
+@pytest.fixture(scope="module")
+def world(config):
+    one = load_run(config).sequence(0)
+    return one, build_scene(one.scene, one.camera, one.time.t0_ns, one.time.t1_ns, seed=one.seed)
+
+
+@pytest.fixture(scope="module")
+def written(config, tmp_path_factory):
+    from blinkgl import cli
+
+    out = tmp_path_factory.mktemp("passes")
+    assert cli.run(["shader", "passes", config, "--out", str(out)]) == 0
+    return out
+
+
+# ------------------------------------------------------------------------------------------------- passes
+
+
+def test_passes_writes_every_buffer_that_generation_renders(written, world):
+    config, scene = world
+    arrays = {name: np.load(written / f"{name}.npy") for name in moments.PASSES}
+    ask = LabelRequest(depth=True, ids=True, normals=True, velocity=True, flow_forward=True, flow_backward=True, occlusion=True)
+    with create_context() as gl, Renderer(gl, scene, config.render) as renderer:
+        labels = renderer.labels(T, ask, T_NEXT, T_LAST)
+        luminance, colour = renderer.luminance(T), renderer.colour(T)
+    for name, expected in {
+        "luminance": luminance, "colour": colour, "depth": labels.depth, "id": labels.ids, "normals": labels.normals, "velocity": labels.velocity,
+        "flow_forward": labels.forward.flow, "valid_forward": labels.forward.valid, "occluded_forward": labels.forward.occluded,
+        "flow_backward": labels.backward.flow, "valid_backward": labels.backward.valid, "occluded_backward": labels.backward.occluded,
+    }.items():  # fmt: skip
+        assert arrays[name].dtype == expected.dtype, name
+        np.testing.assert_array_equal(arrays[name], expected, err_msg=name)
+    np.testing.assert_allclose(arrays["log_luminance"], np.log(luminance + np.float32(config.events.log_eps)), rtol=1e-6)
+    assert arrays["uv"].shape == (HEIGHT, WIDTH, 2) and arrays["mip_level"].shape == (HEIGHT, WIDTH)
+    assert not arrays["valid_forward"][labels.ids == 4].any() and (labels.ids == 4).any()  # the pane passes the camera
+
+
+def test_pictures_are_labelled_and_large_enough(written):
+    for name in moments.PASSES:
+        with Image.open(written / f"{name}.png") as image:
+            assert image.width >= 600 and image.height > image.width * HEIGHT / WIDTH  # room for title and colour bar
+    with Image.open(written / "contact_sheet.png") as sheet:
+        assert sheet.width > 1000 and len(sheet.convert("RGB").getcolors(1 << 24)) > 50
+    assert not list(written.glob(".*"))  # no temporaries
+
+
+def test_only_the_passes_asked_for(shader, config, tmp_path):
+    status, out, _ = shader("passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "uv", "--time", 0.25)
+    assert status == 0 and sorted(p.name for p in (tmp_path / "o").iterdir()) == ["contact_sheet.png", "depth.npy", "depth.png", "uv.npy", "uv.png"]
+
+
+# ------------------------------------------------------------------------------------------------- against the reference
+
+
+@pytest.fixture(scope="module")
+def both(config):
+    subject = open_subject(config)
+    when = moment(subject)
+    with open_renderer(subject) as renderer:
+        gpu, ref = moments.GpuMoment(renderer, when, subject.log_eps), moments.ReferenceMoment(subject.scene, when, subject.log_eps)
+        for name in (*moments.PASSES, "part", "local", "shade", "window", "next_depth_forward", "next_depth_backward"):
+            gpu[name]
+        comparison = compare.Comparison(gpu, ref)
+        reports = {name: comparison.report(name) for name in comparison.names()}
+        yield gpu, ref, comparison, reports
+
+
+def test_every_buffer_agrees(both):
+    gpu, _, _, reports = both
+    assert set(reports) == set(compare.QUANTITIES)
+    for name, report in reports.items():
+        assert report.passed, (name, report.value)
+        assert report.graded.mean() > 0.8, name
+    assert np.ptp(gpu["mip_level"]) > 3 and np.abs(gpu["dL_dt"]).max() > 1
+
+
+def test_debug_pass_draws_the_same_fragments(both):
+    gpu, ref, _, _ = both
+    parts = reference.scene_parts(ref.scene)
+    ids = np.array([thing.instance_id for thing, _ in parts] + [0])
+    np.testing.assert_array_equal(ids[gpu["part"]], gpu["id"])
+    hit = gpu["id"] != 0
+    np.testing.assert_allclose(1 / gpu["window"][..., 3][hit], gpu["depth"][hit], rtol=1e-6)
+    np.testing.assert_allclose(gpu["luminance"][hit], (gpu["shade"][..., 0] * gpu["shade"][..., 1])[hit], rtol=2e-6)
+    np.testing.assert_allclose(gpu["colour"][hit], (gpu["albedo"] * gpu["irradiance"][..., None])[hit], rtol=1e-5, atol=1e-7)
+
+
+def test_derivative_of_luminance_of_a_sliding_cosine(gl):
+    """A camera slides along a wall painted L(x) = 0.5 + 0.3 cos(k x): dL/dt = -0.3 k sin(k x) dx/dt, on the GPU and in the reference."""
+    speed, depth, width, texels, periods = 0.5, 4.0, 4.0, 128, 2
+    k = 2 * np.pi * periods / width
+    u = (np.arange(texels) + 0.5) / texels
+    paint = np.repeat((0.5 + 0.3 * np.cos(2 * np.pi * periods * u)).astype(np.float32)[None, :, None], 3, axis=2).repeat(4, axis=0)
+    wall = SceneObject("wall", 1, (Part(grid(width=width, depth=width), Material(Texture(paint), unlit=True)),), StaticPath(np.eye(4)))
+    eye = KeyframePath([0, 10**9], [(0.0, 0, depth), (speed, 0, depth)], Rotation.concatenate([Rotation.from_matrix(np.diag([1.0, -1, -1]))] * 2),
+                       interpolation="linear")
+    camera = Camera(64, 8, 200.0, 200.0, 31.5, 3.5, eye)
+    scene = Scene((wall,), camera, 0, 10**9)
+    when = When(500_000_000, 600_000_000, 400_000_000, 499_000_000, 501_000_000)
+    x = speed * 0.5 + depth * (np.arange(64) - 31.5) / 200.0
+    phase = wall.parts[0].mesh.uvs[:, 0][np.argmin(wall.parts[0].mesh.vertices[:, 0])] - (-0.5)  # where u = 0 lies, in texture widths
+    expected = -0.3 * k * np.sin(k * x + 2 * np.pi * periods * phase) * speed
+    with DebugRenderer(gl, scene, RenderConfig()) as renderer:
+        measured = moments.GpuMoment(renderer, when, 1e-3)["dL_dt"]
+    true = moments.ReferenceMoment(scene, when, 1e-3)["dL_dt"]
+    largest = 0.3 * k * speed
+    for derivative in (measured, true):  # the bilinear texture's slope is a staircase: off by up to half a texel's curvature, 5 %
+        assert np.abs(derivative - expected).max() < 0.06 * largest and np.abs(derivative - expected).mean() < 0.03 * largest
+    assert np.abs(measured - true).max() < 0.01 * largest
+
+
+def test_reference_mip_level_of_a_facing_plane():
+    """texels per px = texels per unit * Z / f, at every pixel; and an oblique one by brute force."""
+    focal, depth, per_unit = (120.0, 110.0), 4.0, 64.0
+    points = np.array([[[-1, -1, depth], [1, -1, depth], [0, 1.5, depth]]])
+    texels = points[:, :, :2] * per_unit
+    ray = np.array([[0.02, -0.01, 1.0]])
+    assert moments.footprint(points, texels, ray, focal)[0] == pytest.approx(np.log2(per_unit * depth / 110.0), abs=1e-12)
+    points[0, 2, 2] = 9.0
+
+    def where(rx, ry):
+        b = np.linalg.solve(points[0].T, [rx, ry, 1.0])
+        return b @ texels[0] / b.sum()
+
+    h = 1e-6
+    x = (where(0.02 + h, -0.01) - where(0.02 - h, -0.01)) / (2 * h) / focal[0]
+    y = (where(0.02, -0.01 + h) - where(0.02, -0.01 - h)) / (2 * h) / focal[1]
+    brute = np.log2(max(np.linalg.norm(x), np.linalg.norm(y)))
+    assert moments.footprint(points, texels, ray, focal)[0] == pytest.approx(brute, abs=1e-6)
+
+
+def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():
+    rng = np.random.default_rng(1)
+    image = rng.uniform(0, 1, (32, 64, 3)).astype(np.float32)
+    texture = Texture(image)
+    chain = mipmaps.mip_chain(texture)
+    assert [level.image.shape[:2] for level in chain] == [(32, 64), (16, 32), (8, 16), (4, 8), (2, 4), (1, 2), (1, 1)]
+    np.testing.assert_allclose(chain[2].image[3, 5], image[12:16, 20:24].mean((0, 1)), atol=1e-6)
+    np.testing.assert_allclose(chain[-1].image[0, 0], image.mean((0, 1)), atol=1e-6)
+    uv = rng.uniform(-2, 2, (50, 2))
+    np.testing.assert_array_equal(mipmaps.sample_trilinear(texture, uv, np.zeros(50)), reference.sample_bilinear(texture, uv))
+    np.testing.assert_array_equal(mipmaps.sample_trilinear(texture, uv, np.full(50, -3.0)), reference.sample_bilinear(texture, uv))
+    half = mipmaps.sample_trilinear(texture, uv, np.full(50, 1.5))
+    np.testing.assert_allclose(half, (mipmaps.sample_trilinear(texture, uv, np.full(50, 1.0)) + mipmaps.sample_trilinear(texture, uv, np.full(50, 2.0))) / 2)
+
+
+# ------------------------------------------------------------------------------------------------- probe
+
+
+def test_probe_shows_the_values_of_passes(shader, config, written, world):
+    x, y = 35, 40
+    status, out, _ = shader("probe", config, "--time", 0.1, "--pixel", f"{x},{y}", "--json")
+    found = json.loads(out)
+    assert status == 0 and found["pixel"] == [x, y]
+    for row in found["buffers"]:
+        if row["name"] != "colour":  # passes super-samples it, as generation does
+            np.testing.assert_array_equal(np.asarray(row["gpu"]), np.load(written / f"{row['name']}.npy")[y, x])
+    by_name = {row["name"]: row for row in found["buffers"]}
+    assert by_name["depth"]["ulps"] < 8 and by_name["flow_forward"]["error"] < 1e-5 and by_name["flow_forward"]["error_unit"] == "px"
+    assert found["surface"]["gpu"]["object"] == found["surface"]["reference"]["object"] == "ball"
+    bary = found["surface"]["reference"]["bary"]
+    np.testing.assert_allclose(found["surface"]["gpu"]["bary"], bary, atol=1e-3)
+    assert sum(bary) == pytest.approx(1) and min(bary) >= 0
+    # the positions hang together: barycentrics -> local -> world -> clip -> pixel
+    scene = world[1]
+    thing = next(o for o in scene.objects if o.name == "ball")
+    mesh = thing.parts[0].mesh
+    local = np.asarray(bary) @ mesh.vertices[mesh.faces[found["surface"]["reference"]["triangle"]]]
+    positions = {row["name"]: row["reference"] for row in found["positions"]}
+    np.testing.assert_allclose(positions["local"], local, atol=1e-12)
+    for label, t in (("t", T), ("t' forward", T_NEXT)):
+        at = thing.path.pose(t)[:3, :3] @ local + thing.path.pose(t)[:3, 3]
+        np.testing.assert_allclose(positions[f"world, {label}"], at, atol=1e-12)
+        X = scene.camera.path.pose(t)[:3, :3].T @ (at - scene.camera.path.pose(t)[:3, 3])
+        np.testing.assert_allclose(positions[f"camera, {label}"], X, atol=1e-12)
+        clip = np.asarray(positions[f"clip, {label}"])
+        pixel = (clip[:2] / clip[3] + 1) / 2 * [WIDTH, HEIGHT] - 0.5
+        np.testing.assert_allclose(pixel, [x, y] if label == "t" else positions["pixel, t' forward"], atol=1e-9)
+    for row in found["positions"]:
+        if row["gpu"] is not None:
+            np.testing.assert_allclose(row["gpu"], row["reference"], atol=1e-4)
+
+
+def test_probe_says_why(both, config, shader):
+    gpu, ref, comparison, _ = both
+    clear = ~comparison.band
+    flow = ref.frame.forward
+    hidden = clear & ref["occluded_forward"] & ~flow.outside & gpu["occluded_forward"]
+    cases = {
+        "behind the camera at t'": clear & (ref["id"] == 4),
+        "hidden at t'": hidden & (flow.hidden_by[..., 0] == 2) & (gpu["id"] == 2),
+        "outside the image at t'": clear & flow.outside & gpu["occluded_forward"],
+        "nothing hit": clear & ~ref.frame.hit,
+        "": clear & ref["valid_forward"] & ~ref["occluded_forward"] & ~gpu["occluded_forward"],
+    }
+    for words, mask in cases.items():
+        assert mask.any(), words
+        gpu.renderer.gl.make_current()  # the commands of other tests had contexts of their own
+        y, x = np.argwhere(mask)[mask.sum() // 2]
+        found = probe.probe(gpu, ref, int(x), int(y), comparison)
+        for side in ("gpu", "reference"):
+            why = found["why"]["forward"][side]
+            assert why.startswith(words) and bool(why) == bool(words), (side, why)
+        if words == "hidden at t'":
+            assert "box" in found["why"]["forward"]["gpu"] and "box" in found["why"]["forward"]["reference"]
+            status, out, _ = shader("probe", config, "--pixel", f"{x},{y}")
+            assert status == 0 and "forward   reference  hidden at t' by box" in out
+
+
+def test_ulps():
+    one = np.float32(1.0)
+    assert probe.ulps(one + np.spacing(one), 1.0) == 1.0 and probe.ulps(one, 1.0) == 0.0
+    assert probe.ulps(np.float32(np.inf), np.inf) == 0.0 and probe.ulps(np.float32(np.nan), 1.0) == np.inf
+    assert probe.ulps(np.array([1, 2], np.float32), np.array([1.0, 2.0 + 4 * np.spacing(np.float32(2))])) == 4.0
+
+
+# ------------------------------------------------------------------------------------------------- diff, and the mistakes
+
+
+def test_diff_of_the_shipped_shaders_is_clean(shader, config, tmp_path):
+    some = ("--pass", "depth", "--pass", "flow_forward", "--pass", "luminance")
+    status, out, _ = shader("diff", config, "--time", 0.1, *some, "--out", tmp_path / "d")
+    assert status == 0 and "all 3 buffers agree" in out and "silhouette band" in out and "no mip maps" in out
+    assert (tmp_path / "d" / "diff.png").stat().st_size > 10_000
+    assert np.load(tmp_path / "d" / "depth_error.npy").shape == (HEIGHT, WIDTH)
+
+
+def test_tolerances(shader, config):
+    status, out, _ = shader("diff", config, "--pass", "depth", "--pass", "id", "--tolerance", "depth=0", "--json")
+    report = json.loads(out)
+    assert status == 1 and not report["passed"]
+    assert [(b["buffer"], b["passed"]) for b in report["buffers"]] == [("depth", False), ("id", True)]
+    worst = report["buffers"][0]["worst"]
+    assert len(worst) == 10 and [w["error"] for w in worst] == sorted((w["error"] for w in worst), reverse=True)
+    assert sum(report["buffers"][0]["histogram"].values()) == report["buffers"][0]["off_silhouettes"]["pixels"]
+
+
+EXPECTED = {"sign of the flow": ("flow_forward", "the sign is wrong", "forward flow"),
+            "no perspective division": ("flow_forward", "the perspective division is missing", "forward flow"),
+            "depth off by near": ("depth", "off by the near plane: near = 0.05 is subtracted", "depth")}  # fmt: skip
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_broken_shader_is_found(shader, config, shaders, mistake):
+    file, right, wrong = MISTAKES[mistake]
+    edit(shaders / file, right, wrong)
+    buffer, suspicion, title = EXPECTED[mistake]
+    status, out, _ = shader("diff", config, "--shaders", shaders, "--json")
+    reports = {b["buffer"]: b for b in json.loads(out)["buffers"]}
+    assert status == 1 and not reports[buffer]["passed"]
+    assert reports[buffer]["suspicions"][0].startswith(suspicion)
+    unharmed = {"id", "velocity", "normals", "luminance", "colour", "albedo", "uv"} | ({"depth"} if buffer != "depth" else {"flow_forward"})
+    assert all(reports[name]["passed"] for name in unharmed)
+
+    worst = reports[buffer]["worst"][0]
+    status, out, _ = shader("probe", config, "--shaders", shaders, "--pixel", f"{worst['x']},{worst['y']}")
+    marked = [line for line in out.splitlines() if line.startswith("!!")]
+    assert status == 0 and any(line[3:].startswith(title) for line in marked)
+
+
+def test_suspicions_want_evidence(both):
+    gpu, ref, _, _ = both
+    right = ref["flow_forward"]
+    everywhere = ref.frame.hit
+    noise = np.random.default_rng(0).normal(0, 1, right.shape)
+    assert suspicions.suspicions("flow_forward", right + noise, right, everywhere, 1e-2, gpu, ref) == []
+    found = suspicions.suspicions("flow_forward", right[..., ::-1], right, everywhere, 1e-2, gpu, ref)
+    assert found[0].startswith("x and y are exchanged")
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    camera = ref.scene.camera
+    along = ref["depth"] * np.sqrt(1 + ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2)
+    assert suspicions.suspicions("depth", along, ref["depth"], everywhere, 1e-5, gpu, ref)[0].startswith("distance along the ray")
+
+
+def test_nothing_written_where_the_gpu_says_nan(both):
+    _, ref, comparison, _ = both
+    quantity = compare.QUANTITIES["depth"]
+    broken = comparison.gpu["depth"].copy()
+    y, x = np.argwhere(ref.frame.hit & ~comparison.band)[500]
+    broken[y, x] = np.nan
+    original = comparison.gpu._made["depth"]
+    try:
+        comparison.gpu._made["depth"] = broken
+        report = comparison.report("depth")
+    finally:
+        comparison.gpu._made["depth"] = original
+    assert report.value == np.inf and report.tolerance == quantity.tolerance and (report.worst[0]["x"], report.worst[0]["y"]) == (x, y)

@@ -21,6 +21,7 @@ from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
 from blinkgl.events import make_emulator
+from blinkgl.events.readout import Readout
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.render.renderer import LabelRequest, Renderer
@@ -93,6 +94,7 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
     """Pass 1: luminance frames through the emulator, events into events.h5, and the preview on the way."""
     camera, t0_ns, t1_ns = scene.camera, scene.t0_ns, scene.t1_ns
     emulator = make_emulator(config.events, camera.height, camera.width, kernel_seed(config.seed, index, Role.EVENTS))
+    readout = Readout(config.readout) if config.readout is not None else None
     timeline = config.timeline
 
     def speed(t_ns: int) -> float:
@@ -104,6 +106,8 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
             renderer.luminance(t_ns, out=luminance)
             with clock("events"):
                 events = emulator.step(luminance, t_ns, renderer.changed_rows)
+                if readout is not None:
+                    events = readout.step(events)
             with clock("write"):
                 writer.append_events(events)
             preview.add_events(events)
@@ -113,6 +117,8 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
             report.events += len(events)
             if progress is not None:
                 progress(report, (t_ns - t0_ns) / (t1_ns - t0_ns))
+    writer.info["events_cut_by_max_events_per_step"] = emulator.saturated
+    writer.info["events_lost_in_readout"] = readout.dropped if readout is not None else 0
 
 
 def _write_labels(config: SequenceConfig, renderer: Renderer, writer: SequenceWriter, clock: StageClock,

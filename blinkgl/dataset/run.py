@@ -150,6 +150,8 @@ def _loop(plan: Plan, executor: Executor, todo: deque, folder: RunFolder, outcom
                 elif message["stop"]:
                     raise OutputError(f"{message['error']}; the run has stopped with {outcome.found + len(outcome.made)} of "
                                       f"{outcome.planned} sequences whole", accepted="run again with --resume when that is mended")
+                elif message.get("lost"):  # no fault of the sequence's: a whole machine went
+                    todo.append((number, attempt))
                 elif attempt >= ATTEMPTS or message["final"]:
                     outcome.set_aside[task.name] = message["error"]
                     message["given_up"] = True

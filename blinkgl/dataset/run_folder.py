@@ -73,6 +73,7 @@ class RunFolder:
     def locked(self) -> Iterator[None]:
         """One run at a time per folder; the lock goes when the process does. Makes the folder."""
         with output_errors(self.out):
+            made = not self.out.exists()
             self.out.mkdir(parents=True, exist_ok=True)
             handle = os.open(self.out, os.O_RDONLY)
         try:
@@ -87,6 +88,9 @@ class RunFolder:
             yield
         finally:
             os.close(handle)
+            if made:
+                with contextlib.suppress(OSError):  # refused after all: an empty folder would only be in the way
+                    self.out.rmdir()
 
     # ---- sequences ------------------------------------------------------------------------------------------------
 

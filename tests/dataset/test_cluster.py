@@ -1,0 +1,125 @@
+"""The Ray executor: the same bytes as without Ray, also when a worker or a whole node is lost. Needs the extra [cluster]."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.cluster import RayCluster, _egl_device, _first_line
+from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.errors import ConfigError
+from runs import RECIPE, recipe_file, temporaries, tree
+
+ray = pytest.importorskip("ray", reason="Ray is not installed (extra [cluster])")
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("reference")
+    list(generate_run(load_run(recipe_file(folder, **LONG)), folder / "out"))
+    return folder / "out"
+
+
+LONG = {"time": {"duration": 2.0, "label_rate": 10}, "groups": {"fly": RECIPE["groups"]["fly"]}}
+
+
+class Once:
+    """Calls ``act(task messages so far)`` until it returns true."""
+
+    def __init__(self, act):
+        self.act, self.done, self.failures = act, False, []
+
+    def begin(self, plan, outcome) -> None: ...
+    def end(self, outcome) -> None: ...
+
+    def message(self, name, message) -> None:
+        if message["kind"] == "failed":
+            self.failures.append(message["error"])
+        if message["kind"] == "progress" and not self.done:
+            self.done = bool(self.act(name))
+
+
+def assert_same(out: Path, reference: Path) -> None:
+    made = tree(out)
+    made.pop("index.jsonl")
+    assert made == tree(reference) and temporaries(out) == []
+
+
+@pytest.fixture
+def two_nodes():
+    from ray.cluster_utils import Cluster
+
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
+    second = cluster.add_node(num_cpus=1)
+    ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
+    try:
+        yield cluster, second
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+
+
+@pytest.mark.slow
+def test_a_lost_node_leaves_no_trace(reference, tmp_path, two_nodes):
+    cluster, second = two_nodes
+    at_work = set()
+
+    def lose(name):
+        at_work.add(name)
+        if len(at_work) == 2:  # both nodes are busy
+            cluster.remove_node(second, allow_graceful=False)
+            return True
+
+    display = Once(lose)
+    outcome = run_dataset(load_run(recipe_file(tmp_path, **LONG)), tmp_path / "out", RayCluster(2), listener=display)
+    assert display.done and display.failures and not outcome.set_aside
+    assert_same(tmp_path / "out", reference)
+    assert verify_dataset(tmp_path / "out", deep=1).clean
+
+
+@pytest.mark.slow
+def test_a_killed_worker_leaves_no_trace(reference, tmp_path):
+    recipe = load_run(recipe_file(tmp_path, **LONG))
+
+    def kill(name):
+        log = (tmp_path / "out/.run/logs" / f"{name}.log").read_text()
+        os.kill(int(log.split("pid ")[-1].split()[0]), signal.SIGKILL)
+        return True
+
+    display = Once(kill)
+    try:
+        outcome = run_dataset(recipe, tmp_path / "out", RayCluster(2), listener=display)
+    finally:
+        ray.shutdown()
+    assert display.failures == ["the worker was ended"] and len(outcome.made) == 4
+    assert_same(tmp_path / "out", reference)
+
+
+@pytest.mark.parametrize("address, message", [
+    ("127.0.0.1:1", "--address: cannot be reached: "),
+    ("nowhere", "--address: not an address (got 'nowhere'); expected host:port"),
+])
+def test_unreachable_address_is_one_line_and_nothing_is_written(tmp_path, capsys, address, message):
+    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray", "--address", address]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_gpu_numbers_become_egl_devices(monkeypatch):
+    monkeypatch.setattr("blinkgl.gl.context.egl_devices", lambda: ["NVIDIA", "Mesa software rasteriser", "NVIDIA"])
+    assert [_egl_device([]), _egl_device(["0"]), _egl_device([1]), _egl_device([7])] == [None, 0, 2, None]
+
+
+def test_without_ray_the_remedy_is_named(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ConfigError, match=r"Ray is not installed .*pip install blinkgl\[cluster\]"):
+        RayCluster(2)
+    assert _first_line(RuntimeError("\n\na\nb")) == "a"

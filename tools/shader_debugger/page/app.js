@@ -237,6 +237,12 @@ async function start() {
   Object.assign($("time"), { min: state.t0, max: state.t1, step: state.interval / 50 });
   recall();
   showShaders(state);
+  let before = $("a").value.split(":")[0];
+  $("a").addEventListener("change", () => { // B stays the counterpart of A when it was one
+    const [now] = $("a").value.split(":"), [b, source] = $("b").value.split(":");
+    if (b === before) $("b").value = `${now}:${source}`;
+    before = now;
+  });
   for (const id of SETTINGS) $(id).addEventListener("change", refresh);
   $("time").addEventListener("input", () => { setTime(Number($("time").value)); refresh(); });
   $("seconds").addEventListener("change", refresh);

@@ -5,6 +5,7 @@ from importlib import resources
 
 import pytest
 
+from blinkgl.config.recipe import all_groups
 from blinkgl.config.sequence import CameraConfig, SequenceConfig, TimeConfig, load_run
 from blinkgl.errors import ConfigError
 
@@ -23,7 +24,8 @@ def test_shipped_configurations_are_valid():
     shipped = [p for p in resources.files("blinkgl.configs").iterdir() if p.name.endswith(".yaml")]
     assert {p.name for p in shipped} >= {"demo.yaml", "flying_objects.yaml"}
     for path in shipped:
-        load_run(path).sequence(0)
+        for group in all_groups(load_run(path)):
+            group.template.sequence(0)
 
 
 def test_ranges_are_drawn_per_sequence_and_recorded(tmp_path):
@@ -128,3 +130,25 @@ def test_bad_overrides(tmp_path, option, message):
     with pytest.raises(ConfigError) as caught:
         load_run(write(tmp_path, "camera: {width: 3}\nlabels: {flow: [forward]}"), [option])
     assert str(caught.value).startswith(message)
+
+
+def test_a_named_sensor_fills_in_what_is_not_said(tmp_path):
+    config = load_run(write(tmp_path, "sensor: DAVIS346\nevents: {emulator: v2e, contrast_threshold: 0.3}")).sequence(0)
+    assert (config.camera.width, config.camera.height) == (346, 260)
+    assert config.events.contrast_threshold == 0.3, "what is said wins"
+    assert config.events.refractory_us == 500 and config.events.leak_rate_hz == 0.1
+    assert config.readout.events_per_second == 12e6
+    bare = load_run(write(tmp_path, "sensor: imx636\ncamera: {width: 320, height: 180, fov: 50}\nreadout: null")).sequence(0)
+    assert (bare.camera.width, bare.camera.fov, bare.readout) == (320, 50, None) and bare.events.emulator == "esim"
+
+
+def test_a_resolved_sensor_configuration_is_stable(tmp_path):
+    from blinkgl.dataset.generate import config_yaml
+
+    first = load_run(write(tmp_path, "sensor: dvxplorer\nevents: {emulator: voltmeter}")).sequence(0)
+    assert load_run(write(tmp_path, config_yaml(first, 0))).sequence(0) == first
+
+
+def test_an_unknown_sensor_names_the_known_ones(tmp_path):
+    with pytest.raises(ConfigError, match="sensor: unknown sensor .*'kodak'.*davis346"):
+        load_run(write(tmp_path, "sensor: kodak"))

@@ -104,10 +104,25 @@ def verify(
 
 
 @app.command()
+def explain(
+    config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
+    sequence: Annotated[Optional[int], typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
+    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+) -> None:
+    """Say what a run will model, what it leaves out and why, and what it will cost. Writes nothing."""
+    from blinkgl import explain as explanation
+    from blinkgl.config.sequence import load_run
+
+    explanation.show(explanation.explain(load_run(config, overrides or [], seed=seed), sequence))
+
+
+@app.command()
 def simulate(
     source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")],
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    sensor: Annotated[Optional[str], typer.Option("--sensor", help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.")] = None,
     config: Annotated[Optional[str], typer.Option("--config", help="YAML file of emulator parameters.")] = None,
     overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")] = None,
     fps: Annotated[Optional[float], typer.Option(help="Frames per second (default: the video's, or the time stamps).")] = None,
@@ -124,7 +139,7 @@ def simulate(
     """Turn any video into events."""
     from blinkgl import commands
 
-    commands.simulate(source, out, quiet, emulator=commands.emulator_options(emulator, config, overrides or []), fps=fps,
+    commands.simulate(source, out, quiet, **commands.emulator_options(emulator, config, overrides or [], sensor), fps=fps,
                       timestamps=timestamps, gamma=gamma, interpolate=interpolate, max_px=max_px, factor=factor, seed=seed,
                       preview=preview, overwrite=overwrite)
 

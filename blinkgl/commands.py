@@ -15,8 +15,9 @@ from rich.table import Table
 from blinkgl.errors import AssetError, ConfigError
 
 
-def emulator_options(name: str, config: str | None, overrides: list[str]) -> dict[str, Any]:
-    """Emulator parameters from a name, an optional YAML mapping (it may name the emulator itself) and ``key=value`` overrides."""
+def emulator_options(name: str, config: str | None, overrides: list[str], sensor: str | None = None) -> dict[str, Any]:
+    """``emulator`` and ``readout`` of :func:`blinkgl.simulate` from an emulator's name, an optional YAML mapping (it may name
+    the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where nothing else is said."""
     data: dict[str, Any] = {}
     if config is not None:
         try:
@@ -33,7 +34,12 @@ def emulator_options(name: str, config: str | None, overrides: list[str]) -> dic
         if not equals:
             raise ConfigError("not key=value", where="--set", value=item)
         data[key.strip()] = yaml.safe_load(value)
-    return data
+    if sensor is None:
+        return {"emulator": data, "readout": None}
+    from blinkgl.config.sensor import load_sensor
+
+    camera = load_sensor(sensor)
+    return {"emulator": camera.emulator(data.pop("emulator"), **data), "readout": camera.readout}
 
 
 def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
@@ -59,6 +65,8 @@ def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
         say(str(report.displacement))
     elif report.steps > report.frames:
         say(f"{report.steps - report.frames} of the frames were interpolated, not recorded")
+    if report.lost:
+        say(f"{report.lost:,} events were lost in the sensor's read-out")
     if report.saturated:
         say(f"warning: {report.saturated:,} events were cut by max_events_per_step")
 

@@ -21,8 +21,10 @@ import numpy as np
 
 from blinkgl.config.base import Config
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
+from blinkgl.events.readout import Readout
 from blinkgl.io.frames import open_frames
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.timeline import interpolate as between
@@ -47,6 +49,8 @@ class SimulationReport:
     on: int = 0
     saturated: int = 0
     """events cut by the emulator's max_events_per_step"""
+    lost: int = 0
+    """events that the sensor's read-out could not carry"""
     displacement: between.Displacement | None = None
     """for interpolate="motion" """
 
@@ -56,7 +60,7 @@ class SimulationReport:
 
 
 def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | Config = "esim", gamma: str | float | None = None,
-             interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
+             interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, readout: ReadoutConfig | None = None,
              report: SimulationReport | None = None, on_frame: Callable[[np.ndarray, int, Events], None] | None = None) -> Iterator[Events]:
     """Events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
 
@@ -68,7 +72,7 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | Conf
     gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: srgb for integers, linear for floats.
     interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1`` frames in between
         by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
-    seed : of the emulator. report : filled as it goes. on_frame : called with (luminance or uint8 frame, t_ns, events) per step.
+    seed : of the emulator. readout : the sensor's bus (``load_sensor(name).readout``); None: no limit. report : filled as it goes. on_frame : called with (luminance or uint8 frame, t_ns, events) per step.
 
     Raises
     ------
@@ -79,15 +83,16 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | Conf
     if interpolate not in INTERPOLATIONS:
         raise ConfigError("unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS))
     report = report if report is not None else SimulationReport()
-    return _run(_timed(frames, fps), config, _checked_gamma(gamma), interpolate, factor, max_px, seed, report, on_frame)
+    return _run(_timed(frames, fps), config, _checked_gamma(gamma), interpolate, factor, max_px, seed, readout, report, on_frame)
 
 
-def _run(frames, config, gamma, interpolate, factor, max_px, seed, report, on_frame) -> Iterator[Events]:
+def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, report, on_frame) -> Iterator[Events]:
     first = next(frames, None)
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
     height, width = first[0].shape[:2]
     model = make_emulator(config, height, width, seed)
+    bus = Readout(readout) if readout is not None else None
     decode = Decoder(gamma)
     table = interpolate == "linear" and first[0].dtype == np.uint8 and first[0].ndim == 2
     if table:
@@ -122,6 +127,9 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, report, on_fr
         if report.steps == 0:
             report.first_ns = t_ns
         events = model.step(luminance, t_ns)
+        if bus is not None:
+            events = bus.step(events)
+            report.lost = bus.dropped
         report.steps += 1
         report.last_ns = t_ns
         report.events += len(events)

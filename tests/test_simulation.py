@@ -248,3 +248,25 @@ def test_real_frames_against_the_real_recording():
         result = compare(root / "events_chunk.txt", f"{folder}/e.h5", frames=root)
     assert len(result.edges_us) == 5 and result.polarity_correlation.min() > 0.8
     assert 0.7 < np.nanmean(result.rate_ratio) < 1.1 and result.pixel_correlation > 0.75
+
+
+def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
+    """The DAVIS346's bus carries 12 M events/s: a strobing clip makes more, and what does not fit is lost and counted."""
+    from blinkgl.commands import emulator_options
+    from blinkgl.config.sensor import load_sensor
+
+    options = emulator_options("v2e", None, ["contrast_threshold=0.3"], "davis346")
+    assert options["emulator"].refractory_us == 500 and options["emulator"].contrast_threshold == 0.3
+    assert options["readout"] == load_sensor("davis346").readout
+    strobe = [np.full((120, 160), 0.1 if k % 2 else 1.0, np.float32) for k in range(20)]
+    report = SimulationReport()
+    kept = all_of(strobe, fps=2000, emulator=EsimConfig(), readout=options["readout"], report=report)
+    free = all_of(strobe, fps=2000, emulator=EsimConfig())
+    assert report.lost > 0 and len(kept) + report.lost == len(free)
+    assert len(kept) <= 12e6 * 19 / 2000 + options["readout"].queue_events + 1
+    np.save(tmp_path / "strobe.npy", np.stack(strobe))
+    command = ["simulate", str(tmp_path / "strobe.npy"), "--fps", "2000", "--sensor", "DAVIS 346", "--set", "refractory_us=0",
+               "--out", str(tmp_path / "e.h5")]
+    assert run(command) == 0 and "lost in the sensor's read-out" in capsys.readouterr().out
+    assert run([*command[:-1], str(tmp_path / "f.h5"), "--sensor", "kodak"]) == 2
+    assert "unknown sensor" in capsys.readouterr().err

@@ -20,6 +20,7 @@ from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
+from blinkgl.config.sensor import ReadoutConfig, load_sensor
 from blinkgl.errors import ConfigError
 
 NS_PER_S = 1_000_000_000
@@ -176,7 +177,10 @@ class SequenceConfig(Config):
     frames: FramesConfig | None = Field(None, description="recorded frames to convert; then nothing is rendered, and `camera`, `time`, "
                                         "`timeline`, `scene` and `render` have no meaning")
     render: RenderConfig = Field(RenderConfig(), description="how a frame is drawn")
+    sensor: str | None = Field(None, description="davis240c, davis346, dvxplorer, gen31_vga or imx636: gives camera.width and height, events and "
+                               "readout the camera's values; what is said beside it wins")
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
+    readout: ReadoutConfig | None = Field(None, description="the sensor's bus: events above its rate are late, then lost; null: no limit")
     labels: LabelsConfig = Field(LabelsConfig(), description="which ground truth is written")
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
@@ -197,7 +201,7 @@ class RunTemplate:
         several groups of sequences (:mod:`blinkgl.config.recipe` takes those apart)."""
         if "groups" in self.tree:
             raise ConfigError("the recipe has groups; only a group has numbered sequences", where="groups")
-        return validate(SequenceConfig, draw(self.tree, self.seed, index))
+        return _validated(draw(self.tree, self.seed, index))
 
     @property
     def seed(self) -> int:
@@ -210,7 +214,20 @@ class RunTemplate:
             from blinkgl.config.recipe import all_groups
 
             return [group.template.check() for group in all_groups(self)][0]
-        return [validate(SequenceConfig, tree) for tree in extremes(self.tree)][0]
+        return [_validated(tree) for tree in extremes(self.tree)][0]
+
+
+def _validated(tree: dict[str, Any]) -> SequenceConfig:
+    """SequenceConfig of plain data, with the values of a named sensor filled in where the tree says nothing."""
+    config = validate(SequenceConfig, tree)
+    if config.sensor is None:
+        return config
+    sensor = load_sensor(config.sensor)
+    table = lambda key: dict(tree[key]) if isinstance(tree.get(key), dict) else {}
+    events = table("events")
+    events = sensor.emulator(events.pop("emulator", "esim"), **events).model_dump()
+    return validate(SequenceConfig, {"readout": sensor.readout.model_dump(), **tree, "events": events,
+                                     "camera": {"width": sensor.width, "height": sensor.height, **table("camera")}})
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

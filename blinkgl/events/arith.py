@@ -140,19 +140,31 @@ _X0, _X1, _X2, _X3, _X4, _X5, _X6, _X7, _X8, _X9, _X10, _X11, _X12 = (_D(c) for 
 
 
 @register_jitable
-def exp_f64(v):
-    """exp(v) for float64 v <= 700, relative error < 5e-16; below -700 it stays at exp(-700) ~ 1e-304."""
-    v = np.maximum(v, _EXP_MIN_64)
-    n = (v * _LOG2E_64 + _ROUND_64) - _ROUND_64
-    r = (v - n * _LN2_HI_64) - n * _LN2_LO_64
+def _exp_reduced(r):
+    """exp(r) for |r| <= 1/2, float64."""
     # Estrin's scheme: a chain of four multiplications instead of twelve.
     r2 = r * r
     r4 = r2 * r2
     low = (_X0 + _X1 * r) + r2 * (_X2 + _X3 * r)
     middle = (_X4 + _X5 * r) + r2 * (_X6 + _X7 * r)
     high = (_X8 + _X9 * r) + r2 * (_X10 + _X11 * r)
-    p = low + r4 * (middle + r4 * (high + r4 * _X12))
+    return low + r4 * (middle + r4 * (high + r4 * _X12))
+
+
+@register_jitable
+def exp_f64(v):
+    """exp(v) for float64 v <= 700, relative error < 5e-16; below -700 it stays at exp(-700) ~ 1e-304."""
+    v = np.maximum(v, _EXP_MIN_64)
+    n = (v * _LOG2E_64 + _ROUND_64) - _ROUND_64
+    r = (v - n * _LN2_HI_64) - n * _LN2_LO_64
+    p = _exp_reduced(r)
     return p * _L((_L(n) + _BIAS_64) << _EXP52).view(np.float64)
+
+
+@register_jitable
+def fall_f64(x):
+    """e^-x for float64 x >= 0, scalars; without the range reduction where x <= 1/2."""
+    return _exp_reduced(-x) if x <= 0.5 else exp_f64(-x)
 
 
 _S0, _S1, _S2, _S3, _S4, _S5, _S6 = (_D(c) for c in (

@@ -441,14 +441,16 @@ class V2e(Emulator):
         if self._noise.size and dt_ns != self._sizes_dt_ns:
             self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, config.contrast_threshold)
             self._sizes_dt_ns = dt_ns
-        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._noise_sizes, self._upper, self._lower, self._constants,
+        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._noise_sizes, self._upper,
+                        self._lower, self._constants,
                         self._leak, self._release, self._clock_ns, self._clock_index, self._shot_table)
         base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
         brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
         gentle = kappa * (max(brightest, self._brightest[0]) + 20.0) < 0.499
-        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9, kappa, gentle, self._scale, self.seed, self.frames, self.width,
-                            self._refractory_ns, self._leak_jitter, self._shot_unit, self._inverse_threshold,
+        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9, kappa, gentle,
+                            self._scale, self.seed, self.frames, self.width, self._refractory_ns, self._leak_jitter,
+                            self._shot_unit, self._inverse_threshold,
                             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         events = self._run(_band, _bands, (*source, self._table, self._x_table, pixels, interval), base_us,

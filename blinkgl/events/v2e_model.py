@@ -10,7 +10,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.config.events import V2eConfig
-from blinkgl.events.arith import exp_f32, exp_f64, log_f32, log_f64, select
+from blinkgl.events.arith import exp_f32, exp_f64, fall_f64, log_f32, log_f64, select
 from blinkgl.events.emulator import BLOCK
 from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_sizes
 from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
@@ -88,7 +88,7 @@ def signal_at(s, c, rise, fall, k):
     """z at fraction s of the interval."""
     if k < 0:
         return c + rise * s
-    return c + rise * s + fall * exp_f64(-k * s)
+    return c + rise * s + fall * fall_f64(k * s)
 
 
 @register_jitable
@@ -101,7 +101,7 @@ def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
         return min(max((target - c) / rise, start), 1.0)
     sign = 1.0 if polarity else -1.0
     low, high = start, 1.0
-    e_low = 1.0 if start == 0.0 else exp_f64(-k * start)
+    e_low = 1.0 if start == 0.0 else fall_f64(k * start)
     f_low = sign * (c + rise * start + fall * e_low - target)
     if f_low >= 0:
         return start
@@ -117,7 +117,7 @@ def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
         if 0.0 < guess < 1.0:
             s = low + width * guess
     for _ in range(60):
-        e = fall * exp_f64(-k * s)
+        e = fall * fall_f64(k * s)
         f = sign * (c + rise * s + e - target)
         if f < 0:
             low = s
@@ -125,11 +125,13 @@ def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
             high = s
         slope = sign * (rise - k * e)
         following = s - f / slope if slope > 0 else -1.0
-        if not (low <= following <= high):
+        newton = low <= following <= high
+        if not newton:
             following = 0.5 * (low + high)
         moved = abs(following - s)
         s = following
-        if moved * (1.0 + k) < 1e-3:  # the error after a Newton step is about its square
+        # After a Newton step the error is moved^2 |z''| / (2 z'): no further step where that is below 1e-6.
+        if (newton and moved * moved * k * k * abs(e) <= 2e-6 * slope) or moved < 1e-9:
             break
     return s
 

@@ -115,7 +115,7 @@ class Inspector:
         return picture.png_bytes(rgb), legend | {"unit": info.unit}
 
     def difference(self, q: dict[str, str]) -> tuple[bytes, dict]:
-        """PNG and legend of |A - B|. q : a, b (each "pass:source"), t, component, map, low, high."""
+        """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0. q : a, b (each "pass:source"), t, component, map, low, high."""
         when = self._when(q.get("t", ""))
         arrays = []
         for key in ("a", "b"):
@@ -128,8 +128,12 @@ class Inspector:
         with np.errstate(invalid="ignore"):
             change = np.where(a == b, 0.0, a - b)
         values = np.abs(picture.component(change, "length" if which == "auto" else which))
-        rgb, legend = picture.picture("error", values, which="length", colours=q.get("map") or picture.ERROR_MAP, low=_number(q, "low", 0.0),
-                                      high=_number(q, "high", float(np.nanmax(np.where(np.isfinite(values), values, 0.0))) or 1e-12))
+        some = values[np.isfinite(values) & (values > 0)]
+        low, high = (float(v) for v in (np.quantile(some, 0.01), some.max())) if some.size else (1e-12, 1.0)
+        low, high = _number(q, "low", min(low, 0.999 * high)), _number(q, "high", high)
+        if low > 0:  # logarithmic: one flipped pixel on a silhouette would hide everything else
+            values = np.where(np.isnan(values), values, np.clip(values, low, None))
+        rgb, legend = picture.picture("depth", values, which="length", colours=q.get("map") or picture.ERROR_MAP, low=low, high=high)
         return picture.png_bytes(rgb), legend | {"unit": PASSES[name].unit}
 
     def probe(self, q: dict[str, str]) -> dict:

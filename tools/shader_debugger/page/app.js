@@ -115,7 +115,7 @@ async function refresh() {
         const head = $("pane-b").querySelector("figcaption");
         head.children[0].textContent = "|A − B|";
         head.children[1].textContent = s.a.replace(":", ", ") + " − " + s.b.replace(":", ", ");
-        await show("b", "difference", { t: s.t, component: s.component, a: s.a, b: s.b });
+        await show("b", "difference", { t: s.t, component: s.component, a: s.a, b: s.b }); // its own range
       }
       if (pixel) await showProbe();
       document.body.dataset.shown = s.t;

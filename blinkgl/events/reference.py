@@ -110,6 +110,7 @@ class ReferenceV2e:
         self.mean_leak = self.leak.copy()
         self.leaks = bool(config.leak_rate_hz or config.hot_pixel_fraction)
         self.rebase_ns = int(v2e.REBASE / float(np.median(self.leak[self.leak > 0])) * 1e9) if self.leaks else 2**61
+        self.hums = bool(config.photoreceptor_noise and config.shot_noise_rate_hz)
         self.shot_table = v2e.shot_tables(self.on, self.off, *nominal)
         self.refractory = round(config.refractory_us * 1000)
         self.release: list[int | None] = [None] * self.pixels
@@ -138,7 +139,7 @@ class ReferenceV2e:
             reference = x - phase.astype(np.float32) * self.on if self.leaks else x
             self.upper, self.lower = reference + self.on, reference - self.off
             lag = np.zeros(self.pixels, np.float32)
-            if self.config.photoreceptor_noise:
+            if self.hums:
                 start = v2e.draw_start_noise(intensity, self.config, self.seed)
                 self.hum = start
                 reference = x + start
@@ -154,7 +155,7 @@ class ReferenceV2e:
             if self.config.cutoff_hz:
                 lag = v2e.relax(self.lag, self.x, x, self.intensity, intensity, np.float32(kappa))
             noise, hum = self.noise(intensity, t_ns), np.zeros(self.pixels, np.float32)
-            if self.config.photoreceptor_noise:
+            if self.hums:
                 hum = self.photoreceptor_noise(intensity, np.float32(kappa), (t_ns - self.t_ns) * 1e-9)
             for i in range(self.pixels):
                 rows += self.pixel(i, x, lag, intensity, kappa, t_ns, noise[i], hum[i])
@@ -199,7 +200,7 @@ class ReferenceV2e:
         since = (self.t_ns - self.epoch) * 1e-9, (t_ns - self.epoch) * 1e-9
         z_now = x[i] + lag[i] if self.config.cutoff_hz else x[i]
         z_now = z_now + self.leak[i] * np.float32(since[1]) if self.leaks else z_now
-        z_now = z_now + hum if self.config.photoreceptor_noise else z_now
+        z_now = z_now + hum if self.hums else z_now
         waiting = self.release[i] is not None
         if not (waiting or noise or z_now >= self.upper[i] or z_now <= self.lower[i]):
             return []
@@ -209,7 +210,7 @@ class ReferenceV2e:
             curve_lag, k = f(self.lag[i]), kappa * (0.5 * (f(self.intensity[i]) + f(intensity[i])) + 20.0)
         leak = f(self.leak[i])
         change_of_hum = 0.0
-        if self.config.photoreceptor_noise:
+        if self.hums:
             x0, change_of_hum = x0 + f(self.hum[i]), f(hum) - f(self.hum[i])
         base, drift = x0 + leak * since[0], change_of_hum + leak * (dt_ns * 1e-9)
         c, rise, fall = v2e.curve_of(base, drift, dx, curve_lag, k)

@@ -28,7 +28,7 @@ import numpy as np
 from blinkgl.config.events import V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import select
-from blinkgl.events.blocks import compact_flags, copy_block, scale_block
+from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
@@ -50,7 +50,7 @@ _FARTHEST, _FAR_BELOW = _F(1e6), np.int32(-(2**31))
 class Pixels(NamedTuple):
     """Per-pixel arrays, flat; size 0 when the feature is off. What the photoreceptor holds is of the frame before."""
 
-    intensity: np.ndarray  # float32 DN
+    intensity: np.ndarray  # float32 DN; [] when neither low-pass nor shot noise asks for it
     x: np.ndarray  # float32 lin-log
     lag: np.ndarray  # float32 y - x; [] without low-pass
     noise: np.ndarray  # float32 photoreceptor noise, ln units; []
@@ -90,14 +90,6 @@ def _lin_log_block(intensity, out, z):
         x = lin_log(intensity[i])
         out[i] = x
         z[i] = x
-
-
-@numba.njit(**JIT)
-def _lookup_block(codes, table, x_table, intensity, x, z):
-    for i in range(codes.size):
-        intensity[i] = table[codes[i]]
-        x[i] = x_table[codes[i]]
-        z[i] = x_table[codes[i]]
 
 
 @numba.njit(**JIT)
@@ -310,7 +302,10 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         if n < BLOCK:
             flags[:] = 0
         if codes.size:
-            _lookup_block(codes[s:e], table, x_table, intensity[:n], x[:n], z[:n])
+            lookup_block(codes[s:e], x_table, x[:n])
+            copy_block(x[:n], z[:n])
+            if p.intensity.size:
+                lookup_block(codes[s:e], table, intensity[:n])
         else:
             scale_block(frame[s:e], v.scale, intensity[:n])
             _lin_log_block(intensity[:n], x[:n], z[:n])
@@ -343,7 +338,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
             now = (intensity, x, lag, noise)
             filled, cut_here = _emit_block(active, count, s, now, constants, keys, shots, p, v, cap, packed, filled)
             cut += cut_here
-        copy_block(intensity[:n], p.intensity[s:e])
+        if p.intensity.size:
+            copy_block(intensity[:n], p.intensity[s:e])
         copy_block(x[:n], p.x[s:e])
         if p.lag.size:
             copy_block(lag[:n], p.lag[s:e])
@@ -366,7 +362,8 @@ def _bands(edges, progress, share, packed, frame, codes, table, x_table, p, v):
 class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
-    State: 16 bytes per pixel; the low-pass, leak and photoreceptor noise add 4 each, the dead time 8. Constants:
+    State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first or
+    shot noise asks for it, 8 with the dead time. Constants:
     16 bytes per pixel, 8 more with shot noise."""
 
     _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",
@@ -380,7 +377,8 @@ class V2e(Emulator):
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
         self._on, self._off = (c.astype(np.float32) for c in
                                draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed))
-        self._intensity, self._x, self._upper, self._lower = (frame() for _ in range(4))
+        self._x, self._upper, self._lower = (frame() for _ in range(3))
+        self._intensity = frame(config.cutoff_hz > 0 or config.shot_noise_rate_hz > 0)
         noisy = config.photoreceptor_noise and config.shot_noise_rate_hz > 0
         self._lag, self._noise = frame(config.cutoff_hz > 0), frame(noisy)
         self._noise_sizes, self._sizes_dt_ns = np.empty(0, np.float32), -1
@@ -413,14 +411,13 @@ class V2e(Emulator):
         self._x_table = lin_log(self._table)
 
     def _start(self, frame: np.ndarray, t_ns: int) -> Events:
-        if frame.dtype == np.uint8:
-            _lookup_block(frame, self._table, self._x_table, self._intensity, self._x, self._upper)
-        else:
-            self._intensity[...] = frame * self._scale
-            self._x[...] = lin_log(self._intensity)
+        intensity = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
+        self._x[...] = lin_log(intensity)
+        if self._intensity.size:
+            self._intensity[...] = intensity
         reference = self._x
         if self._noise.size:
-            self._noise[...] = draw_start_noise(self._intensity, self.config, self.seed)
+            self._noise[...] = draw_start_noise(intensity, self.config, self.seed)
             reference = reference + self._noise
         if self._leak.size:  # else every pixel's first leak event would come at the same time
             phase, _ = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))
@@ -430,7 +427,7 @@ class V2e(Emulator):
             rate = self._shot_unit * float(self._shot_table[block, -1])
             gap, _ = shot_draw(self.seed, np.uint64(block), np.uint64(2**62), rate)
             self._clock_ns[block] = t_ns + gap
-        self._epoch_ns[0], self._brightest[0] = t_ns, self._intensity.max()
+        self._epoch_ns[0], self._brightest[0] = t_ns, intensity.max()
         return Events.empty()
 
     def _advance(self, frame: np.ndarray, t_ns: int) -> Events:

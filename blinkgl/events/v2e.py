@@ -287,6 +287,44 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
 
 
 @numba.njit(**JIT)
+def _emit_block_plain(active, count, first, x_now, constants, p, v, cap, packed, begin):
+    """:func:`_emit_block` without low-pass, leak, noise and dead time: the same bits, straight lines only."""
+    out, cut, dt_ns = begin, 0, v.dt_ns
+    start_ns = v.t0_ns - 1000 * v.base_us
+    y = first // v.width
+    row_end = (y + 1) * v.width
+    for j in range(count):
+        for c in range(2):
+            constants[j, c] = p.constants[active[j], c]
+    for j in range(count):
+        i = np.int64(active[j])
+        while i >= row_end:
+            y += 1
+            row_end += v.width
+        before, on, off = np.float64(p.x[i]), np.float64(constants[j, 0]), np.float64(constants[j, 1])
+        rise = np.float64(x_now[i - first]) - before
+        end = before + rise
+        up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
+        polarity = np.int64(end >= up)
+        level, step = (up, on) if polarity else (down, -off)
+        sign = 1.0 if polarity else -1.0
+        pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
+        emitted, s = 0, 0.0
+        while sign * (end - level) >= 0.0:
+            s = min(max((level - before) / rise, s), 1.0)
+            if emitted < cap:
+                packed[out] = (np.int64(np.uint64(start_ns + np.int64(s * dt_ns)) // _U1000) << T_SHIFT) | pixel
+                out += 1
+                emitted += 1
+            else:
+                cut += 1
+            up, down = level + on, level - off
+            level += step
+        p.upper[i], p.lower[i] = np.float32(up), np.float32(down)
+    return out, cut
+
+
+@numba.njit(**JIT)
 def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x_table, p, v):
     """Band kernel, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.x.size
@@ -295,6 +333,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     lag, noise, normals = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     keys, constants = np.empty(BLOCK, np.int64), np.empty((BLOCK, 3), np.float32)
     kappa, since = np.float32(v.kappa), np.float32(v.since_epoch_1)
+    plain = not (p.lag.size or p.leak.size or p.noise.size or p.release.size or p.clock_ns.size)
     for block in range(first_block, stop_block):
         s = block * BLOCK
         e = min(s + BLOCK, pixels)
@@ -335,8 +374,11 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:
                 return block, filled, cut
-            now = (intensity, x, lag, noise)
-            filled, cut_here = _emit_block(active, count, s, now, constants, keys, shots, p, v, cap, packed, filled)
+            if plain:
+                filled, cut_here = _emit_block_plain(active, count, s, x, constants, p, v, cap, packed, filled)
+            else:
+                now = (intensity, x, lag, noise)
+                filled, cut_here = _emit_block(active, count, s, now, constants, keys, shots, p, v, cap, packed, filled)
             cut += cut_here
         if p.intensity.size:
             copy_block(intensity[:n], p.intensity[s:e])
@@ -363,8 +405,7 @@ class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
     State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first or
-    shot noise asks for it, 8 with the dead time. Constants:
-    16 bytes per pixel, 8 more with shot noise."""
+    shot noise asks for it, 8 with the dead time. Constants: 16 bytes per pixel, 8 more with shot noise."""
 
     _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",
               "_clock_index", "_epoch_ns", "_brightest")

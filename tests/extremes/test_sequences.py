@@ -1,0 +1,133 @@
+"""Whole sequences where duration, clock, image and speed are extreme, and how what is beyond is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
+import numpy as np
+import pytest
+
+from blinkgl.config.sequence import RunTemplate
+from blinkgl.dataset.generate import generate_sequence
+from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.sequence_dir import verify_sequence
+
+BOX = {
+    "kind": "explicit",
+    "meshes": {"box": {"primitive": "cuboid"}},
+    "materials": {"paint": {"procedural": "checks", "max_size": 64}},
+    "objects": [{"mesh": "box", "material": "paint", "position": [3.0, 0.2, 0.1]}],
+    "camera": {"position": [0.0, 0.0, 0.0]},
+}
+
+
+def moving(seconds: float, distance: float, start: float = 0.0) -> dict:
+    keys = [{"time": start, "position": [3.0, -distance / 2, 0.0]}, {"time": start + seconds, "position": [3.0, distance / 2, 0.0]}]
+    return {**BOX, "objects": [{"mesh": "box", "material": "paint", "keyframes": keys, "interpolation": "linear"}]}
+
+
+def generate(gl, out: Path, **tree):
+    defaults = {"camera": {"width": 32, "height": 24}, "scene": BOX, "preview": {"enabled": False}, "timeline": {"kind": "uniform", "fps": 20},
+                "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True}}  # fmt: skip
+    config = RunTemplate({**defaults, **tree}, Path(".")).sequence(0)
+    report = generate_sequence(config, 0, out, gl)
+    assert verify_sequence(report.path) == []
+    return report
+
+
+def events_of(path: Path) -> tuple[np.ndarray, int, h5py.Dataset]:
+    with h5py.File(path / "events.h5") as file:
+        return file["events/t"][:].astype(np.int64) + int(file["t_offset"][()]), int(file["t_offset"][()]), file["ms_to_idx"].shape[0]
+
+
+def test_a_still_day(gl, tmp_path, promise):
+    """24 h and one label interval, from 10^6 s on, in 101 frames of at most 15 minutes."""
+    day = {"duration": 86_400, "label_rate": 1 / 3600, "start": 1_000_000}
+    report = generate(gl, tmp_path, time=day, timeline={"kind": "displacement", "max_step_us": 9e8})
+    assert report.labels == 24 and report.frames == 101
+    promise("a still day as a sequence: events", report.events, 0)
+    flow = np.stack([np.load(f) for f in sorted((report.path / "flow/forward_npy").iterdir())])
+    assert flow.shape[0] == 24 and flow[..., 2].any()
+    promise("a still day as a sequence: flow", np.abs(flow[..., :2]).max(), 0.0, "px")
+    _, offset, milliseconds = events_of(report.path)
+    assert offset == 10**12 and milliseconds == 25 * 3_600_000 + 1  # covers the eventless tail, to the last millisecond
+
+
+def test_longer_than_the_event_format_can_hold(gl, tmp_path):
+    """DSEC's u4 of microseconds ends after 71.6 minutes; events beyond are an error and leave no half-written folder."""
+    with pytest.raises(EventDataError, match="71.6 minutes per file"):
+        generate(gl, tmp_path, time={"duration": 7200, "label_rate": 1 / 3600}, scene=moving(10_800, 1.0), timeline={"kind": "uniform", "fps": 0.01})
+    assert not any(tmp_path.rglob("*.h5"))
+
+
+def test_a_start_at_a_million_seconds_shifts_the_clock_and_nothing_else(gl, tmp_path, promise):
+    runs = [generate(gl, tmp_path / str(start), time={"duration": 0.2, "label_rate": 10, "start": start}, scene=moving(0.5, 2.0, start),
+                     timeline={"kind": "displacement"}) for start in (0, 1_000_000)]  # fmt: skip
+    (a, _, _), (b, offset, _) = (events_of(run.path) for run in runs)
+    assert offset == 10**12 and len(a) == len(b) > 300
+    promise("a run from 1e6 s on: shift of any event time, less 1e6 s", np.abs(b - a - 10**12).max(), 0, "us")
+    for k in range(2):
+        np.testing.assert_array_equal(*(np.load(run.path / f"flow/forward_npy/{k:06d}.npy") for run in runs))
+
+
+@pytest.mark.parametrize("camera", [{"width": 1, "height": 1}, {"width": 1, "height": 30}, {"width": 30, "height": 1}, {"width": 24, "height": 16, "fov": 170},
+                                    {"width": 24, "height": 16, "fov": 1}])  # fmt: skip
+def test_images_and_lenses(gl, tmp_path, camera):
+    report = generate(gl, tmp_path, camera=camera, time={"duration": 0.2, "label_rate": 10}, scene=moving(0.4, 2.0), timeline={"kind": "displacement"},
+                      preview={"enabled": True}, render={"supersample": 4})  # fmt: skip
+    assert report.labels == 2 and (report.path / "preview.mp4").stat().st_size > 500
+
+
+def test_a_million_pixels_per_second(gl, tmp_path, promise):
+    """Two labels 1 ms apart, 1000 px of motion between them: exact in float, out of range and counted in DSEC's PNG."""
+    speed, focal = 1e6, 27.7  # 32 px wide, 60 degrees
+    wide = {**moving(0.004, 0.004 * speed * 3 / focal)}
+    wide["objects"] = [{**wide["objects"][0], "scale": 1e4, "keyframes": [{**k, "position": [k["position"][0] + 5e3, *k["position"][1:]]} for k in
+                                                                      wide["objects"][0]["keyframes"]]}]  # a wall 3 units ahead  # fmt: skip
+    report = generate(gl, tmp_path, time={"duration": 0.001, "label_rate": 1000}, scene=wide, camera={"width": 32, "height": 24, "near": 0.01},
+                      timeline={"kind": "displacement", "min_step_us": 0.5, "max_px": 1.0})  # fmt: skip
+    flow = np.load(report.path / "flow/forward_npy/000000.npy")
+    assert flow[..., 2].all()
+    exact = -0.001 * speed * (32 / 2 / np.tan(np.pi / 6)) / focal
+    promise("1e6 px/s as a sequence: flow of 1000 px over 1 ms", np.abs(flow[..., 0] - exact).max(), 1e-3, "px")
+    png, valid = read_flow_png(report.path / "flow/forward/000000.png")
+    manifest = json.loads((report.path / "manifest.json").read_text())
+    assert not valid.any() and (png == 0).all() and manifest["flow_pixels_out_of_range"]["forward"] == 32 * 24
+
+
+@pytest.mark.parametrize("change, message", [
+    ({"camera": {"near": 0.0}}, "camera.near"),
+    ({"camera": {"near": 1e-40}}, "camera.near"),
+    ({"camera": {"fov": 180}}, "camera.fov"),
+    ({"camera": {"focal": 1e12}}, "camera.focal"),
+    ({"camera": {"width": 0}}, "camera.width"),
+    ({"time": {"duration": 1e9}}, "time.duration"),
+    ({"time": {"start": 1e300}}, "time.start"),
+    ({"events": {"emulator": "esim", "contrast_threshold": 1e-4}}, "events.contrast_threshold"),
+    ({"timeline": {"kind": "uniform", "fps": 1e12}}, "timeline.fps"),
+    ({"scene": {**BOX, "camera": {"position": [1e300, 0, 0]}}}, "scene.camera.position"),
+    ({"scene": {**BOX, "light": {"sun": 1e39}}}, "scene.light.sun"),
+    ({"scene": {**BOX, "background": 1e39}}, "scene.background"),
+    ({"scene": {**BOX, "objects": [{"mesh": "box", "scale": 1e300}]}}, "scene.objects.0.scale"),
+    ({"camera": {"near": 5.0, "fov": 179}, "scene": {"kind": "random"}}, "scene.region.height"),
+])  # fmt: skip
+def test_beyond_the_ranges_there_is_a_message(gl, tmp_path, change, message):
+    with pytest.raises(ConfigError, match=message.replace(".", "\\.")) as caught:
+        generate(gl, tmp_path, **change)
+    assert "\n" not in str(caught.value) and not any(tmp_path.iterdir())
+
+
+def test_light_beyond_the_emulators_is_refused_where_it_is_seen(gl, tmp_path):
+    bright = {**BOX, "materials": {"paint": {"color": [1e6, 1e6, 1e6]}}, "light": {"sky": 1e6}}
+    with pytest.raises(BlinkGLError, match="frame 0: intensity at pixel .* a finite value from 0 to 1.07e\\+09"):
+        generate(gl, tmp_path, scene=bright)
+    assert not any(tmp_path.rglob("*.h5"))
+
+
+def test_frames_further_apart_than_17_minutes_are_refused(gl, tmp_path):
+    with pytest.raises(EventDataError, match="at most 17 minutes between two frames"):
+        generate(gl, tmp_path, time={"duration": 7200, "label_rate": 1 / 3600}, timeline={"kind": "uniform", "fps": 1 / 3600})

@@ -20,7 +20,7 @@ from blinkgl.io.sequence_dir import refuse_existing
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
 from eflow.infer import predict
-from eflow.metrics import Tally, frame_metrics
+from eflow.metrics import NAMES, Tally, frame_metrics
 from eflow.models import FlowModel, parameters_of
 from eflow.pictures import comparison, events_of, write_picture
 
@@ -104,24 +104,24 @@ def write_json(path: Path, tree: dict) -> None:
 
 
 def show(result: dict[str, Any], console: Console | None = None) -> None:
-    """The table: network and baselines, then the network per scene."""
+    """Two tables: all metrics of the network and the baselines; the network scene by scene. Fits 80 columns."""
     console = console or Console()
-    columns = ("AEE", "outlier", "1PE", "2PE", "3PE", "AE2D", "AE3D", "cosine")
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
     table = Table(title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on {result['device']}")
     table.add_column("")
-    for c in columns:
-        table.add_column(f"{c} {units.get(c, '%')}".strip(), justify="right")
-    row = lambda name, m: table.add_row(name, *(f"{m[c]:.3f}" for c in columns))  # noqa: E731
-    for name, scores in result["methods"].items():
-        row(name, scores["total"])
+    for name in result["methods"]:
+        table.add_column(name, justify="right")
+    for metric in NAMES:
+        table.add_row(f"{metric} {units.get(metric, '%')}".strip(), *(f"{m['total'][metric]:.3f}" for m in result["methods"].values()))
+    console.print(table)
     scenes = result["methods"]["network"]["scenes"]
     if len(scenes) > 1:
-        table.add_section()
+        columns = ("AEE", "outlier", "3PE", "AE2D")
+        table = Table(title="by scene")
+        for name in ("", "frames", *columns):
+            table.add_column(name, justify="right" if name else "left")
         for scene, scores in scenes.items():
-            row(f"{scene} ({scores['frames']})", scores)
-    console.print(table)
+            table.add_row(scene, str(scores["frames"]), *(f"{scores[c]:.3f}" for c in columns))
+        console.print(table)
     if result["skipped"]:
         console.print(f"{result['skipped']} samples without a valid pixel were left out")
-
-

@@ -1,0 +1,232 @@
+"""``eflow evaluate``, ``predict``, ``submit``, ``bench`` from the command line, on tiny files, with an untrained network."""
+
+import json
+import re
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from blinkgl.io.flow_png import read_flow_png  # noqa: E402
+from blinkgl.io.formats import write_events  # noqa: E402
+from eflow import checkpoint as ckpt  # noqa: E402
+from eflow import submit  # noqa: E402
+from eflow.cli import run  # noqa: E402
+from eflow.models import build_model, model_config  # noqa: E402
+from flow_data import SPAN, blinkflow_set, blinkgl_set, dsec_set, moving_events, mvsec_set  # noqa: E402
+from shared_data import shared  # noqa: E402
+
+
+def weights(folder: Path, **tree) -> Path:
+    torch.manual_seed(0)
+    model = build_model(model_config(tree))
+    path = folder / f"{tree['name']}.safetensors"
+    ckpt.write_tensors(path, model.state_dict(), ckpt.metadata_of(model))
+    return path
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory) -> str:
+    return str(weights(tmp_path_factory.mktemp("weights"), name="ev_flownet"))
+
+
+@pytest.fixture(scope="module")
+def refined(tmp_path_factory) -> str:
+    return str(weights(tmp_path_factory.mktemp("refined"), name="eflowformer", layers=1, iterations=2))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return blinkgl_set(tmp_path_factory.mktemp("set"))
+
+
+def test_evaluate_writes_table_json_and_pictures(network, data, tmp_path, capsys):
+    out = tmp_path / "scores"
+    assert run(["evaluate", network, str(data), "--out", str(out), "--pictures", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "network" in text and "zero flow" in text and "median of the frame" in text and "AEE px" in text
+    result = json.loads((out / "results.json").read_text())
+    zero = result["methods"]["zero flow"]
+    # two sequences of constant flow (4, -2) and (5, -2): zero flow errs by their lengths, the frame's median not at all
+    lengths = [np.hypot(4, 2), np.hypot(5, 2)]
+    assert [s["AEE"] for s in zero["scenes"].values()] == pytest.approx(lengths, abs=0.01)
+    assert zero["total"]["AEE"] == pytest.approx(np.mean(lengths), abs=0.01) and zero["total"]["frames"] == 6
+    assert result["methods"]["median of the frame"]["total"]["AEE"] < 1e-6
+    assert 0.2 < result["methods"]["median of the set"]["total"]["AEE"] < 1
+    assert 0 < result["methods"]["network"]["total"]["AEE"] < 20 and result["samples"] == 6
+    pictures = sorted((out / "pictures").glob("*.png"))
+    assert len(pictures) == 2 and cv2.imread(str(pictures[0])).shape == (128, 4 * 144 + 12, 3)
+    assert run(["evaluate", network, str(data), "--out", str(out)]) == 2  # nothing is overwritten
+    assert "output folder exists" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("make", [dsec_set, blinkflow_set, mvsec_set], ids=["dsec", "blinkflow", "mvsec"])
+def test_evaluate_other_data_sets(network, make, tmp_path, capsys):
+    assert run(["evaluate", network, str(make(tmp_path)), "--limit", "1", "--pictures", "0"]) == 0
+    assert "1 samples" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("ending, format", [("h5", None), ("raw", "evt2"), ("raw", "evt3"), ("txt", None), ("npz", None), ("aedat4", None)])
+def test_predict_any_event_file(network, tmp_path, ending, format, capsys):
+    if ending == "aedat4":
+        pytest.importorskip("dv_processing")
+    events = moving_events(180, 240, 0, 4 * SPAN, n=8000)
+    file = tmp_path / f"events.{ending}"
+    write_events(file, events, 180, 240, **({"format": format} if format else {}))
+    out = tmp_path / "flow"
+    assert run(["predict", network, str(file), "--out", str(out), "--npy", "--size", "240x180"]) == 0, capsys.readouterr().err
+    # from the first event on: [t0 + 1, t0 + 2) and so on as long as both windows lie inside
+    times = [line for line in (out / "timestamps.txt").read_text().splitlines() if line[0] != "#"]
+    t0 = int(events.t[0])
+    assert times[0] == f"{t0 + SPAN}, {t0 + 2 * SPAN}" and len(times) in (2, 3)
+    flow, valid = read_flow_png(out / "000000.png")
+    exact = np.load(out / "npy" / "000000.npy")
+    assert valid.all() and flow.shape == (180, 240, 2) and np.abs(flow - exact).max() <= 1 / 256
+    assert (out / "pictures/000001.png").is_file()
+    assert run(["predict", network, str(file), "--out", str(out)]) == 2
+
+
+def test_predict_streams_the_same_windows_as_a_slice(tmp_path):
+    from eflow.infer import open_sized, windows
+
+    events = moving_events(180, 240, 5000, 1_000_000, n=30000)
+    write_events(tmp_path / "e.h5", events, 180, 240)
+    file = open_sized(tmp_path / "e.h5")
+    got = list(windows(file, 90_000, start_us=20_000, end_us=700_000))
+    assert [w.t_us for w in got] == [110_000 + 90_000 * i for i in range(6)]
+    for w in got:
+        for part, a, b in ((w.old, w.t_us - 90_000, w.t_us), (w.new, w.t_us, w.t_us + 90_000)):
+            expected = events.window(a, b)
+            assert (part.t0, part.t1) == (a, b) and np.array_equal(part.t, expected.t) and np.array_equal(part.x, expected.x)
+
+
+def test_predict_whole_file_with_truth(refined, tmp_path, capsys):
+    truth = np.broadcast_to(np.float32([[[8.0]], [[-4.0]]]), (1, 2, 128, 144)).copy()  # 2 intervals at (40, -20) px/s
+    np.save(tmp_path / "truth.npy", truth)
+    write_events(tmp_path / "e.txt", moving_events(128, 144, 0, 2 * SPAN), 128, 144)
+    assert run(["predict", refined, str(tmp_path / "e.txt"), "--whole", "--truth", str(tmp_path / "truth.npy"), "--size", "144x128"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"all pixels: AEE [\d.]+ px, cosine -?[\d.]+; zero flow AEE 8\.944 px", out) and "pixels with events" in out
+
+
+def test_warm_start_runs(refined, tmp_path, capsys):
+    write_events(tmp_path / "e.h5", moving_events(128, 144, 0, 3 * SPAN, n=9000), 128, 144)
+    outputs = []
+    for flag in ([], ["--warm-start"]):
+        assert run(["predict", refined, str(tmp_path / "e.h5"), "--window-ms", "70", *flag]) == 0
+        outputs.append(capsys.readouterr().out.splitlines())
+    assert outputs[0][0] == outputs[1][0] and outputs[0][1:] != outputs[1][1:]
+
+
+@pytest.mark.parametrize("burst", ["boxes_rotation", "shapes_rotation"])
+def test_predict_on_real_events(refined, burst, capsys):
+    folder = shared(f"data/events/ecd_rotation/{burst}")
+    assert run(["predict", refined, str(folder / "events.txt"), "--size", "240x180", "--whole", "--truth", str(folder / "flow.npy")]) == 0
+    assert "cosine" in capsys.readouterr().out
+
+
+def test_submit_dsec(network, tmp_path, monkeypatch, capsys):
+    names = ("thun_01_a", "thun_01_b")
+    monkeypatch.setattr(submit, "submit_dsec", lambda *a, **k: submit.__dict__["_real"](*a, sequences=names, **k))
+    monkeypatch.setitem(submit.__dict__, "_real", SUBMIT_DSEC)
+    root, out = dsec_set(tmp_path / "test", names, labels=1, test=True), tmp_path / "sub.zip"
+    assert run(["submit", network, str(root), "--benchmark", "dsec", "--out", str(out)]) == 0, capsys.readouterr().err
+    assert "2 files" in capsys.readouterr().out
+    with zipfile.ZipFile(out) as archive:
+        assert sorted(archive.namelist()) == [f"{n}/{i:06d}.png" for n in names for i in (2,)]
+        image = cv2.imdecode(np.frombuffer(archive.read(f"{names[0]}/000002.png"), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image.dtype == np.uint16 and image.shape == (480, 640, 3) and not image[..., 0].any()
+    flow = (image[..., :0:-1].astype(float) - 2**15) / 128
+    assert 0 < np.abs(flow).max() < 256
+    assert run(["submit", network, str(root), "--benchmark", "dsec", "--out", str(out)]) == 2  # not overwritten
+
+
+SUBMIT_DSEC = submit.submit_dsec
+
+
+def test_submit_refuses_an_incomplete_test_set(network, tmp_path, capsys):
+    root = dsec_set(tmp_path / "test", ("thun_01_a",), test=True)
+    assert run(["submit", network, str(root), "--benchmark", "dsec", "--out", str(tmp_path / "sub.zip")]) == 2
+    assert "missing interlaken_00_b" in capsys.readouterr().err and not (tmp_path / "sub.zip").exists()
+
+
+def test_submission_check_finds_what_is_wrong(tmp_path):
+    from blinkgl.errors import OutputError
+
+    good = submit._dsec_png(np.zeros((4, 6, 2), np.float32), "x")
+    bad = cv2.imencode(".png", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
+
+    def zipped(**files) -> Path:
+        with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+            for name, content in files.items():
+                archive.writestr(f"{name}.png", content)
+        return tmp_path / "a.zip"
+
+    submit.check_dsec(zipped(a=good, b=good), {"a.png", "b.png"}, (4, 6))
+    for path, message in ((lambda: zipped(a=good), "does not match the CSV"), (lambda: zipped(a=good, b=bad), "wrong image"),
+                          (lambda: zipped(a=good, b=b"junk"), "wrong image")):
+        with pytest.raises(OutputError, match=message):
+            submit.check_dsec(path(), {"a.png", "b.png"}, (4, 6))
+    with pytest.raises(OutputError, match="cannot hold"):
+        submit._dsec_png(np.full((4, 6, 2), np.nan, np.float32), "x")
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_submit_blinkflow(network, tmp_path, full, capsys):
+    root, out = blinkflow_set(tmp_path / "set", labels=2), tmp_path / "sub.zip"
+    assert run(["submit", network, str(root), "--benchmark", "blinkflow", "--out", str(out)] + (["--full"] if full else [])) == 0
+    with zipfile.ZipFile(out) as archive:
+        assert sorted(archive.namelist()) == ["scene_a/seq_0/100_200.flo"]
+        data = archive.read("scene_a/seq_0/100_200.flo")
+    tag = int.from_bytes(data[:4], "little")
+    assert tag == (2502001 if full else 2502002)
+    assert len(data) == 12 + 8 * (480 * 640 if full else 120 * 160)
+    assert submit.decode(data).shape == ((480, 640, 2) if full else (19200, 2))
+
+
+def test_bench_reports_every_row(tmp_path, capsys):
+    assert run(["bench", "-m", "ev_flownet", "--size", "64x48", "--repeats", "1", "--no-training", "--json", str(tmp_path / "b.json")]) == 0
+    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
+    assert [r["mode"] for r in rows] == ["forward"] and all(r["ms"] > 0 and r["peak_mib"] > 50 and r["gmacs"] > 0.3 for r in rows)
+
+
+@pytest.mark.parametrize("arguments, message", [
+    (["evaluate", "{tmp}/none", "{data}"], "none: no such checkpoint"),
+    (["evaluate", "{net}", "{tmp}/none"], "none: no such data set"),
+    (["evaluate", "{net}", "{data}", "--format", "kitti"], "--format: unknown choice"),
+    (["predict", "{net}", "{tmp}/none.h5"], "none.h5: no such file"),
+    (["predict", "{net}", "{tmp}/x.docx"], "unknown event file ending"),
+    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--window-ms", "900"], "shorter than two windows"),
+    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--iterations", "3"], "--iterations: this network has no iterations"),
+    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--size", "big"], "--size: not a size"),
+    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--precision", "fp8"], "--precision: unknown choice"),
+    (["submit", "{net}", "{data}", "--benchmark", "kitti", "--out", "{tmp}/a.zip"], "--benchmark: unknown choice"),
+    (["bench", "-m", "raft"], "--model: unknown model"),
+    (["train", "{tmp}/none.yaml", "--out", "{tmp}/o"], "none.yaml: no such file")])
+def test_one_clear_line(network, data, tmp_path, arguments, message, capsys):
+    filled = [a.format(tmp=tmp_path, data=data, net=network) for a in arguments]
+    assert run(filled) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("error: ") and err.count("\n") == 1 and message in err, err
+
+
+def test_a_small_sensor_is_refused_by_name(refined, tmp_path, capsys):
+    write_events(tmp_path / "e.npz", moving_events(64, 64, 0, 3 * SPAN), 64, 64)
+    assert run(["predict", refined, str(tmp_path / "e.npz"), "--out", str(tmp_path / "flow")]) == 2
+    assert "input is too small" in capsys.readouterr().err and not (tmp_path / "flow").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["e.npz"]  # no temporary left
+
+
+def test_a_silent_window(network, tmp_path, capsys):
+    events = moving_events(64, 64, 0, SPAN)
+    late = moving_events(64, 64, 3 * SPAN, 4 * SPAN)
+    from blinkgl.events.types import Events
+
+    write_events(tmp_path / "e.npz", Events.concatenate([events, late]), 64, 64)
+    assert run(["predict", network, str(tmp_path / "e.npz")]) == 2
+    assert "no events in the" in capsys.readouterr().err
+    assert run(["predict", network, str(tmp_path / "e.npz"), "--empty", "zero"]) == 0

@@ -118,6 +118,31 @@ def explain(
 
 
 @app.command()
+def report(
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
+    out: Annotated[Optional[str], typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
+    examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
+) -> None:
+    """Write one self-contained HTML page about a data set, and its index.jsonl."""
+    from blinkgl.report import write_report
+
+    typer.echo(f"written to {write_report(folder, out, examples=examples)}")
+
+
+@app.command()
+def export(
+    folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder for the shards: SPLIT-000000.tar …")],
+    shard_mb: Annotated[float, typer.Option("--shard-mb", min=1, help="Size of a shard.")] = 512.0,
+    seed: Annotated[int, typer.Option(min=0, help="Order of the samples; a reader then only has to shuffle shards.")] = 0,
+) -> None:
+    """Write a data set as WebDataset shards, one sample per flow label, for training from object storage."""
+    from blinkgl.dataset.shards import export_and_show
+
+    export_and_show(folder, out, shard_bytes=int(shard_mb * 1e6), seed=seed)
+
+
+@app.command()
 def simulate(
     source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")],

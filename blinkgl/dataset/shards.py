@@ -1,0 +1,107 @@
+"""A data set as WebDataset shards: plain tar files, read from front to back, for training from object storage.
+
+One sample per flow label, its files side by side under one key:
+
+    flying_000017_000003.json        sequence, times in µs, size, polarity convention
+    flying_000017_000003.old.npz     events of the interval before the label: x, y uint16, t int64 µs, p uint8
+    flying_000017_000003.new.npz     events of the label's interval [from, to)
+    flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has them
+
+The same data set, seed and shard size give the same bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from blinkgl.dataset.index import sequence_folders
+from blinkgl.errors import AssetError, OutputError
+from blinkgl.events.types import Events
+from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.sequence_dir import read_manifest, verify_sequence
+
+_EXTRAS = {"back.png": "flow/backward", "image.png": "images", "occlusion.png": "occlusion/forward"}
+
+
+def export_shards(root: str | Path, out: str | Path, *, shard_bytes: int = 512_000_000, seed: int = 0) -> dict[str, list[int]]:
+    """Writes ``<out>/<split>-000000.tar`` …, each whole or not at all; returns the samples per shard of each split.
+
+    Labels are put in a random order (``seed``) over all sequences of a split, since shards are read in one go.
+    Raises AssetError (no labels, a damaged sequence), OutputError (shards are there already, disk full)."""
+    root, out = Path(root), Path(out)
+    if out.is_dir() and any(out.glob("*-*.tar")):
+        raise OutputError("holds shards", where=str(out), accepted="a new folder name")
+    labels: dict[str, list[tuple[Path, int]]] = {}
+    for folder in sequence_folders(root):
+        if problems := verify_sequence(folder, checksums=False):
+            raise AssetError(f"damaged sequence: {problems[0]}", where=str(folder), accepted="a data set that 'blinkgl verify' passes")
+        manifest = read_manifest(folder)
+        count = sum(name.startswith("flow/forward/") for name in manifest["files"])
+        labels.setdefault(str(manifest.get("split", "all")), []).extend((folder, k) for k in range(count))
+    if not any(labels.values()):
+        raise AssetError("no flow labels found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
+    written = {}
+    for split, entries in sorted(labels.items()):
+        order = np.random.default_rng(seed).permutation(len(entries))
+        written[split] = _write(out, split, (entries[i] for i in order), shard_bytes)
+    return written
+
+
+def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_bytes: int) -> list[int]:
+    counts: list[int] = []
+    pending = next(entries, None)
+    while pending is not None:
+        with atomic_file(out / f"{split}-{len(counts):06d}.tar", overwrite=False) as path, output_errors(path):
+            counts.append(0)
+            with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
+                while pending is not None and (counts[-1] == 0 or shard.offset < shard_bytes):
+                    for name, data in sample(*pending):
+                        member = tarfile.TarInfo(name)  # owner, mode and time stay at their defaults: the same bytes on every day
+                        member.size = len(data)
+                        shard.addfile(member, io.BytesIO(data))
+                    counts[-1] += 1
+                    pending = next(entries, None)
+    return counts
+
+
+def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
+    """(member name, bytes) of the ``k``-th label of a sequence."""
+    key = f"{folder.name}_{k:06d}"
+    lines = [line for line in (folder / "flow/forward_timestamps.txt").read_text().splitlines() if not line.startswith("#")]
+    start, end = (int(v) for v in lines[k].split(","))
+    manifest = read_manifest(folder)
+    about: dict[str, Any] = {"sequence": folder.name, "label": k, "from_us": start, "to_us": end, "height": manifest["height"],
+                             "width": manifest["width"], "emulator": manifest.get("emulator"), "seed": manifest.get("seed")}
+    with DsecEventReader(folder / "events.h5") as reader:
+        windows = {"old": reader.slice(2 * start - end, start), "new": reader.slice(start, end)}
+    yield f"{key}.json", json.dumps(about, sort_keys=True).encode()
+    for name, events in windows.items():
+        yield f"{key}.{name}.npz", _npz(events)
+    yield f"{key}.flow.png", (folder / f"flow/forward/{k:06d}.png").read_bytes()
+    for ending, where in _EXTRAS.items():
+        if (path := folder / where / f"{k:06d}.png").is_file():
+            yield f"{key}.{ending}", path.read_bytes()
+
+
+def _npz(events: Events) -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, x=events.x, y=events.y, t=events.t, p=events.p)
+    return buffer.getvalue()
+
+
+def export_and_show(root: str, out: str, *, shard_bytes: int, seed: int) -> None:
+    """What ``blinkgl export`` shows."""
+    console = Console()
+    with console.status("writing shards"):
+        written = export_shards(root, out, shard_bytes=shard_bytes, seed=seed)
+    for split, counts in written.items():
+        console.print(f"{out}/{split}-*.tar: {sum(counts):,} samples in {len(counts)} shard{'s' * (len(counts) != 1)}", highlight=False, soft_wrap=True)

@@ -1,0 +1,247 @@
+"""What the page is made of: a sample of labels for pictures and distributions, every configuration for the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from blinkgl.config.draw import is_distribution
+from blinkgl.dataset.index import entry, sequence_folders
+from blinkgl.dataset.plan import Plan
+from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.verify import plan_of
+from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.images import read_image, read_npy
+
+SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
+MAX_CONFIGS = 5000
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+@dataclass
+class Example:
+    """Pictures of one label, RGB uint8 (H, W, 3), and what stands below them."""
+
+    name: str
+    image: np.ndarray | None
+    events: np.ndarray
+    flow: np.ndarray
+    caption: str
+
+
+@dataclass
+class Parameter:
+    """A distribution of the recipe, and the values that the sequences have."""
+
+    group: str
+    path: str
+    kind: str
+    spec: Any
+    values: list[Any]
+
+
+@dataclass
+class Collected:
+    root: Path
+    sequences: list[dict[str, Any]]
+    plan: Plan | None
+    environment: dict[str, str]
+    failed: dict[str, str]
+    costs: list[dict[str, Any]]
+    quantities: dict[str, np.ndarray] = field(default_factory=dict)
+    examples: list[Example] = field(default_factory=list)
+    parameters: list[Parameter] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+
+
+def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
+    """Raises AssetError when there is no data set; sequences that cannot be read are listed, not fatal."""
+    root = Path(root)
+    if not root.is_dir():
+        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
+    sequences, unreadable = [], []
+    for folder in sequence_folders(root):
+        try:
+            sequences.append(entry(root, folder))
+        except BlinkGLError as error:
+            unreadable.append(str(error))
+    run = RunFolder(root)
+    try:
+        plan, record, failed = plan_of(root), run.read("run.json") or {}, run.read("failed.json") or {}
+    except BlinkGLError as error:
+        plan, record, failed = None, {}, {}
+        unreadable.append(str(error))
+    if not sequences and plan is None:
+        raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
+    found = Collected(root, sequences, plan, record.get("environment", {}), failed, run.costs(), unreadable=unreadable)
+    rng = np.random.default_rng(seed)
+    _sample(found, rng, examples)
+    _parameters(found, rng)
+    return found
+
+
+def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
+    """Displacements, speeds, depths, numbers of objects from some labels; rates from every sequence."""
+    values: dict[str, list] = {k: [] for k in ("displacement", "speed", "depth", "objects", "share")}
+    found.quantities["rate"] = np.array([1e6 * s["events"] / s["duration_us"] / (s["height"] * s["width"]) for s in found.sequences
+                                         if s["duration_us"] and s["events"] is not None])
+    found.quantities["events"] = np.array([s["events"] for s in found.sequences if s["events"] is not None], float)
+    order = rng.permutation(len(found.sequences))[:SAMPLED_SEQUENCES]
+    shown = set(_spread(found.sequences, order, examples))
+    for number in order:
+        line = found.sequences[number]
+        folder = found.root / line["path"]
+        try:
+            flows = sorted((folder / "flow/forward").glob("*.png"))
+            if not flows:
+                continue
+            pairs = _pairs(folder / "flow/forward_timestamps.txt")
+            picks = sorted(rng.permutation(len(flows))[:LABELS_EACH])
+            for k in picks:
+                flow, valid = read_flow_png(flows[k])
+                displacement = np.hypot(flow[..., 0], flow[..., 1])[::PIXEL_STEP, ::PIXEL_STEP][valid[::PIXEL_STEP, ::PIXEL_STEP]]
+                values["displacement"].append(displacement)
+                values["speed"].append(displacement / ((pairs[k][1] - pairs[k][0]) * 1e-6))
+                if (path := folder / f"depth/{flows[k].stem}.npy").is_file():
+                    depth = read_npy(path)[::PIXEL_STEP, ::PIXEL_STEP]
+                    values["depth"].append(depth[np.isfinite(depth)])
+                if (path := folder / f"ids/{flows[k].stem}.png").is_file():
+                    ids, counts = np.unique(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), return_counts=True)
+                    counts = counts[ids > 0]
+                    values["objects"].append([len(counts)])
+                    values["share"].append(counts / (line["height"] * line["width"]))
+            if number in shown:
+                found.examples.append(_example(folder, line, flows, pairs, picks[len(picks) // 2]))
+        except (BlinkGLError, OSError, ValueError, IndexError) as error:
+            found.unreadable.append(f"{line['path']}: {' '.join(str(error).split())[:160]}")
+    found.examples.sort(key=lambda e: e.name)
+    found.quantities.update({k: np.concatenate(v).astype(float) for k, v in values.items() if v})
+
+
+def _spread(sequences: list[dict[str, Any]], order: np.ndarray, count: int) -> list[int]:
+    """Of each (split, kind of name, emulator) in turn, so that rare kinds are shown, too."""
+    kinds: dict[tuple, list[int]] = {}
+    for number in order:
+        s = sequences[number]
+        kinds.setdefault((s["split"], s["name"].rpartition("_")[0], s["emulator"]), []).append(int(number))
+    chosen: list[int] = []
+    while len(chosen) < min(count, len(order)):
+        for members in kinds.values():
+            if members and len(chosen) < count:
+                chosen.append(members.pop(0))
+    return chosen
+
+
+def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: int) -> Example:
+    from blinkgl.io.colour import count_events, event_colour, flow_colour
+
+    flow, valid = read_flow_png(flows[k])
+    start, end = pairs[k]
+    with DsecEventReader(folder / "events.h5") as reader:
+        # A whole label interval is a blot: the first part of it, about one event in five pixels.
+        window = end - start
+        events = reader.slice(start, end)
+        wanted = line["height"] * line["width"] // 5
+        if len(events) > wanted:
+            window = max(int(events.t[wanted]) - start, 1000)
+            events = reader.slice(start, start + window)
+    counts = np.zeros((2, line["height"], line["width"]), np.uint16)
+    count_events(events.x, events.y, events.p, counts)
+    picture = folder / f"images/{flows[k].stem}.png"
+    image = None
+    if picture.is_file():
+        image = read_image(picture)
+        image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+    speed = np.hypot(flow[..., 0], flow[..., 1])[valid]
+    top = float(np.percentile(speed, 99)) if speed.size else 0.0
+    caption = (f"{line['emulator'] or ''}, t = {start / 1e6:.3f} s; events of {window / 1000:.1f} ms ({len(events):,}); "
+               f"flow over {(end - start) / 1000:g} ms, full colour {top:.1f} px")
+    return Example(line["path"], image, event_colour(counts), flow_colour(flow, top or None, valid), caption)
+
+
+def _pairs(path: Path) -> list[tuple[int, int]]:
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
+    return [tuple(int(v) for v in line.split(",")) for line in lines]
+
+
+# ---- parameters ------------------------------------------------------------------------------------------------------
+
+
+def _parameters(found: Collected, rng: np.random.Generator) -> None:
+    """Every distribution of the recipe with the values drawn, as the sequences' own config.yaml say."""
+    if found.plan is None:
+        return
+    here = {s["path"] for s in found.sequences}
+    tasks = [task for task in found.plan.tasks if task.name in here]
+    tasks = [tasks[i] for i in sorted(rng.permutation(len(tasks))[:MAX_CONFIGS])]
+    configs: dict[str, list[dict]] = {}
+    for task in tasks:
+        try:
+            configs.setdefault(task.group, []).append(yaml.load((found.root / task.name / "config.yaml").read_text(encoding="utf-8"), Loader=_LOADER))  # noqa: S506
+        except (OSError, yaml.YAMLError) as error:
+            found.unreadable.append(f"{task.name}/config.yaml: {error.__class__.__name__}")
+    for group in found.plan.used:
+        _walk(group.name, group.template.tree, (), configs.get(group.name, []), found.parameters)
+
+
+def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], into: list[Parameter]) -> None:
+    if is_distribution(node):
+        kind, spec = next(iter(node.items()))
+        values = [v for v in (_at(c, path) for c in configs) if v is not None]
+        if kind in ("uniform", "log_uniform", "integer"):
+            into.append(Parameter(group, ".".join(path), kind, spec, values))
+            return
+        options = [part["value"] for part in spec] if kind == "shares" else list(spec)
+        if all(not isinstance(o, (dict, list)) for o in options):
+            into.append(Parameter(group, ".".join(path), kind, spec, values))
+            return
+        counted: list[Any] = []
+        for option in options:
+            having = [c for c in configs if _fits(_at(c, path), option)]
+            counted += [_label(option)] * len(having)
+            _walk(group, option, path, having, into)
+        labels = [_label(o) for o in options]
+        into.append(Parameter(group, ".".join(path), kind, [{"share": p["share"], "value": la} for p, la in zip(spec, labels)] if kind == "shares"
+                              else labels, counted))
+    elif isinstance(node, dict):
+        for key, value in node.items():
+            _walk(group, value, (*path, str(key)), configs, into)
+    elif isinstance(node, list):
+        for i, value in enumerate(node):
+            _walk(group, value, (*path, str(i)), configs, into)
+
+
+def _at(config: Any, path: tuple[str, ...]) -> Any:
+    for key in path:
+        if isinstance(config, list) and key.isdigit() and int(key) < len(config):
+            config = config[int(key)]
+        elif isinstance(config, dict) and key in config:
+            config = config[key]
+        else:
+            return None
+    return config
+
+
+def _fits(value: Any, option: Any) -> bool:
+    """Whether a drawn table may have come of this option: its plain keys agree, what was drawn is inside its range."""
+    if is_distribution(option):
+        kind, spec = next(iter(option.items()))
+        return kind not in ("uniform", "log_uniform", "integer") or (value is not None and float(spec[0]) <= value <= float(spec[1]))
+    if not isinstance(option, dict) or not isinstance(value, dict):
+        return isinstance(option, list) or value == option
+    return all(key in value and _fits(value[key], inner) for key, inner in option.items())
+
+
+def _label(option: Any) -> str:
+    if isinstance(option, dict):
+        return str(next((option[tag] for tag in ("emulator", "kind") if tag in option), "; ".join(map(str, option))))
+    return str(option)
+
+

@@ -1,0 +1,73 @@
+"""WebDataset shards, read back with tarfile alone and compared with the sequences."""
+
+import io
+import json
+import tarfile
+
+import cv2
+import numpy as np
+import pytest
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.shards import export_shards
+from blinkgl.errors import AssetError, OutputError
+from blinkgl.io.dsec import DsecEventReader
+from runs import recipe_file
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    run_dataset(load_run(recipe_file(folder)), folder / "out", num=2)
+    return folder / "out"
+
+
+def members(folder, split):
+    found = []
+    for shard in sorted(folder.glob(f"{split}-*.tar")):
+        with tarfile.open(shard) as tar:
+            assert all(m.uid == 0 and m.mtime == 0 and m.isfile() for m in tar)
+            found += [(m.name, tar.extractfile(m).read()) for m in tar]
+    return found
+
+
+def test_shards_hold_every_label_once(data, tmp_path):
+    assert run(["export", str(data), "--out", str(tmp_path / "a"), "--shard-mb", "1"]) == 0
+    for split, name in (("train", "fly"), ("test", "probe")):
+        files = members(tmp_path / "a", split)
+        keys = [n.partition(".")[0] for n, _ in files]
+        assert set(keys) == {f"{name}_{s:06d}_{k:06d}" for s in range(2) for k in range(4)}
+        assert len(set(n for n, _ in files)) == len(files)
+        changes = sum(a != b for a, b in zip(keys, keys[1:]))
+        assert changes == 7, "a sample's files stand together"
+        assert keys[:: len(files) // 8] != sorted(keys[:: len(files) // 8]), "labels are mixed"
+        contents = dict(files)
+        for key in set(keys):
+            about = json.loads(contents[f"{key}.json"])
+            folder = data / split / about["sequence"]
+            assert contents[f"{key}.flow.png"] == (folder / f"flow/forward/{about['label']:06d}.png").read_bytes()
+            assert cv2.imdecode(np.frombuffer(contents[f"{key}.image.png"], np.uint8), 1).shape == (48, 64, 3)
+            span = about["to_us"] - about["from_us"]
+            with DsecEventReader(folder / "events.h5") as reader:
+                for window, start in (("old", about["from_us"] - span), ("new", about["from_us"])):
+                    with np.load(io.BytesIO(contents[f"{key}.{window}.npz"]), allow_pickle=False) as given:
+                        expected = reader.slice(start, start + span)
+                        for column in "xytp":
+                            np.testing.assert_array_equal(given[column], getattr(expected, column))
+
+
+def test_the_same_bytes_again_and_shards_of_the_size_asked_for(data, tmp_path):
+    counts = export_shards(data, tmp_path / "a", shard_bytes=60_000)
+    assert len(counts["train"]) > 1 and sum(counts["train"]) == 8
+    export_shards(data, tmp_path / "b", shard_bytes=60_000)
+    assert [p.read_bytes() for p in sorted((tmp_path / "a").iterdir())] == [p.read_bytes() for p in sorted((tmp_path / "b").iterdir())]
+
+
+def test_bad_input(data, tmp_path):
+    with pytest.raises(AssetError, match="no flow labels"):
+        export_shards(tmp_path, tmp_path / "x")
+    export_shards(data / "train", tmp_path / "a")
+    with pytest.raises(OutputError, match="holds shards"):
+        export_shards(data, tmp_path / "a")

@@ -1,0 +1,130 @@
+"""The page says what the data set holds; nothing in it is fetched; what a stranger wrote is escaped."""
+
+import base64
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.report.charts import bars, histogram, number, stacked
+from blinkgl.report.collect import collect
+
+RECIPE = {
+    "seed": 5, "camera": {"width": 48, "height": 36}, "time": {"duration": 0.2, "label_rate": 20}, "timeline": {"kind": "uniform", "fps": 200},
+    "scene": {"kind": "random", "objects": {"count": {"integer": [1, 3]}}, "pool": {"primitives": ["cuboid"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
+              "textures": {"procedural": ["checks"], "variants": 12, "photographs": False, "max_size": 64, "test_fraction": 0.3}},
+    "labels": {"flow": ["forward"], "ids": True, "depth": True}, "preview": {"enabled": False},
+    "groups": {"fly": {"output": {"sequences": 5}, "events": {"shares": [
+        {"share": 0.6, "value": {"emulator": "esim", "contrast_threshold": {"uniform": [0.2, 0.4]}}}, {"share": 0.4, "value": {"emulator": "esim", "contrast_threshold": 0.5}}]}},
+        "probe": {"output": {"split": "test", "sequences": 2}}},
+}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    (folder / "r.yaml").write_text(yaml.safe_dump(RECIPE))
+    run_dataset(load_run(folder / "r.yaml"), folder / "out")
+    return folder / "out"
+
+
+class Reader(HTMLParser):
+    """Tags balanced, no reference to anything outside."""
+
+    VOID = {"meta", "img", "rect", "line"}
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.images, self.text, self.outside = [], [], [], []
+
+    def handle_starttag(self, tag, attrs):
+        for name, value in attrs:
+            if name in ("src", "href", "action", "xlink:href") and not (value or "").startswith("data:"):
+                self.outside.append(value)
+            if name == "src":
+                self.images.append(value)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag in self.VOID:
+            return
+        while self.open and self.open[-1] != tag and self.open[-1] in ("p",):
+            self.open.pop()
+        assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-3:]}"
+        self.open.pop()
+
+    def handle_data(self, text):
+        self.text.append(text)
+
+
+def read(path: Path) -> Reader:
+    reader = Reader()
+    reader.feed(path.read_text())
+    assert reader.outside == [] and reader.open == []
+    return reader
+
+
+def test_the_page_is_whole_and_shows_what_is_there(data, capsys):
+    assert run(["report", str(data), "--examples", "3"]) == 0
+    page = read(data / "report.html")
+    text = " ".join(page.text)
+    assert "url(" not in text and "@import" not in text and "<script" not in (data / "report.html").read_text()
+    assert len(page.images) == 9
+    pictures = [cv2.imdecode(np.frombuffer(base64.b64decode(i.split(",")[1]), np.uint8), cv2.IMREAD_COLOR) for i in page.images]
+    assert {p.shape for p in pictures} == {(36, 48, 3)} and all(p.std() > 3 for p in pictures)
+    for words in ("5 / 5", "2 / 2", "train, esim", "Displacement", "Depth", "scene.objects.count", "events.contrast_threshold", "fly: uniform, 3 sequences",
+                  "fly: shares, 5 sequences", "made at the first attempt", "7 of 7", "None."):
+        assert words in text, words
+    assert run(["verify", str(data)]) == 0, "the page belongs to the data set"
+
+
+def test_numbers_are_those_of_the_files(data):
+    found = collect(data)
+    index = [json.loads(line) for line in (data / "index.jsonl").read_text().splitlines()]
+    assert found.sequences == index
+    rates = sorted(1e6 * e["events"] / e["duration_us"] / (48 * 36) for e in index)
+    np.testing.assert_allclose(sorted(found.quantities["rate"]), rates)
+    assert 0 < found.quantities["displacement"].mean() < 50
+    np.testing.assert_allclose(found.quantities["speed"], found.quantities["displacement"] * 20)  # labels every 50 ms
+    parameters = {(p.group, p.path, p.kind): p for p in found.parameters}
+    drawn = [yaml.safe_load((data / f"train/fly_{i:06d}/config.yaml").read_text())["events"]["contrast_threshold"] for i in range(5)]
+    assert sorted(parameters["fly", "events.contrast_threshold", "uniform"].values + [0.5, 0.5]) == sorted(drawn)
+
+
+def test_what_is_missing_or_broken_is_said(data, tmp_path):
+    copy = Path(shutil.copytree(data, tmp_path / "copy"))
+    shutil.rmtree(copy / "train/fly_000001")
+    (copy / "train/fly_000002/manifest.json").write_text("{")
+    (copy / "train/fly_000003/flow/forward/000001.png").write_bytes(b"")
+    (copy / ".run/failed.json").write_text(json.dumps({"train/fly_000001": "the mesh <script>alert(1)</script> is corrupt"}))
+    assert run(["report", str(copy), "--out", str(tmp_path / "page.html"), "--examples", "7"]) == 0
+    text = " ".join(read(tmp_path / "page.html").text)
+    assert "<script>" not in (tmp_path / "page.html").read_text()
+    for words in ("3 / 5", "Some sequences that the recipe asks for are missing", "is corrupt", "damaged manifest"):
+        assert words in text, words
+
+
+def test_no_data_set(tmp_path, capsys):
+    assert run(["report", str(tmp_path)]) == 2
+    assert "no sequence found" in capsys.readouterr().err
+
+
+def test_charts():
+    chart = histogram(np.array([1.0] * 10 + [2.0] * 5), bins=2, span=(0.5, 2.5))
+    heights = [float(h) for h in re.findall(r'class=bar .*? height="([\d.]+)"', chart)]
+    assert len(heights) == 2 and heights[0] == pytest.approx(2 * heights[1], abs=0.2)
+    assert "no values" in histogram(np.array([])) and "no values" in histogram(np.array([-1.0, 0.0]), log=True)
+    assert histogram(np.array([3.0, 3.0])).count("class=bar") == 1
+    assert "&lt;b&gt;" in bars([("<b>", 1.0, 2.0)]) and "left:100.0%" in bars([("a", 1.0, 2.0)])
+    assert "75 %" in stacked([("a", 3.0), ("b", 1.0)])
+    assert [number(v) for v in (0.01234, 12.34, 1234.5, 12345, 2.5e6, 3e9, float("nan"))] == ["0.0123", "12.3", "1234", "12.3 k", "2.5 M", "3 G", "-"]

@@ -26,6 +26,7 @@ BLOCK = 1 << 17
 """Events per HDF5 chunk and per write."""
 
 _COLUMNS = {"x": np.uint16, "y": np.uint16, "t": np.uint32, "p": np.uint8}
+_MS_PIECE = 1 << 20
 _MAX_RELATIVE_US = np.iinfo(np.uint32).max
 
 
@@ -118,7 +119,9 @@ class DsecEventWriter:
             with output_errors(self.path):
                 # One entry past the last millisecond: a slicer asks for ceil(end).
                 last_ms = -(-(end - self.t_offset_us) // 1000)
-                self._store_ms(np.full(last_ms + 1 - self._next_ms, self._written, np.uint64))
+                while self._next_ms <= last_ms:  # an eventless day is 700 MB in one piece; pieces end where chunks do
+                    stop = min((self._next_ms // _MS_PIECE + 1) * _MS_PIECE, last_ms + 1)
+                    self._store_ms(np.full(stop - self._next_ms, self._written, np.uint64))
                 self._file.close()
             self._closed = True
         except BaseException:

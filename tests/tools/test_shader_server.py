@@ -133,6 +133,9 @@ def test_foreign_hosts_are_refused(served):
                  "0.0.0.0", "169.254.169.254", "[::1", "127.0.0.1/x", "localhost.", "127.1"):  # fmt: skip
         status, _, body = ask(server, "/state", host=host)
         assert status == 403 and b"passes" not in body, host
+    with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:  # two of them, the first one local
+        wire.sendall(b"GET /state HTTP/1.1\r\nHost: localhost\r\nHost: evil.example\r\n\r\n")
+        assert b" 403 " in wire.recv(100)
     for host in (f"localhost:{server.port}", "127.0.0.1", f"[::1]:{server.port}", "LOCALHOST"):
         assert ask(server, "/state", host=host)[0] == 200, host
 

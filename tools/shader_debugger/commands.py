@@ -114,7 +114,7 @@ def diff_text(reports: list[Report]) -> str:
     for s in summaries:
         if s["note"]:
             notes[s["note"]].append(s["buffer"])
-    lines += [""] + [f"{', '.join(names)}: {note}" for note, names in notes.items()]
+    lines += ["" for _ in notes][:1] + [f"{', '.join(names)}: {note}" for note, names in notes.items()]
     for s in summaries:
         if s["passed"] and len(summaries) > 1:
             continue
@@ -130,7 +130,7 @@ def diff_text(reports: list[Report]) -> str:
         w = failed[0]["worst"][0] if failed[0]["worst"] else None
         lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance" + (f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else "")]
     else:
-        lines += ["", f"all {len(summaries)} buffers agree with the reference"]
+        lines += ["", f"all {len(summaries)} buffers agree with the reference" if len(summaries) > 1 else "agrees with the reference"]
     return "\n".join(lines)
 
 

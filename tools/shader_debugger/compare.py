@@ -29,7 +29,7 @@ WORST = 10
 
 @dataclass(frozen=True)
 class Quantity:
-    """How one buffer is graded. error : (gpu, reference, gpu moment) -> (H, W) >= 0 in ``unit``.
+    """How one buffer is graded. error : (what the GPU wrote, the reference, both moments) -> (H, W) >= 0 in ``unit``.
 
     statistic : "max" of the graded pixels' errors, or "mean" (the fraction of pixels, for masks), must not exceed ``tolerance``.
     """
@@ -47,26 +47,36 @@ def length(difference: np.ndarray) -> np.ndarray:
     return np.linalg.norm(difference, axis=-1) if difference.ndim == 3 else np.abs(difference)
 
 
-def _absolute(g, r, moment):
+def _absolute(g, r, gpu, ref):
     return length(g.astype(np.float64) - r)
 
 
-def _relative(g, r, moment):
+def _relative(g, r, gpu, ref):
     with np.errstate(divide="ignore", invalid="ignore"):
         error = np.abs(g / r - 1.0)
     return np.where(np.isinf(g) & np.isinf(r), 0.0, error)
 
 
-def _different(g, r, moment):
+def _different(g, r, gpu, ref):
     return (g != r).astype(np.float64)
 
 
-def _per_interval(g, r, moment):
-    return length(g.astype(np.float64) - r) * moment.when.interval_s
+def _motion(g, r, gpu, ref):
+    """px; of motions longer than 100 px, px per 100 px: float32 rounds them in proportion."""
+    return length(g.astype(np.float64) - r) / np.maximum(1.0, length(r) / 100.0)
 
 
-def _per_step(g, r, moment):
-    return length(g.astype(np.float64) - r) * moment.when.step_s
+def _per_interval(g, r, gpu, ref):
+    return _motion(g * gpu.when.interval_s, r * gpu.when.interval_s, gpu, ref)
+
+
+def _per_step(g, r, gpu, ref):
+    return length(g.astype(np.float64) - r) * gpu.when.step_s
+
+
+def _pixels_of_texture(g, r, gpu, ref):
+    """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's rounding."""
+    return length((g.astype(np.float64) - r) * ref["texture_size"]) / np.exp2(ref["mip_level"])
 
 
 _SHADING = "against the GPU's own albedo times the reference's irradiance (the reference has no mip maps)"
@@ -75,8 +85,8 @@ _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps di
 QUANTITIES = {q.name: q for q in (
     Quantity("id", "mismatch", 0.0, _different, same_triangle=False),
     Quantity("depth", "relative", 1e-5, _relative),
-    Quantity("flow_forward", "px", 1e-2, _absolute),
-    Quantity("flow_backward", "px", 1e-2, _absolute),
+    Quantity("flow_forward", "px", 1e-2, _motion),
+    Quantity("flow_backward", "px", 1e-2, _motion),
     Quantity("velocity", "px per label interval", 1e-2, _per_interval),
     Quantity("valid_forward", "mismatch", 0.0, _different),
     Quantity("valid_backward", "mismatch", 0.0, _different),
@@ -85,7 +95,7 @@ QUANTITIES = {q.name: q for q in (
     Quantity("occluded_backward", "fraction of pixels", 1e-2, _different, "mean", False,
              "off the band at t' as well: the mask rests on one depth sample per pixel there"),
     Quantity("normals", "of a unit vector", 1e-3, _absolute),
-    Quantity("uv", "texture repeats", 5e-3, _absolute),
+    Quantity("uv", "px of shifted texture", 0.05, _pixels_of_texture),
     Quantity("mip_level", "levels", 0.6, _absolute, note="drivers may approximate the level (OpenGL 4.6, 8.14.1)"),
     Quantity("albedo", "linear", 0.1, _absolute, note=_MIPS),
     Quantity("irradiance", "1", 1e-4, _absolute),
@@ -189,7 +199,7 @@ class Comparison:
     def errors(self, name: str) -> np.ndarray:
         """(H, W) float64 in the quantity's unit; inf where the GPU wrote nan."""
         g, r = self.pair(name)
-        error = QUANTITIES[name].error(g, r, self.gpu)
+        error = QUANTITIES[name].error(g, r, self.gpu, self.ref)
         return np.where(np.isnan(error), np.inf, error)
 
     def report(self, name: str, tolerance: float | None = None) -> Report:

@@ -128,6 +128,7 @@ class ReferenceMoment(_Lazy):
     from the exact derivatives of uv on the triangle's plane; a GPU takes it from 2 x 2 pixels. albedo, and what follows from it
     (colour, luminance, log_luminance, dL_dt), is sampled at that level by the CPU twin in :mod:`mipmaps`, because the reference
     itself has no mip maps; its own values, at full resolution, are albedo_level0, colour_level0 and luminance_level0.
+    texture_size : (H, W, 2) texels, 1 where there is no texture.
     """
 
     def __init__(self, scene: Scene, when: When, log_eps: float):
@@ -174,7 +175,7 @@ class ReferenceMoment(_Lazy):
         if name == "dL_dt":
             before, after = (self._surface(t)["luminance"] for t in (self.when.before_ns, self.when.after_ns))
             return {name: (after - before) / self.when.step_s}
-        if name in ("uv", "irradiance", "mip_level", "albedo", "colour", "luminance"):
+        if name in ("uv", "irradiance", "mip_level", "albedo", "colour", "luminance", "texture_size"):
             return self._surface(self.when.t_ns)
         flows = {}
         for way in ("forward", "backward"):
@@ -186,7 +187,7 @@ class ReferenceMoment(_Lazy):
     def _surface(self, t_ns: int) -> dict[str, np.ndarray]:
         frame, scene = self.at(t_ns), self.scene
         shape = frame.hit.shape
-        uv, light, level, albedo = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3))
+        uv, light, level, albedo, size = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3)), np.ones((*shape, 2))
         rays = (reference.pixel_grid(scene.camera) - [scene.camera.cx, scene.camera.cy]) / [scene.camera.fx, scene.camera.fy]
         rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1).reshape(*shape, 3)
         for p, (thing, part) in enumerate(reference.scene_parts(scene)):
@@ -196,6 +197,7 @@ class ReferenceMoment(_Lazy):
             light[on] = 1.0 if part.material.unlit else reference.irradiance(scene, frame.normal[on])
             if part.material.texture is not None:  # else the GPU has no coordinates either
                 uv[on] = frame.uv[on] * part.material.uv_scale
+                size[on] = part.material.texture.image.shape[1::-1]
                 corners = part.mesh.faces[frame.triangle[on]]
                 pose = reference.relative_pose_at(scene, thing, t_ns)
                 points = part.mesh.vertices[corners] @ pose[:3, :3].T + pose[:3, 3]
@@ -203,7 +205,8 @@ class ReferenceMoment(_Lazy):
                 level[on] = footprint(points, texels, rays[on], (scene.camera.fx, scene.camera.fy))
             albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
         colour = np.where(frame.hit[..., None], albedo * light[..., None], frame.colour)
-        return {"uv": uv, "irradiance": light, "mip_level": level, "albedo": albedo, "colour": colour, "luminance": colour @ LUMA}
+        return {"uv": uv, "irradiance": light, "mip_level": level, "albedo": albedo, "colour": colour, "luminance": colour @ LUMA,
+                "texture_size": size}
 
 
 def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, focal: tuple[float, float]) -> np.ndarray:

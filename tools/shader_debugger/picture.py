@@ -166,16 +166,17 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
     figure.text(x, y + h / 2, text, fontsize=size, color=MUTED, va="center")
 
 
-def _save(figure: Figure, path: Path, dpi: int = 100, palette: bool = False) -> None:
+def _save(figure: Figure, path: Path, palette: bool = False) -> None:
     """palette : 256 colours, dithered; a third of the size."""
-    FigureCanvasAgg(figure)
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=dpi, facecolor=PAPER)
-    image = Image.open(io.BytesIO(out.getvalue())).convert("RGB")
+    figure.set_dpi(100)
+    figure.set_facecolor(PAPER)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    if palette:
+        image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)  # Pillow dithers to given palettes only
     with atomic_file(path) as temporary, output_errors(path):
-        if palette:
-            image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)  # Pillow dithers to given palettes only
-        image.save(temporary, "PNG", optimize=True)
+        image.save(temporary, "PNG", optimize=palette)
 
 
 def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption: str) -> None:

@@ -59,7 +59,8 @@ class _Handler(BaseHTTPRequestHandler):
     server: "_Server"
 
     def do_GET(self) -> None:
-        if not host_allowed(self.headers.get("Host"), self.server.bound, self.server.server_address[1]):
+        hosts = self.headers.get_all("Host") or [None]
+        if len(hosts) != 1 or not host_allowed(hosts[0], self.server.bound, self.server.server_address[1]):
             return self._error(403, "this Host is not served here")
         parts = urlsplit(self.path)
         query = dict(parse_qsl(parts.query, keep_blank_values=True))

@@ -1,0 +1,131 @@
+"""Frame folders in the way of TartanAir become sequences: their own flow as labels, the emulator's events between frames."""
+
+import json
+from pathlib import Path
+
+import cv2
+import h5py
+import hdf5plugin  # noqa: F401
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.images import read_mask
+
+H, W, N, SHIFT = 48, 64, 6, (1.5, 0.5)
+
+
+@pytest.fixture(scope="module")
+def tartan(tmp_path_factory) -> Path:
+    """Two trajectories of a texture that slides by SHIFT px per frame; the flow is exact, a stripe is masked."""
+    root = tmp_path_factory.mktemp("tartan")
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.random((4 * H, 4 * W)).astype(np.float32), (0, 0), 2)
+    texture = (texture - texture.min()) / np.ptp(texture)
+    for trajectory in ("P000", "P001"):
+        for folder in ("image_left", "flow"):
+            (root / trajectory / folder).mkdir(parents=True)
+        for k in range(N):
+            move = np.float32([[1, 0, k * SHIFT[0] - W], [0, 1, k * SHIFT[1] - H]])
+            image = cv2.warpAffine(texture, move, (W, H), flags=cv2.INTER_LINEAR)
+            cv2.imwrite(str(root / trajectory / f"image_left/{k:06d}_left.png"), np.repeat((image * 255).astype(np.uint8)[..., None], 3, axis=2))
+        for k in range(N - 1):
+            flow = np.broadcast_to(np.float32(SHIFT), (H, W, 2)) * (1 + 0.1 * k)
+            mask = np.zeros((H, W), np.uint8)
+            mask[:, -2:] = 100
+            np.save(root / trajectory / f"flow/{k:06d}_{k + 1:06d}_flow.npy", flow)
+            np.save(root / trajectory / f"flow/{k:06d}_{k + 1:06d}_mask.npy", mask)
+    return root
+
+
+def recipe(tmp_path, tartan, **frames):
+    path = tmp_path / "recipe.yaml"
+    path.write_text(yaml.safe_dump({"seed": 1, "groups": {"tartan": {
+        "output": {"split": "test", "sequences": 2}, "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.2]}},
+        "preview": {"enabled": False}, "frames": {"folders": [f"{tartan}/P*"], "fps": 10, "max_px": 0.5, **frames}}}}))
+    return load_run(path)
+
+
+def test_conversion(tmp_path, tartan):
+    outcome = run_dataset(recipe(tmp_path, tartan), tmp_path / "out")
+    assert [r.path.name for r in outcome.made] == ["tartan_000000", "tartan_000001"] and not outcome.set_aside
+    folder = tmp_path / "out/test/tartan_000000"
+    # Label k is the flow from frame k + 1, which has an interval of events before it; the last frame has no flow.
+    assert (folder / "images/timestamps.txt").read_text().split() == ["100000", "200000", "300000", "400000", "500000"]
+    lines = (folder / "flow/forward_timestamps.txt").read_text().splitlines()[1:]
+    assert lines == [f"{100_000 * (k + 1)}, {100_000 * (k + 2)}" for k in range(4)]
+    for k in range(4):
+        flow, valid = read_flow_png(folder / f"flow/forward/{k:06d}.png")
+        assert valid.all() and np.abs(flow - np.float32(SHIFT) * (1 + 0.1 * (k + 1))).max() <= 0.5 / 128 + 1e-6
+        assert read_mask(folder / f"occlusion/forward/{k:06d}.png").sum() == 2 * H
+        given = cv2.imread(str(tartan / f"P000/image_left/{k + 1:06d}_left.png"))
+        np.testing.assert_array_equal(cv2.imread(str(folder / f"images/{k:06d}.png")), given)
+    with h5py.File(folder / "events.h5") as file:
+        t = file["events/t"][...]
+        assert np.histogram(t, np.arange(6) * 100_000)[0].min() > 200, "events in every interval"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["frames"] > N and manifest["source"]["images"] == N, "motion interpolation made steps in between"
+    assert verify_dataset(tmp_path / "out", deep=2).deep == ["test/tartan_000000", "test/tartan_000001"]
+    assert verify_dataset(tmp_path / "out", deep=2).clean
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    assert config["frames"]["folders"][0].endswith("P000"), "the sequence's own configuration names its folder"
+
+
+def test_a_part_of_the_frames_and_other_flow_files(tmp_path, tartan):
+    run_dataset(recipe(tmp_path, tartan, first=1, count=4, interpolate="linear"), tmp_path / "out", num=1)
+    folder = tmp_path / "out/test/tartan_000000"
+    flow, _ = read_flow_png(folder / "flow/forward/000000.png")
+    assert flow[0, 0, 0] == pytest.approx(1.5 * 1.2, abs=0.01), "frame 2 -> 3: one frame left out, one for the events before"
+    assert len(list((folder / "flow/forward").iterdir())) == 2
+
+
+@pytest.mark.parametrize("frames, error, message", [
+    ({"folders": ["nowhere*"]}, ConfigError, "frames.folders.0: in group 'tartan': no such folder"),
+    ({"folders": []}, ConfigError, "frames.folders: in group 'tartan': no folders of frames"),
+    ({"images": "image_right"}, ConfigError, "frames.images: in group 'tartan': no such folder"),
+])
+def test_bad_folders_are_found_before_any_work(tmp_path, tartan, frames, error, message):
+    with pytest.raises(error) as raised:
+        run_dataset(recipe(tmp_path, tartan, **frames), tmp_path / "out")
+    assert message in str(raised.value) and not (tmp_path / "out").exists()
+
+
+def test_too_few_folders(tmp_path, tartan):
+    template = recipe(tmp_path, tartan)
+    template.tree["groups"]["tartan"]["output"]["sequences"] = 3
+    with pytest.raises(ConfigError, match="2 folders are too few for sequence 2"):
+        run_dataset(template, tmp_path / "out")
+
+
+@pytest.mark.parametrize("frames, message", [
+    ({"first": 4}, "too few frames"), ({"count": 20}, "too few frames"), ({"flow": "image_left"}, "not a flow PNG"), ({"flow": "depth"}, "no such folder"),
+])
+def test_frames_that_do_not_fit_are_set_aside(tmp_path, tartan, frames, message):
+    outcome = run_dataset(recipe(tmp_path, tartan, **frames), tmp_path / "out", num=1)
+    assert list(outcome.set_aside) == ["test/tartan_000000"] and message in outcome.set_aside["test/tartan_000000"]
+    assert not [p for p in (tmp_path / "out").rglob("*.h5")]
+
+
+def test_the_shipped_recipe_takes_frames(tmp_path, tartan):
+    mini = Path(__file__).parents[2] / "configs/blinkflow_mini.yaml"
+    assert run(["generate", str(mini), "--out", str(tmp_path / "out"), "--num", "1", "--quiet", "--set", "groups.e_tartan.enabled=true",
+                "--set", f"groups.e_tartan.frames.folders=[{tartan}/P000]", "--set", "groups.flying_train.enabled=false",
+                "--set", "groups.flying_test.enabled=false", "--set", "groups.falling_dice.enabled=false"]) == 0
+    assert (tmp_path / "out/test/tartan_000000/events.h5").is_file()
+
+
+def test_asset_errors_name_the_file(tmp_path, tartan):
+    from blinkgl.dataset.frames import _flow
+
+    np.save(tmp_path / "f.npy", np.zeros((3, 4, 5), np.float32))
+    with pytest.raises(AssetError, match="not a flow field"):
+        _flow(tmp_path / "f.npy", (3, 4))
+    np.save(tmp_path / "g.npy", np.zeros((3, 4, 2), np.float32))
+    with pytest.raises(AssetError, match="flow and image differ in size"):
+        _flow(tmp_path / "g.npy", (4, 4))

@@ -225,8 +225,13 @@ def test_include_cycle_and_a_vanished_file_while_serving(served):
     server, folder = served
     light, good = folder / "include/light.glsl", (folder / "include/light.glsl").read_text()
     state = as_json(server, "/state")
+    light.write_text(good + "// an edit\n")
+    state = next_version(server, state["version"])
     light.write_text('#include "light.glsl"\n' + good)
     broken = next_version(server, state["version"])
+    # variants that nobody had asked the last good shaders for are compiled now, from what they were
+    probed = as_json(server, "/probe?t=0.27&x=50&y=40")
+    assert probed["surface"]["gpu"]["object"] == probed["surface"]["reference"]["object"]
     assert broken["errors"][0]["where"] == "include/light.glsl:1:1" and "include cycle" in broken["errors"][0]["text"]
     light.unlink()
     gone = next_version(server, broken["version"])
@@ -326,7 +331,11 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         line = next(i for i, text in enumerate((folder / "include/motion.glsl").read_text().splitlines(), 1) if "imagesize" in text)
         assert f"include/motion.glsl:{line}:" in error and "imagesize" in error and "^" in error
         assert "last good" in page.text("#reload")
-        assert page.text("#probe [data-gpu=depth]")  # still there
+        page.choose("#time", "0.22")  # the last good shaders draw what they never drew before
+        page.wait("return document.body.dataset.shown === '0.22'")
+        page.choose("#time", "0.3")
+        page.wait("return document.body.dataset.shown === '0.3'")
+        assert page.text("#probe [data-gpu=depth]")
         print(f"error shown {noticed:.2f} s after the edit")
 
         (folder / "include/motion.glsl").write_text(good)

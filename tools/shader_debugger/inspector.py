@@ -19,10 +19,11 @@ from blinkgl.tools.shader_debugger.compare import Comparison
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass
 from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
-from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, files_of, moment, open_folder, open_renderer
+from blinkgl.tools.shader_debugger.session import Snapshot, Subject, When, check_pixel, files_of, moment, open_folder, open_renderer
 
 POLL_S = 0.15  # between two looks at the shader files
 KEPT = 6  # moments in memory
+MOST_ERRORS = 5  # shown at once
 SOURCES = ("gpu", "reference")
 
 
@@ -54,7 +55,7 @@ class Inspector:
         self._context = open_renderer(self.subject, self._shaders)
         self.renderer = self._context.__enter__()
         try:
-            self.renderer.use_shaders(_Loader(self.renderer.gl.ctx, self.folder))
+            self.renderer.use_shaders(_Loader(self.renderer.gl.ctx, Snapshot.of(self.folder)))
             self._draw_all(when=self.first)
         except BaseException as error:
             self._context.__exit__(type(error), error, None)
@@ -156,12 +157,13 @@ class Inspector:
     def reload(self) -> None:
         """Takes the edited shaders when all of them compile and draw; otherwise keeps the old ones and :attr:`errors`."""
         old = self.renderer.gl.shaders
-        new = _Loader(self.renderer.gl.ctx, self.folder)
+        new = _Loader(self.renderer.gl.ctx, Snapshot.of(self.folder))
         self.renderer.use_shaders(new)
         try:
             self._draw_all(self._shown)
         except ShaderError as error:
-            self.errors = [d for d in diagnose(error, self._sources(new), self.folder) if d.kind == "error"]
+            found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
+            self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
         except Exception as error:  # an edit that compiles but cannot be drawn with: not the tool's end
             self.errors = [Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")]
         else:
@@ -175,7 +177,7 @@ class Inspector:
 
     def _sources(self, loader: _Loader) -> dict:
         try:
-            return {stage: expand(loader.asked[0], stage, loader.asked[1], self.folder) for stage in STAGES}
+            return {stage: expand(loader.asked[0], stage, loader.asked[1], loader.folder) for stage in STAGES}
         except ShaderError:
             return {}
 

@@ -137,6 +137,41 @@ def open_folder(shaders: str | None):
     return EditedFolder(folder)
 
 
+class Snapshot:
+    """The shader folder as it was at one moment. Programs compile when something first asks for them: without it, a variant asked
+    for after a bad edit would be compiled from the bad file."""
+
+    def __init__(self, files: dict[str, bytes], path: str = ""):
+        self._files, self.path = files, path
+
+    @classmethod
+    def of(cls, folder) -> Snapshot:
+        root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
+        files = {}
+        for path in [*files_of(folder), Path(str(folder / DEBUG_PROGRAM))]:
+            try:
+                files[path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name] = path.read_bytes()
+            except OSError:
+                pass  # gone or unreadable: missing here, and reported as missing when a program needs it
+        return cls(files)
+
+    @property
+    def name(self) -> str:
+        return self.path.rpartition("/")[2]
+
+    def __truediv__(self, name: str) -> Snapshot:
+        return Snapshot(self._files, f"{self.path}/{name}" if self.path else name)
+
+    def iterdir(self):
+        inside = f"{self.path}/" if self.path else ""
+        return (Snapshot(self._files, path) for path in sorted(self._files) if path.startswith(inside) and "/" not in path[len(inside):])
+
+    def read_text(self, encoding: str = "utf-8") -> str:
+        if self.path not in self._files:
+            raise FileNotFoundError(self.path)
+        return self._files[self.path].decode(encoding)
+
+
 def files_of(folder) -> list[Path]:
     """Every shader file below ``folder``, for watching and for messages."""
     root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))

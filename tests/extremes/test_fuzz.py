@@ -10,15 +10,17 @@ import h5py
 import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
 import numpy as np
 import pytest
-from configurations import esim, runs, v2e, voltmeter
-from hypothesis import HealthCheck, event, given, settings
+from tests.extremes.configurations import esim, runs, v2e, voltmeter
+from hypothesis import HealthCheck, Phase, event, given, settings
 
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.sequence_dir import verify_sequence
 
-COMMON = dict(deadline=None, suppress_health_check=list(HealthCheck), database=None, print_blob=False)
+# No explain phase: it re-runs a failing sequence hundreds of times to say which of its values matter.
+COMMON = dict(deadline=None, suppress_health_check=list(HealthCheck), database=None, print_blob=False,
+              phases=(Phase.explicit, Phase.generate, Phase.shrink))
 
 
 def check_sequence(folder: Path, config) -> int:
@@ -63,4 +65,17 @@ def generate(gl, tree: dict) -> None:
 @settings(max_examples=40, derandomize=True, **COMMON)
 @given(tree=runs(esim))
 def test_any_configuration_makes_a_sequence_or_a_message(_gl_session, tree):
+    generate(_gl_session, tree)
+
+
+@settings(max_examples=15, derandomize=True, **COMMON)
+@given(tree=runs(v2e | voltmeter))
+def test_any_noisy_camera_too(_gl_session, tree):
+    generate(_gl_session, tree)
+
+
+@pytest.mark.slow
+@settings(max_examples=1500, **COMMON)
+@given(tree=runs(esim | v2e | voltmeter))
+def test_a_thousand_configurations(_gl_session, tree):
     generate(_gl_session, tree)

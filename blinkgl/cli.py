@@ -1,7 +1,8 @@
 """The ``blinkgl`` command: thin functions over the library, one line per error.
 
-Exit status: 0 done, 3 done but for sequences that were set aside, 2 the user's input or machine (``error: …`` on stderr, one line), 130 interrupted. A traceback means a
-bug in BlinkGL, or ``--debug``. Commands import what they need inside the function, so that ``--help`` answers at once.
+Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine (``error: …`` on
+stderr, one line); 3 done but for sequences that were set aside; 130 interrupted. A traceback means a bug in BlinkGL, or
+``--debug``. Commands import what they need inside the function, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations

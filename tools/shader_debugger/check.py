@@ -19,8 +19,8 @@ from blinkgl.tools.shader_debugger.session import EditedFolder, files_of, open_f
 from blinkgl.tools.shader_debugger.variants import variants
 
 _DECLARATION = re.compile(
-    r"^\s*(?:layout\s*\([^)]*\)\s*)?(?:(?:flat|smooth|noperspective|centroid|invariant|highp|mediump|lowp)\s+)*(in|out|uniform)\s+(?:(?:highp|mediump|lowp)\s+)?"
-    r"\w+\s+([^;{]+);")
+    r"^\s*(?:layout\s*\([^)]*\)\s*)?(?:(?:flat|smooth|noperspective|centroid|invariant|highp|mediump|lowp)\s+)*"
+    r"(in|out|uniform)\s+(?:(?:highp|mediump|lowp)\s+)?\w+\s+([^;{]+);")
 _NAME = re.compile(r"^\s*(\w+)")
 
 
@@ -48,7 +48,8 @@ class Result:
         def plain(findings):
             return [f.diagnostic.as_dict() | {"program": f.program, "variants": f.count, "example": f.example} for f in findings]
 
-        return {"renderer": self.renderer, "seconds": self.seconds, "programs": self.programs, "errors": plain(self.errors), "unused": plain(self.unused)}
+        return {"renderer": self.renderer, "seconds": self.seconds, "programs": self.programs, "errors": plain(self.errors),
+                "unused": plain(self.unused)}
 
 
 def check(files: list[str], shaders: str | None = None, backend: str = "auto", device: int = 0) -> Result:
@@ -174,7 +175,8 @@ def as_text(result: Result) -> str:
                   f"         in {found.count} of {result.programs[found.program]} variants of {found.program}, first {_defines(found.example)}", ""]
     for found in result.unused:
         d = found.diagnostic
-        lines.append(f"{d.where}: {d.text} in {found.count} of {result.programs[found.program]} variants of {found.program}, first {_defines(found.example)}")
+        lines.append(f"{d.where}: {d.text} in {found.count} of {result.programs[found.program]} variants of {found.program}, "
+                     f"first {_defines(found.example)}")
     if result.unused:
         lines.append("")
     lines += [f"{name:<18} {count:>4} variants" for name, count in result.programs.items()]

@@ -43,7 +43,8 @@ def _meaningful(moment, info) -> np.ndarray | None:
     """Where a buffer's values mean something: where something is hit, or where the flow is valid."""
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
-    return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and info.name not in ("luminance", "log_luminance", "dL_dt") else None
+    everywhere = info.name in ("luminance", "log_luminance", "dL_dt")  # the background has them, too
+    return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and not everywhere else None
 
 
 def _folder(out: str) -> Path:
@@ -104,12 +105,13 @@ def _finite(value):
 
 def diff_text(reports: list[Report]) -> str:
     """The table, then histogram, worst pixels and suspicions of each buffer that failed, or of a single one."""
-    lines = [f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} {'max':>8}   silhouette band: over / pixels"]
+    lines = [f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} {'max':>8}   "
+             "silhouette band: over / pixels"]
     summaries = [report.summary() for report in reports]
     for s in summaries:
         e, b = s["off_silhouettes"], s["silhouette_band"]
-        lines.append(f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  {s['unit']:<24} {e['pixels']:>8} "
-                     f"{e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   {b['over_tolerance']} / {b['pixels']}")
+        lines.append(f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  {s['unit']:<24} "
+                     f"{e['pixels']:>8} {e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   {b['over_tolerance']} / {b['pixels']}")
     notes = {s["note"]: [] for s in summaries if s["note"]}
     for s in summaries:
         if s["note"]:
@@ -122,13 +124,15 @@ def diff_text(reports: list[Report]) -> str:
                   + (f"over {s['tolerance']:g} {s['unit']}" if s["statistic"] == "max" else "differ")]
         lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
         top = max([1, *s["histogram"].values()])
-        lines += [f"  {name:>6} {count:>8} {'#' * max(1, round(40 * np.log1p(count) / np.log1p(top)))}" for name, count in s["histogram"].items() if count]
+        bars = {name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count}
+        lines += [f"  {name:>6} {s['histogram'][name]:>8} {'#' * bar}" for name, bar in bars.items()]
         lines += [f"  worst: ({w['x']}, {w['y']}) error {w['error']:.3g}, GPU {_short(w['gpu'])}, reference {_short(w['reference'])}, "
                   f"{w['object'] or 'nothing hit'}" + (f" triangle {w['triangle']}" if w["object"] else "") for w in s["worst"]]
     failed = [s for s in summaries if not s["passed"]]
     if failed:
         w = failed[0]["worst"][0] if failed[0]["worst"] else None
-        lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance" + (f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else "")]
+        closer = f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else ""
+        lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"]
     else:
         lines += ["", f"all {len(summaries)} buffers agree with the reference" if len(summaries) > 1 else "agrees with the reference"]
     return "\n".join(lines)

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from blinkgl.dataset.work import Job, Maker, Message, thread_environment
+from blinkgl.dataset.work import Job, Maker, Message, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 
 _HELLO_S = 600.0
@@ -217,8 +217,8 @@ def _work(job: dict[str, Any], task: int, attempt: int, expected: tuple[dict[str
     try:
         if _maker is None or _maker.job.to_dict() != job:
             _, hello = _open(job)
-            if hello["environment"] != expected[0]:
-                return {"kind": "refused", "error": f"node {socket.gethostname()} joined with other versions or hardware: {hello['environment']}"}
+            if different := environment_differences(hello["environment"], expected[0]):
+                return {"kind": "refused", "error": f"a worker on {socket.gethostname()} differs from the run's first in version or hardware: {different}"}
             if hello["assets"] != expected[1]:
                 return {"kind": "refused", "error": f"node {socket.gethostname()} sees other meshes or textures"}
     except BlinkGLError as error:

@@ -24,7 +24,7 @@ from blinkgl.dataset.index import write_index
 from blinkgl.dataset.plan import Plan, check_output, digest
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run_folder import RunFolder
-from blinkgl.dataset.work import Job, Message, report_of
+from blinkgl.dataset.work import Job, Message, environment_differences, report_of
 from blinkgl.errors import ConfigError, OutputError
 from blinkgl.io.sequence_dir import refuse_existing
 
@@ -167,9 +167,8 @@ def _loop(plan: Plan, executor: Executor, todo: deque, folder: RunFolder, outcom
 
 def _agree(hello: Message, environment: dict[str, str], assets: str | None) -> None:
     """Workers that differ in anything that decides the bytes must not work on one data set."""
-    if different := [f"{key} {hello['environment'].get(key)} and {value}" for key, value in environment.items()
-                     if hello["environment"].get(key) != value]:
-        raise ConfigError("workers differ in version or hardware: " + "; ".join(different), where="--executor",
+    if different := environment_differences(hello["environment"], environment):
+        raise ConfigError(f"workers differ in version or hardware: {different}", where="--executor",
                           accepted="the same installation on all of them")
     if assets is not None and hello["assets"] != assets:
         raise ConfigError("a worker sees other meshes or textures than the driver", where="--executor", accepted="the same files on all machines")

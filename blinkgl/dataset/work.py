@@ -140,6 +140,11 @@ def environment(gl: GLContext | None) -> dict[str, str]:
             "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used"}
 
 
+def environment_differences(one: dict[str, str], other: dict[str, str]) -> str:
+    """"numpy 2.4 and 2.3; …", empty when they agree."""
+    return "; ".join(f"{key} {one.get(key)} and {value}" for key, value in other.items() if one.get(key) != value)
+
+
 @lru_cache(maxsize=1)
 def _source_hash() -> str:
     """12 hex digits of the code and shaders that are running: a version number says little about a checkout."""

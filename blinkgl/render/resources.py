@@ -119,7 +119,7 @@ class SceneResources:
         if key not in self._buffers:
             data = np.empty((len(mesh.vertices), 8), np.float32)
             data[:, :3], data[:, 3:6] = mesh.vertices, mesh.normals
-            data[:, 6:] = mesh.uvs * np.asarray(uv_scale, np.float64)
+            data[:, 6:] = _near_zero(mesh.uvs * np.asarray(uv_scale, np.float64))
             self._buffers[key] = (self.ctx.buffer(data.tobytes()),
                                   self.ctx.buffer(np.ascontiguousarray(mesh.faces, np.int32).tobytes()))
         return self._buffers[key]
@@ -137,6 +137,13 @@ class SceneResources:
         texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         texture.anisotropy = self.anisotropy
         return texture
+
+
+def _near_zero(uvs: np.ndarray) -> np.ndarray:
+    """(V, 2) float64 texture coordinates less whole repeats, so that a mesh with thousands of them has zero in its middle.
+    float32 at 50 000 repeats resolves 0.004 of a repeat: the texture of a wide ground would move in steps."""
+    low, high = uvs.min(axis=0), uvs.max(axis=0)
+    return uvs - np.rint((low + high) / 2) if max(-low.min(), high.max()) > 64 else uvs
 
 
 def _draw_item(index: int, mesh: Mesh, material: Material, category: str) -> DrawItem:

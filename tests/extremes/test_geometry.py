@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
-from tests.render.render_scenes import LEVEL, camera, drift, mesh, mixed_scene, quad, scene, sphere, still, thing
+from tests.render.render_scenes import LEVEL, camera, drift, mesh, mixed_scene, quad, scene, smooth_texture, sphere, still, thing
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError, GLError
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.scene.types import Material
 
 MS = 1_000_000
 MEDIAN, WORST = 5e-7, 1e-5
@@ -63,6 +64,22 @@ def test_a_ground_of_200_km(gl, promise, splits, median, worst):
     e = compare(gl, scene([thing("ground", 1, quad(1e5, 1e5, splits), drift((0, 0, -1.5), (0.1, 0, -1.5)))], moving_camera()))
     promise(f"ground of 2e5 units, {splits} x {splits} cells: flow, median, relative", e.relative, median)
     promise(f"ground of 2e5 units, {splits} x {splits} cells: flow, largest, relative", e.worst, worst)
+
+
+@pytest.mark.parametrize("away, median, worst", [(0.0, 1e-6, 1e-3), (1e3, 5e-5, 1e-3), (1e4, 1e-3, 1e-2)])
+def test_a_hundred_thousand_repeats_of_a_texture(gl, promise, away, median, worst):
+    """Texture coordinates are float32 and count whole repeats from the mesh's middle: at n repeats from there they resolve
+    n 2^-24 of one, and a steep texture (1.5 per repeat here) shows four times that. Near the middle, bilinear weights of 8 bits
+    are all that is left. (Counted from a corner, the middle of this ground resolved 1/250.)"""
+    paint = Material(texture=smooth_texture(1, 64), uv_scale=(1e5, 1e5), unlit=True)
+    eye = camera(path=still((away, 0, 0), LEVEL * Rotation.from_rotvec([-0.6, 0, 0])))
+    world = scene([thing("ground", 1, quad(1e5, 1e5, 32), still((0, 0, -1.5)), paint)], eye)
+    with Renderer(gl, world, RenderConfig()) as renderer:
+        luminance = renderer.luminance(0)
+    near = np.s_[60:]  # magnified: mip maps do not come in
+    error = np.abs(luminance - reference.render(world, 0).luminance)[near]
+    promise(f"10^5 repeats on 2e5 units, {away:g} from the middle: luminance, median", np.median(error), median)
+    promise(f"10^5 repeats on 2e5 units, {away:g} from the middle: luminance, largest", error.max(), worst)
 
 
 @pytest.mark.parametrize("distance, area", [(4, 0.1), (30, 0.002)])

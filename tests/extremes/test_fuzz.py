@@ -10,8 +10,8 @@ import h5py
 import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
 import numpy as np
 import pytest
-from tests.extremes.configurations import esim, runs, v2e, voltmeter
 from hypothesis import HealthCheck, Phase, event, given, settings
+from tests.extremes.configurations import esim, runs, v2e, voltmeter
 
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
@@ -62,20 +62,20 @@ def generate(gl, tree: dict) -> None:
     event("events" if count else "no events")
 
 
-@settings(max_examples=40, derandomize=True, **COMMON)
+@settings(max_examples=25, derandomize=True, **COMMON)
 @given(tree=runs(esim))
 def test_any_configuration_makes_a_sequence_or_a_message(_gl_session, tree):
     generate(_gl_session, tree)
 
 
-@settings(max_examples=15, derandomize=True, **COMMON)
+@settings(max_examples=10, derandomize=True, **COMMON)
 @given(tree=runs(v2e | voltmeter))
 def test_any_noisy_camera_too(_gl_session, tree):
     generate(_gl_session, tree)
 
 
 @pytest.mark.slow
-@settings(max_examples=1500, **COMMON)
+@settings(max_examples=500, **COMMON)
 @given(tree=runs(esim | v2e | voltmeter))
-def test_a_thousand_configurations(_gl_session, tree):
+def test_hundreds_of_configurations(_gl_session, tree):
     generate(_gl_session, tree)

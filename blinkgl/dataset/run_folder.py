@@ -2,7 +2,7 @@
 
     .run/run.json       groups' hashes, versions, OpenGL, where the recipe's relative paths start
     .run/recipe.yaml    the recipe with all overrides      .run/assets.json   content hashes of the pools' files
-    .run/costs.jsonl    one line per sequence made: wall seconds by stage, bytes, memory, attempts
+    .run/costs.jsonl    one line per sequence made: wall seconds by stage, CPU seconds, bytes, memory, attempts
     .run/failed.json    sequences that were set aside, and why
     .run/logs/          one log per sequence, one per worker
     .run/damaged/       what was found under a sequence's name and was not whole
@@ -145,7 +145,7 @@ class RunFolder:
 
     def add_cost(self, task: Task, message: Message, attempt: int) -> None:
         line = {"name": task.name, "group": task.group, **{k: v for k, v in message["report"].items() if k not in ("path", "index")},
-                "bytes": message["bytes"], "peak_rss_kib": message["peak_rss_kib"], "attempts": attempt, "when": time.time()}
+                "bytes": message["bytes"], "cpu_s": message["cpu_s"], "peak_rss_kib": message["peak_rss_kib"], "attempts": attempt, "when": time.time()}
         with contextlib.suppress(OSError), open(self.path / "costs.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 

@@ -5,7 +5,7 @@ A :class:`Job` says what the run is; a :class:`Maker` turns task numbers into se
 
     {"kind": "hello", "pid", "environment", "assets"}          ready
     {"kind": "progress", "task", "frames", "events", "fraction"}
-    {"kind": "done", "task", "report": {…}, "bytes", "peak_rss_kib"}
+    {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
     {"kind": "failed", "task", "error": one line, "final": no use trying again, "stop": nor anything else}
 """
 
@@ -90,7 +90,7 @@ class Maker:
         task = self.plan.tasks[number]
         log = SequenceLog(self.job.out, task.name)
         log.write(f"attempt {attempt}, pid {os.getpid()} on {platform.node()}")
-        last = 0.0
+        last, cpu = 0.0, time.process_time()
 
         def progress(report: SequenceReport, fraction: float) -> None:
             nonlocal last
@@ -112,7 +112,7 @@ class Maker:
         size = sum(p.stat().st_size for p in report.path.rglob("*") if p.is_file())
         log.write(f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} labels, {size} bytes; "
                   + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items()))
-        return {"kind": "done", "task": number, "bytes": size, "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        return {"kind": "done", "task": number, "bytes": size, "cpu_s": time.process_time() - cpu, "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
                 "report": {**asdict(report), "path": str(report.path)}}
 
     def __enter__(self) -> "Maker":

@@ -151,7 +151,7 @@ def _cost(costs: list[dict[str, Any]]) -> str:
         seconds["other"] += max(0.0, c["total_s"] - sum(c["seconds"].values()))
     total, simulated = sum(c["total_s"] for c in costs), sum(c["simulated_s"] for c in costs)
     facts = [("wall time of all sequences", f"{total / 3600:.2f} h" if total > 3600 else f"{total:.1f} s"),
-             ("per simulated second", f"{total / simulated:.2f} s" if simulated else "-"), ("event frames", f"{sum(c['frames'] for c in costs):,}"),
+             ("per simulated second", f"{total / simulated:.2f} s" if simulated else "-"), ("processor time per sequence", f"{np.mean([c.get('cpu_s', np.nan) for c in costs]):.1f} s"), ("event frames", f"{sum(c['frames'] for c in costs):,}"),
              ("largest process", _bytes(1024 * max(c["peak_rss_kib"] for c in costs))),
              ("made at the first attempt", f"{sum(c['attempts'] == 1 for c in costs)} of {len(costs)}")]
     table = "".join(f"<tr><td>{k}</td><td class=n>{v}</td></tr>" for k, v in facts)

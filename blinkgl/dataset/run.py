@@ -20,7 +20,7 @@ from typing import Protocol
 
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.executor import Executor, Inline
-from blinkgl.dataset.index import write_index
+from blinkgl.io.index import write_index
 from blinkgl.dataset.plan import Plan, check_output, digest
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run_folder import RunFolder

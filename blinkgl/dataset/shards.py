@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from blinkgl.dataset.index import sequence_folders
+from blinkgl.io.index import sequence_folders
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file, output_errors

@@ -19,7 +19,7 @@ import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, load_run
 from blinkgl.dataset.generate import generate_sequence
-from blinkgl.dataset.index import INDEX, entry, read_index, sequence_folders
+from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import RUN_FOLDER

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from blinkgl.config.draw import is_distribution
-from blinkgl.dataset.index import entry, sequence_folders
+from blinkgl.io.index import entry, sequence_folders
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import plan_of

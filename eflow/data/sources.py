@@ -26,6 +26,7 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.dsec import DsecEventReader, open_hdf5
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.images import read_npy
+from blinkgl.io.index import INDEX, read_index
 from eflow.data.window import RawSample, Window
 
 FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow")
@@ -161,10 +162,12 @@ def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_blinkgl(root: Path) -> list[Sequence]:
-    """Sequence directories at or below ``root``. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
+    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds. Flow is taken from
+    the 16-bit PNG (quantum 1/128 px)."""
     found = []
-    for manifest in sorted(root.rglob("manifest.json")):
-        folder = manifest.parent
+    indexed = (root / INDEX).is_file()
+    folders = [root / line["path"] for line in read_index(root)] if indexed else [m.parent for m in sorted(root.rglob("manifest.json"))]
+    for folder in folders:
         if any(part.startswith(".") for part in folder.relative_to(root).parts) or not (folder / "events.h5").is_file():
             continue
         times = read_times(folder / "flow/forward_timestamps.txt")
@@ -274,7 +277,7 @@ def detect_format(root: Path) -> str:
         return "mvsec"
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
-    if next(root.rglob("manifest.json"), None):
+    if (root / INDEX).is_file() or next(root.rglob("manifest.json"), None):
         return "blinkgl"
     if next(root.rglob("forward_flow"), None):
         return "blinkflow"

@@ -13,7 +13,7 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset import run as run_module
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.index import read_index
+from blinkgl.io.index import read_index
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.work import thread_environment

@@ -130,3 +130,14 @@ def test_nothing_to_verify(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(AssetError, match="no sequence found|no such data set"):
             verify_dataset(path)
+
+
+def test_eflow_reads_by_the_index(data):
+    """A line taken out of the index takes the sequence out of training; without an index everything is found."""
+    sources = pytest.importorskip("eflow.data.sources")
+    assert len(sources.open_source(data)) == 16
+    lines = (data / "index.jsonl").read_text().splitlines(keepends=True)
+    (data / "index.jsonl").write_text("".join(lines[1:]))
+    assert len(sources.open_source(data)) == 12
+    (data / "index.jsonl").unlink()
+    assert len(sources.open_source(data)) == 16

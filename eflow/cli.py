@@ -223,12 +223,14 @@ def bench(
 def _model(checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None):
     import torch
 
+    from eflow.allocator import keep_memory
     from eflow.checkpoint import load_model
 
     _one_of("--precision", precision, ("fp32", "bf16"))
     _one_of("--device", device, ("auto", "cpu", "cuda"))
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigError("no CUDA device on this machine", where="--device", value=device, accepted="cpu or auto")
+    keep_memory()
     model = load_model(checkpoint, averaged=not raw)
     if iterations is not None:
         if not hasattr(model.config, "iterations"):

@@ -29,6 +29,7 @@ from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
 from eflow import checkpoint as ckpt
+from eflow.allocator import keep_memory
 from eflow.config import SourceConfig, TrainConfig
 from eflow.data.dataset import FlowDataset, Mixture, StepSampler, collate, loader
 from eflow.data.sources import open_source
@@ -205,6 +206,8 @@ def _setup(config: TrainConfig) -> tuple[int, int, torch.device]:
     device = torch.device("cuda", local) if kind == "cuda" else torch.device("cpu")
     if kind == "cuda":
         torch.cuda.set_device(device)
+    if kind == "cpu":
+        keep_memory()
     if config.run.threads:
         torch.set_num_threads(config.run.threads)
     if world > 1 and not dist.is_initialized():

@@ -15,8 +15,20 @@ LAYERS = {"base": 4, "small": 2, "twins": 2}
 HEADS, WINDOW, REDUCTION, MLP_RATIO = 8, 10, 4, 4
 
 
-def _mlp() -> nn.Sequential:
-    return nn.Sequential(nn.LayerNorm(FEATURES), nn.Linear(FEATURES, MLP_RATIO * FEATURES), nn.GELU(), nn.Linear(MLP_RATIO * FEATURES, FEATURES))
+_TOKENS = 1024
+
+
+class Mlp(nn.Sequential):
+    """Norm, expand fourfold, GELU, contract. Without gradients in blocks of tokens, whose hidden layer then stays in the cache."""
+
+    def __init__(self):
+        super().__init__(nn.LayerNorm(FEATURES), nn.Linear(FEATURES, MLP_RATIO * FEATURES), nn.GELU(), nn.Linear(MLP_RATIO * FEATURES, FEATURES))
+
+    def forward(self, x: Tensor) -> Tensor:
+        if torch.is_grad_enabled() or x.device.type != "cpu":
+            return super().forward(x)
+        blocks = x.reshape(-1, FEATURES).split(_TOKENS)
+        return torch.cat([super(Mlp, self).forward(block) for block in blocks]).view(x.shape)
 
 
 class EnhancementLayer(nn.Module):
@@ -26,12 +38,12 @@ class EnhancementLayer(nn.Module):
     def __init__(self, twins: bool):
         super().__init__()
         self.norm_local, self.local = nn.LayerNorm(FEATURES), WindowAttention(FEATURES, HEADS, WINDOW)
-        self.mlp_local = _mlp() if twins else None
+        self.mlp_local = Mlp() if twins else None
         self.position = ConditionalPosition(FEATURES)
         self.norm_global, self.globally = nn.LayerNorm(FEATURES), GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins)
-        self.mlp_global = _mlp()
+        self.mlp_global = Mlp()
         self.norm_cross, self.cross = nn.LayerNorm(FEATURES), GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins)
-        self.mlp_cross = _mlp()
+        self.mlp_cross = Mlp()
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (2N, h, w, C), the old windows' features, then the new ones'; each half's cross-attention queries the other."""

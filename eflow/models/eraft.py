@@ -25,9 +25,9 @@ class ResidualBlock(nn.Module):
         self.shortcut = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride), norm(outputs)) if stride > 1 else nn.Identity()
 
     def forward(self, x: Tensor) -> Tensor:
-        y = F.relu(self.norm1(self.conv1(x)))
-        y = F.relu(self.norm2(self.conv2(y)))
-        return F.relu(self.shortcut(x) + y)
+        y = F.relu(self.norm1(self.conv1(x)), inplace=True)
+        y = F.relu(self.norm2(self.conv2(y)), inplace=True)
+        return F.relu(self.shortcut(x) + y, inplace=True)
 
 
 class Trunk(nn.Sequential):
@@ -37,7 +37,7 @@ class Trunk(nn.Sequential):
         make = {"instance": nn.InstanceNorm2d, "batch": nn.BatchNorm2d}[norm]
         blocks = [ResidualBlock(a, b, s, make) for a, b, s in
                   ((64, 64, 1), (64, 64, 1), (64, 96, 2), (96, 96, 1), (96, 128, 2), (128, 128, 1))]
-        super().__init__(nn.Conv2d(inputs, 64, 7, 2, 3), make(64), nn.ReLU(), *blocks, nn.Conv2d(128, outputs, 1))
+        super().__init__(nn.Conv2d(inputs, 64, 7, 2, 3), make(64), nn.ReLU(inplace=True), *blocks, nn.Conv2d(128, outputs, 1))
 
 
 class MotionEncoder(nn.Module):
@@ -50,9 +50,10 @@ class MotionEncoder(nn.Module):
         self.join = nn.Conv2d(192 + 64, 128 - 2, 3, padding=1)
 
     def forward(self, taps: Tensor, flow: Tensor) -> Tensor:
-        c = F.relu(self.corr2(F.relu(self.corr1(taps))))
-        f = F.relu(self.flow2(F.relu(self.flow1(flow))))
-        joined = F.relu(self.join(torch.cat([c, f], 1)))
+        relu = lambda x: F.relu(x, inplace=True)  # noqa: E731
+        c = relu(self.corr2(relu(self.corr1(taps))))
+        f = relu(self.flow2(relu(self.flow1(flow))))
+        joined = relu(self.join(torch.cat([c, f], 1)))
         return torch.cat([joined, flow.to(joined.dtype)], 1)
 
 
@@ -98,8 +99,8 @@ class Update(nn.Module):
     def __init__(self):
         super().__init__()
         self.motion, self.gru = MotionEncoder(), SepConvGru()
-        self.flow_head = nn.Sequential(nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(), nn.Conv2d(256, 2, 3, padding=1))
-        self.mask_head = nn.Sequential(nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(), nn.Conv2d(256, 9 * 64, 1))
+        self.flow_head = nn.Sequential(nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 2, 3, padding=1))
+        self.mask_head = nn.Sequential(nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 9 * 64, 1))
 
     def forward(self, h: Tensor, context, taps: Tensor, flow: Tensor, with_mask: bool) -> tuple[Tensor, Tensor, Tensor | None]:
         """h (N, 128, h, w), context: :meth:`SepConvGru.prepare`'s result (or the context itself: the slow twin), taps (N, 324, h, w),

@@ -25,7 +25,7 @@ from eflow.ops.precision import fp32
 RADIUS, LEVELS = 4, 4
 CHANNELS = LEVELS * (2 * RADIUS + 1) ** 2
 DENSE_TOKENS = 8192
-_CHUNK = 2048
+_CHUNK, _ROWS = 2048, 256
 
 
 def pixel_grid(h: int, w: int, like: Tensor) -> Tensor:
@@ -128,6 +128,8 @@ def expected_flow(volume: Tensor, h: int, w: int) -> Tensor:
 
 def expected_position(logits: Tensor, h: int, w: int) -> Tensor:
     """(N, rows, h*w) logits -> (N, 2, rows) expected (x, y). By the marginals: sums, which TF32 and bf16 products do not touch."""
+    if not torch.is_grad_enabled() and logits.shape[1] > _ROWS:  # row blocks that stay in the cache
+        return torch.cat([expected_position(logits[:, s:s + _ROWS], h, w) for s in range(0, logits.shape[1], _ROWS)], 2)
     p = logits.float().softmax(-1).unflatten(-1, (h, w))
     x = torch.arange(w, device=p.device, dtype=torch.float32)
     y = torch.arange(h, device=p.device, dtype=torch.float32)

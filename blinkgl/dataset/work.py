@@ -147,7 +147,10 @@ def environment_differences(one: dict[str, str], other: dict[str, str]) -> str:
 
 @lru_cache(maxsize=1)
 def _source_hash() -> str:
-    """12 hex digits of the code and shaders that are running: a version number says little about a checkout."""
+    """12 hex digits of the code and shaders that are running: a version number says little about a checkout. BLINKGL_BUILD says
+    it instead where somebody else answers for that (the tag of a container image; tests while the code is being worked on)."""
+    if build := os.environ.get("BLINKGL_BUILD"):
+        return build
     found = hashlib.sha256()
     for package in ("blinkgl", "blinkgl.shaders"):
         root = resources.files(package)

@@ -101,6 +101,8 @@ class FlowDataset(Dataset):
         if isinstance(key, Key):
             rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(2, key.epoch, key.position)))
             sample = self._raw(key.source, key.index)
+            if sample.flow is None:
+                raise EventDataError("no ground truth to train on", where=sample.name, accepted="a labelled data set")
             if self.augment is not None:
                 sample = augmented(sample, self.augment, rng)
             return self._tensors(sample, rng)

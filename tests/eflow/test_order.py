@@ -10,7 +10,7 @@ from eflow.config import AugmentConfig  # noqa: E402
 from eflow.data.dataset import FlowDataset, Key, Mixture, StepSampler, collate, cropped, loader, scaled  # noqa: E402
 from eflow.data.representation import VoxelGrid  # noqa: E402
 from eflow.data.sources import open_source  # noqa: E402
-from flow_data import blinkgl_set, blinkflow_set  # noqa: E402
+from flow_data import blinkflow_set, blinkgl_set, dsec_set  # noqa: E402
 
 STRONG = AugmentConfig(vertical_flip=0.5, time_reversal=0.5, drop_probability=1, hot_probability=1, noise_probability=1, scale_probability=0.5)
 
@@ -113,6 +113,14 @@ def test_refusals(source, tmp_path):
     forward_only = open_source(blinkgl_set(tmp_path / "f", sequences=1, backward=False))
     with pytest.raises(ConfigError, match="data.augment.time_reversal: time reversal needs backward flow"):
         FlowDataset([forward_only], VoxelGrid(), augment=STRONG)
+
+
+def test_unlabelled_data_cannot_be_trained_on(tmp_path):
+    source = open_source(dsec_set(tmp_path, labels=1, test=True))
+    dataset = FlowDataset([source], VoxelGrid())
+    assert "flow" not in dataset[0]
+    with pytest.raises(BlinkGLError, match="thun_00_a/000002: no ground truth to train on"):
+        dataset[Key(0, 0, 0, 0)]
 
 
 def test_windows_without_events(tmp_path):

@@ -54,7 +54,7 @@ TINY = {"name": "eflowformer", "layers": 1, "train_iterations": 1, "input": {"bi
 
 
 def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path, data):
-    k, n = 2, 2
+    k, n = 3, 1  # two steps are an epoch: the cut is inside the second
     config = load_train_config(config_file(tmp_path, data, TINY, steps=k + n, crop=(128, 128)))
     whole = train(config, tmp_path / "whole", quiet=True)
     assert (whole.step, whole.reason) == (k + n, "finished")

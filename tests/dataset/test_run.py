@@ -76,6 +76,7 @@ def test_killed_workers_leave_no_trace(reference, tmp_path):
     assert run(["verify", str(tmp_path / "out"), "--deep", "--sample", "2"]) == 0
 
 
+@pytest.mark.slow
 def test_a_worker_that_hangs_is_replaced_and_a_hopeless_sequence_set_aside(reference, tmp_path, monkeypatch):
     """One sequence's worker is stopped each time it is tried: after the last attempt (two here) the run does without it."""
     monkeypatch.setattr(run_module, "ATTEMPTS", 2)

@@ -1,6 +1,7 @@
 """Frame folders in the way of TartanAir become sequences: their own flow as labels, the emulator's events between frames."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2
@@ -103,13 +104,19 @@ def test_too_few_folders(tmp_path, tartan):
         run_dataset(template, tmp_path / "out")
 
 
-@pytest.mark.parametrize("frames, message", [
-    ({"first": 4}, "too few frames"), ({"count": 20}, "too few frames"), ({"flow": "image_left"}, "not a flow PNG"), ({"flow": "depth"}, "no such folder"),
+@pytest.mark.parametrize("damage, message", [
+    (lambda t: [p.unlink() for p in sorted((t / "image_left").iterdir())[2:]], "too few frames"),
+    (lambda t: (t / "flow/000001_000002_flow.npy").unlink(), "not one flow file per pair of frames"),
+    (lambda t: np.save(t / "flow/000002_000003_flow.npy", np.zeros((4, 4, 2), np.float32)), "flow and image differ in size"),
+    (lambda t: shutil.rmtree(t / "flow"), "no such folder"),
+    (lambda t: (t / "image_left/000003_left.png").write_bytes(b"no image"), "000003_left.png"),
 ])
-def test_frames_that_do_not_fit_are_set_aside(tmp_path, tartan, frames, message):
-    outcome = run_dataset(recipe(tmp_path, tartan, **frames), tmp_path / "out", num=1)
-    assert list(outcome.set_aside) == ["test/tartan_000000"] and message in outcome.set_aside["test/tartan_000000"]
-    assert not [p for p in (tmp_path / "out").rglob("*.h5")]
+def test_a_folder_that_cannot_be_used_is_set_aside(tmp_path, tartan, damage, message):
+    copy = Path(shutil.copytree(tartan, tmp_path / "copy"))
+    damage(copy / "P001")
+    outcome = run_dataset(recipe(tmp_path, copy), tmp_path / "out")
+    assert list(outcome.set_aside) == ["test/tartan_000001"] and message in outcome.set_aside["test/tartan_000001"]
+    assert [p.parent.name for p in (tmp_path / "out").rglob("*.h5")] == ["tartan_000000"]
 
 
 def test_the_shipped_recipe_takes_frames(tmp_path, tartan):

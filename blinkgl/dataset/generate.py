@@ -63,7 +63,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
     if config.frames is not None:
         return convert_sequence(config, index, path, base=base, progress=progress)
     clock = StageClock()
-    report = SequenceReport(index, path)
+    report = SequenceReport(index, path, seconds=clock.seconds)
     t0_ns, t1_ns = config.time.t0_ns, config.time.t1_ns
     with clock("scene"):
         scene = build_scene(config.scene, config.camera, t0_ns, t1_ns, split=config.output.split, seed=config.seed,
@@ -79,13 +79,12 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
             writer.poses(**poses_of(scene, [t0_ns, *config.time.label_times_ns]))
             writer.t_end_us = t1_ns // 1000
             writer.info.update(manifest_info(config, index, scene, gl, report, renderer.triangles))
-        clock.add("render", renderer.stats.render_s)
-        clock.add("read-back", renderer.stats.readback_s)
+        clock.seconds.update({"render": renderer.stats.render_s, "read-back": renderer.stats.readback_s})
         report.triangles = renderer.triangles
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files
     clock.add("write", flushing.total)
     report.simulated_s = (t1_ns - t0_ns) * 1e-9
-    report.seconds, report.total_s = clock.seconds, clock.total
+    report.total_s = clock.total
     return report
 
 
@@ -116,6 +115,7 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
             report.frames += 1
             report.events += len(events)
             if progress is not None:
+                clock.seconds.update({"render": renderer.stats.render_s, "read-back": renderer.stats.readback_s})
                 progress(report, (t_ns - t0_ns) / (t1_ns - t0_ns))
     writer.info["events_cut_by_max_events_per_step"] = emulator.saturated
     writer.info["events_lost_in_readout"] = readout.dropped if readout is not None else 0

@@ -25,7 +25,7 @@ from blinkgl.dataset.plan import Plan, check_output, digest
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, Message, environment_differences, report_of
-from blinkgl.errors import ConfigError, OutputError
+from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.io.sequence_dir import refuse_existing
 
 ATTEMPTS = 3
@@ -42,6 +42,8 @@ class Outcome:
     made: list[SequenceReport] = field(default_factory=list)
     set_aside: dict[str, str] = field(default_factory=dict)
     elapsed_s: float = 0.0
+    surprises: int = 0
+    """Failures that were no BlinkGLError: dead workers, time limits, bugs."""
     damaged: dict[str, str] = field(default_factory=dict)
     """Folders found damaged and moved to ``.run/damaged``: name -> what was wrong."""
 
@@ -63,6 +65,7 @@ def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | Non
     mixed : go on although the recipe, the assets or the software are not those the run began with.
     time_limit_s : wall time of one attempt at one sequence; 0: none.
 
+    Raises BlinkGLError when no sequence at all could be made; nothing but logs is left then, and another recipe may start in ``out``.
     Raises, before any work: ConfigError and AssetError (recipe, assets), GLError, OutputError (folder of another recipe, another
     run at work in it, cannot be written). Raises during work: OutputError when the disk is full, KeyboardInterrupt for Ctrl-C and
     SIGTERM; whole sequences stay, and ``resume`` goes on.
@@ -114,6 +117,10 @@ def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | Non
                     write_index(out)
             if listener:
                 listener.end(outcome)
+        if outcome.set_aside and not (outcome.made or outcome.found):
+            folder.forget(keep_logs=outcome.surprises > 0)
+            reason = next(iter(outcome.set_aside.values()))
+            raise BlinkGLError(reason if outcome.planned == 1 else f"{reason} (all {outcome.planned} sequences failed, this is the first's reason)")
     return outcome
 
 
@@ -144,6 +151,7 @@ def _loop(plan: Plan, executor: Executor, todo: deque, folder: RunFolder, outcom
                 folder.add_cost(task, message, attempt)
             elif message["kind"] == "failed":
                 attempt, _ = running.pop(number)
+                outcome.surprises += not message.get("expected", False)
                 folder.log(task.name, f"attempt {attempt} failed: {message['error']}")
                 if folder.state(task.name) == "":  # the worker died between the rename and the message
                     outcome.found += 1

@@ -143,6 +143,19 @@ class RunFolder:
             path.write_text(plan.recipe_text(), encoding="utf-8")
         self.begun = True
 
+    def forget(self, keep_logs: bool) -> None:
+        """Takes back :meth:`begin` for a run of which nothing came."""
+        for name in ("run.json", "recipe.yaml", "assets.json", "failed.json", "costs.jsonl"):
+            (self.path / name).unlink(missing_ok=True)
+        (self.out / "index.jsonl").unlink(missing_ok=True)
+        if not keep_logs:
+            shutil.rmtree(self.path, ignore_errors=True)
+        for folder in sorted((p for p in self.out.rglob("*") if p.is_dir()), reverse=True):
+            with contextlib.suppress(OSError):  # what is not empty stays
+                folder.rmdir()
+        with contextlib.suppress(OSError):
+            self.out.rmdir()
+
     def add_cost(self, task: Task, message: Message, attempt: int) -> None:
         line = {"name": task.name, "group": task.group, **{k: v for k, v in message["report"].items() if k not in ("path", "index")},
                 "bytes": message["bytes"], "cpu_s": message["cpu_s"], "peak_rss_kib": message["peak_rss_kib"], "attempts": attempt, "when": time.time()}

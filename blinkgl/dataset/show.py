@@ -62,7 +62,7 @@ class Display:
             self._at_work[name] = (message["fraction"], message["frames"], message["events"])
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, total=1.0, detail="")
-            detail = f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events" if message["fraction"] < 1 else "labels, files"
+            detail = f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {_shares(message['seconds'])}" if message["fraction"] < 1 else "labels, files"
             self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
         else:
             self._at_work.pop(name, None)
@@ -101,6 +101,13 @@ class Display:
 
     def _say(self, text: str) -> None:
         self._console.print(text, highlight=False, soft_wrap=True, markup=False)
+
+
+def _shares(seconds: dict[str, float]) -> str:
+    """"render 63 %, events 12 %": where most of the time has gone so far."""
+    total = sum(seconds.values()) or 1.0
+    largest = sorted(STAGES, key=lambda name: -seconds.get(name, 0.0))[:2]
+    return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
 
 
 def _size(size: float) -> str:

@@ -52,6 +52,7 @@ class EvFlowNetConfig(Config):
     name: Literal["ev_flownet"] = "ev_flownet"
     input: Literal["counts", "voxel"] = Field("counts", description="4 channels of counts and latest times, or a voxel grid")
     bins: int = Field(15, ge=2, le=64, description="time bins of the voxel input")
+    width: int = Field(64, ge=4, le=512, multiple_of=2, description="channels of the first encoder; 64 as published")
 
 
 class SpikeFlowNetConfig(Config):

@@ -9,7 +9,7 @@ from torch import nn
 from eflow.config import EvFlowNetConfig
 from eflow.data.representation import CountsAndTimes, VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
-from eflow.models.unets import CHANNELS, Residual, ScaledTanh, double, to_size
+from eflow.models.unets import Residual, ScaledTanh, double, to_size
 
 
 class EvFlowNet(FlowModel):
@@ -22,12 +22,13 @@ class EvFlowNet(FlowModel):
         super().__init__()
         self.config = config
         self.representation = CountsAndTimes() if config.input == "counts" else VoxelGrid(config.bins)
-        widths = (self.representation.channels, *CHANNELS)
+        w = config.width
+        widths = (self.representation.channels, w, 2 * w, 4 * w, 8 * w)
         self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(widths, widths[1:])])
-        self.residuals = nn.Sequential(Residual(512), Residual(512))
+        self.residuals = nn.Sequential(Residual(8 * w), Residual(8 * w))
         self.decoders = nn.ModuleList([nn.Conv2d(c, c_out, 3, padding=1) for c, c_out in
-                                       ((512 + 512, 256), (256 + 256 + 2, 128), (128 + 128 + 2, 64), (64 + 64 + 2, 32))])
-        self.heads = nn.ModuleList([ScaledTanh(c) for c in (256, 128, 64, 32)])
+                                       ((16 * w, 4 * w), (8 * w + 2, 2 * w), (4 * w + 2, w), (2 * w + 2, w // 2))])
+        self.heads = nn.ModuleList([ScaledTanh(c) for c in (4 * w, 2 * w, w, w // 2)])
         initialise(self)
         for head in self.heads:
             head.calm()

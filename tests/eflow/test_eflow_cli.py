@@ -31,7 +31,7 @@ def weights(folder: Path, **tree) -> Path:
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory) -> str:
-    return str(weights(tmp_path_factory.mktemp("weights"), name="ev_flownet"))
+    return str(weights(tmp_path_factory.mktemp("weights"), name="ev_flownet", width=8))
 
 
 @pytest.fixture(scope="module")

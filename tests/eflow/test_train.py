@@ -22,7 +22,7 @@ from eflow.config import load_train_config  # noqa: E402
 from eflow.train import TrainingError, learning_rate, train  # noqa: E402
 from flow_data import blinkgl_set  # noqa: E402
 
-FAST = {"name": "ev_flownet", "input": "voxel", "bins": 5}
+FAST = {"name": "ev_flownet", "input": "voxel", "bins": 5, "width": 8}
 
 
 @pytest.fixture(scope="module")
@@ -254,7 +254,7 @@ def test_checkpoint_of_another_model(trained, tmp_path):
     with pytest.raises(BlinkGLError, match=r"checkpoint of another model: model\.name differs \(got 'ev_flownet'\); expected 'eraft'"):
         ckpt.load_model(trained, expected=model_config({"name": "eraft"}))
     tensors_, metadata = ckpt.read_tensors(trained / "weights.safetensors")
-    forged = {**metadata, "model": json.dumps({"name": "ev_flownet", "input": "voxel", "bins": 7})}
+    forged = {**metadata, "model": json.dumps({**FAST, "bins": 7})}
     ckpt.write_tensors(tmp_path / "forged.safetensors", tensors_, forged)
     with pytest.raises(BlinkGLError, match=r"forged\.safetensors: tensor 'encoders\.0\.weight' has another shape"):
         ckpt.load_model(tmp_path / "forged.safetensors")

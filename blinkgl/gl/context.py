@@ -104,9 +104,14 @@ class GLContext:
             _unbind_egl()
         self._raw.__enter__()
 
+    @property
+    def released(self) -> bool:
+        return self._raw is None
+
     def release(self) -> None:
         """Free the context and everything in it. Harmless when repeated."""
         if self._raw is not None:
+            self.make_current()  # OpenGL's names are per context: freed while another is current, they would be that one's
             self.shaders.clear()
             self.ctx.release()
             self._raw.release()

@@ -126,6 +126,9 @@ class Renderer:
         self.release()
 
     def release(self) -> None:
+        if self.gl.released:  # everything went with the context
+            return
+        self.gl.make_current()
         for target in self._targets.values():
             target.release()
         self._targets = {}

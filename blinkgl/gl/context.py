@@ -7,10 +7,13 @@ precision of a 32F depth buffer only when clip-space depth runs from 0 to 1 (wit
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import re
-from collections.abc import Mapping
+import threading
+import weakref
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import moderngl
@@ -20,6 +23,8 @@ from blinkgl.gl.framebuffer import Target
 from blinkgl.gl.osmesa import OSMesaContext, OSMesaUnavailable
 from blinkgl.gl.shader import ShaderLoader
 
+_thread = threading.local()
+"""``current``: weak reference to the context last made current in the thread."""
 REQUIRED_VERSION = 430
 APT_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6"
 REMEDY = f"run 'sudo apt-get install -y --no-install-recommends {APT_PACKAGES}', or install the GPU's driver with its EGL part"
@@ -67,6 +72,7 @@ class GLContext:
             # (measured: event kernels between frames took 18 times as long). libgomp reads this when it is loaded, with
             # the first parallel kernel; where there is no software OpenGL, spinning is right: kernels are 1.6x faster.
             os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        _thread.current = weakref.ref(self)
         self.shaders = ShaderLoader(self.ctx)
         self.idle = self.ctx.framebuffer(self.ctx.renderbuffer((1, 1)))  # bound when a target in use is released
         self._set_clip_control()
@@ -103,6 +109,20 @@ class GLContext:
             # EGL does not see what OSMesa does behind its back: it takes a context it bound for still bound, and does nothing.
             _unbind_egl()
         self._raw.__enter__()
+        _thread.current = weakref.ref(self)
+
+    @contextlib.contextmanager
+    def borrowed(self) -> Iterator[None]:
+        """Current inside the block; afterwards the one that was current in this thread before is so again. Releasing needs it:
+        OpenGL's names are per context, so what is freed while another context is current is that other one's, and the
+        garbage collector may finish an abandoned generator, and with it a renderer, at any moment."""
+        before = getattr(_thread, "current", lambda: None)()
+        self.make_current()
+        try:
+            yield
+        finally:
+            if before is not None and before is not self and not before.released:
+                before.make_current()
 
     @property
     def released(self) -> bool:
@@ -111,11 +131,11 @@ class GLContext:
     def release(self) -> None:
         """Free the context and everything in it. Harmless when repeated."""
         if self._raw is not None:
-            self.make_current()  # OpenGL's names are per context: freed while another is current, they would be that one's
-            self.shaders.clear()
-            self.ctx.release()
-            self._raw.release()
-            self._raw = None
+            with self.borrowed():
+                self.shaders.clear()
+                self.ctx.release()
+                self._raw.release()
+                self._raw = None
 
     def __enter__(self) -> GLContext:
         return self

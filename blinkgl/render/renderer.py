@@ -128,11 +128,11 @@ class Renderer:
     def release(self) -> None:
         if self.gl.released:  # everything went with the context
             return
-        self.gl.make_current()
-        for target in self._targets.values():
-            target.release()
-        self._targets = {}
-        self._resources.release()
+        with self.gl.borrowed():
+            for target in self._targets.values():
+                target.release()
+            self._targets = {}
+            self._resources.release()
 
     @property
     def changed_rows(self) -> tuple[int, int] | None:

@@ -27,3 +27,24 @@ def test_names_of_another_context_survive(gl):
         assert np.isfinite(target.read(0)).all()
         target.release()
     assert gl.ctx.error == "GL_NO_ERROR"
+
+
+def test_an_abandoned_generator_leaves_the_current_context_current(gl):
+    """The garbage collector may close it, and release its context, in the middle of somebody else's drawing."""
+    def suspended():
+        with create_context("egl") as other:
+            other.program("downsample.glsl", {"FACTOR": 3})
+            yield
+
+    try:
+        generator = suspended()
+        next(generator)
+    except GLError:
+        pytest.skip("no EGL for a second context")
+    gl.make_current()
+    with gl.framebuffer(4, 4, ("R32UI",), depth=False) as target:
+        target.clear(7)
+        generator.close()
+        target.clear(9)
+        assert (target.read(0) == 9).all()
+    assert gl.ctx.error == "GL_NO_ERROR"

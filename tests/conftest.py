@@ -15,8 +15,9 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("PYGLET_HEADLESS", "1")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def _gl_session():
+    """A context per test file: what one file does to OpenGL's state (other contexts, OSMesa, threads) ends with it."""
     from blinkgl.gl import create_context
 
     with create_context() as context:
@@ -25,7 +26,7 @@ def _gl_session():
 
 @pytest.fixture
 def gl(_gl_session):
-    """The session's GLContext, current and in moderngl's default state; no GL error before nor after the test."""
+    """The test file's GLContext, current and in moderngl's default state; no GL error before nor after the test."""
     _gl_session.make_current()
     ctx = _gl_session.ctx
     ctx.enable_only(ctx.NOTHING)

@@ -1,0 +1,1 @@
+"""What accuracy costs: settings timed and judged against a converged reference (``blinkgl trade``)."""

@@ -1,0 +1,152 @@
+"""Matching and errors of event streams: cases that were worked out by hand, an exhaustive search, exact shifts."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from blinkgl.events.types import Events
+from blinkgl.trade.matching import match_events
+from blinkgl.trade.metrics import SpeedMaps, event_errors, voxel_grid
+
+H, W = 4, 5
+
+
+def stream(*rows) -> Events:
+    """Events from (x, y, t, p) rows, sorted by time."""
+    rows = sorted(rows, key=lambda r: r[2])
+    x, y, t, p = zip(*rows) if rows else ((), (), (), ())
+    return Events(np.array(x, np.uint16), np.array(y, np.uint16), np.array(t, np.int64), np.array(p, np.uint8))
+
+
+def train(*times, x=1, y=2, p=1) -> Events:
+    return stream(*((x, y, t, p) for t in times))
+
+
+def random_stream(n: int, span_us: int, seed: int) -> Events:
+    rng = np.random.default_rng(seed)
+    return Events(rng.integers(0, W, n).astype(np.uint16), rng.integers(0, H, n).astype(np.uint16), np.sort(rng.integers(0, span_us, n)),
+                  rng.integers(0, 2, n).astype(np.uint8))
+
+
+def pairs(a: Events, b: Events, limit_us: int) -> list[tuple[int, int]]:
+    m = match_events(a, b, H, W, limit_us)
+    return [(int(a.t[i]), int(b.t[j])) for i, j in enumerate(m.partner) if j >= 0]
+
+
+SPEED = SpeedMaps(np.array([0]), np.full((1, H, W), 200.0, np.float32))
+
+
+def errors(a: Events, b: Events, limit_us: int = 1000, **options):
+    return event_errors(a, b, SPEED, 0, 100_000, limit_us=limit_us, **options)
+
+
+def test_equal_streams_have_no_error():
+    a = random_stream(5000, 100_000, 0)
+    e = errors(a, a)
+    assert (e.time_median_us, e.time_p95_us, e.shift_p95_px, e.missed, e.extra, e.voxel, e.count) == (0,) * 7
+    assert e.events == e.reference_events == len(a)
+
+
+def test_a_shift_is_the_error_in_us_and_px():
+    a = train(*range(100, 90_000, 400))
+    b = Events(a.x, a.y, a.t + 7, a.p)
+    e = errors(a, b)
+    assert e.time_median_us == e.time_p95_us == 7 and e.missed == e.extra == 0
+    assert e.shift_median_px == pytest.approx(7e-6 * 200)
+
+
+def test_dropped_and_invented_events_are_counted():
+    a = random_stream(4000, 100_000, 1)
+    keep = np.arange(len(a)) % 8 != 0
+    b = Events(a.x[keep], a.y[keep], a.t[keep], a.p[keep])
+    e = errors(a, b)
+    assert e.missed == pytest.approx(1 / 8) and e.extra == 0 and e.time_p95_us == 0 and e.count == pytest.approx(-1 / 8)
+    e = errors(b, a)
+    assert e.missed == 0 and e.extra == pytest.approx(1 / 7)
+
+
+def test_pixel_and_polarity_are_not_mixed():
+    a = train(1000)
+    for other in (train(1000, p=0), train(1000, x=2), train(1000, y=1)):
+        assert pairs(a, other, 500) == []
+
+
+def test_by_hand():
+    # The neighbour in time is not the partner when that would leave another one alone ...
+    assert pairs(train(100, 200), train(170, 270), 150) == [(100, 170), (200, 270)]
+    # ... but losing one and inventing one (150) is cheaper than moving three by 100 each.
+    assert pairs(train(100, 200, 300), train(200, 300, 400), 150) == [(200, 200), (300, 300)]
+    # The limit itself still matches, one more does not; each event has one partner.
+    assert pairs(train(0), train(150), 150) == [(0, 150)]
+    assert pairs(train(0), train(151), 150) == []
+    assert pairs(train(100, 101, 102), train(101), 50) == [(101, 101)]
+    assert pairs(train(), train(5), 50) == pairs(train(5), train(), 50) == []
+
+
+def cost_of(a: list[int], b: list[int], limit: int) -> float:
+    """The least cost over all matchings, by trying them all."""
+    best = np.inf
+    for size in range(min(len(a), len(b)) + 1):
+        for left in itertools.combinations(range(len(a)), size):
+            for right in itertools.permutations(range(len(b)), size):
+                distances = [abs(a[i] - b[j]) for i, j in zip(left, right)]
+                if all(d <= limit for d in distances):
+                    best = min(best, sum(distances) + limit / 2 * (len(a) + len(b) - 2 * size))
+    return best
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_optimal_among_all_matchings(seed):
+    rng = np.random.default_rng(seed)
+    a, b = (sorted(rng.integers(0, 60, rng.integers(1, 6)).tolist()) for _ in range(2))
+    limit = int(rng.integers(2, 40))
+    found = match_events(train(*a), train(*b), H, W, limit)
+    cost = float(np.abs(found.dt_us).sum()) + limit / 2 * (int((~found.matched).sum()) + found.extra)
+    assert cost == cost_of(a, b, limit)
+    used = found.partner[found.matched]
+    assert len(set(used.tolist())) == len(used) and np.abs(found.dt_us).max(initial=0) <= limit
+
+
+def test_symmetric():
+    a, b = random_stream(3000, 20_000, 2), random_stream(2500, 20_000, 3)
+    forward, backward = match_events(a, b, H, W, 300), match_events(b, a, H, W, 300)
+    assert forward.matched.sum() == backward.matched.sum()
+    assert np.abs(forward.dt_us).sum() == np.abs(backward.dt_us).sum()
+
+
+def test_window_and_mask():
+    a = train(1000, 5000, 9000)
+    b = stream((1, 2, 1010, 1), (1, 2, 9010, 1), (4, 3, 5000, 1))
+    e = event_errors(a, b, SPEED, 0, 6000, limit_us=100)
+    assert (e.reference_events, e.events, e.missed, e.extra) == (2, 2, 0.5, 0.5)
+    mask = np.zeros((H, W), bool)
+    mask[2, 1] = True
+    e = event_errors(a, b, SPEED, 0, 10_000, limit_us=100, mask=mask)
+    assert (e.reference_events, e.events, e.extra) == (3, 2, 0) and e.missed == pytest.approx(1 / 3)
+    empty = event_errors(train(), train(), SPEED, 0, 10, limit_us=5)
+    assert np.isnan(empty.missed) and np.isnan(empty.voxel) and np.isnan(empty.time_median_us) and np.isnan(empty.count)
+
+
+def test_speed_of_the_nearest_map():
+    maps = SpeedMaps(np.array([0, 100, 200]), np.stack([np.full((H, W), v, np.float32) for v in (1, 2, 3)]))
+    zero = np.zeros(5, int)
+    assert maps.at(zero, zero, np.array([-5, 49, 51, 149, 1000])).tolist() == [1, 1, 2, 2, 3]
+
+
+def test_voxel_grid_by_hand():
+    grid = voxel_grid(stream((1, 2, 0, 1), (1, 2, 100, 1), (0, 0, 125, 0), (3, 1, 1399, 1)), 0, 1400, H, W)
+    assert grid.shape == (15, H, W) and grid.dtype == np.float32
+    assert grid[0, 2, 1] == 1 and grid[1, 2, 1] == 1
+    assert grid[1, 0, 0] == pytest.approx(-0.75) and grid[2, 0, 0] == pytest.approx(-0.25)
+    assert grid[13, 1, 3] == pytest.approx(0.01, abs=1e-6) and grid[14, 1, 3] == pytest.approx(0.99, abs=1e-6)
+    assert grid.sum() == pytest.approx(2)
+
+
+def test_off_the_sensor_is_refused():
+    with pytest.raises(ValueError, match="off the sensor"):
+        match_events(train(1, x=W), train(1), H, W, 10)
+    with pytest.raises(ValueError, match="limit_us"):
+        match_events(train(1), train(1), H, W, 0)

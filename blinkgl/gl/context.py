@@ -104,11 +104,17 @@ class GLContext:
         return Target(self, width, height, colour, depth)
 
     def make_current(self) -> None:
-        """Make this context the current one again, after another context was used in the same thread."""
+        """Make this context the current one again, after another context was used in the same thread.
+
+        Raises GLError where it is current in another thread: going on would draw into, and free, what belongs to the context
+        that is current here."""
+        egl = None
         if self.backend == "egl":
             # EGL does not see what OSMesa does behind its back: it takes a context it bound for still bound, and does nothing.
-            _unbind_egl()
-        self._raw.__enter__()
+            egl = _unbind_egl()
+        self._raw.__enter__()  # glcontext does not look at what eglMakeCurrent answers
+        if egl is not None and not egl.eglGetCurrentContext():
+            raise GLError("this context is in use by another thread", where=self.renderer, accepted="a context per thread")
         _thread.current = weakref.ref(self)
 
     @contextlib.contextmanager
@@ -117,8 +123,8 @@ class GLContext:
         OpenGL's names are per context, so what is freed while another context is current is that other one's, and the
         garbage collector may finish an abandoned generator, and with it a renderer, at any moment."""
         before = getattr(_thread, "current", lambda: None)()
-        self.make_current()
         try:
+            self.make_current()
             yield
         finally:
             if before is not None and before is not self and not before.released:
@@ -209,14 +215,17 @@ def _egl(device: int) -> Any:
         raise _EGLUnavailable(message, no_such_device="requested device index" in message) from None
 
 
-def _unbind_egl() -> None:
+def _unbind_egl() -> ctypes.CDLL:
+    """libEGL, after which no context is current in this thread as far as EGL knows."""
     name = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
     lib = ctypes.CDLL(name)
     lib.eglGetCurrentDisplay.restype = ctypes.c_void_p
+    lib.eglGetCurrentContext.restype = ctypes.c_void_p
     lib.eglMakeCurrent.argtypes = [ctypes.c_void_p] * 4
     display = lib.eglGetCurrentDisplay()
     if display:
         lib.eglMakeCurrent(display, None, None, None)
+    return lib
 
 
 def _loadable(names: tuple[str, ...]) -> str | None:

@@ -111,6 +111,17 @@ def test_unreachable_address_is_one_line_and_nothing_is_written(tmp_path, capsys
     assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+def test_a_cluster_of_another_version_is_one_line_and_nothing_is_written(tmp_path, capsys, monkeypatch, two_nodes):
+    cluster, _ = two_nodes
+    ray.shutdown()
+    monkeypatch.setattr(ray, "__version__", "2.0.0")  # what this side says it is when it connects
+    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray", "--address", cluster.address]) == 2
+    error = capsys.readouterr().err
+    assert "--address: Ray's or Python's version differs from the cluster's: " in error and "2.0.0" in error
+    assert error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
 def test_gpu_numbers_become_egl_devices(monkeypatch):
     monkeypatch.setattr("blinkgl.gl.context.egl_devices", lambda: ["NVIDIA", "Mesa software rasteriser", "NVIDIA"])
     assert [_egl_device([]), _egl_device(["0"]), _egl_device([1]), _egl_device([7])] == [None, 0, 2, None]

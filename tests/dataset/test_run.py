@@ -306,6 +306,15 @@ def test_bad_options(tmp_path, capsys, arguments, message):
     assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("place", ["file/out", "/proc/out"])  # root, too, can write neither
+def test_output_that_cannot_be_written_is_one_line_before_any_work(tmp_path, capsys, place):
+    (tmp_path / "file").write_text("not a folder")
+    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / place), "--workers", "2"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and "out" in error and error.count("\n") == 1, error
+    assert (tmp_path / "file").read_text() == "not a folder"
+
+
 def test_workers_without_opengl_say_so(tmp_path):
     with pytest.raises(BlinkGLError, match="no such EGL device|no usable OpenGL"):
         run_dataset(load_run(recipe_file(tmp_path, gl={"backend": "egl", "device": 99})), tmp_path / "out", Local(1))

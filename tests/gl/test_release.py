@@ -1,5 +1,7 @@
 """Releasing one context must not free what belongs to another that happens to be current."""
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -49,3 +51,37 @@ def test_an_abandoned_generator_leaves_the_current_context_current(gl):
         target.clear(9)
         assert (target.read(0) == 9).all()
     assert gl.ctx.error == "GL_NO_ERROR"
+
+
+def test_a_context_of_another_thread_is_refused_and_nothing_of_ours_is_freed(gl):
+    """eglMakeCurrent fails for it; what was current here would then be drawn into, and its objects deleted."""
+    made, done, box = threading.Event(), threading.Event(), {}
+
+    def work():
+        try:
+            box["other"] = create_context("egl")
+        except GLError as error:
+            box["error"] = error
+        made.set()
+        done.wait()
+        if "other" in box:
+            box["other"].release()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        assert made.wait(30)
+        if "error" in box:
+            pytest.skip("no EGL for a second context")
+        gl.make_current()
+        with gl.framebuffer(4, 4, ("R32F",), depth=False) as target:
+            target.clear(1.0)
+            with pytest.raises(GLError, match="in use by another thread"):
+                box["other"].release()
+            target.clear(2.0)
+            assert (target.read(0) == 2.0).all()
+        assert not box["other"].released
+    finally:
+        done.set()
+        thread.join()
+    assert box["other"].released and gl.ctx.error == "GL_NO_ERROR"

@@ -16,6 +16,7 @@ from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.events import make_emulator
 from blinkgl.gl import GLContext, create_context
 from blinkgl.gl.framebuffer import FORMATS
+from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
@@ -105,7 +106,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
 
     luminance = np.empty((renderer.height, renderer.width), np.float32)
     event_s = _timed(lambda t: renderer.luminance(t, out=luminance), times)
-    fine = config.render.supersample**2
+    fine = samples_of(config.render.antialiasing).stored
     timeline, rejected = config.timeline, 1.0
     if timeline.kind == "uniform":
         result.frames = int(duration * timeline.fps) + 1
@@ -122,8 +123,8 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         result.passes.append(Pass("velocity", f"bounds the step; every {timeline.sample_every}. pixel", ("velocity",),
                                   pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, velocity_s * count))
     if config.labels.images:
-        result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, {config.render.image_supersample}x super-sampled",
-                                  ("colour",), pixels * config.render.image_supersample**2 * (16 + DEPTH_BYTES), labels + 1,
+        result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
+                                  ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
                                   _timed(renderer.colour, times[:3]) * (labels + 1)))
     request = _request(config)
     wanted = [name for name in ("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward") if getattr(request, name)]
@@ -135,7 +136,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
                                   pixels * (sum(sizes[w] for w in wanted) + DEPTH_BYTES), labels, each * labels))
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
-        each = _timed(lambda t: (renderer.colour(t, supersample=1), renderer.velocity(t)), times[:3])
+        each = _timed(lambda t: (renderer.colour(t, antialiasing="none"), renderer.velocity(t)), times[:3])
         result.passes.append(Pass("preview", f"{config.preview.rate:g} pictures per simulated second", ("colour", "velocity"),
                                   pixels * (16 + 8 + DEPTH_BYTES), pictures, each * pictures))
     emulator = make_emulator(config.events, renderer.height, renderer.width, kernel_seed(config.seed, index, Role.EVENTS))
@@ -170,8 +171,10 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
                           ("preview", config.preview.enabled, "preview.enabled: false")):
         if not on:
             add(name, key)
-    if config.render.supersample == 1:
-        add("anti-aliasing of event frames", "render.supersample: 1 (mip-maps filter textures; edges are not filtered)")
+    if config.render.antialiasing == "none":
+        add("anti-aliasing of event frames", "render.antialiasing: none (mip-maps filter textures; edges are not filtered)")
+    elif config.render.antialiasing == "msaa4":
+        add("super-sampling of event frames", "render.antialiasing: msaa4 (edges are filtered; textures by mip-maps alone)")
     if config.render.anisotropy == 1:
         add("anisotropic filtering", "render.anisotropy: 1")
     if all(p.material.unlit for o in scene.objects for p in o.parts):

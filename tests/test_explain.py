@@ -35,7 +35,7 @@ def test_what_is_left_out_follows_the_configuration(tmp_path):
     out = dict(explain(template(tmp_path)).left_out)
     assert "depth" in out and "backward flow" in out and "preview" in out and "esim: refractory_us" in out
     more = explain(template(tmp_path, timeline={"kind": "uniform", "fps": 100}, labels={"images": False, "depth": True, "flow": []},
-                            events={"emulator": "esim", "refractory_us": 50}, render={"supersample": 2}))
+                            events={"emulator": "esim", "refractory_us": 50}, render={"antialiasing": "ssaa2"}))
     out = dict(more.left_out)
     assert "depth" not in out and "images" in out and "velocity pass" in out and "esim: refractory_us" not in out
     assert "anti-aliasing of event frames" not in out

@@ -19,7 +19,6 @@ import json
 import tempfile
 from dataclasses import replace
 from importlib import resources
-from types import SimpleNamespace
 
 import numpy as np
 from rich.console import Console
@@ -28,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl import bench
 from blinkgl.config.events import EsimConfig
-from blinkgl.config.sequence import load_run
+from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.show import STAGES, summary
 from blinkgl.events import make_emulator
@@ -80,7 +79,7 @@ def probe_scene(kind: str, width: int, height: int, lit: bool = False) -> Scene:
     return Scene(tuple(objects), camera, 0, 2 * SECOND)
 
 
-PLAIN = SimpleNamespace(supersample=1, image_supersample=1, anisotropy=1.0)
+PLAIN = RenderConfig(image_antialiasing="none")
 
 
 def event_pass(gl, kind: str, width: int, height: int, lit: bool, repeat: int) -> dict:

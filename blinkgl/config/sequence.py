@@ -127,12 +127,17 @@ class DisplacementTimeline(Config):
 TimelineConfig = Annotated[UniformTimeline | DisplacementTimeline, Field(discriminator="kind")]
 
 
+Antialiasing = Literal["none", "msaa4", "ssaa2", "ssaa4"]
+
+
 class RenderConfig(Config):
     """How a frame is drawn."""
 
-    supersample: Literal[1, 2, 4] = Field(1, description="event frames are drawn n x n finer and box-filtered (cost ~n²)")
-    image_supersample: Literal[1, 2, 4] = Field(2, description="the same for the colour images at label times")
+    antialiasing: Antialiasing = Field("none", description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel); ssaa2 and ssaa4 "
+                                       "draw 2 x 2 and 4 x 4 finer and average (cost ~n²), textures included. Labels are never filtered")
+    image_antialiasing: Antialiasing = Field("ssaa2", description="the same for the colour images at label times")
     anisotropy: float = Field(1.0, ge=1, le=16, description="texture anisotropy, 1 is off (halves the rate on software GL)")
+    mip_bias: float = Field(0.0, ge=-8, le=8, description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more")
 
 
 class LabelsConfig(Config):

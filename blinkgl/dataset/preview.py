@@ -36,7 +36,7 @@ class PreviewRecorder:
 
     def frame(self, t_ns: int) -> None:
         """The picture at t_ns: colour and flow are drawn for it."""
-        colour = self._renderer.colour(t_ns, supersample=1)
+        colour = self._renderer.colour(t_ns, antialiasing="none")
         velocity = self._renderer.velocity(t_ns)
         with self._clock("preview"):
             self._video.set_flow(velocity * self._interval_s)

@@ -99,9 +99,10 @@ class GLContext:
         """The program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
         return self.shaders.program(name, defines)
 
-    def framebuffer(self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True) -> Target:
+    def framebuffer(self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True,
+                    samples: int = 0) -> Target:
         """A new render target; see :class:`~blinkgl.gl.framebuffer.Target`."""
-        return Target(self, width, height, colour, depth)
+        return Target(self, width, height, colour, depth, samples)
 
     def make_current(self) -> None:
         """Make this context the current one again, after another context was used in the same thread.

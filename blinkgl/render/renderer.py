@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 
+from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.matrices import (cam_from_obj, cam_from_obj_rate, mat4_bytes, projection, rows_xyw_bytes)
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
@@ -111,7 +112,8 @@ class Renderer:
         self._backdrop: Backdrop | None = None
         self.changed: list[Rectangle] | None = None
         self._surfaces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-        self._resources = SceneResources(gl.ctx, scene, config.anisotropy)
+        self._samples, self._image_samples = samples_of(config.antialiasing), samples_of(config.image_antialiasing, "render.image_antialiasing")
+        self._resources = SceneResources(gl, scene, config.anisotropy, config.mip_bias)
         items = self._resources.items
         self._item_object = np.array([i.object_index for i in items], np.intp)
         self._item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
@@ -154,16 +156,14 @@ class Renderer:
         With a still camera only what moves is drawn, and when ``out`` is the array of the call before, only what has
         changed is written: leave it as it was returned. ``changed`` then says where."""
         started = time.perf_counter()
-        factor = self.config.supersample
-        target = self._target("luminance", factor, ("R32F",))
+        samples = self._samples
+        target = self._target("luminance", samples.grid, ("R32F",), samples.multi)
         moment = self._moment(t_ns)
         if self._still:
             return self._mend_luminance(moment, target, started, out)
         self._begin(target, moment, self.scene.background)
         self._draw_luminance(moment, self._visible(moment))
-        if factor > 1:
-            target = self._downsample(target, "luminance", "R32F", factor)
-        return self._read(target, 0, started, out)
+        return self._read(self._filtered(target, "luminance", "R32F", samples), 0, started, out)
 
     def speed(self, t_ns: int, sample_every: int = 1, percentile: float = 100.0) -> float:
         """Largest image speed at t_ns, px/s (or a percentile of the pixels' speeds), on every n-th pixel in x and y.
@@ -222,11 +222,11 @@ class Renderer:
                     result[key] = self._flow(buffers[name], buffers.get("ID"), t_other, needs_occlusion)
         return LabelFrame(t_ns, **result)
 
-    def colour(self, t_ns: int, supersample: int | None = None) -> np.ndarray:
-        """Linear radiance at t_ns, (H, W, 3) float32; ``supersample`` overrides the configuration's."""
+    def colour(self, t_ns: int, antialiasing: str | None = None) -> np.ndarray:
+        """Linear radiance at t_ns, (H, W, 3) float32; ``antialiasing`` overrides the configuration's."""
         started = time.perf_counter()
-        factor = self.config.image_supersample if supersample is None else supersample
-        target = self._target("colour", factor, ("RGBA32F",))
+        samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
+        target = self._target("colour", samples.grid, ("RGBA32F",), samples.multi)
         moment = self._moment(t_ns)
         self._begin(target, moment, self.scene.background)
         for item in self._visible(moment):
@@ -235,8 +235,7 @@ class Renderer:
             if item.textured:
                 self._resources.colour_texture(item.material).use(0)
             self._draw(uniforms, item)
-        if factor > 1:
-            target = self._downsample(target, "colour", "RGBA32F", factor)
+        target = self._filtered(target, "colour", "RGBA32F", samples)
         return np.ascontiguousarray(self._read(target, 0, started, None)[..., :3])
 
     # ---- parts of the event pass -------------------------------------------------------------------------------
@@ -252,14 +251,14 @@ class Renderer:
 
     def _mend_luminance(self, moment: _Moment, target, started: float, out: np.ndarray | None) -> np.ndarray:
         """:meth:`luminance` for a still camera; see ``still.py``."""
-        factor, ctx = self.config.supersample, self.gl.ctx
+        samples, ctx = self._samples, self.gl.ctx
         visible = self._visible(moment)
         movers = [(item, screen_rectangle(item, moment.T_cam_obj[item.object_index], self.scene.camera))
                   for item in visible if self._moves[item.object_index]]
         movers = [(item, rectangle) for item, rectangle in movers if rectangle is not None]
         whole = Rectangle(0, 0, self.width, self.height)
         if self._backdrop is None:
-            picture = self._target("backdrop", factor, ("R32F",))
+            picture = self._target("backdrop", samples.grid, ("R32F",), samples.multi)
             self._begin(picture, moment, self.scene.background)
             self._draw_luminance(moment, [item for item in visible if not self._moves[item.object_index]])
             self._backdrop = Backdrop(self.gl, picture, target)
@@ -269,15 +268,13 @@ class Renderer:
             stale = self._backdrop.stale([r for _, r in movers])
         self._prepare(target)
         for rectangle in stale:
-            fine = rectangle.scaled(factor)
+            fine = rectangle.scaled(samples.grid)
             ctx.scissor = (fine.x0, fine.y0, fine.x1 - fine.x0, fine.y1 - fine.y0)
             self._backdrop.restore(fine)
             self._draw_luminance(moment, [item for item, r in movers if r.meets(rectangle)])
         ctx.scissor = None
         self.stats.frames += 1
-        result = self._downsample(target, "luminance", "R32F", factor) if factor > 1 and stale else target
-        if factor > 1:
-            result = self._targets[("luminance", "mean")]
+        result = self._filtered(target, "luminance", "R32F", samples, stale=bool(stale))
         image = np.empty((self.height, self.width), np.float32) if out is None else out
         self.changed = stale
         if image is not self._backdrop.image:
@@ -380,11 +377,11 @@ class Renderer:
 
     # ---- GL state ----------------------------------------------------------------------------------------------
 
-    def _target(self, name: str, scale: float, formats: tuple[str, ...]):
-        key = (name, scale)
+    def _target(self, name: str, scale: float, formats: tuple[str, ...], samples: int = 0):
+        key = (name, scale, samples)
         if key not in self._targets:
             width, height = max(1, int(self.width * scale)), max(1, int(self.height * scale))
-            self._targets[key] = self.gl.framebuffer(width, height, colour=formats, depth=True)
+            self._targets[key] = self.gl.framebuffer(width, height, colour=formats, depth=True, samples=samples)
         return self._targets[key]
 
     def _begin(self, target, moment: _Moment, background: float) -> None:
@@ -437,11 +434,21 @@ class Renderer:
         self._resources.vertex_array(uniforms[""], item).render(moderngl.TRIANGLES)
         self.stats.triangles += len(item.mesh.faces)
 
-    def _downsample(self, fine, name: str, fmt: str, factor: int):
+    def _filtered(self, drawn, name: str, fmt: str, samples: Samples, stale: bool = True):
+        """Target with one value per pixel: ``drawn`` itself, or the mean of its samples (of before, where not ``stale``)."""
+        if samples.stored == 1:
+            return drawn
         key = (name, "mean")
         if key not in self._targets:
             self._targets[key] = self.gl.framebuffer(self.width, self.height, colour=(fmt,), depth=False)
         target = self._targets[key]
+        if stale and samples.multi:
+            drawn.resolve_into(target)
+        elif stale:
+            self._downsample(drawn, target, samples.grid)
+        return target
+
+    def _downsample(self, fine, target, factor: int) -> None:
         program = self.gl.program("downsample.glsl", {"FACTOR": factor})
         vao_key = ("downsample", factor)
         if vao_key not in self._uniforms:
@@ -451,7 +458,6 @@ class Renderer:
         self.gl.ctx.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         fine.colour[0].use(0)
         self._uniforms[vao_key].render(moderngl.TRIANGLES, vertices=3)
-        return target
 
     def _read(self, target, index: int, started: float, out: np.ndarray | None) -> np.ndarray:
         self.gl.ctx.finish()

@@ -3,6 +3,7 @@ content, and released together."""
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 
 import moderngl
@@ -12,6 +13,7 @@ from blinkgl.errors import AssetError
 from blinkgl.render.colour import LUMA, decode_image, luminance_image
 from blinkgl.scene.types import Material, Mesh, Scene
 
+_TEXTURE_2D, _TEXTURE_LOD_BIAS = 0x0DE1, 0x8501
 _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f", 8))
 
 
@@ -48,8 +50,9 @@ _LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
 class SceneResources:
     """GL side of one Scene. Release it before the context."""
 
-    def __init__(self, ctx: moderngl.Context, scene: Scene, anisotropy: float = 1.0):
-        self.ctx, self.scene, self.anisotropy = ctx, scene, anisotropy
+    def __init__(self, gl, scene: Scene, anisotropy: float = 1.0, mip_bias: float = 0.0):
+        self.ctx, self.scene, self.anisotropy, self.mip_bias = gl.ctx, scene, anisotropy, mip_bias
+        self._parameter = gl.function("glTexParameterf", None, ctypes.c_uint, ctypes.c_uint, ctypes.c_float)
         self._buffers: dict[tuple, tuple[moderngl.Buffer, moderngl.Buffer]] = {}
         self._textures: dict[tuple, moderngl.Texture] = {}
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
@@ -136,6 +139,9 @@ class SceneResources:
         texture.build_mipmaps()
         texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         texture.anisotropy = self.anisotropy
+        if self.mip_bias:
+            texture.use(0)
+            self._parameter(_TEXTURE_2D, _TEXTURE_LOD_BIAS, self.mip_bias)
         return texture
 
 

@@ -149,7 +149,7 @@ def sized(width, height):
 def test_images_of_a_few_pixels(gl, promise, width, height):
     world = sized(width, height)
     true = reference.render(world, 300 * MS, forward_ns=310 * MS)
-    with Renderer(gl, world, RenderConfig(supersample=4)) as renderer:
+    with Renderer(gl, world, RenderConfig(antialiasing="ssaa4")) as renderer:
         labels = renderer.labels(300 * MS, replace(MOTION, occlusion=True), 310 * MS)
         assert renderer.luminance(300 * MS).shape == (height, width)
         assert renderer.velocity(300 * MS, 4).shape == (max(1, height // 4), max(1, width // 4), 2)
@@ -177,6 +177,6 @@ def test_large_images(gl, promise, side):
 
 
 def test_an_image_beyond_opengl_is_refused(gl):
-    for width, factor in ((5000, 4), (16384, 2)):
-        with Renderer(gl, sized(width, 2), RenderConfig(supersample=factor)) as renderer, pytest.raises(GLError, match="beyond this OpenGL's limit"):
+    for width, antialiasing in ((5000, "ssaa4"), (16384, "ssaa2")):
+        with Renderer(gl, sized(width, 2), RenderConfig(antialiasing=antialiasing)) as renderer, pytest.raises(GLError, match="beyond this OpenGL's limit"):
             renderer.luminance(0)

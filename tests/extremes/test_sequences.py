@@ -78,7 +78,7 @@ def test_a_start_at_a_million_seconds_shifts_the_clock_and_nothing_else(gl, tmp_
                                     {"width": 24, "height": 16, "fov": 1}])  # fmt: skip
 def test_images_and_lenses(gl, tmp_path, camera):
     report = generate(gl, tmp_path, camera=camera, time={"duration": 0.2, "label_rate": 10}, scene=moving(0.4, 2.0), timeline={"kind": "displacement"},
-                      preview={"enabled": True}, render={"supersample": 4})  # fmt: skip
+                      preview={"enabled": True}, render={"antialiasing": "ssaa4"})  # fmt: skip
     assert report.labels == 2 and (report.path / "preview.mp4").stat().st_size > 500
 
 

@@ -4,19 +4,18 @@ A camera slides past a wall painted so that ln(luminance) at a pixel is a sinuso
 reconstruction between frames is then off by O(step²) for the sinusoid and exact for the ramp.
 """
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from blinkgl.config.events import EsimConfig
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Esim, Events
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Camera, Material, Texture
 
 from render_scenes import LEVEL, SECOND, drift, quad, scene, still, thing
 
-PLAIN = SimpleNamespace(supersample=1, image_supersample=1, anisotropy=1.0)
+PLAIN = RenderConfig(image_antialiasing="none")
 THRESHOLD, PERIODS_PER_SECOND, AMPLITUDE, TEXELS, WIDTH, HEIGHT = 0.1, 4.0, 1.0, 2048, 24, 6
 DURATION = 0.2
 RAMP_PER_PERIOD = 3.0  # ln units

@@ -51,7 +51,7 @@ def shapes():
 
 
 def drawn(gl, world, t=T0, request=EVERYTHING, forward=T1, backward=T_BACK, **config):
-    with Renderer(gl, world, RenderConfig(image_supersample=1, **config)) as renderer:
+    with Renderer(gl, world, RenderConfig(image_antialiasing="none", **config)) as renderer:
         labels = renderer.labels(t, request, forward, backward)
         return labels, renderer.luminance(t)
 
@@ -168,7 +168,7 @@ def test_supersampling_is_the_mean_of_finer_rays(gl, factor):
     grid = reference.pixel_grid(cam)
     rays = (grid[:, None, None] + np.stack(np.meshgrid(sub, sub), -1)).reshape(-1, 2)
     fine = reference.surface(world, reference.cast(world, T0, rays)).luminance.reshape(cam.height, cam.width, -1).mean(-1)
-    with Renderer(gl, world, RenderConfig(supersample=factor)) as renderer:
+    with Renderer(gl, world, RenderConfig(antialiasing=f"ssaa{factor}")) as renderer:
         luminance = renderer.luminance(T0)
     error = np.abs(luminance - fine)
     assert np.quantile(error, 0.99) < 1e-5

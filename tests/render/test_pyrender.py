@@ -51,7 +51,7 @@ def peer(world):
 def test_depth_ids_and_colour_agree(gl, world, peer, moment):
     t = TIMES[moment]
     true = reference.render(world, t)
-    with Renderer(gl, world, RenderConfig(image_supersample=1)) as renderer:
+    with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
         ours = renderer.labels(t, LabelRequest(colour=True, depth=True, ids=True))
     assert true.depth.min() > NEAR
     band = reference.silhouette_band(true.instance, true.depth)
@@ -78,7 +78,7 @@ def test_flat_colours_are_equal_to_8_bit_rounding(gl):
     base = replace(base, objects=(replace(sky, parts=(plain,)), *base.objects[1:]))
     theirs = peer_pyrender.render(base, TIMES[:1])["colour"][0]
     true = reference.render(base, TIMES[0])
-    with Renderer(gl, base, RenderConfig(image_supersample=1)) as renderer:
+    with Renderer(gl, base, RenderConfig(image_antialiasing="none")) as renderer:
         ours = renderer.colour(TIMES[0])
     band = reference.silhouette_band(true.instance, true.depth)
     for colour in (ours, true.colour):
@@ -93,7 +93,7 @@ def test_picture_is_the_same_way_up(gl):
     eye = camera(path=still((0.1, 0.2, -2.5)))
     picture = scene([thing("picture", 300, quad(3, 2.5), still(), paint)], eye)
     theirs = peer_pyrender.render(picture, [0])
-    with Renderer(gl, picture, RenderConfig(image_supersample=1)) as renderer:
+    with Renderer(gl, picture, RenderConfig(image_antialiasing="none")) as renderer:
         ours = renderer.colour(0)
     true = reference.render(picture, 0)
     assert true.hit.all() and (theirs["ids"] == 300).all()

@@ -1,10 +1,9 @@
 """The renderer's own promises: culling changes nothing, super-sampling is the mean, nothing unasked is made."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import renderer as module
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid, projection
 from blinkgl.render.occlusion import occlusion_mask
@@ -15,7 +14,7 @@ from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObjec
 
 from render_scenes import LEVEL, SECOND, curve, still
 
-PLAIN = SimpleNamespace(supersample=1, image_supersample=1, anisotropy=1.0)
+PLAIN = RenderConfig(image_antialiasing="none")
 
 
 def world(width=96, height=72, objects=12, light=Light()):
@@ -95,7 +94,7 @@ def test_supersampling_is_the_mean_of_a_finer_image(gl, factor):
     c = scene.camera
     fine = Camera(c.width * factor, c.height * factor, c.fx * factor, c.fy * factor,
                   (c.cx + 0.5) * factor - 0.5, (c.cy + 0.5) * factor - 0.5, c.path, c.near)
-    with Renderer(gl, scene, SimpleNamespace(supersample=factor, image_supersample=factor, anisotropy=1.0)) as renderer:
+    with Renderer(gl, scene, RenderConfig(antialiasing=f"ssaa{factor}", image_antialiasing=f"ssaa{factor}")) as renderer:
         luminance, colour = renderer.luminance(0), renderer.colour(0)
     with Renderer(gl, Scene(scene.objects, fine, 0, SECOND, scene.light, scene.background), PLAIN) as renderer:
         h, w = c.height, c.width

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.still import Rectangle, merged, screen_rectangle
 from blinkgl.scene.paths import KeyframePath
@@ -13,7 +14,7 @@ from blinkgl.scene.types import Camera, Part, SceneObject
 
 from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
 
-PLAIN = SimpleNamespace(supersample=1, image_supersample=1, anisotropy=1.0)
+PLAIN = RenderConfig(image_antialiasing="none")
 
 
 def full_redraw(gl, world, config=PLAIN):
@@ -22,10 +23,10 @@ def full_redraw(gl, world, config=PLAIN):
     return renderer
 
 
-@pytest.mark.parametrize("factor", [1, 2])
+@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa2"])
 @pytest.mark.parametrize("reuse", [True, False])
-def test_identical_to_the_full_redraw(gl, factor, reuse):
-    config = SimpleNamespace(supersample=factor, image_supersample=1, anisotropy=1.0)
+def test_identical_to_the_full_redraw(gl, antialiasing, reuse):
+    config = RenderConfig(antialiasing=antialiasing)
     world = mixed_scene(camera_moves=False)
     out = np.empty((120, 160), np.float32) if reuse else None
     with Renderer(gl, world, config) as quick, full_redraw(gl, world, config) as slow:

@@ -53,7 +53,7 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     world = scene_of(config, width=8, height=6)
     fields = ("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward")
     t = 100_000_000
-    with Renderer(gl, world, RenderConfig(supersample=2, image_supersample=4)) as renderer:
+    with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
         renderer.luminance(t), renderer.colour(t), renderer.velocity(t)
         for count in range(1, 7):
             for names in combinations(fields, count):
@@ -92,7 +92,7 @@ def test_production_programs_are_the_same_without_the_debugger(tmp_path, gl, con
 
     before, gl.shaders = gl.shaders, Recorder(gl.ctx)
     try:
-        with DebugRenderer(gl, subject.scene, RenderConfig(image_supersample=1)) as renderer:
+        with DebugRenderer(gl, subject.scene, RenderConfig(image_antialiasing="none")) as renderer:
             made = GpuMoment(renderer, moment(subject), 1e-3)
             for name in PASSES:
                 made[name]

@@ -18,7 +18,7 @@ from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, op
 def write_passes(subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None) -> list[Path]:
     """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the folder ``out``. Returns the paths.
 
-    Super-sampled as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
+    Anti-aliased as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
     from blinkgl.tools.shader_debugger import picture
 
     names = [check_pass(name) for name in names] if names else list(PASSES)

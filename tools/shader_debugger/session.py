@@ -254,13 +254,13 @@ class DebugRenderer(Renderer):
 def open_renderer(subject: Subject, shaders: str | None = None, *, as_configured: bool = False):
     """A :class:`DebugRenderer` of the subject with the shaders of a folder, on the configuration's OpenGL.
 
-    as_configured : super-sample as generation does; otherwise one sample at the pixel centre, which is what the
+    as_configured : anti-aliasing as generation does; otherwise one sample at the pixel centre, which is what the
     reference's rays see.   Raises GLError."""
     folder = open_folder(shaders)
     with create_context(subject.config.gl.backend, subject.config.gl.device) as gl:
         gl.shaders = ShaderLoader(gl.ctx, folder)
         config = subject.config.render
         if not as_configured:
-            config = config.model_copy(update={"supersample": 1, "image_supersample": 1})
+            config = config.model_copy(update={"antialiasing": "none", "image_antialiasing": "none"})
         with DebugRenderer(gl, subject.scene, config) as renderer:
             yield renderer

@@ -24,6 +24,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import LabelRequest
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.session import DebugRenderer, Subject, When, open_renderer
@@ -150,12 +151,12 @@ def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
     """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that generation runs for this configuration."""
     config = subject.config
     labels, render = config.labels, config.render
-    out = {"luminance": (lambda r: r.luminance(when.t_ns), render.supersample)}
+    out = {"luminance": (lambda r: r.luminance(when.t_ns), samples_of(render.antialiasing).grid)}
     if config.timeline.kind == "displacement":
         reduce = getattr(config.timeline, "sample_every", 1)
         out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, reduce), 1 / reduce)
     if labels.images or config.preview.enabled:
-        out["colour"] = (lambda r: r.colour(when.t_ns), render.image_supersample)
+        out["colour"] = (lambda r: r.colour(when.t_ns), samples_of(render.image_antialiasing).grid)
     request = LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
                            flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=False)
     occlusion = labels.occlusion and (request.flow_forward or request.flow_backward)

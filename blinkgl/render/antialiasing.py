@@ -1,0 +1,33 @@
+"""The values of ``render.antialiasing`` as numbers of samples."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from blinkgl.errors import GLError
+
+
+class Samples(NamedTuple):
+    """How one pixel is sampled.
+
+    grid  : the image is drawn grid x grid times finer and averaged (super-sampling: everything is evaluated grid² times).
+    multi : coverage samples per drawn pixel (multi-sampling: silhouettes are filtered, the shader runs once per pixel
+            and triangle); 0: one, at the pixel's centre."""
+
+    grid: int = 1
+    multi: int = 0
+
+    @property
+    def stored(self) -> int:
+        """Samples kept in memory per pixel of the image."""
+        return self.grid**2 * max(1, self.multi)
+
+
+ANTIALIASING = {"none": Samples(), "msaa4": Samples(multi=4), "ssaa2": Samples(grid=2), "ssaa4": Samples(grid=4)}
+
+
+def samples_of(name: str, where: str = "render.antialiasing") -> Samples:
+    """GLError for a name that is none of :data:`ANTIALIASING`'s."""
+    if name not in ANTIALIASING:
+        raise GLError("unknown anti-aliasing", where=where, value=name, accepted="one of " + ", ".join(ANTIALIASING))
+    return ANTIALIASING[name]

@@ -1,0 +1,280 @@
+"""The Blender side of ``peer_cycles.py``: reads a scene from two plain files, path-traces its frames, writes them as .npy.
+
+    python cycles_worker.py FOLDER        FOLDER/job.json, FOLDER/job.npz in; FOLDER/000000.npy … out
+
+A program of its own that needs nothing but numpy and ``bpy``, and imports nothing of BlinkGL: Blender is GPL, so it stays in another
+process, and possibly in another interpreter, and only files pass between the two. ``peer_cycles.export`` describes them.
+
+Standard output carries one JSON object per line: ``{"blender", "setup_s", "setup_cpu_s"}`` when the scene stands, ``{"frame", "wall_s",
+"cpu_s"}`` after each frame (rendering alone, without writing the file), or ``{"error"}`` with a line for the user. What
+Blender itself prints goes to standard error.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+FAR = 1e8  # far plane, world units: where Blender's picture ends, which BlinkGL's does not
+
+
+def main(folder: Path) -> int:
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # Blender and its libraries print to standard output from C
+
+    def say(**words):
+        answers.write(json.dumps(words) + "\n")
+
+    try:
+        import bpy
+    except ImportError as problem:
+        say(error=f"bpy cannot be imported by Python {sys.version_info.major}.{sys.version_info.minor}: {problem}")
+        return 1
+    job = json.loads((folder / "job.json").read_text())
+    with np.load(folder / "job.npz", allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    started, cpu = time.perf_counter(), time.process_time()
+    scene, bodies, camera = build(bpy, job, arrays)
+    say(blender=f"Blender {bpy.app.version_string}", setup_s=time.perf_counter() - started, setup_cpu_s=time.process_time() - cpu)
+    exr = folder / "frame.exr"
+    for k in range(job["frames"]):
+        for body, poses in zip(bodies, arrays["poses"]):
+            place(body, poses[k])
+        place(camera, arrays["camera_poses"][k])
+        scene.render.filepath = str(exr)
+        started, cpu = time.perf_counter(), time.process_time()
+        bpy.ops.render.render(write_still=True)
+        spent = {"wall_s": time.perf_counter() - started, "cpu_s": time.process_time() - cpu}
+        part = folder / "part.npy"
+        np.save(part, read_exr(bpy, exr, *job["size"]))
+        part.rename(folder / f"{k:06d}.npy")
+        say(frame=k, **spent)
+    return 0
+
+
+def place(thing, pose: np.ndarray) -> None:
+    """Through a quaternion made here in float64: Blender takes float32."""
+    thing.location = pose[:3, 3]
+    thing.rotation_quaternion = quaternion(pose[:3, :3])
+
+
+def quaternion(R: np.ndarray) -> np.ndarray:
+    """(4,) w, x, y, z of a rotation matrix (Shepperd 1978: divides by the largest component)."""
+    xx, yy, zz = np.diagonal(R)
+    squares = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
+    products = np.array([
+        [0, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+        [0, 0, R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
+        [0, 0, 0, R[1, 2] + R[2, 1]],
+        [0, 0, 0, 0]])
+    k = int(squares.argmax())
+    q = (products + products.T)[k]
+    q[k] = squares[k]
+    return q / np.linalg.norm(q)
+
+
+def read_exr(bpy, path: Path, width: int, height: int) -> np.ndarray:
+    """(H, W, 3) float32 linear radiance, row 0 at the top."""
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"
+    rgba = np.empty((height, width, 4), np.float32)
+    image.pixels.foreach_get(rgba.ravel())
+    bpy.data.images.remove(image)
+    return np.ascontiguousarray(rgba[::-1, :, :3])
+
+
+# ------------------------------------------------------------------------------------------------------------- scene
+
+
+def build(bpy, job: dict, arrays: dict):
+    """(scene, objects in the order of the job's bodies, camera)."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    images = {}
+    materials = [make_material(bpy, m, k, images, arrays) for k, m in enumerate(job["materials"])]
+    meshes: dict[tuple[int, int], object] = {}
+    bodies = []
+    for body in job["bodies"]:
+        root = bpy.data.objects.new(body["name"], None)
+        root.rotation_mode = "QUATERNION"
+        scene.collection.objects.link(root)
+        bodies.append(root)
+        for mesh, material in body["parts"]:
+            if (mesh, material) not in meshes:
+                meshes[mesh, material] = make_mesh(bpy, mesh, arrays)
+                meshes[mesh, material].materials.append(materials[material])
+            thing = bpy.data.objects.new(body["name"], meshes[mesh, material])
+            thing.parent = root
+            solid = not body["picture_only"]
+            thing.visible_diffuse = thing.visible_shadow = solid and job["settings"]["shadows"]
+            thing.visible_glossy = thing.visible_transmission = False
+            scene.collection.objects.link(thing)
+    make_light(bpy, scene, job)
+    camera = make_camera(bpy, scene, job)
+    adjust(scene, job["settings"])
+    scene.render.resolution_x, scene.render.resolution_y = job["size"]
+    scene.render.resolution_percentage = 100
+    return scene, bodies, camera
+
+
+def make_mesh(bpy, k: int, arrays: dict):
+    mesh = bpy.data.meshes.new(f"mesh {k}")
+    faces = arrays[f"faces{k}"]
+    mesh.from_pydata(arrays[f"vertices{k}"], [], faces, shade_flat=False)
+    mesh.uv_layers.new().uv.foreach_set("vector", arrays[f"uvs{k}"][faces.ravel()].ravel())
+    # A plain vector attribute of this name is taken as it is; normals_split_custom_set would round to 16 bits.
+    mesh.attributes.new("custom_normal", "FLOAT_VECTOR", "POINT").data.foreach_set("vector", arrays[f"normals{k}"].ravel())
+    mesh.update()
+    return mesh
+
+
+def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict):
+    """Unlit: emission that only the camera sees. Lit: a diffuse BSDF. Culled: nothing where the camera sees a back face."""
+    material = bpy.data.materials.new(f"material {k}")
+    material.use_nodes = True
+    material.use_transparent_shadow = False  # what is culled is culled for the camera alone
+    material.cycles.emission_sampling = "NONE"
+    tree = material.node_tree
+    tree.nodes.clear()
+    add, link = tree.nodes.new, tree.links.new
+    if paint["unlit"]:
+        surface = add("ShaderNodeEmission")
+        link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], surface.inputs["Strength"])
+    else:
+        surface = add("ShaderNodeBsdfDiffuse")
+        surface.inputs["Roughness"].default_value = 0.0
+    colour = surface.inputs["Color"]
+    colour.default_value = [*paint["base_color"], 1.0]
+    if paint["texture"] is not None:
+        picture = add("ShaderNodeTexImage")
+        picture.image = images.get(paint["texture"]) or images.setdefault(paint["texture"], make_image(bpy, paint["texture"], arrays))
+        picture.interpolation, picture.extension = "Linear", "REPEAT"
+        product = add("ShaderNodeVectorMath")
+        product.operation = "MULTIPLY"
+        product.inputs[1].default_value = paint["base_color"]
+        link(picture.outputs["Color"], product.inputs[0])
+        link(product.outputs["Vector"], colour)
+    shader = surface.outputs[0]
+    if paint["culled"]:
+        seen = add("ShaderNodeMath")
+        seen.operation = "MULTIPLY"
+        link(add("ShaderNodeNewGeometry").outputs["Backfacing"], seen.inputs[0])
+        link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], seen.inputs[1])
+        mix = add("ShaderNodeMixShader")
+        link(seen.outputs[0], mix.inputs[0])
+        link(shader, mix.inputs[1])
+        link(add("ShaderNodeBsdfTransparent").outputs[0], mix.inputs[2])
+        shader = mix.outputs[0]
+    link(shader, add("ShaderNodeOutputMaterial").inputs["Surface"])
+    return material
+
+
+def make_image(bpy, k: int, arrays: dict):
+    """Linear float texels, used as they are; Blender's row 0 is the bottom one."""
+    texels = arrays[f"texture{k}"][::-1]
+    height, width, _ = texels.shape
+    image = bpy.data.images.new(f"texture {k}", width, height, alpha=False, float_buffer=True, is_data=True)
+    rgba = np.ones((height, width, 4), np.float32)
+    rgba[..., :3] = texels
+    image.pixels.foreach_set(rgba.ravel())
+    image.update()
+    return image
+
+
+def make_light(bpy, scene, job: dict) -> None:
+    """Sun without extent, and a dome that is white above the horizon and black below: without anything in between it gives
+    an upward-facing share of 0.5 + 0.5 n_z, exactly BlinkGL's sky. The camera sees the background instead of the dome."""
+    light = job["light"]
+    if light["sun"] > 0:
+        lamp = bpy.data.lights.new("sun", "SUN")
+        lamp.energy, lamp.angle = np.pi * light["sun"], 0.0  # W/m²; a Lambert surface sends 1/pi of it to every side
+        lamp.use_shadow = job["settings"]["shadows"]
+        sun = bpy.data.objects.new("sun", lamp)
+        sun.rotation_mode = "QUATERNION"
+        sun.rotation_quaternion = quaternion(turn_z_to(np.asarray(light["sun_direction"], float)))
+        scene.collection.objects.link(sun)
+    world = scene.world = bpy.data.worlds.new("world")
+    world.use_nodes = True
+    world.cycles.sampling_method = "NONE"  # the surface's own cosine distribution finds a dome best
+    tree = world.node_tree
+    tree.nodes.clear()
+    add, link = tree.nodes.new, tree.links.new
+    split = add("ShaderNodeSeparateXYZ")
+    link(add("ShaderNodeTexCoord").outputs["Generated"], split.inputs[0])
+    above = add("ShaderNodeMath")
+    above.operation = "GREATER_THAN"
+    above.inputs[1].default_value = 0.0
+    link(split.outputs["Z"], above.inputs[0])
+    strength = add("ShaderNodeMix")  # its first sockets are those of floats
+    link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], strength.inputs[0])
+    scale = add("ShaderNodeMath")
+    scale.operation = "MULTIPLY"
+    scale.inputs[1].default_value = light["sky"]
+    link(above.outputs[0], scale.inputs[0])
+    link(scale.outputs[0], strength.inputs[2])
+    strength.inputs[3].default_value = job["background"]
+    shine = add("ShaderNodeBackground")
+    shine.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    link(strength.outputs[0], shine.inputs["Strength"])
+    link(shine.outputs[0], add("ShaderNodeOutputWorld").inputs["Surface"])
+
+
+def turn_z_to(axis: np.ndarray) -> np.ndarray:
+    """(3, 3) a rotation whose z axis is ``axis`` (a sun lamp shines along its -z)."""
+    z = axis / np.linalg.norm(axis)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def make_camera(bpy, scene, job: dict):
+    lens = bpy.data.cameras.new("camera")
+    for name, value in job["blender_camera"].items():
+        setattr(scene.render if name.startswith("pixel_aspect") else lens, name, value)
+    lens.clip_start, lens.clip_end = job["near"], FAR
+    camera = bpy.data.objects.new("camera", lens)
+    camera.rotation_mode = "QUATERNION"
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    return camera
+
+
+def adjust(scene, settings: dict) -> None:
+    """Plain radiance in 32-bit floats: no view transform, no denoiser, no clamping, no adaptive sampling; a box of one pixel."""
+    render = scene.render
+    render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
+    render.image_settings.color_mode, render.image_settings.exr_codec = "RGBA", "NONE"
+    scene.view_settings.view_transform = "Raw"
+    render.use_persistent_data = True
+    render.film_transparent = False
+    render.use_motion_blur = False
+    render.dither_intensity = 0.0
+    if settings["threads"]:
+        render.threads_mode, render.threads = "FIXED", settings["threads"]
+    if settings["engine"] == "eevee":
+        render.engine = "BLENDER_EEVEE_NEXT"
+        scene.eevee.taa_render_samples = settings["samples"]
+        scene.eevee.use_shadows = settings["shadows"]
+        render.filter_size = 0.5
+        return
+    render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.samples, cycles.seed, cycles.use_animated_seed = settings["samples"], settings["seed"], False
+    cycles.use_adaptive_sampling = cycles.use_denoising = False
+    cycles.pixel_filter_type = "BOX"
+    cycles.max_bounces = cycles.diffuse_bounces = settings["bounces"]
+    cycles.glossy_bounces = cycles.transmission_bounces = cycles.volume_bounces = 0
+    cycles.transparent_max_bounces = 64
+    cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0.0
+    cycles.light_sampling_threshold = 0.0
+    cycles.caustics_reflective = cycles.caustics_refractive = False
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,250 @@
+"""A path tracer, Blender's Cycles, on the same scenes: what rasterising itself costs (shadows, inter-reflection, filtering).
+
+    cost = Cost()
+    for luminance in frames(scene, times_ns, CyclesSettings(samples=64), cost):     # (H, W) float32, one per time, as it is done
+        ...
+    cost.wall_s, cost.cpu_s                                                         # per frame
+
+Blender's Python module ``bpy`` (extra [cycles]) is GPL and wants NumPy 1: it is never imported here. The scene is written to a folder as
+plain files (:func:`export`), and ``cycles_worker.py`` renders it in a process of its own, with this interpreter or with the one
+that the environment variable BLINKGL_BPY_PYTHON names.
+
+The same picture, as far as two renderers can make it:
+
+* Geometry, shading normals, texture coordinates, poses and camera are converted, not approximated; Blender keeps them in float32, so the
+  scene is moved to the first camera's place. Textures are handed over as linear float32, so no transfer curve is involved,
+  filtered bilinearly without mip maps; the pixel is the mean over its square (box filter of 1 px).
+* The sun is a lamp without extent, the sky a dome that is white above the horizon and black below: unobstructed, exactly
+  ``sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)``. Obstructed it is not what BlinkGL draws: that is the measurement. ``shadows=False,
+  bounces=0`` is BlinkGL's own light model; ``bounces=0`` adds shadows of sun and dome; ``bounces > 0`` adds inter-reflection.
+* Sky boxes are pictures: the camera sees them, light passes through them. Other unlit surfaces cast shadows but do not shine on
+  anything, as in BlinkGL. Back faces of closed one-sided meshes are invisible to the camera alone.
+* What stays different: shading normals that point away from the side that is lit are treated more strictly by a path tracer (dark
+  terminators on coarse smooth meshes), the picture ends at a far plane (1e8 units), and a path-traced frame is noisy: the same seed in every
+  frame keeps the noise of still surfaces still.
+* EEVEE is here for its speed and for unlit pictures: its filter is narrow but not a box, and of its lit pictures nothing is claimed.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.render.colour import LUMA, decode_image
+from blinkgl.scene.types import Camera, Material, Scene
+
+ENVIRONMENT = "BLINKGL_BPY_PYTHON"
+WORKER = Path(__file__).with_name("cycles_worker.py")
+REMEDY = (f"run pip install 'blinkgl[cycles]' (Python 3.11), or name an interpreter that has bpy in {ENVIRONMENT}; "
+          "see docs/results.md, What rasterising costs")
+# OpenCV's camera looks along +z with y down, Blender's along -z with y up.
+CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class CyclesSettings:
+    """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome.   bounces : of diffuse light, 0: direct light only.
+    engine : "cycles" or "eevee" (bounces and seed do nothing there).   threads : 0 for all."""
+
+    samples: int = 64
+    seed: int = 0
+    shadows: bool = True
+    bounces: int = 4
+    engine: str = "cycles"
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (("samples", 1, 2**24), ("seed", 0, 2**31 - 1), ("bounces", 0, 1024), ("threads", 0, 1024)):
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError("out of range", where=f"cycles.{name}", value=getattr(self, name), accepted=f"{low} to {high}")
+        if self.engine not in ("cycles", "eevee"):
+            raise ConfigError("unknown engine", where="cycles.engine", value=self.engine, accepted="cycles or eevee")
+
+
+@dataclass
+class Cost:
+    """Filled while frames arrive: seconds per frame of rendering alone (wall, and processor time of all threads); setup_s, setup_cpu_s:
+    making the scene in Blender (not counted in the frames; the first frame also builds the acceleration structure)."""
+
+    blender: str = ""
+    setup_s: float = 0.0
+    setup_cpu_s: float = 0.0
+    wall_s: list[float] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)
+
+
+def interpreter() -> str:
+    """The Python that runs Blender: the environment's, or this one."""
+    return os.environ.get(ENVIRONMENT) or sys.executable
+
+
+def available() -> str:
+    """'' when a bpy is there (not whether it loads: that takes seconds and is found out by using it), else a line that says what to do."""
+    chosen = interpreter()
+    if chosen == sys.executable:
+        found = importlib.util.find_spec("bpy") is not None
+    else:
+        probe = "import importlib.util, sys; sys.exit(importlib.util.find_spec('bpy') is None)"
+        try:
+            found = subprocess.run([chosen, "-c", probe], capture_output=True).returncode == 0
+        except OSError:
+            return f"{ENVIRONMENT} names no interpreter that runs: {chosen}"
+    return "" if found else f"no bpy (Blender as a Python module) for {chosen}: {REMEDY}"
+
+
+def frames(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
+    """Linear luminance at each time, (H, W) float32, Rec. 709 luma of :func:`colours`; see there."""
+    for colour in colours(scene, times_ns, settings, cost):
+        yield (colour @ LUMA).astype(np.float32)
+
+
+def colours(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
+    """Linear radiance at each time, (H, W, 3) float32, in the order of times_ns, each as soon as it is rendered.
+
+    One Blender process serves the iterator and ends with it, also when it is abandoned. Raises BlinkGLError (one line) when there is no
+    bpy, when it does not fit its interpreter, or when Blender stops.
+    """
+    if missing := available():
+        raise BlinkGLError("Blender is not installed", accepted=missing)
+    cost = Cost() if cost is None else cost
+    times_ns = np.asarray(times_ns, np.int64)
+    with tempfile.TemporaryDirectory(prefix="blinkgl-cycles-") as name, open(Path(name) / "blender.log", "w+b") as log:
+        folder = Path(name)
+        export(scene, times_ns, settings, folder)
+        # What this process set for its own OpenGL and its own libraries is not for Blender.
+        environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "LP_NUM_THREADS", "OMP_NUM_THREADS")}
+        blender = subprocess.Popen([interpreter(), str(WORKER), name], env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                                   stderr=log, text=True)
+        try:
+            yield from _answers(blender, folder, log, len(times_ns), cost)
+        finally:
+            if blender.poll() is None:
+                blender.kill()
+            blender.wait()
+            blender.stdout.close()
+
+
+def _answers(blender, folder: Path, log, count: int, cost: Cost) -> Iterator[np.ndarray]:
+    done = 0
+    for line in blender.stdout:
+        words = json.loads(line)
+        if "error" in words:
+            raise BlinkGLError(words["error"], where=interpreter(), accepted=REMEDY)
+        if "blender" in words:
+            cost.blender, cost.setup_s, cost.setup_cpu_s = words["blender"], words["setup_s"], words["setup_cpu_s"]
+            continue
+        cost.wall_s.append(words["wall_s"])
+        cost.cpu_s.append(words["cpu_s"])
+        file = folder / f"{words['frame']:06d}.npy"
+        frame = np.load(file, allow_pickle=False)
+        file.unlink()
+        done += 1
+        yield frame
+    status = blender.wait()
+    if status or done < count:
+        log.seek(0)
+        words = log.read().decode("utf-8", "replace").strip().splitlines() or ["no message"]
+        raise BlinkGLError(f"Blender stopped after {done} of {count} frames (status {status}): {words[-1]}", where=interpreter())
+
+
+# ------------------------------------------------------------------------------------------------------------ export
+
+
+def export(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings, folder: Path) -> None:
+    """Writes job.json and job.npz, all that the worker reads. World axes are the scene's (z up in both), its origin the first camera's place.
+
+    job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky}; settings; frames;
+    materials [{texture index or null, base_color, unlit, culled}]; bodies [{name, picture_only, parts [[mesh, material], …]}].
+    job.npz, k counting what job.json refers to: vertices{k} (V, 3), normals{k} (V, 3), uvs{k} (V, 2) float32 with uv_scale in them and v
+    growing upwards, faces{k} (F, 3) int32; texture{k} (h, w, 3) float32 linear, row 0 at the top; poses (bodies, N, 4, 4)
+    and camera_poses (N, 4, 4) float64, the camera's in Blender's camera axes.
+    """
+    times_ns = np.asarray(times_ns, np.int64)
+    camera, arrays = scene.camera, {}
+    meshes, materials, textures = _Numbered(), _Numbered(), _Numbered()
+    bodies, paints = [], []
+    for thing in scene.objects:
+        parts = []
+        for part in thing.parts:
+            mesh, paint = part.mesh, part.material
+            culled = mesh.closed and not paint.double_sided
+            k, new = meshes.number((id(mesh), paint.uv_scale))
+            if new:
+                arrays[f"vertices{k}"] = mesh.vertices.astype(np.float32)
+                arrays[f"normals{k}"] = mesh.normals.astype(np.float32)
+                arrays[f"faces{k}"] = mesh.faces.astype(np.int32)
+                arrays[f"uvs{k}"] = _blender_uvs(mesh.uvs, paint.uv_scale)
+            m, new = materials.number((id(paint), culled))
+            if new:
+                paints.append(_paint(paint, culled, textures, arrays))
+            parts.append([k, m])
+        bodies.append({"name": thing.name, "picture_only": thing.category == "sky", "parts": parts})
+
+    origin = camera.path.pose(int(times_ns[0]))[:3, 3] if len(times_ns) else np.zeros(3)
+
+    def poses(path):
+        stack = path.poses(times_ns).copy()
+        stack[:, :3, 3] -= origin
+        return stack
+
+    arrays["poses"] = np.array([poses(thing.path) for thing in scene.objects]).reshape(-1, len(times_ns), 4, 4)
+    arrays["camera_poses"] = poses(camera.path) @ CV_FROM_BLENDER
+    light = scene.light
+    job = {
+        "size": [camera.width, camera.height], "blender_camera": blender_camera(camera), "near": float(camera.near),
+        "background": float(scene.background), "frames": len(times_ns), "settings": asdict(settings),
+        "light": {"sun_direction": [float(s) for s in light.sun_direction], "sun": float(light.sun), "sky": float(light.sky)},
+        "materials": paints, "bodies": bodies,
+    }  # fmt: skip
+    np.savez(folder / "job.npz", **arrays)
+    (folder / "job.json").write_text(json.dumps(job))
+
+
+def blender_camera(camera: Camera) -> dict[str, float | str]:
+    """Blender's parameters of the same pin-hole.
+
+    With horizontal fit the sensor's width is W px; a pixel is as wide as the sensor / W, and pixel_aspect_y / pixel_aspect_x times as
+    high, so fx = lens W / sensor and fy = fx aspect_x / aspect_y. Shifts are in widths of the sensor, +x right, +y up, and move the frame
+    under the optical axis, which with our pixel convention stands at the picture's middle for cx = (W - 1) / 2.
+    """
+    sensor, tall = 36.0, camera.fx / camera.fy
+    return {
+        "sensor_fit": "HORIZONTAL", "sensor_width": sensor, "lens": sensor * camera.fx / camera.width,
+        "pixel_aspect_x": max(1.0, 1.0 / tall), "pixel_aspect_y": max(1.0, tall),  # Blender takes nothing below 1
+        "shift_x": ((camera.width - 1) / 2 - camera.cx) / camera.width,
+        "shift_y": (camera.cy - (camera.height - 1) / 2) * tall / camera.width,
+    }  # fmt: skip
+
+
+class _Numbered(dict):
+    def number(self, key) -> tuple[int, bool]:
+        """(index of key in order of appearance, whether it is new)."""
+        new = key not in self
+        return self.setdefault(key, len(self)), new
+
+
+def _paint(material: Material, culled: bool, textures: _Numbered, arrays: dict) -> dict:
+    index = None
+    if material.texture is not None:
+        index, new = textures.number(id(material.texture))
+        if new:
+            arrays[f"texture{index}"] = decode_image(material.texture.image)
+    return {"texture": index, "base_color": [float(c) for c in material.base_color], "unlit": material.unlit, "culled": culled}
+
+
+def _blender_uvs(uvs: np.ndarray, uv_scale: tuple[float, float]) -> np.ndarray:
+    """(V, 2) float32. Whole repeats are taken off before the cast, so that a mesh with thousands of them has zero in its middle."""
+    scaled = uvs.astype(np.float64) * uv_scale
+    if len(scaled):
+        scaled -= np.rint((scaled.min(axis=0) + scaled.max(axis=0)) / 2)
+    return np.stack([scaled[:, 0], 1.0 - scaled[:, 1]], axis=1).astype(np.float32)

@@ -96,7 +96,9 @@ def build(bpy, job: dict, arrays: dict):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     images = {}
-    materials = [make_material(bpy, m, k, images, arrays) for k, m in enumerate(job["materials"])]
+    # Without shadows nothing is in the way of the dome: its share is a formula, and needs no paths.
+    even_sky = 0.0 if job["settings"]["shadows"] else job["light"]["sky"]
+    materials = [make_material(bpy, m, k, images, arrays, even_sky) for k, m in enumerate(job["materials"])]
     meshes: dict[tuple[int, int], object] = {}
     bodies = []
     for body in job["bodies"]:
@@ -133,8 +135,9 @@ def make_mesh(bpy, k: int, arrays: dict):
     return mesh
 
 
-def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict):
-    """Unlit: emission that only the camera sees. Lit: a diffuse BSDF. Culled: nothing where the camera sees a back face."""
+def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky: float):
+    """Unlit: emission that only the camera sees. Lit: a diffuse BSDF, and albedo * even_sky * (0.5 + 0.5 n_z) as emission. Culled:
+    nothing where the camera sees a back face."""
     material = bpy.data.materials.new(f"material {k}")
     material.use_nodes = True
     material.use_transparent_shadow = False  # what is culled is culled for the camera alone
@@ -148,8 +151,18 @@ def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict):
     else:
         surface = add("ShaderNodeBsdfDiffuse")
         surface.inputs["Roughness"].default_value = 0.0
-    colour = surface.inputs["Color"]
-    colour.default_value = [*paint["base_color"], 1.0]
+    glow = None
+    if even_sky > 0 and not paint["unlit"]:
+        glow = add("ShaderNodeEmission")
+        axes, up = add("ShaderNodeSeparateXYZ"), add("ShaderNodeMath")
+        up.operation = "MULTIPLY_ADD"
+        up.inputs[1].default_value = up.inputs[2].default_value = 0.5 * even_sky
+        link(add("ShaderNodeNewGeometry").outputs["Normal"], axes.inputs[0])
+        link(axes.outputs["Z"], up.inputs[0])
+        link(up.outputs[0], glow.inputs["Strength"])
+    coloured = [node.inputs["Color"] for node in (surface, glow) if node is not None]
+    for colour in coloured:
+        colour.default_value = [*paint["base_color"], 1.0]
     if paint["texture"] is not None:
         picture = add("ShaderNodeTexImage")
         picture.image = images.get(paint["texture"]) or images.setdefault(paint["texture"], make_image(bpy, paint["texture"], arrays))
@@ -158,8 +171,14 @@ def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict):
         product.operation = "MULTIPLY"
         product.inputs[1].default_value = paint["base_color"]
         link(picture.outputs["Color"], product.inputs[0])
-        link(product.outputs["Vector"], colour)
+        for colour in coloured:
+            link(product.outputs["Vector"], colour)
     shader = surface.outputs[0]
+    if glow is not None:
+        both = add("ShaderNodeAddShader")
+        link(shader, both.inputs[0])
+        link(glow.outputs[0], both.inputs[1])
+        shader = both.outputs[0]
     if paint["culled"]:
         seen = add("ShaderNodeMath")
         seen.operation = "MULTIPLY"
@@ -214,7 +233,7 @@ def make_light(bpy, scene, job: dict) -> None:
     link(add("ShaderNodeLightPath").outputs["Is Camera Ray"], strength.inputs[0])
     scale = add("ShaderNodeMath")
     scale.operation = "MULTIPLY"
-    scale.inputs[1].default_value = light["sky"]
+    scale.inputs[1].default_value = light["sky"] if job["settings"]["shadows"] else 0.0  # else see make_material
     link(above.outputs[0], scale.inputs[0])
     link(scale.outputs[0], strength.inputs[2])
     strength.inputs[3].default_value = job["background"]

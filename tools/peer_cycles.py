@@ -16,7 +16,7 @@ The same picture, as far as two renderers can make it:
   filtered bilinearly without mip maps; the pixel is the mean over its square (box filter of 1 px).
 * The sun is a lamp without extent, the sky a dome that is white above the horizon and black below: unobstructed, exactly
   ``sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)``. Obstructed it is not what BlinkGL draws: that is the measurement. ``shadows=False,
-  bounces=0`` is BlinkGL's own light model; ``bounces=0`` adds shadows of sun and dome; ``bounces > 0`` adds inter-reflection.
+  bounces=0`` is BlinkGL's own light model (the sky is evaluated, so nothing is noisy); ``bounces=0`` adds shadows of sun and dome; ``bounces > 0`` adds inter-reflection.
 * Sky boxes are pictures: the camera sees them, light passes through them. Other unlit surfaces cast shadows but do not shine on
   anything, as in BlinkGL. Back faces of closed one-sided meshes are invisible to the camera alone.
 * What stays different: shading normals that point away from the side that is lit are treated more strictly by a path tracer (dark
@@ -33,7 +33,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -45,15 +45,15 @@ from blinkgl.scene.types import Camera, Material, Scene
 
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 WORKER = Path(__file__).with_name("cycles_worker.py")
-REMEDY = (f"run pip install 'blinkgl[cycles]' (Python 3.11), or name an interpreter that has bpy in {ENVIRONMENT}; "
-          "see docs/results.md, What rasterising costs")
+REMEDY = (f"run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter in {ENVIRONMENT} "
+          "(or pip install 'blinkgl[cycles]')")
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
 CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class CyclesSettings:
-    """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome.   bounces : of diffuse light, 0: direct light only.
+    """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome; False needs bounces=0.   bounces : of diffuse light.
     engine : "cycles" or "eevee" (bounces and seed do nothing there).   threads : 0 for all."""
 
     samples: int = 64
@@ -69,6 +69,9 @@ class CyclesSettings:
                 raise ConfigError("out of range", where=f"cycles.{name}", value=getattr(self, name), accepted=f"{low} to {high}")
         if self.engine not in ("cycles", "eevee"):
             raise ConfigError("unknown engine", where="cycles.engine", value=self.engine, accepted="cycles or eevee")
+        if self.bounces and not self.shadows:
+            raise ConfigError("light that passes through everything cannot bounce", where="cycles.bounces", value=self.bounces,
+                              accepted="0 with shadows=False")
 
 
 @dataclass
@@ -102,13 +105,18 @@ def available() -> str:
     return "" if found else f"no bpy (Blender as a Python module) for {chosen}: {REMEDY}"
 
 
-def frames(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
+def frames(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
     """Linear luminance at each time, (H, W) float32, Rec. 709 luma of :func:`colours`; see there."""
     for colour in colours(scene, times_ns, settings, cost):
         yield (colour @ LUMA).astype(np.float32)
 
 
-def colours(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
+def source(scene: Scene, settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Callable[[Iterable[int]], Iterator[np.ndarray]]:
+    """:func:`frames` of one scene as a function of the times: a ``blinkgl.trade.reference.FrameSource``."""
+    return lambda times_ns: frames(scene, times_ns, settings, cost)
+
+
+def colours(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
     """Linear radiance at each time, (H, W, 3) float32, in the order of times_ns, each as soon as it is rendered.
 
     One Blender process serves the iterator and ends with it, also when it is abandoned. Raises BlinkGLError (one line) when there is no
@@ -117,7 +125,7 @@ def colours(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings = Cy
     if missing := available():
         raise BlinkGLError("Blender is not installed", accepted=missing)
     cost = Cost() if cost is None else cost
-    times_ns = np.asarray(times_ns, np.int64)
+    times_ns = np.array(list(times_ns), np.int64)
     with tempfile.TemporaryDirectory(prefix="blinkgl-cycles-") as name, open(Path(name) / "blender.log", "w+b") as log:
         folder = Path(name)
         export(scene, times_ns, settings, folder)
@@ -160,7 +168,7 @@ def _answers(blender, folder: Path, log, count: int, cost: Cost) -> Iterator[np.
 # ------------------------------------------------------------------------------------------------------------ export
 
 
-def export(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings, folder: Path) -> None:
+def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, folder: Path) -> None:
     """Writes job.json and job.npz, all that the worker reads. World axes are the scene's (z up in both), its origin the first camera's place.
 
     job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky}; settings; frames;
@@ -169,7 +177,7 @@ def export(scene: Scene, times_ns: Sequence[int], settings: CyclesSettings, fold
     growing upwards, faces{k} (F, 3) int32; texture{k} (h, w, 3) float32 linear, row 0 at the top; poses (bodies, N, 4, 4)
     and camera_poses (N, 4, 4) float64, the camera's in Blender's camera axes.
     """
-    times_ns = np.asarray(times_ns, np.int64)
+    times_ns = np.array(list(times_ns), np.int64)
     camera, arrays = scene.camera, {}
     meshes, materials, textures = _Numbered(), _Numbered(), _Numbered()
     bodies, paints = [], []

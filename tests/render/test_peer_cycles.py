@@ -183,6 +183,7 @@ time.sleep(600)
 
 
 @pytest.mark.parametrize("wrong, words", [({"samples": 0}, "cycles.samples: out of range"), ({"bounces": -1}, "cycles.bounces"),
+                                          ({"shadows": False}, "cycles.bounces: light that passes through"),
                                           ({"engine": "luxcore"}, "cycles.engine: unknown engine")])
 def test_settings_are_checked(wrong, words):
     with pytest.raises(ConfigError, match=words):
@@ -193,7 +194,7 @@ def test_settings_are_checked(wrong, words):
 
 
 def ours(gl, world, t):
-    with Renderer(gl, world, RenderConfig(supersample=4)) as renderer:
+    with Renderer(gl, world, RenderConfig(antialiasing="ssaa4")) as renderer:
         return renderer.luminance(t)
 
 
@@ -221,30 +222,20 @@ def test_unlit_pictures_agree(gl):
 
 
 @needs_blender
-def test_sun_without_shadows_is_our_light(gl):
-    """No dome, so no noise: shading normals (smooth and flat, two-sided from behind), pi in the lamp, direction of the sun. One triangle in
-    a few is where the sun grazes: interpolated normals there point away from their triangle, which a path tracer does not light."""
-    world = replace(mixed_scene(), light=Light(sun=1.2, sky=0.0))
+@pytest.mark.parametrize("sun, sky", [(1.2, 0.0), (0.0, 1.0)])
+def test_light_without_shadows_is_ours(gl, sun, sky):
+    """Shading normals (smooth and flat, two-sided from behind), the sun's direction, pi in its lamp, the sky's formula. What is left at the
+    99th percentile is the mip map, as above; the sun has a few triangles more, where it grazes: a normal interpolated there points
+    away from its triangle, which a path tracer does not light."""
+    world = replace(mixed_scene(), light=Light(sun=sun, sky=sky))
     theirs = next(frames(world, TIMES[:1], CyclesSettings(samples=16, shadows=False, bounces=0)))
-    mine = ours(gl, world, TIMES[0])
     band, true = band_of(world, TIMES[0])
-    error = np.abs(theirs - mine)[~band]
-    lit = (true.luminance > 0.05) & ~band
-    assert lit[true.instance == 3].sum() > 200 and np.quantile(np.abs(theirs - mine)[lit & (true.instance > 1)], 0.95) < 2e-3
-    assert np.median(error) < 3e-4 and np.quantile(error, 0.99) < 0.02
-
-
-@needs_blender
-def test_sky_without_shadows_is_our_light_in_the_mean(gl):
-    """The dome is sampled: half of the paths of a wall go to the black half. Binomial: sd = albedo sky 0.5 / sqrt(samples) at most."""
-    world = replace(mixed_scene(), light=Light(sun=0.0, sky=1.0))
-    theirs = next(frames(world, TIMES[:1], CyclesSettings(samples=64, shadows=False, bounces=0)))
-    band, true = band_of(world, TIMES[0])
-    error = theirs - ours(gl, world, TIMES[0])
+    error = np.abs(theirs - ours(gl, world, TIMES[0]))
     for instance in (2, 3, 4, 5):
         here = (true.instance == instance) & ~band
-        noise = 0.5 * (true.albedo[here] @ reference.LUMA).max() / np.sqrt(64)
-        assert np.sqrt((error[here] ** 2).mean()) < noise and np.abs(error[here].mean()) < 4 * noise / np.sqrt(here.sum())
+        assert here.sum() > 300 and np.median(error[here]) < 6e-4 and np.quantile(error[here], 0.95) < 2.5e-3
+        assert sun or np.quantile(error[here], 0.99) < 2.5e-3
+    assert max((true.luminance[(true.instance == k) & ~band] > 0.1).sum() for k in (3, 4, 5)) > 200  # something of it is lit
 
 
 @needs_blender

@@ -119,6 +119,28 @@ def explain(
 
 
 @app.command()
+def trade(
+    config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")] = "trade",
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")] = False,
+    only: Annotated[Optional[list[str]], typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated.")] = None,
+    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    sequence: Annotated[Optional[int], typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
+    clip: Annotated[Optional[float], typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")] = None,
+    limit_ms: Annotated[float, typer.Option(min=0.001, help="Events further apart than this are not the same event.")] = 10.0,
+    rounds: Annotated[Optional[int], typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
+    minutes: Annotated[Optional[float], typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long.")] = None,
+    cost: Annotated[str, typer.Option(help="What the front is drawn over: wall, or cpu on a busy machine.")] = "wall",
+) -> None:
+    """Measure what accuracy costs: settings timed and judged against a converged reference, as a table, a plot and a page."""
+    from blinkgl.trade.show import trade_and_show
+
+    trade_and_show(config, out, overrides=overrides or [], quick=quick, only=only or [], sequence=sequence, clip=clip, limit_ms=limit_ms, rounds=rounds,
+                   minutes=minutes, cost=cost, seed=seed)
+
+
+@app.command()
 def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
     out: Annotated[Optional[str], typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,

@@ -11,7 +11,7 @@ targets are made the first time something asks for them, and only in the variant
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
@@ -135,6 +135,14 @@ class Renderer:
                 target.release()
             self._targets = {}
             self._resources.release()
+
+    def look_through(self, camera) -> None:
+        """From now on draws with another camera of the same size and path: another part of the picture at the same cost."""
+        self._projection, self._frustum = projection(camera), _frustum_planes(camera)
+        if self._last_moment is not None:
+            t_ns, moment = self._last_moment
+            self._last_moment = (t_ns, replace(moment, mvp=self._projection @ moment.T_cam_obj))
+        self._still = False  # what stands still in one picture is no backdrop of the other
 
     @property
     def changed_rows(self) -> tuple[int, int] | None:

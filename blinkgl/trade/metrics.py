@@ -66,7 +66,9 @@ def event_errors(reference: Events, judged: Events, speeds: SpeedMaps, t0_us: in
 
     limit_us : longest distance between partners; see :func:`blinkgl.trade.matching.match_events`."""
     height, width = speeds.speed.shape[1:]
-    mine, theirs = (_inside(e.window(t0_us, t1_us), mask) for e in (judged, reference))
+    mine, theirs = (e.window(t0_us, t1_us) for e in (judged, reference))
+    if mask is not None:
+        mine, theirs = masked(mine, mask), masked(theirs, mask)
     matching = match_events(theirs, mine, height, width, limit_us)
     found = matching.matched
     late = np.abs(matching.dt_us[found])
@@ -101,9 +103,8 @@ def _vote(x, y, t, p, t0, t1, grid):
             grid[b + 1, y[i], x[i]] += sign * weight
 
 
-def _inside(events: Events, mask: np.ndarray | None) -> Events:
-    if mask is None:
-        return events
+def masked(events: Events, mask: np.ndarray) -> Events:
+    """The events of the pixels where ``mask`` (H, W) is True."""
     keep = mask[events.y, events.x]
     return Events(events.x[keep], events.y[keep], events.t[keep], events.p[keep])
 

@@ -1,0 +1,271 @@
+"""Times settings and judges their events: the measurement behind ``blinkgl trade``.
+
+A clip of one sequence goes through pass 1 of ``blinkgl generate`` (frames, event kernel; nothing is written), once per setting and
+round. Rounds are interleaved, so that a busy moment of the machine falls on all settings alike.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from blinkgl.config.events import EsimConfig
+from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
+from blinkgl.errors import ConfigError
+from blinkgl.events import make_emulator
+from blinkgl.events.types import Events
+from blinkgl.render.renderer import Renderer
+from blinkgl.rng import Role, kernel_seed
+from blinkgl.scene.build import build_scene
+from blinkgl.scene.types import Scene
+from blinkgl.timeline import frame_times
+from blinkgl.trade.labels import flow_errors
+from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors, masked
+from blinkgl.trade.reference import FineTiles, lattice, mask_of, reference_events
+from blinkgl.trade.settings import SIZES, Setting
+
+JUDGED = ("time_median_us", "time_p95_us", "wrong", "voxel")
+"""The errors whose movement decides whether the reference has converged."""
+ENOUGH = 0.1
+"""Of the smallest error judged: by how much the reference may move."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """clip_s : simulated seconds; 0: one label interval.   tiles : columns, rows, width, height of the judged rectangles.
+    levels : (samples per pixel side, px between frames) of the reference, rising until it has converged or ``reference_s`` is spent.
+    rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
+
+    clip_s: float = 0.0
+    tiles: tuple[int, int, int, int] = (3, 3, 64, 48)
+    levels: tuple[tuple[int, float], ...] = ((8, 0.1), (16, 0.05), (32, 0.03), (64, 0.02))
+    reference_s: float = 1200.0
+    rounds: int = 3
+    rounds_s: float = 1200.0
+    limit_us: int = 10_000
+    sequence: int = 0
+
+
+QUICK = Options(tiles=(3, 2, 32, 24), levels=((8, 0.12), (16, 0.06), (32, 0.04)), reference_s=60.0, rounds=3, rounds_s=40.0, clip_s=0.05)
+
+
+@dataclass
+class Measured:
+    """One setting. wall_s, cpu_s : seconds (processor: of all threads) per simulated second, one per round."""
+
+    setting: Setting
+    frames_per_s: float = 0.0
+    triangles: float = 0.0
+    """drawn per frame, after culling"""
+    wall_s: list[float] = field(default_factory=list)
+    cpu_s: list[float] = field(default_factory=list)
+    flow: dict[str, float] = field(default_factory=dict)
+    events: Events | None = field(default=None, repr=False)
+    errors: EventErrors | None = None
+
+    @property
+    def cost(self) -> float:
+        """Wall seconds per simulated second, median of the rounds."""
+        return float(np.median(self.wall_s))
+
+    def to_dict(self) -> dict:
+        s = self.setting
+        return {"name": s.name, "sampling": s.sampling, "reconstruction": s.reconstruction, "antialiasing": s.antialiasing, "other": s.other,
+                "size": s.size, "overrides": list(s.overrides), "wall_s": self.cost, "cpu_s": float(np.median(self.cpu_s)),
+                "wall_rounds": self.wall_s, "frames_per_s": self.frames_per_s, "triangles": self.triangles, **self.errors.to_dict(), **self.flow}
+
+
+@dataclass
+class Level:
+    """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest error of any
+    setting judged by this one."""
+
+    scale: int
+    max_px: float
+    frames: int
+    seconds: float
+    events: Events = field(repr=False)
+    movement: dict[str, float] | None = None
+    smallest: dict[str, float] | None = None
+
+    @property
+    def ratio(self) -> dict[str, float]:
+        return {k: self.movement[k] / self.smallest[k] if self.smallest[k] else float("inf") for k in JUDGED} if self.movement else {}
+
+    @property
+    def converged(self) -> bool:
+        return bool(self.ratio) and max(self.ratio.values()) <= ENOUGH
+
+    def to_dict(self) -> dict:
+        return {"scale": self.scale, "max_px": self.max_px, "frames": self.frames, "seconds": self.seconds, "events": len(self.events),
+                "movement": self.movement, "smallest": self.smallest, "ratio": self.ratio, "converged": self.converged}
+
+
+class Bench:
+    """One sequence at one image size: its scenes, its clip, its judged pixels."""
+
+    def __init__(self, gl, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
+        self.gl, self.options, self.say = gl, options, say
+        base = template.sequence(options.sequence)
+        if base.frames is not None:
+            raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
+        self._template = RunTemplate(apply_overrides(template.tree, _sized(base, SIZES[size])), template.base)
+        # Labels and previews take no part in this; noise would drown the errors that are asked for.
+        self.emulator = noiseless(base.events)
+        self._scenes: dict[str, Scene] = {}
+        self.base = self.config(())
+        self.scene = self.scene_of(self.base)
+        camera = self.scene.camera
+        self.height, self.width = camera.height, camera.width
+        self.tiles = lattice(self.width, self.height, *options.tiles)
+        self.mask = mask_of(self.tiles, self.height, self.width)
+        self.seed = kernel_seed(self.base.seed, options.sequence, Role.EVENTS)
+        length = round(options.clip_s * 1e9) or self.base.time.interval_ns
+        length = min(length, self.base.time.t1_ns - self.base.time.t0_ns)
+        # From the middle, on a microsecond: event windows are in microseconds.
+        self.t0_ns = (self.base.time.t0_ns + self.base.time.t1_ns - length) // 2000 * 1000
+        self.t1_ns = self.t0_ns + length // 1000 * 1000
+
+    def config(self, overrides: Iterable[str]) -> SequenceConfig:
+        return RunTemplate(apply_overrides(self._template.tree, list(overrides)), self._template.base).sequence(self.options.sequence)
+
+    def scene_of(self, config: SequenceConfig) -> Scene:
+        key = json.dumps(config.scene.model_dump(), sort_keys=True)
+        if key not in self._scenes:
+            self._scenes[key] = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
+                                            seed=config.seed, sequence=self.options.sequence, base=self._template.base)
+        return self._scenes[key]
+
+    @property
+    def duration_s(self) -> float:
+        return (self.t1_ns - self.t0_ns) * 1e-9
+
+    # ---- settings ------------------------------------------------------------------------------------------------
+
+    def measure(self, settings: Iterable[Setting]) -> list[Measured]:
+        """Every setting, in interleaved rounds."""
+        results = [Measured(s) for s in settings]
+        configs = [self.config(m.setting.overrides) for m in results]
+        groups: dict[str, list[int]] = {}  # settings that draw alike share a renderer
+        for i, c in enumerate(configs):
+            groups.setdefault(json.dumps([c.render.model_dump(), c.scene.model_dump()], sort_keys=True), []).append(i)
+        started = time.perf_counter()
+        for number in range(self.options.rounds):
+            for members in groups.values():
+                config = configs[members[0]]
+                with Renderer(self.gl, self.scene_of(config), config.render) as renderer:
+                    for i in members:
+                        self._run(results[i], configs[i], renderer, first=number == 0)
+                    if number == 0:
+                        flow = flow_errors(self.scene, renderer, self.t0_ns, self.t0_ns + self.base.time.interval_ns)
+                        for i in members:
+                            results[i].flow = flow
+            spent = time.perf_counter() - started
+            self.say(f"round {number + 1} of {len(results)} settings, {spent:.0f} s")
+            if spent + spent / (number + 1) > self.options.rounds_s:
+                break
+        return results
+
+    def _run(self, result: Measured, config: SequenceConfig, renderer: Renderer, first: bool) -> None:
+        new = lambda: make_emulator(self.emulator, self.height, self.width, self.seed)  # noqa: E731
+        end = self.t0_ns + (self.t1_ns - self.t0_ns) // 20
+        for _ in simulate(config, renderer, new(), self.t0_ns, end):  # programs, targets, kernels: made the first time
+            pass
+        emulator, drawn = new(), renderer.stats.triangles
+        chunks: list[Events] = []
+        frames, wall, cpu = 0, time.perf_counter(), time.process_time()
+        for events in simulate(config, renderer, emulator, self.t0_ns, self.t1_ns):
+            frames += 1
+            if first:
+                paused = time.perf_counter(), time.process_time()
+                chunks.append(masked(events, self.mask))
+                wall += time.perf_counter() - paused[0]
+                cpu += time.process_time() - paused[1]
+        result.wall_s.append((time.perf_counter() - wall) / self.duration_s)
+        result.cpu_s.append((time.process_time() - cpu) / self.duration_s)
+        if first:
+            result.events = Events.concatenate(chunks)
+            result.frames_per_s = frames / self.duration_s
+            result.triangles = (renderer.stats.triangles - drawn) / frames
+
+    # ---- judging -------------------------------------------------------------------------------------------------
+
+    def speeds(self) -> SpeedMaps:
+        """Analytic image speed all over the clip, every 5 ms."""
+        count = max(2, round(self.duration_s / 0.005) + 1)
+        times = np.linspace(self.t0_ns, self.t1_ns, count).astype(np.int64)
+        with Renderer(self.gl, self.scene, self.base.render) as renderer:
+            maps = [np.hypot(*np.moveaxis(renderer.velocity(int(t)), -1, 0)) for t in times]
+        return SpeedMaps(times // 1000, np.stack(maps))
+
+    def judge(self, results: list[Measured], speeds: SpeedMaps) -> list[Level]:
+        """Raises the reference until it has converged (or time is up) and fills in the results' errors."""
+        levels: list[Level] = []
+        begun = time.perf_counter()
+        for scale, max_px in self.options.levels:
+            if levels and not self._affordable(levels, scale, max_px, time.perf_counter() - begun):
+                self.say(f"reference: {scale}x{scale} at {max_px:g} px would take too long; stopped")
+                break
+            started = time.perf_counter()
+            with FineTiles(self.gl, self.scene, self.tiles, scale) as source:
+                times = list(source.times(max_px, self.t0_ns, self.t1_ns))
+                events, frames = reference_events(source, times, self.emulator, self.height, self.width, self.seed, self.mask)
+            level = Level(scale, max_px, frames, time.perf_counter() - started, events)
+            for result in results:
+                result.errors = self.errors(events, result.events, speeds)
+            if levels and results:
+                moved = self.errors(events, levels[-1].events, speeds).to_dict()
+                level.movement = {k: moved[k] for k in JUDGED}
+                level.smallest = {k: float(np.nanmin([r.errors.to_dict()[k] for r in results])) for k in JUDGED}
+            levels.append(level)
+            said = f"; moved by {max(level.ratio.values()):.2g} of the smallest error" if level.ratio else ""
+            self.say(f"reference {scale}x{scale} samples, {max_px:g} px, {frames} frames, {level.seconds:.0f} s{said}")
+            if level.converged:
+                break
+        return levels
+
+    def errors(self, reference: Events, events: Events, speeds: SpeedMaps) -> EventErrors:
+        return event_errors(reference, events, speeds, self.t0_ns // 1000, self.t1_ns // 1000, limit_us=self.options.limit_us)
+
+    def _affordable(self, levels: list[Level], scale: int, max_px: float, spent: float) -> bool:
+        last = levels[-1]
+        return spent + last.seconds * (scale / last.scale) ** 2 * last.max_px / max_px <= self.options.reference_s
+
+
+def simulate(config: SequenceConfig, renderer: Renderer, emulator, t0_ns: int, t1_ns: int):
+    """Pass 1 without writing: yields the events of each frame."""
+    timeline = config.timeline
+
+    def speed(t_ns: int) -> float:
+        return renderer.speed(t_ns, timeline.sample_every, timeline.percentile)
+
+    luminance = np.empty((renderer.height, renderer.width), np.float32)
+    for t_ns in frame_times(timeline, t0_ns, t1_ns, speed):
+        renderer.luminance(t_ns, out=luminance)
+        yield emulator.step(luminance, t_ns, renderer.changed_rows)
+
+
+def noiseless(config) -> EsimConfig:
+    """ESIM with the thresholds of any emulator's configuration: what is left of it when noise and bandwidth are taken away."""
+    if config.emulator == "voltmeter":
+        return EsimConfig(contrast_threshold=min(max(1 / config.k1, 0.001), 10))
+    return EsimConfig(contrast_threshold=config.contrast_threshold, contrast_threshold_off=config.contrast_threshold_off,
+                      threshold_sigma=config.threshold_sigma)
+
+
+def _sized(config: SequenceConfig, factor: float) -> list[str]:
+    """Overrides that shrink the image, its field of view kept."""
+    if factor == 1:
+        return []
+    camera = config.camera
+    scaled = {"width": max(1, round(camera.width * factor)), "height": max(1, round(camera.height * factor)), "near": camera.near}
+    for key in ("cx", "cy"):
+        if (value := getattr(camera, key)) is not None:
+            scaled[key] = (value + 0.5) * factor - 0.5
+    scaled |= {"focal": camera.focal * factor} if camera.focal is not None else {"fov": camera.fov} if camera.fov is not None else {}
+    return ["camera=" + json.dumps(scaled)]

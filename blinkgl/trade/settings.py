@@ -1,0 +1,78 @@
+"""The settings that are measured: named points on five axes, each a few lines of YAML.
+
+Not the full product: it would be thousands of settings, most of them silly. What is there and why:
+
+1. displacement x anti-aliasing, in full: the two axes that matter most, and they interact, because each hides the other's error.
+2. reconstruction x displacement at one anti-aliasing: a better curve between frames trades against more frames and nothing else ...
+3. ... and the same curves at the other anti-aliasings for the coarse steps, where presets are looked for.
+4. every other way to choose the times (uniform, brightness, budget) at one anti-aliasing, so that each is a curve to compare.
+5. mip bias, anisotropy, level of detail and texture size one at a time: they change what a frame is, not when it is drawn.
+6. half the image size: another data set, with a reference of its own; it says what a pixel costs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+SAMPLINGS = {
+    **{f"uniform {fps}/s": (f"timeline={{kind: uniform, fps: {fps}}}",) for fps in (50, 100, 200, 400, 800, 1600)},
+    **{f"displacement {px:g} px": (f"timeline={{kind: displacement, max_px: {px}, min_step_us: 20}}",) for px in (4, 2, 1, 0.5, 0.25, 0.125)},
+}
+RECONSTRUCTIONS = {"linear": ()}
+ANTIALIASINGS = {name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "ssaa2", "ssaa4")}
+OTHERS = {
+    "": (),
+    "mip bias -0.5": ("render.mip_bias=-0.5",),
+    "mip bias -1": ("render.mip_bias=-1",),
+    "anisotropy 4": ("render.anisotropy=4",),
+    "textures 256 px": ("scene.textures.max_size=256",),
+    "textures 128 px": ("scene.textures.max_size=128",),
+}
+SIZES = {"": 1.0, "half size": 0.5}
+"""Factor on the image's sides; every size has its own reference."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A point on the axes; the attributes are names in the tables above."""
+
+    sampling: str
+    reconstruction: str = "linear"
+    antialiasing: str = "none"
+    other: str = ""
+    size: str = ""
+
+    @property
+    def name(self) -> str:
+        return ", ".join(part for part in (self.sampling, self.reconstruction, self.antialiasing, self.other, self.size) if part)
+
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """As ``--set`` options; the size is not among them."""
+        return (*SAMPLINGS[self.sampling], *RECONSTRUCTIONS[self.reconstruction], *ANTIALIASINGS[self.antialiasing], *OTHERS[self.other])
+
+
+def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
+    """The settings of a sweep, without repetitions. random_scene : the scene has pools, whose textures can be made smaller."""
+    displacement = lambda *px: [f"displacement {p:g} px" for p in px]  # noqa: E731
+    uniform = lambda *fps: [f"uniform {f}/s" for f in fps]  # noqa: E731
+    curves = [r for r in RECONSTRUCTIONS if r != "linear"]
+    extra = [s for s in SAMPLINGS if not s.startswith(("uniform", "displacement"))]
+    centre = displacement(0.5)[0]
+    others = [o for o in OTHERS if o and (random_scene or not o.startswith("textures"))]
+    if quick:
+        points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2")]
+        points += [Setting(s, r, "ssaa2") for s in displacement(2, 1) for r in curves]
+        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "ssaa4")]
+        points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 400)]
+        points += [Setting(s, curves[0] if curves else "linear", "ssaa2") for s in extra[1::3]]
+        points += [Setting(displacement(1)[0], antialiasing="none", other=o) for o in others if not o.startswith(("anisotropy", "textures 128", "mip bias -1"))]
+    else:
+        points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5, 0.25) for a in ANTIALIASINGS]
+        points += [Setting(s, r, "ssaa2") for s in displacement(4, 2, 1, 0.5, 0.25) for r in curves]
+        points += [Setting(s, r, a) for s in displacement(2, 1, 0.5) for r in curves for a in ("none", "ssaa4")]
+        points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]
+        points += [Setting(s, r, "ssaa2") for s in extra for r in (curves or ["linear"])]
+        points += [Setting(centre, antialiasing=a, other=o) for o in others for a in ("none", "ssaa2")]
+        points += [Setting(s, antialiasing=a, size="half size") for s, a in zip(displacement(1, 0.5, 0.5), ("none", "none", "ssaa2"))]
+    return tuple(dict.fromkeys(points))

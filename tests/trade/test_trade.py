@@ -1,0 +1,171 @@
+"""The measurement: its reference, its front, its files."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.cli import run
+from blinkgl.config.events import V2eConfig, VoltmeterConfig
+from blinkgl.config.sequence import load_run
+from blinkgl.render.renderer import Renderer
+from blinkgl.render.still import Rectangle
+from blinkgl.trade.front import dominating, front
+from blinkgl.trade.measure import Bench, Level, Options, noiseless
+from blinkgl.trade.reference import FineTiles, lattice, mask_of
+from blinkgl.trade.run import convergence_line, trade
+from blinkgl.trade.settings import Setting, design
+
+CONFIG = {
+    "seed": 3, "camera": {"width": 64, "height": 48}, "time": {"duration": 0.1, "label_rate": 20},
+    "scene": {"kind": "random", "objects": {"count": 3, "distance": [2, 4]},
+              "pool": {"primitives": ["cuboid", "sphere"], "variants": 4, "urdfs": False},
+              "textures": {"procedural": ["checks", "fbm"], "variants": 4, "photographs": False, "max_size": 64}},
+}
+OPTIONS = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5), (4, 0.25)), rounds=1)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    path = tmp_path_factory.mktemp("trade") / "c.yaml"
+    path.write_text(yaml.safe_dump(CONFIG))
+    return path
+
+
+def test_front_by_hand():
+    rows = [dict(n=n, c=c, e=e) for n, c, e in (("a", 1, 9), ("b", 2, 5), ("worse than b", 3, 5), ("c", 4, 1), ("slow", 9, 2), ("equal to c", 4, 1),
+                                               ("unknown", 0, float("nan")))]
+    assert [r["n"] for r in front(rows, "c", "e")] == ["a", "b", "c"]
+    assert [r["n"] for r in dominating(rows[4], rows, "c", "e")] == ["c", "equal to c"]
+    assert dominating(rows[4], rows, "c", "e", margin=0.6) == []
+
+
+def test_lattice_covers_what_it_says():
+    tiles = lattice(640, 480, 3, 2, 32, 24)
+    mask = mask_of(tiles, 480, 640)
+    assert len(tiles) == 6 and mask.sum() == 6 * 32 * 24 and tiles[0].x0 == 91
+    assert lattice(60, 48, 3, 2, 32, 24) == (Rectangle(0, 0, 60, 48),)
+
+
+def test_fine_tiles_are_the_image_itself_and_then_its_mean(gl, config):
+    """One sample a pixel: the picture's own pixels. More: what super-sampling the whole image gives."""
+    bench = Bench(gl, load_run(config), OPTIONS)
+    t = bench.t0_ns
+    for scale, antialiasing in ((1, "none"), (2, "ssaa2"), (4, "ssaa4")):
+        render = bench.config([f"render.antialiasing={antialiasing}"]).render
+        with Renderer(gl, bench.scene, render) as whole, FineTiles(gl, bench.scene, bench.tiles, scale) as tiles:
+            image = whole.luminance(t)
+            (mine,) = tiles([t])
+            inside = np.abs(mine - image)[bench.mask]
+            # The tiles' projection rounds differently: a sample on an edge may fall on its other side.
+            assert np.percentile(inside, 97) < 2e-4 * image.max() and inside.mean() < 2e-3 * image.max()
+            assert not mine[~bench.mask].any()
+            speed = np.hypot(*np.moveaxis(whole.velocity(t), -1, 0))[bench.mask].max()
+            assert tiles.speed(t) == pytest.approx(speed, rel=0.05)
+
+
+def test_reference_converges_and_the_ladder_says_so(gl, config):
+    """The finer of two references moves less; what is judged by itself is without error."""
+    bench = Bench(gl, load_run(config), replace(OPTIONS, levels=((2, 0.5), (4, 0.2), (8, 0.1), (16, 0.05))))
+    results = bench.measure([Setting("displacement 2 px")])
+    levels = bench.judge(results, bench.speeds())
+    moved = [level.movement["voxel"] for level in levels[1:]]
+    assert len(levels) >= 3 and moved[-1] < 0.7 * moved[0]
+    assert levels[-1].ratio["voxel"] == pytest.approx(levels[-1].movement["voxel"] / results[0].errors.voxel)
+    assert bench.errors(levels[-1].events, levels[-1].events, bench.speeds()).voxel == 0
+    assert results[0].flow["flow_max_px"] < 1e-2
+    level = replace(levels[-1], movement=dict.fromkeys(levels[-1].movement, 1.0), smallest=dict.fromkeys(levels[-1].movement, 10.0))
+    assert level.converged and not replace(level, smallest=dict.fromkeys(level.movement, 9.9)).converged
+    assert not Level(1, 1.0, 1, 1.0, levels[0].events).converged, "a single level was never checked"
+
+
+def test_no_more_time_no_finer_reference(gl, config):
+    bench = Bench(gl, load_run(config), replace(OPTIONS, reference_s=0.0))
+    assert len(bench.judge(bench.measure([Setting("uniform 100/s")]), bench.speeds())) == 1
+
+
+def test_events_are_the_same_in_every_round_and_order(gl, config):
+    bench = Bench(gl, load_run(config), OPTIONS)
+    a, b = Setting("displacement 1 px"), Setting("uniform 400/s", antialiasing="ssaa2")
+    first, second = bench.measure([a, b]), bench.measure([b, a])
+    for mine, theirs in ((first[0], second[1]), (first[1], second[0])):
+        assert len(mine.events) and np.array_equal(mine.events.t, theirs.events.t) and mine.frames_per_s == theirs.frames_per_s
+
+
+def test_noise_is_taken_out():
+    assert noiseless(V2eConfig(contrast_threshold=0.3, threshold_sigma=0.01)).model_dump()["contrast_threshold"] == 0.3
+    assert noiseless(VoltmeterConfig(k1=5)).contrast_threshold == pytest.approx(0.2)
+
+
+def test_design():
+    for quick in (True, False):
+        settings = design(quick)
+        assert len(set(settings)) == len(settings) and len({s.name for s in settings}) == len(settings)
+        assert {s.antialiasing for s in settings} == {"none", "msaa4", "ssaa2", "ssaa4"}
+    assert len(design(True)) < 25 < len(design(False))
+    assert not any("textures" in s.other for s in design(False, random_scene=False))
+
+
+def test_every_setting_is_a_valid_configuration(config):
+    for setting in design(False):
+        load_run(config, setting.overrides).sequence(0)
+
+
+def test_half_size_keeps_the_view(gl, config):
+    template = load_run(config, ["camera.cx=31.5", "camera.fov=50"])
+    full, half = (Bench(gl, template, OPTIONS, size) for size in ("", "half size"))
+    assert (half.width, half.height) == (32, 24)
+    assert half.scene.camera.fx == pytest.approx(full.scene.camera.fx / 2) and half.scene.camera.cx == pytest.approx(15.5)
+
+
+@pytest.fixture(scope="module")
+def result(config, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "t"
+    status = run(["trade", str(config), "--quick", "--clip", "0.01", "--rounds", "1", "--only", "1 px, linear, ssaa2", "--only", "2 px, linear, none", "--minutes", "0.1", "-o", str(out)])
+    assert status == 0
+    return out
+
+
+def test_files_of_the_command(result):
+    data = json.loads((result / "trade.json").read_text())
+    assert "NaN" not in (result / "trade.json").read_text()
+    names = [s["name"] for s in data["settings"]]
+    assert data["front"] and set(data["front"]) <= set(names) and len(names) == 2
+    rows = list(csv.DictReader((result / "trade.csv").open()))
+    assert [r["name"] for r in rows] == names and float(rows[0]["wall_s"]) > 0 and rows[0]["flow_median_px"]
+    assert (result / "pareto.png").read_bytes()[:4] == b"\x89PNG"
+    page = (result / "trade.html").read_text()
+    assert all(n in page for n in names) and not re.search(r"(src|href)=['\"](?!data:)", page) and "<script" not in page
+
+
+def test_errors(config, tmp_path, capsys):
+    for arguments, message in ((["--only", "raytracing"], "--only: no setting is called that"), (["--cost", "euros"], "--cost: unknown cost"),
+                               (["--set", "render.antialiasing=fxaa"], "render.antialiasing")):
+        assert run(["trade", str(config), "-o", str(tmp_path / "x"), *arguments]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "x").exists()
+    (tmp_path / "f.yaml").write_text("frames: {folders: nothing}\n")
+    assert run(["trade", str(tmp_path / "f.yaml"), "-o", str(tmp_path / "x")]) == 2
+    assert "nothing to trade" in capsys.readouterr().err
+
+
+def test_an_unchecked_reference_is_called_that():
+    result = {"enough": 0.1, "sizes": {"full": {"converged": False, "levels": [{"scale": 8, "max_px": 0.1, "frames": 3, "ratio": {}}]}}}
+    assert "NOT checked" in convergence_line(result)
+    ratio = dict.fromkeys(("time_median_us", "time_p95_us", "wrong", "voxel"), 0.3)
+    result["sizes"]["full"]["levels"].append({"scale": 16, "max_px": 0.05, "frames": 3, "ratio": ratio})
+    assert "did NOT converge" in convergence_line(result) and "voxel grid 30 %" in convergence_line(result)
+    result["sizes"]["full"]["converged"] = True
+    assert "the reference converged" in convergence_line(result)
+
+
+def test_without_the_command(config):
+    result = trade(load_run(config), settings=(Setting("displacement 1 px"),), options=OPTIONS, cost="cpu_s")
+    assert result["front"] == ["displacement 1 px, linear, none"] and result["sizes"]["full"]["clip_s"] == pytest.approx(0.02)

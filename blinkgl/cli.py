@@ -132,12 +132,14 @@ def trade(
     rounds: Annotated[Optional[int], typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
     minutes: Annotated[Optional[float], typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long.")] = None,
     cost: Annotated[str, typer.Option(help="What the front is drawn over: wall, or cpu on a busy machine.")] = "wall",
+    reference: Annotated[str, typer.Option(help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
+                                           "small camera and a short --clip).")] = "raster",
 ) -> None:
     """Measure what accuracy costs: settings timed and judged against a converged reference, as a table, a plot and a page."""
     from blinkgl.trade.show import trade_and_show
 
     trade_and_show(config, out, overrides=overrides or [], quick=quick, only=only or [], sequence=sequence, clip=clip, limit_ms=limit_ms, rounds=rounds,
-                   minutes=minutes, cost=cost, seed=seed)
+                   minutes=minutes, cost=cost, reference=reference, seed=seed)
 
 
 @app.command()

@@ -105,6 +105,12 @@ def available() -> str:
     return "" if found else f"no bpy (Blender as a Python module) for {chosen}: {REMEDY}"
 
 
+def require() -> None:
+    """Raises BlinkGLError when there is no bpy."""
+    if missing := available():
+        raise BlinkGLError(missing)
+
+
 def frames(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
     """Linear luminance at each time, (H, W) float32, Rec. 709 luma of :func:`colours`; see there."""
     for colour in colours(scene, times_ns, settings, cost):
@@ -122,8 +128,7 @@ def colours(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = Cy
     One Blender process serves the iterator and ends with it, also when it is abandoned. Raises BlinkGLError (one line) when there is no
     bpy, when it does not fit its interpreter, or when Blender stops.
     """
-    if missing := available():
-        raise BlinkGLError("Blender is not installed", accepted=missing)
+    require()
     cost = Cost() if cost is None else cost
     times_ns = np.array(list(times_ns), np.int64)
     with tempfile.TemporaryDirectory(prefix="blinkgl-cycles-") as name, open(Path(name) / "blender.log", "w+b") as log:

@@ -39,6 +39,7 @@ ENOUGH = 0.1
 class Options:
     """clip_s : simulated seconds; 0: one label interval.   tiles : columns, rows, width, height of the judged rectangles.
     levels : (samples per pixel side, px between frames) of the reference, rising until it has converged or ``reference_s`` is spent.
+    reference : "raster", or "cycles" (extra [cycles]): the same scene path-traced, samples² paths a pixel.
     rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
 
     clip_s: float = 0.0
@@ -49,8 +50,10 @@ class Options:
     rounds_s: float = 1200.0
     limit_us: int = 10_000
     sequence: int = 0
+    reference: str = "raster"
 
 
+TRACED_LEVELS = ((8, 0.5), (16, 0.25), (32, 0.125))
 QUICK = Options(tiles=(3, 2, 32, 24), levels=((8, 0.12), (16, 0.06), (32, 0.04)), reference_s=60.0, rounds=3, rounds_s=40.0, clip_s=0.05)
 
 
@@ -111,6 +114,10 @@ class Bench:
 
     def __init__(self, gl, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
         self.gl, self.options, self.say = gl, options, say
+        if options.reference == "cycles":
+            from blinkgl.tools import peer_cycles
+
+            peer_cycles.require()  # now, not after minutes of measuring
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
@@ -212,7 +219,7 @@ class Bench:
                 self.say(f"reference: {scale}x{scale} at {max_px:g} px would take too long; stopped")
                 break
             started = time.perf_counter()
-            with FineTiles(self.gl, self.scene, self.tiles, scale) as source:
+            with self._source(scale) as source:
                 times = list(source.times(max_px, self.t0_ns, self.t1_ns))
                 events, frames = reference_events(source, times, self.emulator, self.height, self.width, self.seed, self.mask)
             level = Level(scale, max_px, frames, time.perf_counter() - started, events)
@@ -228,6 +235,13 @@ class Bench:
             if level.converged:
                 break
         return levels
+
+    def _source(self, scale: int):
+        if self.options.reference == "cycles":
+            from blinkgl.trade.traced import TracedFrames
+
+            return TracedFrames(self.gl, self.scene, self.tiles, scale)
+        return FineTiles(self.gl, self.scene, self.tiles, scale)
 
     def errors(self, reference: Events, events: Events, speeds: SpeedMaps) -> EventErrors:
         return event_errors(reference, events, speeds, self.t0_ns // 1000, self.t1_ns // 1000, limit_us=self.options.limit_us)

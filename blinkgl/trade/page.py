@@ -78,7 +78,9 @@ def _all(result: dict) -> str:
 def _reference(result: dict) -> str:
     from blinkgl.trade.run import NAMES
 
-    parts = ["<h2>The reference</h2><p>Judged by the same scene drawn much more finely. It is made finer and finer; each step is judged by the next one "
+    how = ("path-traced by Blender's Cycles (samples are paths), with shadows and inter-reflection, which the settings leave out"
+           if result.get("reference") == "cycles" else "drawn much more finely")
+    parts = [f"<h2>The reference</h2><p>Judged by the same scene {how}. It is made finer and finer; each step is judged by the next one "
              f"as if it were a setting. It is good enough when that error is below {100 * result['enough']:.0f} % of the smallest error of any setting, in all four measures.</p>"]
     for name, size in result["sizes"].items():
         head = "<tr><th>samples a pixel</th><th>px between frames</th><th>frames</th><th>seconds</th>" + "".join(f"<th>moved by, of the smallest error: {NAMES[k]}</th>" for k in NAMES) + "</tr>"

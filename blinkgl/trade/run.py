@@ -64,7 +64,7 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
     best = {r["name"] for r in front([r for r in rows if r["size"] == main], cost, "voxel")}
     for r in rows:
         r["on_front"] = r["name"] in best
-    return {"machine": machine, "config": template.tree, "sequence": options.sequence, "quick": quick, "only": only or [], "cost": cost,
+    return {"machine": machine, "config": template.tree, "sequence": options.sequence, "quick": quick, "reference": options.reference, "only": only or [], "cost": cost,
             "error": "voxel", "size": main or "full", "limit_us": options.limit_us, "enough": ENOUGH, "rounds": max(len(r["wall_rounds"]) for r in rows),
             "seconds": time.perf_counter() - started, "sizes": sizes, "settings": rows, "front": [r["name"] for r in sorted(rows, key=lambda r: r[cost])
                                                                                                 if r["on_front"]]}
@@ -74,7 +74,8 @@ def convergence_line(result: dict, size: str = "full") -> str:
     """One sentence on how far the reference can be trusted."""
     levels = result["sizes"][size]["levels"]
     last = levels[-1]
-    what = f"{last['scale']}x{last['scale']} samples a pixel, {last['max_px']:g} px between frames ({last['frames']} frames)"
+    samples = f"{last['scale']**2} paths a pixel by Cycles" if result.get("reference") == "cycles" else f"{last['scale']}x{last['scale']} samples a pixel"
+    what = f"{samples}, {last['max_px']:g} px between frames ({last['frames']} frames)"
     if not last["ratio"]:
         return f"the reference, {what}, was NOT checked: there was time for one level only"
     moved = ", ".join(f"{NAMES[k]} {100 * v:.2g} %" for k, v in last["ratio"].items())

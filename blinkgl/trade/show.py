@@ -9,18 +9,23 @@ from rich.table import Table
 
 from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
-from blinkgl.trade.measure import QUICK, Options
+from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options
 from blinkgl.trade.run import convergence_line, trade, write
 
 
 def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, only: list[str], sequence: int | None, clip: float | None,
-                   limit_ms: float, rounds: int | None, minutes: float | None, cost: str, seed: int | None = None) -> None:
+                   limit_ms: float, rounds: int | None, minutes: float | None, cost: str, reference: str = "raster",
+                   seed: int | None = None) -> None:
     """Measures, writes the files, and names the settings that nothing beats. Raises BlinkGLError."""
     if cost not in ("wall", "cpu"):
         raise ConfigError("unknown cost", where="--cost", value=cost, accepted="wall or cpu")
+    if reference not in ("raster", "cycles"):
+        raise ConfigError("unknown reference", where="--reference", value=reference, accepted="raster or cycles")
     template = load_run(config, overrides, seed=seed)
     options = QUICK if quick else Options()
     changes = {"limit_us": round(limit_ms * 1000), "sequence": template.sequence(0).output.first_index if sequence is None else sequence}
+    if reference == "cycles":
+        changes |= {"reference": reference, "levels": TRACED_LEVELS}
     if clip is not None:
         changes["clip_s"] = clip
     if rounds is not None:

@@ -16,6 +16,7 @@ from blinkgl.config.events import V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import load_run
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.still import Rectangle
+from blinkgl.tools import peer_cycles
 from blinkgl.trade.front import dominating, front
 from blinkgl.trade.measure import Bench, Level, Options, noiseless
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
@@ -154,6 +155,31 @@ def test_errors(config, tmp_path, capsys):
     (tmp_path / "f.yaml").write_text("frames: {folders: nothing}\n")
     assert run(["trade", str(tmp_path / "f.yaml"), "-o", str(tmp_path / "x")]) == 2
     assert "nothing to trade" in capsys.readouterr().err
+
+
+def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path, capsys):
+    """What Cycles would be asked for, drawn by the rasteriser: the same events as the reference it replaces, and named in the sentence."""
+    asked = []
+
+    def frames(scene, times, settings, cost):
+        asked.append((settings.samples, settings.bounces, settings.shadows))
+        with FineTiles(gl, scene, (Rectangle(0, 0, scene.camera.width, scene.camera.height),), 2) as source:
+            yield from source(times)
+
+    monkeypatch.setattr(peer_cycles, "frames", frames)
+    monkeypatch.setattr(peer_cycles, "available", lambda: "")
+    options = replace(OPTIONS, tiles=(1, 1, 64, 48), reference="cycles")
+    setting = (Setting("displacement 1 px"),)
+    result = trade(load_run(config), settings=setting, options=options)
+    assert asked == [(4, 4, True), (16, 4, True)] and "16 paths a pixel by Cycles" in convergence_line(result)
+    same = trade(load_run(config), settings=setting, options=replace(options, reference="raster", levels=((2, 0.5), (2, 0.25))))
+    assert result["settings"][0]["voxel"] == pytest.approx(same["settings"][0]["voxel"], rel=0.02)
+
+    monkeypatch.setattr(peer_cycles, "available", lambda: "no bpy here")
+    assert run(["trade", str(config), "-o", str(tmp_path / "x"), "--reference", "cycles"]) == 2
+    assert run(["trade", str(config), "-o", str(tmp_path / "x"), "--reference", "truth"]) == 2
+    error = capsys.readouterr().err
+    assert "error: no bpy here" in error and "--reference: unknown reference" in error and error.count("\n") == 2
 
 
 def test_an_unchecked_reference_is_called_that():

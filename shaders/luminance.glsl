@@ -4,6 +4,8 @@
 // Variants   TEXTURED   albedo luminance from a one-channel texture, else the uniform alone
 //            LIT        sun and sky Lambert, else unlit
 //            TWO_SIDED  the normal is turned towards the camera on back faces
+//            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
+//            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's pixels
 
 #ifdef VERTEX_SHADER
 in vec3 in_position;
@@ -17,6 +19,9 @@ out vec2 uv;
 in vec3 in_normal;
 out vec3 normal;
 #endif
+#ifdef RATE
+out vec3 local;
+#endif
 
 void main()
 {
@@ -27,11 +32,29 @@ void main()
 #ifdef LIT
     normal = in_normal;
 #endif
+#ifdef RATE
+    local = in_position;
+#endif
 }
 #endif
 
 #ifdef FRAGMENT_SHADER
-layout(location = 0) out float luminance;
+#ifdef RATE
+layout(location = 0) out vec2 result;
+in vec3 local;
+uniform vec2 image_size;
+uniform mat4x3 rate;
+#include "motion.glsl"
+#include "rate.glsl"
+#else
+layout(location = 0) out float result;
+#endif
+#ifdef EVERY
+#define BIAS , -log2(float(EVERY))
+#else
+#define BIAS
+#define EVERY 1
+#endif
 #ifdef TEXTURED
 in vec2 uv;
 uniform sampler2D albedo;
@@ -46,16 +69,35 @@ in vec3 normal;
 void main()
 {
 #ifdef TEXTURED
-    luminance = texture(albedo, uv).r;
+    float luminance = texture(albedo, uv BIAS).r;
 #else
-    luminance = albedo;
+    float luminance = albedo;
 #endif
 #ifdef LIT
 #ifdef TWO_SIDED
-    luminance *= irradiance(gl_FrontFacing ? normal : -normal);
+    vec3 facing = gl_FrontFacing ? normal : -normal;
 #else
-    luminance *= irradiance(normal);
+    vec3 facing = normal;
 #endif
+    float light = irradiance(facing);
+#endif
+#ifdef RATE
+    vec2 motion = velocity(rate, local, image_size);
+    float change = 0.0;
+#ifdef TEXTURED
+    change = texture_rate(albedo, uv, motion, float(EVERY));
+#endif
+#ifdef LIT
+    change = change * light + luminance * irradiance_rate(facing, seen_rate(facing, motion));
+#endif
+#endif
+#ifdef LIT
+    luminance *= light;
+#endif
+#ifdef RATE
+    result = vec2(luminance, change);
+#else
+    result = luminance;
 #endif
 }
 #endif

@@ -12,12 +12,10 @@ from blinkgl.events.voltmeter import DvsVoltmeter
 __all__ = ["DvsVoltmeter", "Emulator", "Esim", "Events", "V2e", "make_emulator"]
 
 
-def make_emulator(config, height: int, width: int, seed: int = 0) -> Emulator:
-    """The emulator a config asks for: ``EsimConfig``, ``V2eConfig`` or ``VoltmeterConfig``."""
-    if isinstance(config, EsimConfig):
-        return Esim(height, width, config, seed)
-    if isinstance(config, V2eConfig):
-        return V2e(height, width, config, seed)
-    if isinstance(config, VoltmeterConfig):
-        return DvsVoltmeter(height, width, config, seed)
+def make_emulator(config, height: int, width: int, seed: int = 0, reconstruction: str = "linear") -> Emulator:
+    """The emulator a config asks for: ``EsimConfig``, ``V2eConfig`` or ``VoltmeterConfig``; ``reconstruction``: its path
+    between frames, see :class:`Emulator`."""
+    for kind, model in ((EsimConfig, Esim), (V2eConfig, V2e), (VoltmeterConfig, DvsVoltmeter)):
+        if isinstance(config, kind):
+            return model(height, width, config, seed, reconstruction)
     raise TypeError(f"no emulator for {type(config).__name__}")

@@ -20,7 +20,7 @@ INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 are all larger, so one running maximum per frame checks everything at once."""
 MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
-NO_FRAME, NO_CODES = np.empty(0, np.float32), np.empty(0, np.uint8)
+NO_FRAME, NO_CODES, NO_LOG = np.empty(0, np.float32), np.empty(0, np.uint8), np.empty(0, np.int32)
 """Stand for the kind of frame that was not given."""
 
 
@@ -34,6 +34,10 @@ class Emulator(ABC):
     event at the very end of an interval belongs to it and is stamped with its end, so in half-open windows
     [t0, t1) it is the first of the next window.
 
+    reconstruction : the path of log intensity between two frames. ``linear``; ``pchip``, a monotone cubic over the
+    neighbouring frames: step k then returns the events of the interval *before* the last, and :meth:`flush` the rest;
+    ``hermite``, a monotone cubic with the slopes that every ``step`` is given as ``rate``.
+
     The events depend on the configuration, the seed and the frames, and on nothing else: not on the number of
     threads (``numba.set_num_threads``), not on saving and restoring between steps.
 
@@ -41,12 +45,18 @@ class Emulator(ABC):
     then untouched and the next good frame goes on.
     """
 
+    reconstructions: tuple[str, ...] = ("linear",)
+    """Paths between frames that this emulator can follow."""
     _still_pixels_sleep = False
     """Whether a pixel whose luminance does not change has no events and no changing state."""
     _state: tuple[str, ...] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
 
-    def __init__(self, height: int, width: int, seed: int):
+    def __init__(self, height: int, width: int, seed: int, reconstruction: str = "linear"):
+        if reconstruction not in self.reconstructions:
+            raise EventDataError(f"{type(self).__name__} cannot follow this path between frames", where="timeline.reconstruction",
+                                 value=reconstruction, accepted=", ".join(self.reconstructions))
+        self.reconstruction = reconstruction
         if not (1 <= height < MAX_SIDE and 1 <= width < MAX_SIDE and height * width < 2**31):
             raise EventDataError("frame size out of range", value=(height, width), accepted=f"1 to {MAX_SIDE - 1} rows and columns")
         self.height, self.width = int(height), int(width)
@@ -74,17 +84,30 @@ class Emulator(ABC):
     def _tables_changed(self) -> None:
         pass
 
-    def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None) -> Events:
+    @property
+    def needs_rate(self) -> bool:
+        """Whether ``step`` wants dI/dt beside every frame."""
+        return self.reconstruction == "hermite"
+
+    @property
+    def lags(self) -> bool:
+        """Whether events come one frame late, the last of them from :meth:`flush`."""
+        return self.reconstruction == "pchip"
+
+    def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None, rate: np.ndarray | None = None) -> Events:
         """Events since the last frame; see the class.
 
-        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ).
-        Emulators whose still pixels do nothing skip those rows; the events are the same."""
+        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ),
+        and, with ``rate``, that the rates there are 0. Emulators whose still pixels do nothing skip those rows; the events are the same.
+        rate : (H, W) float32, d(luminance)/dt per second at the frame's time (of ``decode[code]`` for uint8). Only ``hermite`` looks
+        at it; a value that is not finite counts as 0."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
+        rate = self._checked_rate(rate) if self.needs_rate else None
         first, stop = (0, self.height) if rows is None or self.t_ns is None else rows
         self._changed = (max(0, first) * self.width, min(self.height, stop) * self.width)
         self._check_intensity(frame)
-        events = self._start(frame, t_ns) if self.t_ns is None else self._advance(frame, t_ns)
+        events = self._start(frame, t_ns, rate) if self.t_ns is None else self._advance(frame, t_ns, rate)
         self.t_ns = t_ns
         self.frames += 1
         return events
@@ -98,6 +121,18 @@ class Emulator(ABC):
             raise EventDataError("unsupported frame type", where=f"frame {self.frames}", value=str(frame.dtype),
                                  accepted="float32 linear luminance or uint8")
         return np.ascontiguousarray(frame).reshape(-1)
+
+    def _checked_rate(self, rate: np.ndarray | None) -> np.ndarray:
+        shape, dtype = (None, None) if rate is None else (np.shape(rate), np.asarray(rate).dtype)
+        if shape != (self.height, self.width) or dtype != np.float32:
+            raise EventDataError("hermite wants the rate of change of every pixel", where=f"frame {self.frames}", value=(shape, str(dtype)),
+                                 accepted=f"({self.height}, {self.width}) float32")
+        return np.ascontiguousarray(rate).reshape(-1)
+
+    def flush(self) -> Events:
+        """Events that are still held back; call it after the last frame. Empty for everything but ``pchip``, which then takes its slope
+        at the last frame from the frames before it. Further frames may follow."""
+        return Events.empty()
 
     def _checked_time(self, t_ns: int) -> int:
         t_ns = int(t_ns)
@@ -121,10 +156,10 @@ class Emulator(ABC):
                                  value=float(frame[bad[0]]), accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}")
 
     @abstractmethod
-    def _start(self, frame: np.ndarray, t_ns: int) -> Events: ...
+    def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events: ...
 
     @abstractmethod
-    def _advance(self, frame: np.ndarray, t_ns: int) -> Events: ...
+    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events: ...
 
     # -- running the kernels --------------------------------------------------------------------------------
     def _run(self, serial, parallel, arguments: tuple, base_us: int, span_us: int) -> Events:

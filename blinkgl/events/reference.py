@@ -33,10 +33,12 @@ def as_luminance(frame: np.ndarray) -> np.ndarray:
 
 
 class ReferenceEsim:
-    """Rebecq et al. 2018, section 3, in exact integer arithmetic (log intensity in 2^-25, time in ns)."""
+    """Rebecq et al. 2018, section 3, in exact integer arithmetic (log intensity in 2^-25, time in ns); the cubics in
+    float64, from Hermite's basis functions and by bisection."""
 
-    def __init__(self, height: int, width: int, config: EsimConfig, seed: int = 0):
-        self.shape, self.config, self.seed = (height, width), config, np.uint64(seed)
+    def __init__(self, height: int, width: int, config: EsimConfig, seed: int = 0, reconstruction: str = "linear"):
+        self.shape, self.config, self.seed, self.reconstruction = (height, width), config, np.uint64(seed), reconstruction
+        self.levels, self.times, self.slopes, self.passed = [], [], [], 0
         q = lambda c: math.floor(c * Q_ONE + 0.5)
         nominal = [config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold]
         floor = [min(0.01, c / 2) for c in nominal]
@@ -49,7 +51,6 @@ class ReferenceEsim:
         self.floor = [q(f) for f in floor]
         self.events_so_far = [0] * (height * width)
         self.last_ns: list[int | None] = [None] * (height * width)
-        self.t_ns: int | None = None
 
     def next_thresholds(self, i: int) -> tuple[int, int]:
         """(C-, C+) of pixel i for its next event."""
@@ -61,17 +62,59 @@ class ReferenceEsim:
             on, off = (max(f, c + math.floor(scale * n[0] + 0.5)) for f, c, n in zip(self.floor, (on, off), draws))
         return off, on
 
-    def step(self, luminance: np.ndarray, t_ns: int) -> Events:
-        level = [int(v) for v in log_q25(as_luminance(luminance) + np.float32(self.config.log_eps)).ravel()]
+    def step(self, luminance: np.ndarray, t_ns: int, rate: np.ndarray | None = None) -> Events:
+        intensity = as_luminance(luminance) + np.float32(self.config.log_eps)
+        self.levels.append([int(v) for v in log_q25(intensity).ravel()])
+        self.times.append(t_ns)
+        if self.reconstruction == "hermite":
+            slope = (rate / intensity).astype(np.float32) * np.float32(Q_ONE * 1e-9)
+            self.slopes.append([float(v) for v in slope.ravel()])
+        if len(self.times) == 1:
+            self.reference = list(self.levels[0])
+            self.next = [self.next_thresholds(i) for i in range(len(self.reference))]
+        return self.events_up_to(len(self.times) - (2 if self.reconstruction == "pchip" else 1))
+
+    def flush(self) -> Events:
+        return self.events_up_to(len(self.times) - 1)
+
+    def events_up_to(self, last: int) -> Events:
+        """Of the intervals that end at the frames after the last one passed, up to frame ``last``."""
         rows = []
-        if self.t_ns is None:
-            self.reference = list(level)
-            self.next = [self.next_thresholds(i) for i in range(len(level))]
-        else:
-            for i, (before, now) in enumerate(zip(self.level, level)):
-                rows += self.pixel(i, before, now, self.t_ns, t_ns)
-        self.level, self.t_ns = level, t_ns
+        while self.passed < last:
+            self.passed += 1
+            for i in range(len(self.reference)):
+                rows += self.pixel(i, self.levels[self.passed - 1][i], self.levels[self.passed][i], *self.times[self.passed - 1 : self.passed + 1])
         return sorted_events(rows)
+
+    def end_slopes(self, i: int) -> tuple[float, float]:
+        """(alpha, beta) of pixel i in the interval that is being passed, unlimited, in units of its secant."""
+        k, t = self.passed, self.times
+        secant = lambda j: (self.levels[j][i] - self.levels[j - 1][i]) / (t[j] - t[j - 1])  # into frame j
+        if self.reconstruction == "hermite":
+            return self.slopes[k - 1][i] / secant(k), self.slopes[k][i] / secant(k)
+
+        def slope(j: int) -> float:  # at frame j: that of the parabola through three frames around it or next to it
+            m = min(max(j, 1), len(t) - 2)
+            if m < 1:
+                return secant(k)
+            curvature = (secant(m + 1) - secant(m)) / (t[m + 1] - t[m - 1])
+            return secant(m) + curvature * ((t[j] - t[m - 1]) + (t[j] - t[m]))
+
+        return slope(k - 1) / secant(k), slope(k) / secant(k)
+
+    def crossing(self, i: int, level: int, before: int, now: int, t0: int, t1: int) -> int:
+        """ns at which pixel i passes ``level``."""
+        if self.reconstruction == "linear":
+            return t0 + (level - before) * (t1 - t0) // (now - before)
+        alpha, beta = (min(max(slope, 0.0), 3.0) for slope in self.end_slopes(i))
+        y, low, high = (level - before) / (now - before), 0.0, 1.0
+        if y == 1.0:
+            return t1
+        for _ in range(70):
+            s = (low + high) / 2
+            value = alpha * s * (1 - s) ** 2 + s * s * (3 - 2 * s) - beta * s * s * (1 - s)
+            low, high = (s, high) if value < y else (low, s)
+        return t0 + int((low + high) / 2 * (t1 - t0))
 
     def pixel(self, i: int, before: int, now: int, t0: int, t1: int) -> list[tuple[int, int, int, int]]:
         y, x = divmod(i, self.shape[1])
@@ -86,7 +129,7 @@ class ReferenceEsim:
                 p = 0
             else:
                 return rows
-            t = t0 + (self.reference[i] - before) * (t1 - t0) // (now - before)
+            t = self.crossing(i, self.reference[i], before, now, t0, t1)
             self.events_so_far[i] += 1
             self.next[i] = self.next_thresholds(i)
             if self.last_ns[i] is None or t - self.last_ns[i] >= round(self.config.refractory_us * 1000):

@@ -410,8 +410,8 @@ class V2e(Emulator):
     _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",
               "_clock_index", "_epoch_ns", "_brightest")
 
-    def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0):
-        super().__init__(height, width, seed)
+    def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
+        super().__init__(height, width, seed, reconstruction)
         self.config = config = config or V2eConfig()
         pixels = self.height * self.width
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
@@ -451,7 +451,7 @@ class V2e(Emulator):
         self._table = self._decode * self._scale
         self._x_table = lin_log(self._table)
 
-    def _start(self, frame: np.ndarray, t_ns: int) -> Events:
+    def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         intensity = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
         self._x[...] = lin_log(intensity)
         if self._intensity.size:
@@ -471,7 +471,7 @@ class V2e(Emulator):
         self._epoch_ns[0], self._brightest[0] = t_ns, intensity.max()
         return Events.empty()
 
-    def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
+    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         config, dt_ns = self.config, t_ns - self.t_ns
         if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > config.max_events_per_step:
             raise EventDataError("more shot noise than max_events_per_step in one interval", where=f"frame {self.frames}",

@@ -281,8 +281,8 @@ class DvsVoltmeter(Emulator):
 
     _state = ("_intensity", "_v", "_release")
 
-    def __init__(self, height: int, width: int, config: VoltmeterConfig | None = None, seed: int = 0):
-        super().__init__(height, width, seed)
+    def __init__(self, height: int, width: int, config: VoltmeterConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
+        super().__init__(height, width, seed, reconstruction)
         self.config = config = config or VoltmeterConfig()
         pixels = self.height * self.width
         self._intensity, self._v = np.zeros(pixels, np.float32), np.zeros(pixels, np.int32)
@@ -294,11 +294,11 @@ class DvsVoltmeter(Emulator):
     def _tables_changed(self) -> None:
         self._table = self._decode * self._scale
 
-    def _start(self, frame: np.ndarray, t_ns: int) -> Events:
+    def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         self._intensity[...] = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
         return Events.empty()
 
-    def _advance(self, frame: np.ndarray, t_ns: int) -> Events:
+    def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         c, dt_ns, base_us = self.config, t_ns - self.t_ns, self.t_ns // 1000
         pixels = Pixels(self._intensity, self._v, self._release)
         interval = Interval(self.t_ns, dt_ns, base_us, c.k1, c.k2, c.k3, c.k4, c.k5, c.k6, self._scale, self.seed,

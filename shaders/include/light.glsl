@@ -12,3 +12,19 @@ float irradiance(vec3 normal)
     return light_strength.x * max(0.0, dot(n, sun_direction))
          + light_strength.y * (0.5 + 0.5 * dot(n, up_direction));
 }
+
+#ifdef RATE
+uniform vec3 sun_rate; // ds/dt and d(up)/dt, object frame, 1/s
+uniform vec3 up_rate;
+
+// dE/dt of the same where the normal seen changes by normal_rate per second.
+float irradiance_rate(vec3 normal, vec3 normal_rate)
+{
+    float scale = inversesqrt(max(dot(normal, normal), 1e-30));
+    vec3 n = normal * scale;
+    vec3 turn = (normal_rate - n * dot(n, normal_rate)) * scale;
+    float facing = dot(n, sun_direction);
+    return (facing > 0.0 ? light_strength.x * (dot(turn, sun_direction) + dot(n, sun_rate)) : 0.0)
+         + light_strength.y * 0.5 * (dot(turn, up_direction) + dot(n, up_rate));
+}
+#endif

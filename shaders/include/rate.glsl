@@ -1,0 +1,32 @@
+// Rate of change, at a fixed pixel, of what a moving surface shows there. A surface point moves by v px/s, so the pixel
+// sees the surface slide the other way: d/dt = -(v . grad) of whatever is interpolated over the surface.
+//
+// A perspective-correct varying times 1/w is linear on the screen, and so is 1/w: the differences of a pixel quad are
+// then exact, and the quotient rule gives the exact gradient (the plain dFdx of the varying is half a pixel off).
+
+// -(v . grad) of a varying, per second
+#define SEEN_RATE(T) T seen_rate(T value, vec2 v) \
+{ \
+    float W = gl_FragCoord.w; \
+    T scaled = value * W; \
+    return ((dFdx(scaled) - value * dFdx(W)) * v.x + (dFdy(scaled) - value * dFdy(W)) * v.y) / -W; \
+}
+SEEN_RATE(vec2)
+SEEN_RATE(vec3)
+
+// Half the distance, px, over which a texture's rate is taken: half a pixel either side is the derivative of what a
+// pixel sees, and far above the 1/256 texel in which GPUs place a sample.
+const float REACH = 0.5;
+
+// Of the texture's first channel, per second, by a central difference along the motion. every: px of the image per px
+// of the target.
+float texture_rate(sampler2D image, vec2 uv, vec2 v, float every)
+{
+    float speed = length(v);
+    if (!(speed > 0.0))
+        return 0.0;
+    vec2 along_x = seen_rate(uv, vec2(-1.0 / every, 0.0)), along_y = seen_rate(uv, vec2(0.0, -1.0 / every));
+    vec2 aside = mat2(along_x, along_y) * (v / speed) * REACH;
+    float ahead = textureGrad(image, uv - aside, along_x, along_y).r, behind = textureGrad(image, uv + aside, along_x, along_y).r;
+    return (ahead - behind) * speed * every * (0.5 / REACH);
+}

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 from rich.console import Console
@@ -14,13 +15,14 @@ from rich.table import Table
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.events import make_emulator
+from blinkgl.events.response import response_of
 from blinkgl.gl import GLContext, create_context
-from blinkgl.gl.framebuffer import FORMATS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
+from blinkgl.timeline import make_timeline
 
 PROBES = 12
 DEPTH_BYTES = 4
@@ -104,24 +106,29 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         return tuple(sorted({"+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
                              for program, defines in gl.shaders._programs if program == name}))
 
-    luminance = np.empty((renderer.height, renderer.width), np.float32)
-    event_s = _timed(lambda t: renderer.luminance(t, out=luminance), times)
-    fine = samples_of(config.render.antialiasing).stored
     timeline, rejected = config.timeline, 1.0
+    luminance = np.empty((renderer.height, renderer.width), np.float32)
+    rate = np.empty_like(luminance) if timeline.reconstruction == "hermite" else None
+    event_s = _timed(lambda t: renderer.luminance(t, out=luminance, rate=rate), times)
+    fine = samples_of(config.render.antialiasing).stored
     if timeline.kind == "uniform":
         result.frames = int(duration * timeline.fps) + 1
     else:
-        speeds = [renderer.speed(t, timeline.sample_every, timeline.percentile) for t in times]
-        steps = np.clip([timeline.max_px / max(v, 1e-12) for v in speeds], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
+        strategy = make_timeline(timeline, t0, t1, renderer, response_of(config.events))
+        if timeline.kind == "budget":  # a short stretch, for the first measurements of the error
+            for t in islice(strategy, 2 * PROBES):
+                strategy.observe(t, renderer.luminance(t, out=luminance, rate=rate), rate)
+        steps = np.clip([1 / max(strategy.pace(t), 1e-12) for t in times], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
         result.frames = int(duration * np.mean(1 / steps)) + 1
         rejected = 1.1  # a step is cut again now and then
-    result.passes.append(Pass("event frames", f"timeline: {timeline.kind}", variants("luminance.glsl"),
-                              pixels * fine * (FORMATS["R32F"].numpy.itemsize + DEPTH_BYTES), result.frames, event_s * result.frames))
+    result.passes.append(Pass("event frames" + (" with rates" if rate is not None else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
+                              variants("luminance.glsl"), pixels * fine * ((4 if rate is None else 8) + DEPTH_BYTES), result.frames,
+                              event_s * result.frames))
     if timeline.kind != "uniform":
-        velocity_s = _timed(lambda t: renderer.speed(t, timeline.sample_every, timeline.percentile), times)
-        count = int(result.frames * rejected)
-        result.passes.append(Pass("velocity", f"bounds the step; every {timeline.sample_every}. pixel", ("velocity",),
-                                  pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, velocity_s * count))
+        small_s, count = _timed(strategy.pace, times), int(result.frames * rejected)
+        name = "brightness" if timeline.kind == "brightness" else "velocity"
+        result.passes.append(Pass(name, f"decides the step; every {timeline.sample_every}. pixel", (name,),
+                                  pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, small_s * count))
     if config.labels.images:
         result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
                                   ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
@@ -139,14 +146,18 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         each = _timed(lambda t: (renderer.colour(t, antialiasing="none"), renderer.velocity(t)), times[:3])
         result.passes.append(Pass("preview", f"{config.preview.rate:g} pictures per simulated second", ("colour", "velocity"),
                                   pixels * (16 + 8 + DEPTH_BYTES), pictures, each * pictures))
-    emulator = make_emulator(config.events, renderer.height, renderer.width, kernel_seed(config.seed, index, Role.EVENTS))
+    emulator = make_emulator(config.events, renderer.height, renderer.width, kernel_seed(config.seed, index, Role.EVENTS), timeline.reconstruction)
     step = max(1, round((t1 - t0) / result.frames))
     moments = [t0 + k * step for k in range(min(PROBES, result.frames))]
-    frames = [renderer.luminance(t).copy() for t in moments]
-    emulator.step(frames[0], moments[0])
+    frames, rates = [], []
+    for t in moments:
+        frames.append(renderer.luminance(t, out=luminance, rate=rate).copy())
+        rates.append(rate if rate is None else rate.copy())
+    emulator.step(frames[0], moments[0], None, rates[0])
     started, events = time.perf_counter(), 0
-    for frame, t in zip(frames[1:], moments[1:]):
-        events += len(emulator.step(frame, t))
+    for frame, t, r in zip(frames[1:], moments[1:], rates[1:]):
+        events += len(emulator.step(frame, t, None, r))
+    events += len(emulator.flush())
     each = (time.perf_counter() - started) / max(1, len(moments) - 1)
     rate = events / max(1, len(moments) - 1)
     result.passes.append(Pass("event kernel", f"{config.events.emulator}; about {rate * result.frames / duration / 1e6:.1f} M events per simulated second",
@@ -181,6 +192,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         add("light", "every material is unlit: no normals in the vertex stream, no light in the shader")
     if config.timeline.kind == "uniform":
         add("velocity pass", "timeline: uniform does not look at motion")
+    if config.timeline.reconstruction != "hermite":
+        add("rates of change in the event frames", f"timeline.reconstruction: {config.timeline.reconstruction}")
     for name, value in config.events.model_dump().items():
         if value in (0, 0.0, False) and name not in ("seed",):
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())

@@ -21,6 +21,7 @@ from blinkgl.config.frames import FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import ReadoutConfig, load_sensor
+from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.errors import ConfigError
 
 NS_PER_S = 1_000_000_000
@@ -98,33 +99,6 @@ class TimeConfig(Config):
     def label_times_ns(self) -> list[int]:
         """label_count + 1 times; flow k runs from label k to label k + 1."""
         return [self.t0_ns + (k + 1) * self.interval_ns for k in range(self.label_count + 1)]
-
-
-class UniformTimeline(Config):
-    """Event frames at a fixed rate."""
-
-    kind: Literal["uniform"] = "uniform"
-    fps: float = Field(300.0, gt=0, le=1e9, description="frames per second, Hz")
-
-
-class DisplacementTimeline(Config):
-    """Event frames so far apart that no pixel moves more than ``max_px`` from one to the next."""
-
-    kind: Literal["displacement"] = "displacement"
-    max_px: float = Field(0.5, gt=0, le=1e4, description="largest displacement between two frames, px")
-    percentile: float = Field(100.0, gt=0, le=100, description="of the per-pixel speeds; 100 bounds every sampled pixel")
-    sample_every: int = Field(4, ge=1, le=64, description="the velocity pass looks at every n-th pixel in x and y; 1 at all of them")
-    min_step_us: float = Field(200.0, ge=0.001, description="the step is never shorter, µs")
-    max_step_us: float = Field(20000.0, ge=0.001, description="the step is never longer, µs")
-
-    @model_validator(mode="after")
-    def _ordered(self):
-        if self.min_step_us > self.max_step_us:
-            raise ValueError(f"min_step_us must not exceed max_step_us = {self.max_step_us}")
-        return self
-
-
-TimelineConfig = Annotated[UniformTimeline | DisplacementTimeline, Field(discriminator="kind")]
 
 
 Antialiasing = Literal["none", "msaa4", "ssaa2", "ssaa4"]
@@ -224,7 +198,7 @@ class RunTemplate:
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
     """SequenceConfig of plain data, with the values of a named sensor filled in where the tree says nothing."""
-    config = validate(SequenceConfig, tree)
+    config = _possible(validate(SequenceConfig, tree))
     if config.sensor is None:
         return config
     sensor = load_sensor(config.sensor)
@@ -233,6 +207,15 @@ def _validated(tree: dict[str, Any]) -> SequenceConfig:
     events = sensor.emulator(events.pop("emulator", "esim"), **events).model_dump()
     return validate(SequenceConfig, {"readout": sensor.readout.model_dump(), **tree, "events": events,
                                      "camera": {"width": sensor.width, "height": sensor.height, **table("camera")}})
+
+
+def _possible(config: SequenceConfig) -> SequenceConfig:
+    """The same; ConfigError where two of its tables contradict each other."""
+    path, emulator = config.timeline.reconstruction, config.events.emulator
+    if path != "linear" and emulator != "esim" and config.frames is None:
+        raise ConfigError(f"{emulator} follows straight lines alone", where="timeline.reconstruction", value=path,
+                          accepted="linear, or events.emulator: esim")
+    return config
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

@@ -16,11 +16,11 @@ import numpy as np
 import blinkgl
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.dataset.clock import StageClock
+from blinkgl.dataset.event_pass import EventPass
 from blinkgl.dataset.frames import convert_sequence
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
-from blinkgl.events import make_emulator
 from blinkgl.events.readout import Readout
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
@@ -28,7 +28,6 @@ from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.timeline import frame_times
 
 
 def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
@@ -91,33 +90,27 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
 def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, writer: SequenceWriter,
                      clock: StageClock, report: SequenceReport, progress: Progress | None) -> None:
     """Pass 1: luminance frames through the emulator, events into events.h5, and the preview on the way."""
-    camera, t0_ns, t1_ns = scene.camera, scene.t0_ns, scene.t1_ns
-    emulator = make_emulator(config.events, camera.height, camera.width, kernel_seed(config.seed, index, Role.EVENTS))
+    t0_ns, t1_ns = scene.t0_ns, scene.t1_ns
     readout = Readout(config.readout) if config.readout is not None else None
-    timeline = config.timeline
-
-    def speed(t_ns: int) -> float:
-        return renderer.speed(t_ns, timeline.sample_every, timeline.percentile)
-
-    luminance = np.empty((camera.height, camera.width), np.float32)
+    frames = EventPass(config.timeline, config.events, renderer, kernel_seed(config.seed, index, Role.EVENTS), clock)
     with PreviewRecorder(config, renderer, writer, clock) as preview:
-        for t_ns in frame_times(timeline, t0_ns, t1_ns, speed):
-            renderer.luminance(t_ns, out=luminance)
-            with clock("events"):
-                events = emulator.step(luminance, t_ns, renderer.changed_rows)
-                if readout is not None:
+        for t_ns, events in frames:
+            if readout is not None:
+                with clock("events"):
                     events = readout.step(events)
             with clock("write"):
                 writer.append_events(events)
             preview.add_events(events)
             if preview.due(t_ns):
                 preview.frame(t_ns)
-            report.frames += 1
+            report.frames = frames.frames
             report.events += len(events)
             if progress is not None:
                 clock.seconds.update({"render": renderer.stats.render_s, "read-back": renderer.stats.readback_s})
                 progress(report, (t_ns - t0_ns) / (t1_ns - t0_ns))
-    writer.info["events_cut_by_max_events_per_step"] = emulator.saturated
+    report.timeline = frames.timeline.info()
+    writer.info["timeline"] = {"kind": config.timeline.kind, "reconstruction": config.timeline.reconstruction, **report.timeline}
+    writer.info["events_cut_by_max_events_per_step"] = frames.emulator.saturated
     writer.info["events_lost_in_readout"] = readout.dropped if readout is not None else 0
 
 

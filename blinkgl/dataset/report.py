@@ -29,6 +29,8 @@ class SequenceReport:
     labels: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     total_s: float = 0.0
+    timeline: dict = field(default_factory=dict)
+    """what an adaptive timeline says it achieved"""
 
 
 def config_yaml(config: SequenceConfig, index: int) -> str:

@@ -94,6 +94,11 @@ class Emulator(ABC):
         """Whether events come one frame late, the last of them from :meth:`flush`."""
         return self.reconstruction == "pchip"
 
+    @property
+    def done_ns(self) -> int | None:
+        """Time up to which events have been returned; None before the first frame."""
+        return self.t_ns
+
     def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None, rate: np.ndarray | None = None) -> Events:
         """Events since the last frame; see the class.
 

@@ -381,6 +381,10 @@ class Esim(Emulator):
                      self._levels(ring(k - 1)), self._interval(ns(k - 1), ns(k)))
         return self._run(_band_curve, _bands_curve, arguments, base_us, ns(k) // 1000 - base_us)
 
+    @property
+    def done_ns(self) -> int | None:
+        return int(self._ring_ns[self._passed[0] % 4]) if self.lags and self.t_ns is not None else self.t_ns
+
     def flush(self) -> Events:
         if not self.lags or self.t_ns is None or self._passed[0] >= self.frames - 1:
             return Events.empty()

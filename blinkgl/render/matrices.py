@@ -68,3 +68,11 @@ def mat4_bytes(matrices: np.ndarray) -> bytes:
 def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
     """GLSL mat4x3 (4 columns of 3) with the x, y, w rows of a (4, 4) clip-space matrix."""
     return np.ascontiguousarray(matrix[[0, 1, 3]].T, dtype=np.float32).tobytes()
+
+
+def frustum_planes(camera) -> np.ndarray:
+    """(5, 3) inward unit normals, camera axes, of left, right, top, bottom and the plane through the centre."""
+    left, right = (-0.5 - camera.cx) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
+    top, bottom = (-0.5 - camera.cy) / camera.fy, (camera.height - 0.5 - camera.cy) / camera.fy
+    planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
+    return planes / np.linalg.norm(planes, axis=1, keepdims=True)

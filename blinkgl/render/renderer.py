@@ -17,7 +17,7 @@ import moderngl
 import numpy as np
 
 from blinkgl.render.antialiasing import Samples, samples_of
-from blinkgl.render.matrices import (cam_from_obj, cam_from_obj_rate, mat4_bytes, projection, rows_xyw_bytes)
+from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, frustum_planes, mat4_bytes, projection, rows_xyw_bytes
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
 from blinkgl.render.statistics import largest_speed
@@ -109,7 +109,7 @@ class Renderer:
         self._moves = np.array([not p.is_static for p in self._paths], bool)
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         self._still = scene.camera.path.is_static and not self._moves.all()
-        self._backdrop: Backdrop | None = None
+        self._backdrops: dict[str, Backdrop] = {}
         self.changed: list[Rectangle] | None = None
         self._surfaces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._samples, self._image_samples = samples_of(config.antialiasing), samples_of(config.image_antialiasing, "render.image_antialiasing")
@@ -119,7 +119,8 @@ class Renderer:
         self._item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
         self._item_radius = np.array([i.radius for i in items])
         self._item_layer = np.array([i.layer for i in items])
-        self._frustum = _frustum_planes(scene.camera)
+        self._frustum = frustum_planes(scene.camera)
+        self._whole = Rectangle(0, 0, self.width, self.height)
 
     def __enter__(self) -> "Renderer":
         return self
@@ -158,25 +159,47 @@ class Renderer:
 
     # ---- passes ------------------------------------------------------------------------------------------------
 
-    def luminance(self, t_ns: int, out: np.ndarray | None = None) -> np.ndarray:
+    def luminance(self, t_ns: int, out: np.ndarray | None = None, rate: np.ndarray | None = None) -> np.ndarray:
         """Linear luminance at t_ns, (H, W) float32, into ``out`` when given (C-contiguous).
 
-        With a still camera only what moves is drawn, and when ``out`` is the array of the call before, only what has
-        changed is written: leave it as it was returned. ``changed`` then says where."""
+        rate : (H, W) float32, filled with d(luminance)/dt per second of each pixel when given, as the surface it shows moves
+        (edges that pass are not in it); a shader variant of its own, not compiled otherwise.
+        With a still camera only what moves is drawn, and when ``out`` (and ``rate``) is the array of the call before, only what
+        has changed is written: leave it as it was returned. ``changed`` then says where."""
         started = time.perf_counter()
-        samples = self._samples
-        target = self._target("luminance", samples.grid, ("R32F",), samples.multi)
+        samples, (name, fmt) = self._samples, ("luminance", "R32F") if rate is None else ("luminance+rate", "RG32F")
+        target = self._target(name, samples.grid, (fmt,), samples.multi)
         moment = self._moment(t_ns)
+        rates = None if rate is None else self._rates(t_ns, moment)
+        image = np.empty((self.height, self.width), np.float32) if out is None else out
         if self._still:
-            return self._mend_luminance(moment, target, started, out)
-        self._begin(target, moment, self.scene.background)
-        self._draw_luminance(moment, self._visible(moment))
-        return self._read(self._filtered(target, "luminance", "R32F", samples), 0, started, out)
+            return self._mend_luminance(name, fmt, moment, rates, target, started, image, rate)
+        self._begin(target, moment, (self.scene.background, 0.0))
+        self._draw_luminance(moment, self._visible(moment), target, rates)
+        target = self._filtered(target, name, fmt, samples)
+        if rate is None:
+            return self._read(target, 0, started, image)
+        image[...], rate[...] = np.moveaxis(self._read(target, 0, started, None), -1, 0)
+        return image
+
+    def brightness(self, t_ns: int, every: int = 1) -> np.ndarray:
+        """(H // every, W // every, 2) float32: luminance and d(luminance)/dt per second on every n-th pixel in x and y, textures
+        filtered as for the whole image."""
+        started = time.perf_counter()
+        target = self._target("brightness", 1 / every, ("RG32F",))
+        moment = self._moment(t_ns)
+        self._begin(target, moment, (self.scene.background, 0.0))
+        self._draw_luminance(moment, self._visible(moment), target, self._rates(t_ns, moment), every)
+        return self._read(target, 0, started, None)
 
     def speed(self, t_ns: int, sample_every: int = 1, percentile: float = 100.0) -> float:
         """Largest image speed at t_ns, px/s (or a percentile of the pixels' speeds), on every n-th pixel in x and y.
         With a still camera the moving objects alone are drawn, those behind something included: still a bound."""
-        return largest_speed(self.velocity(t_ns, sample_every, moving_only=self._still), percentile)
+        return largest_speed(self.motion(t_ns, sample_every), percentile)
+
+    def motion(self, t_ns: int, every: int = 1) -> np.ndarray:
+        """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone."""
+        return self.velocity(t_ns, every, moving_only=self._still)
 
     def velocity(self, t_ns: int, reduce: int = 1, moving_only: bool = False) -> np.ndarray:
         """Image velocity at t_ns in px/s (of the full-size image), (H // reduce, W // reduce, 2) float32, 0 where
@@ -185,8 +208,8 @@ class Renderer:
         started = time.perf_counter()
         target = self._target("velocity", 1 / reduce, ("RG32F",))
         moment = self._moment(t_ns)
-        rate = self._rates(t_ns, moment)
-        self._begin(target, moment, 0.0)
+        rate, _ = self._rates(t_ns, moment)
+        self._begin(target, moment)
         for item in self._visible(moment):
             if moving_only and not self._moves[item.object_index]:
                 continue
@@ -236,7 +259,7 @@ class Renderer:
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
         target = self._target("colour", samples.grid, ("RGBA32F",), samples.multi)
         moment = self._moment(t_ns)
-        self._begin(target, moment, self.scene.background)
+        self._begin(target, moment, (self.scene.background,) * 3)
         for item in self._visible(moment):
             uniforms = self._bind("label.glsl", item, moment, {"OUT_COLOUR": 0})
             uniforms["base_color"].value = tuple(item.material.base_color)
@@ -248,53 +271,68 @@ class Renderer:
 
     # ---- parts of the event pass -------------------------------------------------------------------------------
 
-    def _draw_luminance(self, moment: _Moment, items: list[DrawItem]) -> None:
+    def _draw_luminance(self, moment: _Moment, items: list[DrawItem], target, rates: tuple | None = None, every: int = 1) -> None:
+        defines = {} if rates is None else {"RATE": 1} if every == 1 else {"RATE": 1, "EVERY": every}
         for item in items:
-            uniforms = self._bind("luminance.glsl", item, moment, {})
+            uniforms = self._bind("luminance.glsl", item, moment, defines)
             if item.textured:
                 self._resources.luminance_texture(item.material).use(0)
             else:
                 uniforms["albedo"].value = self._resources.albedo_luminance(item.material)
+            if rates is not None:
+                self._set_rates(uniforms, rates, item, target)
             self._draw(uniforms, item)
 
-    def _mend_luminance(self, moment: _Moment, target, started: float, out: np.ndarray | None) -> np.ndarray:
+    def _set_rates(self, uniforms: dict, rates: tuple[np.ndarray, np.ndarray], item: DrawItem, target) -> None:
+        matrices, dT_world_obj = rates
+        if "rate" in uniforms:
+            self._set_motion(uniforms, "rate", matrices, item, target)
+        if "sun_rate" in uniforms:
+            dR = dT_world_obj[item.object_index, :3, :3]
+            uniforms["sun_rate"].value = tuple(self.scene.light.sun_direction @ dR)
+            uniforms["up_rate"].value = tuple(dR[2])
+
+    def _mend_luminance(self, name: str, fmt: str, moment: _Moment, rates: tuple | None, target, started: float, image: np.ndarray,
+                        rate: np.ndarray | None) -> np.ndarray:
         """:meth:`luminance` for a still camera; see ``still.py``."""
         samples, ctx = self._samples, self.gl.ctx
         visible = self._visible(moment)
         movers = [(item, screen_rectangle(item, moment.T_cam_obj[item.object_index], self.scene.camera))
                   for item in visible if self._moves[item.object_index]]
         movers = [(item, rectangle) for item, rectangle in movers if rectangle is not None]
-        whole = Rectangle(0, 0, self.width, self.height)
-        if self._backdrop is None:
-            picture = self._target("backdrop", samples.grid, ("R32F",), samples.multi)
-            self._begin(picture, moment, self.scene.background)
-            self._draw_luminance(moment, [item for item in visible if not self._moves[item.object_index]])
-            self._backdrop = Backdrop(self.gl, picture, target)
-            stale = self._backdrop.stale([whole])
-            self._backdrop.stale([r for _, r in movers])
+        backdrop = self._backdrops.get(name)
+        if backdrop is None:
+            picture = self._target("backdrop:" + name, samples.grid, (fmt,), samples.multi)
+            self._begin(picture, moment, (self.scene.background, 0.0))
+            self._draw_luminance(moment, [item for item in visible if not self._moves[item.object_index]], picture, rates)
+            backdrop = self._backdrops[name] = Backdrop(self.gl, picture, target)
+            stale = backdrop.stale([self._whole])
+            backdrop.stale([r for _, r in movers])
         else:
-            stale = self._backdrop.stale([r for _, r in movers])
+            stale = backdrop.stale([r for _, r in movers])
         self._prepare(target)
         for rectangle in stale:
             fine = rectangle.scaled(samples.grid)
             ctx.scissor = (fine.x0, fine.y0, fine.x1 - fine.x0, fine.y1 - fine.y0)
-            self._backdrop.restore(fine)
-            self._draw_luminance(moment, [item for item, r in movers if r.meets(rectangle)])
+            backdrop.restore(fine)
+            self._draw_luminance(moment, [item for item, r in movers if r.meets(rectangle)], target, rates)
         ctx.scissor = None
         self.stats.frames += 1
-        result = self._filtered(target, "luminance", "R32F", samples, stale=bool(stale))
-        image = np.empty((self.height, self.width), np.float32) if out is None else out
+        result = self._filtered(target, name, fmt, samples, stale=bool(stale))
         self.changed = stale
-        if image is not self._backdrop.image:
-            stale = [whole]
-            self._backdrop.image = image
+        if backdrop.images is None or backdrop.images[0] is not image or backdrop.images[1] is not rate:
+            stale, backdrop.images = [self._whole], (image, rate)
         ctx.finish()
         drawn = time.perf_counter()
         for r in stale:
-            if r == whole:
+            if r == self._whole and rate is None:
                 result.read(0, out=image)
+                continue
+            part, place = result.read(0, region=(r.x0, r.y0, r.x1 - r.x0, r.y1 - r.y0)), np.s_[r.y0:r.y1, r.x0:r.x1]
+            if rate is None:
+                image[place] = part
             else:
-                image[r.y0:r.y1, r.x0:r.x1] = result.read(0, region=(r.x0, r.y0, r.x1 - r.x0, r.y1 - r.y0))
+                image[place], rate[place] = part[..., 0], part[..., 1]
         self.stats.render_s += drawn - started
         self.stats.readback_s += time.perf_counter() - drawn
         return image
@@ -309,11 +347,11 @@ class Renderer:
         moment = self._moment(t_ns)
         motions = []
         if "OUT_VELOCITY" in defines:
-            motions.append(("rate", self._rates(t_ns, moment)))
+            motions.append(("rate", self._rates(t_ns, moment)[0]))
         for name, t_other in (("forward", t_forward_ns), ("backward", t_backward_ns)):
             if f"OUT_FLOW_{name.upper()}" in defines:
                 motions.append((f"difference_{name}", self._moment(t_other).mvp - moment.mvp))
-        self._begin(target, moment, 0.0)
+        self._begin(target, moment)
         for item in self._visible(moment):
             uniforms = self._bind("label.glsl", item, moment, defines)
             for name, matrices in motions:
@@ -363,13 +401,13 @@ class Renderer:
         self._last_moment = (t_ns, moment)
         return moment
 
-    def _rates(self, t_ns: int, moment: _Moment) -> np.ndarray:
-        """(n, 4, 4) float64 d(MVP)/dt, 1/s, from the analytic derivatives of the paths."""
+    def _rates(self, t_ns: int, moment: _Moment) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 4, 4) float64 d(MVP)/dt and d(T_world_obj)/dt, 1/s, from the analytic derivatives of the paths."""
         dT_world_obj = np.zeros_like(moment.T_world_obj)
         for i in self._moving:
             dT_world_obj[i] = self._paths[i].derivative(t_ns)
         return self._projection @ cam_from_obj_rate(moment.T_world_cam, self.scene.camera.path.derivative(t_ns),
-                                                    moment.T_world_obj, dT_world_obj)
+                                                    moment.T_world_obj, dT_world_obj), dT_world_obj
 
     def _visible(self, moment: _Moment) -> list[DrawItem]:
         """Items whose bounding sphere meets the view frustum: objects front to back, then ground, then sky."""
@@ -392,9 +430,9 @@ class Renderer:
             self._targets[key] = self.gl.framebuffer(width, height, colour=formats, depth=True, samples=samples)
         return self._targets[key]
 
-    def _begin(self, target, moment: _Moment, background: float) -> None:
+    def _begin(self, target, moment: _Moment, background: tuple[float, ...] = ()) -> None:
         self._prepare(target)
-        target.clear((background, background, background, 0.0)[: target.formats[0].components], depth=0.0)
+        target.clear((*background, 0.0, 0.0, 0.0, 0.0)[: target.formats[0].components], depth=0.0)
         self.stats.frames += 1
 
     def _prepare(self, target) -> None:
@@ -474,11 +512,3 @@ class Renderer:
         self.stats.render_s += drawn - started
         self.stats.readback_s += time.perf_counter() - drawn
         return image
-
-
-def _frustum_planes(camera) -> np.ndarray:
-    """(5, 3) inward unit normals, camera axes, of left, right, top, bottom and the plane through the centre."""
-    left, right = (-0.5 - camera.cx) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
-    top, bottom = (-0.5 - camera.cy) / camera.fy, (camera.height - 0.5 - camera.cy) / camera.fy
-    planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
-    return planes / np.linalg.norm(planes, axis=1, keepdims=True)

@@ -12,17 +12,6 @@ from fractions import Fraction
 NS_PER_S = 1_000_000_000
 
 
-def frame_times(config, t0_ns: int, t1_ns: int, speed: Callable[[int], float]) -> Iterator[int]:
-    """Times of one sequence for any ``timeline:`` configuration.
-
-    speed : t_ns -> largest image speed at that time, px/s; only called by strategies that adapt to it.
-    """
-    if config.kind == "uniform":
-        return uniform_times(config.fps, t0_ns, t1_ns)
-    return displacement_times(config.max_px, round(config.min_step_us * 1000), round(config.max_step_us * 1000),
-                              t0_ns, t1_ns, speed)
-
-
 def uniform_times(fps: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
     """t0 + k / fps, each rounded to the nanosecond on its own (no error accumulates), then t1."""
     step = NS_PER_S / Fraction(fps).limit_denominator(1_000_000)
@@ -41,28 +30,36 @@ def displacement_times(max_px: float, min_step_ns: int, max_step_ns: int, t0_ns:
                        speed: Callable[[int], float]) -> Iterator[int]:
     """Steps so short that ``speed * step <= max_px`` at both ends of each step, within [min_step, max_step].
 
-    The step is proposed from the speed at its start (as in Rebecq et al. 2018, section 3.2) and then checked against
-    the speed at its end, which the original does not do: something that accelerates inside the step would exceed the
-    bound. A rejected step is shortened and tried again; the speed at an accepted end is the next step's start, so a
-    speed is asked for once per frame as long as nothing is rejected. The last step ends at t1 exactly, and steps
+    speed : t_ns -> largest image speed at that time, px/s."""
+    return bounded_times(lambda t_ns: speed(t_ns) / max_px, min_step_ns, max_step_ns, t0_ns, t1_ns)
+
+
+def bounded_times(pace: Callable[[int], float], min_step_ns: int, max_step_ns: int, t0_ns: int, t1_ns: int) -> Iterator[int]:
+    """Steps so short that ``pace * step <= 1`` at both ends of each step, within [min_step, max_step].
+
+    pace : t_ns -> how many steps per second the scene asks for at that time.
+    The step is proposed from the pace at its start (as in Rebecq et al. 2018, section 3.2) and then checked against
+    the pace at its end, which the original does not do: something that accelerates inside the step would exceed the
+    bound. A rejected step is shortened and tried again; the pace at an accepted end is the next step's start, so a
+    pace is asked for once per frame as long as nothing is rejected. The last step ends at t1 exactly, and steps
     before it may be shorter than min_step only there.
     """
     yield t0_ns
-    t, v = t0_ns, speed(t0_ns)
+    t, v = t0_ns, pace(t0_ns)
     while t < t1_ns:
-        step = min(_step(max_px, v, min_step_ns, max_step_ns), t1_ns - t)
+        step = min(_step(1.0, v, min_step_ns, max_step_ns), t1_ns - t)
         while True:
             end = t + step
-            v_end = speed(end)
-            if max(v, v_end) * step <= max_px * NS_PER_S * (1 + 1e-9) or step <= min_step_ns:
+            v_end = pace(end)
+            if max(v, v_end) * step <= NS_PER_S * (1 + 1e-9) or step <= min_step_ns:
                 break
-            # 0.9: a step cut to exactly what the end's speed asks for is often rejected again.
-            step = max(min_step_ns, min(int(0.9 * step), _step(0.95 * max_px, max(v, v_end), min_step_ns, max_step_ns)))
+            # 0.9: a step cut to exactly what the end's pace asks for is often rejected again.
+            step = max(min_step_ns, min(int(0.9 * step), _step(0.95, max(v, v_end), min_step_ns, max_step_ns)))
         yield end
         t, v = end, v_end
 
 
-def _step(max_px: float, speed: float, low: int, high: int) -> int:
-    if speed * high <= max_px * NS_PER_S:
+def _step(steps: float, pace: float, low: int, high: int) -> int:
+    if pace * high <= steps * NS_PER_S:
         return high
-    return max(low, int(max_px / speed * NS_PER_S))
+    return max(low, int(steps / pace * NS_PER_S))

@@ -14,9 +14,9 @@
 SEEN_RATE(vec2)
 SEEN_RATE(vec3)
 
-// Half the distance, px, over which a texture's rate is taken: half a pixel either side is the derivative of what a
-// pixel sees, and far above the 1/256 texel in which GPUs place a sample.
-const float REACH = 0.5;
+// Half the distance, px, over which a texture's rate is taken: short enough for steps of a fraction of a
+// pixel, and far above the 1/256 texel in which GPUs place a sample.
+const float REACH = 0.25;
 
 // Of the texture's first channel, per second, by a central difference along the motion. every: px of the image per px
 // of the target.

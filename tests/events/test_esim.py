@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from blinkgl.config.events import EsimConfig
+from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
-from blinkgl.events import Esim, Events
+from blinkgl.events import Esim, Events, V2e
 from blinkgl.events.reference import ReferenceEsim
-from tests.events.clips import assert_same, random_clip, run
+from tests.events.clips import assert_same, random_clip, run, run_cubic
 
 PLAIN = dict(threshold_sigma=0.0)
 VARIANTS = {
@@ -42,6 +42,84 @@ def test_equals_slow_twin(variant, dtype, threads):
     slow = run(ReferenceEsim(37, 45, config, seed=9), clip, times)
     assert len(fast) > 2000
     assert_same(fast, slow)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+@pytest.mark.parametrize("variant", ["plain", "spread", "refractory", "jitter"])
+@pytest.mark.parametrize("reconstruction", ["pchip", "hermite"])
+def test_cubics_equal_slow_twin(reconstruction, variant, dtype, threads):
+    """Slopes of both signs, too large and too small: all that the limiter meets."""
+    clip, times = random_clip(1, dtype=dtype)
+    rates = np.random.default_rng(2).normal(0, 30, clip.shape).astype(np.float32)
+    config = EsimConfig(**VARIANTS[variant])
+    fast = run_cubic(Esim(37, 45, config, 9, reconstruction), clip, times, rates)
+    slow = run_cubic(ReferenceEsim(37, 45, config, 9, reconstruction), clip, times, rates)
+    assert len(fast) > 2000
+    assert_same(fast, slow)
+
+
+@pytest.mark.parametrize("reconstruction", ["pchip", "hermite"])
+def test_cubics_pass_the_levels_of_the_straight_line(reconstruction):
+    """The same events per pixel in the same order; only the times differ, and stay inside their interval."""
+    clip, times = random_clip(5, frames=12)
+    rates = np.random.default_rng(2).normal(0, 30, clip.shape).astype(np.float32)
+    config = EsimConfig(threshold_sigma=0.03, threshold_jitter=0.05)
+    straight = run(Esim(37, 45, config, 9), clip, times)
+    cubic = run_cubic(Esim(37, 45, config, 9, reconstruction), clip, times, rates)
+    a, b = (np.lexsort((np.arange(len(e)), e.x, e.y)) for e in (straight, cubic))
+    for name in "xyp":
+        np.testing.assert_array_equal(getattr(straight, name)[a], getattr(cubic, name)[b])
+    np.testing.assert_array_equal(np.searchsorted(times // 1000, straight.t[a]), np.searchsorted(times // 1000, cubic.t[b]))
+    assert (straight.t[a] != cubic.t[b]).mean() > 0.5 and (np.diff(cubic.t) >= 0).all()
+
+
+@pytest.mark.parametrize("reconstruction", ["pchip", "hermite"])
+@pytest.mark.parametrize("cut", [1, 2, 3, 6])
+def test_cubics_resume_bit_identically(reconstruction, cut):
+    clip, times = random_clip(2, frames=9)
+    rates = np.random.default_rng(3).normal(0, 30, clip.shape).astype(np.float32)
+    config = EsimConfig(**VARIANTS["jitter"])
+    whole = run_cubic(Esim(37, 45, config, 3, reconstruction), clip, times, rates)
+    first, second = (Esim(37, 45, config, 3, reconstruction) for _ in range(2))
+    head = [first.step(f, int(t), None, r) for f, t, r in zip(clip[:cut], times, rates)]
+    second.load_state_dict(first.state_dict())
+    assert_same(whole, Events.concatenate([*head, run_cubic(second, clip[cut:], times[cut:], rates[cut:])]))
+
+
+def test_pchip_is_one_frame_late_and_goes_on_after_a_flush():
+    clip, times = random_clip(7, frames=10)
+    esim = Esim(37, 45, EsimConfig(**PLAIN), 3, "pchip")
+    chunks = []
+    for k, (frame, t) in enumerate(zip(clip, times)):
+        chunks.append(esim.step(frame, int(t)))
+        assert esim.done_ns == times[max(k - 1, 0)] and (len(chunks[-1]) == 0 or chunks[-1].t.max() <= esim.done_ns // 1000)
+        if k in (4, 5):
+            chunks.append(esim.flush())
+            assert esim.done_ns == t and len(esim.flush()) == 0
+    events = Events.concatenate([*chunks, esim.flush()])
+    assert len(events) == len(run(Esim(37, 45, EsimConfig(**PLAIN), 3), clip, times)) and (np.diff(events.t) >= 0).all()
+
+
+def test_hermite_without_rates_and_unknown_paths_are_refused():
+    esim, frame = Esim(4, 5, EsimConfig(), 1, "hermite"), np.ones((4, 5), np.float32)
+    for rate in (None, np.ones((4, 4), np.float32), np.ones((4, 5))):
+        with pytest.raises(EventDataError, match="frame 0: hermite wants the rate"):
+            esim.step(frame, 0, None, rate)
+    with pytest.raises(EventDataError, match="timeline.reconstruction"):
+        Esim(4, 5, EsimConfig(), 1, "spline")
+    with pytest.raises(EventDataError, match="timeline.reconstruction"):
+        V2e(4, 5, V2eConfig(), 1, "pchip")
+
+
+def test_rates_that_are_not_finite_count_as_zero():
+    esim, twin = (Esim(2, 3, EsimConfig(**PLAIN), 1, "hermite") for _ in range(2))
+    frames = [np.full((2, 3), v, np.float32) for v in (0.1, 5.0)]
+    bad = np.array([[np.nan, np.inf, -np.inf], [0, 0, 0]], np.float32)
+    a, b = (Events.concatenate([e.step(f, 10**6 * k, None, r) for k, f in enumerate(frames)])
+            for e, r in ((esim, bad), (twin, np.zeros((2, 3), np.float32))))
+    keep = a.x != 1  # +inf is a slope beyond the limit
+    np.testing.assert_array_equal(a.t[keep], b.t[b.x != 1])
+    assert len(a) == len(b)
 
 
 @pytest.mark.parametrize("variant", ["plain", "jitter"])

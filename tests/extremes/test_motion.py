@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
 from tests.render.render_scenes import LEVEL, SECOND, camera, cube, curve, drift, mixed_scene, moved_scene, quad, scene, sphere, still, thing
 
-from blinkgl.config.sequence import DisplacementTimeline, RenderConfig
+from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.paths import KeyframePath
-from blinkgl.timeline import frame_times, uniform_times
+from blinkgl.timeline import displacement_times, uniform_times
 
 MS = 1_000_000
 MEDIAN, WORST = 5e-7, 1e-5  # of the motion
@@ -112,8 +112,8 @@ def test_a_million_pixels_per_second(gl, promise, speed):
     with Renderer(gl, world, RenderConfig()) as renderer:
         fastest = lambda t: largest_speed(renderer.velocity(t, 4))  # noqa: E731
         ten_px = int(10 / speed * SECOND)
-        times = np.array(list(frame_times(DisplacementTimeline(max_px=0.5, min_step_us=0.001), 0, ten_px, fastest)))
-        slow = np.array(list(frame_times(DisplacementTimeline(max_px=0.5, min_step_us=100), 0, 400_000, fastest)))
+        times = np.array(list(displacement_times(0.5, 1, 20_000_000, 0, ten_px, fastest)))
+        slow = np.array(list(displacement_times(0.5, 100_000, 20_000_000, 0, 400_000, fastest)))
     moved = np.diff(times) * 1e-9 * speed
     promise(f"{speed:g} px/s: displacement between two event frames", moved.max(), 0.5 * (1 + 1e-4), "px")
     assert np.diff(slow).min() >= 100_000  # documented saturation: never shorter than min_step_us, whatever the speed
@@ -124,7 +124,7 @@ def test_frame_times_at_both_ends():
     assert list(uniform_times(0.01, 10**15, 10**15 + 250 * SECOND)) == [10**15, 10**15 + 100 * SECOND, 10**15 + 200 * SECOND, 10**15 + 250 * SECOND]
     day = list(uniform_times(1 / 3600, 0, 86_400 * SECOND))
     assert len(day) == 25 and np.abs(np.diff(day) - 3600 * SECOND).max() <= 3600 * SECOND * 1e-6
-    still_day = list(frame_times(DisplacementTimeline(max_step_us=1e9), 0, 86_400 * SECOND, lambda t: 0.0))
+    still_day = list(displacement_times(0.5, 200_000, 10**12, 0, 86_400 * SECOND, lambda t: 0.0))
     assert len(still_day) == 88 and still_day[-1] == 86_400 * SECOND
 
 

@@ -151,10 +151,14 @@ def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
     """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that generation runs for this configuration."""
     config = subject.config
     labels, render = config.labels, config.render
-    out = {"luminance": (lambda r: r.luminance(when.t_ns), samples_of(render.antialiasing).grid)}
-    if config.timeline.kind == "displacement":
-        reduce = getattr(config.timeline, "sample_every", 1)
-        out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, reduce), 1 / reduce)
+    rate = np.empty((config.camera.height, config.camera.width), np.float32) if config.timeline.reconstruction == "hermite" else None
+    out = {"luminance" + (" and rate" if rate is not None else ""): (lambda r: r.luminance(when.t_ns, rate=rate), samples_of(render.antialiasing).grid)}
+    if config.timeline.kind != "uniform":
+        every = config.timeline.sample_every
+        if config.timeline.kind == "brightness":
+            out["brightness (timeline)"] = (lambda r: r.brightness(when.t_ns, every), 1 / every)
+        else:
+            out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, every), 1 / every)
     if labels.images or config.preview.enabled:
         out["colour"] = (lambda r: r.colour(when.t_ns), samples_of(render.image_antialiasing).grid)
     request = LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,

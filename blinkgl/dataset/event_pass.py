@@ -1,0 +1,44 @@
+"""Pass 1 of a sequence: frames at the times the timeline asks for, through the emulator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from blinkgl.dataset.clock import StageClock
+from blinkgl.events import Emulator, Events, make_emulator
+from blinkgl.events.response import response_of
+from blinkgl.render.renderer import Renderer
+from blinkgl.timeline import make_timeline
+
+
+class EventPass:
+    """Iterates over (t_ns, events): all events up to t_ns that have not been given before. Frames are drawn as it goes.
+
+    timeline, events : ``timeline:`` and ``events:`` configurations.   seed : of the emulator's draws.
+    clock : gets the seconds of the emulator as "events".
+
+    emulator : Emulator.   timeline : Timeline, with what it achieved in ``info()``.   frames : drawn so far."""
+
+    def __init__(self, timeline, events, renderer: Renderer, seed: int, clock: StageClock | None = None):
+        self.renderer, self._clock = renderer, clock or StageClock()
+        self.emulator: Emulator = make_emulator(events, renderer.height, renderer.width, seed, timeline.reconstruction)
+        self.timeline = make_timeline(timeline, renderer.scene.t0_ns, renderer.scene.t1_ns, renderer, response_of(events))
+        self.frames = 0
+
+    def __iter__(self) -> Iterator[tuple[int, Events]]:
+        emulator, renderer = self.emulator, self.renderer
+        luminance = np.empty((renderer.height, renderer.width), np.float32)
+        rate = np.empty_like(luminance) if emulator.needs_rate else None
+        for t_ns in self.timeline:
+            renderer.luminance(t_ns, out=luminance, rate=rate)
+            self.timeline.observe(t_ns, luminance, rate)
+            with self._clock("events"):
+                events = emulator.step(luminance, t_ns, renderer.changed_rows, rate)
+            self.frames += 1
+            yield emulator.done_ns, events
+        if emulator.lags:
+            with self._clock("events"):
+                events = emulator.flush()
+            yield emulator.done_ns, events

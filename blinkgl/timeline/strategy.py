@@ -1,0 +1,135 @@
+"""The strategies of ``timeline:``: frame times that adapt to what is drawn.
+
+    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer, response_of(config.events))
+    for t_ns in timeline:
+        luminance = ...                              # the frame at t_ns
+        timeline.observe(t_ns, luminance, rate)
+    timeline.info()                                  # what was achieved, for the manifest
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import numpy as np
+
+from blinkgl.events.response import Response
+from blinkgl.timeline.budget import TimeError, contraharmonic_mean
+from blinkgl.timeline.sampling import bounded_times, uniform_times
+
+
+class Scene(Protocol):
+    """What a timeline asks of a renderer: small pictures, every n-th pixel in x and y."""
+
+    def motion(self, t_ns: int, every: int) -> np.ndarray:
+        """(h, w, 2) float32 image velocity, px/s of the whole image."""
+
+    def brightness(self, t_ns: int, every: int) -> np.ndarray:
+        """(h, w, 2) float32 luminance and its rate of change per second."""
+
+
+class Timeline:
+    """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when asked for."""
+
+    def __init__(self, config, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
+        self.config, self.t0_ns, self.t1_ns, self.scene, self.response = config, t0_ns, t1_ns, scene, response
+        self.looks = 0
+        """Small pictures asked for so far."""
+
+    def __iter__(self) -> Iterator[int]:
+        c = self.config
+        return bounded_times(self._counted, round(c.min_step_us * 1000), round(c.max_step_us * 1000), self.t0_ns, self.t1_ns)
+
+    def pace(self, t_ns: int) -> float:
+        """Steps per second that the scene asks for at one time."""
+        raise NotImplementedError
+
+    def _counted(self, t_ns: int) -> float:
+        self.looks += 1
+        return self.pace(t_ns)
+
+    def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
+        """To be told every frame that was drawn, in order."""
+
+    def info(self) -> dict[str, Any]:
+        """What was achieved: plain values for the manifest."""
+        return {}
+
+
+class Uniform(Timeline):
+    def __iter__(self) -> Iterator[int]:
+        return uniform_times(self.config.fps, self.t0_ns, self.t1_ns)
+
+
+class Displacement(Timeline):
+    def pace(self, t_ns: int) -> float:
+        speeds = moving(np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every), axis=-1))
+        if not len(speeds):
+            return 0.0
+        pace = percentile(speeds, self.config.percentile) / self.config.max_px
+        return pace if self.config.max_px_peak is None else max(pace, float(speeds.max()) / self.config.max_px_peak)
+
+
+class Brightness(Timeline):
+    def pace(self, t_ns: int) -> float:
+        picture = self.scene.brightness(t_ns, self.config.sample_every)
+        changes = moving(np.abs(self.response.change(picture[..., 0], picture[..., 1])))
+        return percentile(changes, self.config.percentile) / (self.config.max_fraction_of_threshold * self.response.threshold)
+
+
+class Budget(Timeline):
+    """The step whose estimated error is what was asked for: :mod:`blinkgl.timeline.budget`."""
+
+    def __init__(self, config, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
+        super().__init__(config, t0_ns, t1_ns, scene, response)
+        in_px = config.max_time_error_px is not None
+        self.error = TimeError(config.reconstruction, config.max_time_error_px if in_px else config.max_time_error_us * 1e-6, in_px,
+                               config.percentile)
+        self._speeds: dict[int, np.ndarray] = {}
+        self._probing = False
+
+    def __iter__(self) -> Iterator[int]:
+        last = None
+        for k, t in enumerate(super().__iter__()):
+            if last is not None and k % PROBE_EVERY == 0 and t - last >= 2 * self.config.min_step_us * 1000:
+                yield last + (t - last) // 2  # this step in two halves: its own error is then measured, not extrapolated
+            yield t
+            last = t
+
+    def pace(self, t_ns: int) -> float:
+        speed = np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every), axis=-1)
+        self._speeds = {**dict(list(self._speeds.items())[-7:]), t_ns: speed}
+        return self.error.pace(contraharmonic_mean(speed))
+
+    def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
+        n = self.config.sample_every
+        nearest = min(self._speeds, key=lambda t: abs(t - t_ns))
+        speed = self._speeds[nearest]
+        pick = lambda a: np.ascontiguousarray(a[n // 2 :: n, n // 2 :: n][: speed.shape[0], : speed.shape[1]])  # noqa: E731
+        small = pick(luminance)
+        slope = self.response.change(small, pick(rate)) if rate is not None else None
+        self.error.observe(t_ns, self.response.signal(small), slope, speed)
+
+    def info(self) -> dict[str, Any]:
+        return self.error.info()
+
+
+PROBE_EVERY = 12
+_KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness, "budget": Budget}
+
+
+def make_timeline(config, t0_ns: int, t1_ns: int, scene: Scene, response: Response) -> Timeline:
+    """Of any ``timeline:`` configuration."""
+    return _KINDS[config.kind](config, t0_ns, t1_ns, scene, response)
+
+
+def moving(values: np.ndarray) -> np.ndarray:
+    """Those that are neither zero nor beyond all bounds (a surface in the camera plane): a still background has no say in a percentile."""
+    values = values.ravel()
+    return values[(values > 0) & np.isfinite(values)]
+
+
+def percentile(values: np.ndarray, percent: float) -> float:
+    """0 of nothing."""
+    return float(values.max() if percent >= 100 else np.percentile(values, percent)) if len(values) else 0.0

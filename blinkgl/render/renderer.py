@@ -139,7 +139,7 @@ class Renderer:
 
     def look_through(self, camera) -> None:
         """From now on draws with another camera of the same size and path: another part of the picture at the same cost."""
-        self._projection, self._frustum = projection(camera), _frustum_planes(camera)
+        self._projection, self._frustum = projection(camera), frustum_planes(camera)
         if self._last_moment is not None:
             t_ns, moment = self._last_moment
             self._last_moment = (t_ns, replace(moment, mvp=self._projection @ moment.T_cam_obj))

@@ -104,6 +104,8 @@ class Budget(Timeline):
 
     def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
         n = self.config.sample_every
+        if not self._speeds:  # the first frame is drawn before anything is asked about it
+            self.pace(t_ns)
         nearest = min(self._speeds, key=lambda t: abs(t - t_ns))
         speed = self._speeds[nearest]
         pick = lambda a: np.ascontiguousarray(a[n // 2 :: n, n // 2 :: n][: speed.shape[0], : speed.shape[1]])  # noqa: E731

@@ -18,12 +18,13 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import make_emulator
+from blinkgl.events.response import response_of
 from blinkgl.events.types import Events
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.timeline import frame_times
+from blinkgl.timeline import make_timeline
 from blinkgl.trade.labels import flow_errors
 from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors, masked
 from blinkgl.trade.reference import FineTiles, lattice, mask_of, reference_events
@@ -179,7 +180,7 @@ class Bench:
         return results
 
     def _run(self, result: Measured, config: SequenceConfig, renderer: Renderer, first: bool) -> None:
-        new = lambda: make_emulator(self.emulator, self.height, self.width, self.seed)  # noqa: E731
+        new = lambda: make_emulator(self.emulator, self.height, self.width, self.seed, config.timeline.reconstruction)  # noqa: E731
         end = self.t0_ns + (self.t1_ns - self.t0_ns) // 20
         for _ in simulate(config, renderer, new(), self.t0_ns, end):  # programs, targets, kernels: made the first time
             pass
@@ -197,7 +198,7 @@ class Bench:
         result.cpu_s.append((time.process_time() - cpu) / self.duration_s)
         if first:
             result.events = Events.concatenate(chunks)
-            result.frames_per_s = frames / self.duration_s
+            result.frames_per_s = (frames - emulator.lags) / self.duration_s
             result.triangles = (renderer.stats.triangles - drawn) / frames
 
     # ---- judging -------------------------------------------------------------------------------------------------
@@ -252,16 +253,16 @@ class Bench:
 
 
 def simulate(config: SequenceConfig, renderer: Renderer, emulator, t0_ns: int, t1_ns: int):
-    """Pass 1 without writing: yields the events of each frame."""
-    timeline = config.timeline
-
-    def speed(t_ns: int) -> float:
-        return renderer.speed(t_ns, timeline.sample_every, timeline.percentile)
-
+    """Pass 1 without writing: yields the events that each frame brings, and those that an emulator which lags still held back."""
+    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer, response_of(emulator.config))
     luminance = np.empty((renderer.height, renderer.width), np.float32)
-    for t_ns in frame_times(timeline, t0_ns, t1_ns, speed):
-        renderer.luminance(t_ns, out=luminance)
-        yield emulator.step(luminance, t_ns, renderer.changed_rows)
+    rate = np.empty_like(luminance) if emulator.needs_rate else None
+    for t_ns in timeline:
+        renderer.luminance(t_ns, out=luminance, rate=rate)
+        timeline.observe(t_ns, luminance, rate)
+        yield emulator.step(luminance, t_ns, renderer.changed_rows, rate)
+    if emulator.lags:
+        yield emulator.flush()
 
 
 def noiseless(config) -> EsimConfig:

@@ -120,6 +120,12 @@ class DataConfig(Config):
     empty: Literal["error", "skip"] = Field("error", description="a sample without events: stop, or take the next one")
     augment: AugmentConfig | None = AugmentConfig()
 
+    @model_validator(mode="after")
+    def _one_size(self):
+        if self.crop is None and self.augment is not None and self.augment.scale_probability > 0:
+            raise ValueError("scaled samples differ in size: set crop, or augment.scale_probability to 0")
+        return self
+
 
 class OptimConfig(Config):
     """AdamW with a linear one-cycle schedule."""

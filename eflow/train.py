@@ -31,7 +31,7 @@ from blinkgl.io.sequence_dir import refuse_existing
 from eflow import checkpoint as ckpt
 from eflow.allocator import keep_memory
 from eflow.config import SourceConfig, TrainConfig
-from eflow.data.dataset import FlowDataset, Mixture, StepSampler, collate, loader
+from eflow.data.dataset import FlowDataset, Mixture, StepSampler, batches, collate
 from eflow.data.sources import open_source
 from eflow.infer import predict
 from eflow.losses import sequence_loss
@@ -91,6 +91,7 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
 
     sources = [open_source(s.path, s.format, dt=s.dt) for s in config.data.train]
     dataset = FlowDataset(sources, model.representation, seed=config.seed, augment=config.data.augment, crop=config.data.crop, empty=config.data.empty)
+    _check_sizes(dataset, model, config.data.crop)
     validation = _validation(config, model) if lead else []
     mixture = Mixture([len(s) for s in sources], [s.weight for s in config.data.train], config.seed)
     if config.data.batch % world:
@@ -111,7 +112,7 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
         return ckpt.save_checkpoint(out, step, model, ema, optimizer, {"config": json.loads(config.model_dump_json())}, config.run.keep_checkpoints)
 
     with _Signals() as signals, _Log(out, start, enabled=lead) as log, TrainProgress(steps, start, config.data.batch, enabled=lead and not quiet) as progress:
-        for batch in loader(dataset, sampler, config.data.workers, pin=device.type == "cuda"):
+        for batch in batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"):
             rate = learning_rate(step, steps, config.optim.lr, config.optim.warmup)
             for group in optimizer.param_groups:
                 group["lr"] = rate
@@ -157,7 +158,7 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
 def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, float, Tensor]:
     """loss, end-point error of the last field, and that field."""
     kind = batch["new"].device.type
-    with torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"):
+    with _compile_errors(config.run.compile), torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"):
         prediction = net({k: batch[k] for k in ("old", "new")})
     count = None
     if world > 1:  # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels
@@ -169,6 +170,18 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
         error = (prediction.flow - torch.where(batch["valid"][:, None], batch["flow"], 0)).norm(dim=1)
         epe = float(error[batch["valid"]].mean()) if batch["valid"].any() else 0.0
     return loss, epe, prediction.flow.detach()
+
+
+@contextlib.contextmanager
+def _compile_errors(enabled: bool):
+    """What torch.compile needs and does not find (a C++ compiler, Triton) is the machine's lack, not a bug of ours."""
+    try:
+        yield
+    except Exception as error:
+        if enabled and type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+            reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
+            raise ConfigError(f"torch.compile does not work here: {reason}", where="run.compile", value=True, accepted="false") from error
+        raise
 
 
 @torch.no_grad()
@@ -220,6 +233,19 @@ def _weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
     if model.config.name != config.model.name:
         raise AssetError("checkpoint of another model", where=f"init_from: {config.init_from}", value=model.config.name, accepted=config.model.name)
     return model.state_dict(), config.init_from
+
+
+def _check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | None) -> None:
+    """Refuses, before anything is written, what the network would refuse at the first step."""
+    if crop is not None:
+        sizes = {"data.crop": crop}
+    else:
+        firsts = (source[0] for source in dataset.sources)
+        sizes = {f"data.crop is not set, {s.name}": (s.height, s.width) for s in firsts}
+    for where, size in sizes.items():
+        if min(size) < model.least or any(side % model.divisor for side in size):
+            raise ConfigError("a size the network cannot train on", where=where, value=tuple(size),
+                              accepted=f"multiples of {model.divisor}, at least {model.least} px: set data.crop")
 
 
 _FREE = {"run"}

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from blinkgl.errors import ConfigError, EventDataError
+from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
 from eflow.config import AugmentConfig
 from eflow.data.representation import Representation
 from eflow.data.sources import Source
@@ -209,8 +209,36 @@ def collate(samples: list[dict]) -> dict:
     return {k: torch.stack([s[k] for s in samples]) if torch.is_tensor(samples[0][k]) else [s[k] for s in samples] for k in samples[0]}
 
 
-def loader(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool = False) -> DataLoader:
-    """Batches in the sampler's order; the same ones for any number of workers."""
-    return DataLoader(dataset, batch_sampler=sampler, num_workers=workers, collate_fn=collate, pin_memory=pin,
-                      persistent_workers=workers > 0, prefetch_factor=4 if workers else None, generator=torch.Generator(),  # else each start would draw from torch's global one
-                      multiprocessing_context="forkserver" if workers else None)
+class _Carrying(Dataset):
+    """A data set whose errors travel as values: raised in a loader process, torch would hand them on as pages of traceback."""
+
+    def __init__(self, dataset: FlowDataset):
+        self.dataset = dataset
+
+    def __len__(self) -> int:
+        return len(self.dataset)
+
+    def __getitem__(self, key: Key | int) -> dict | BlinkGLError:
+        try:
+            return self.dataset[key]
+        except BlinkGLError as error:
+            return error
+
+
+def _collate_or_carry(samples: list) -> dict | BlinkGLError:
+    try:
+        return next((s for s in samples if isinstance(s, BlinkGLError)), None) or collate(samples)
+    except BlinkGLError as error:
+        return error
+
+
+def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool = False) -> Iterator[dict]:
+    """Batches in the sampler's order; the same ones for any number of workers. Raises what ``dataset`` and :func:`collate` raise."""
+    loader = DataLoader(_Carrying(dataset), batch_sampler=sampler, num_workers=workers, collate_fn=_collate_or_carry, pin_memory=pin,
+                        persistent_workers=workers > 0, prefetch_factor=4 if workers else None,
+                        generator=torch.Generator(),  # else each start would draw from torch's global one
+                        multiprocessing_context="forkserver" if workers else None)
+    for batch in loader:
+        if isinstance(batch, BlinkGLError):
+            raise batch
+        yield batch

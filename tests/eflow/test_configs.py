@@ -1,17 +1,21 @@
 """The configurations that ship: every one is valid, and what the README says about them holds."""
 
+import re
 from pathlib import Path
 
 import pytest
 
 pytest.importorskip("torch")
 
+from blinkgl.config.recipe import all_groups  # noqa: E402
 from blinkgl.config.sequence import load_run  # noqa: E402
 from eflow.config import load_train_config  # noqa: E402
 from eflow.models import NAMES, model_config  # noqa: E402
 
-FOLDER = Path(__file__).resolve().parents[2] / "configs" / "eflow"
+REPOSITORY = Path(__file__).resolve().parents[2]
+FOLDER = REPOSITORY / "configs" / "eflow"
 TRAINING = sorted(p.name for p in FOLDER.glob("*.yaml") if not p.name.endswith("_data.yaml"))
+DATA = ["eflow/" + p.name for p in sorted(FOLDER.glob("*_data.yaml"))] + ["blinkflow.yaml"]
 
 
 @pytest.mark.parametrize("name", TRAINING)
@@ -23,14 +27,33 @@ def test_training_configurations(name):
         assert all(side % 16 == 0 and side >= 128 for side in config.data.crop)
 
 
-@pytest.mark.parametrize("name", sorted(p.name for p in FOLDER.glob("*_data.yaml")))
+@pytest.mark.parametrize("name", DATA)
 def test_generation_configurations(name):
-    """Backward flow for time reversal; train and test from other seeds and, by content hash, other meshes and textures."""
-    first = load_run(FOLDER / name).check()
-    assert set(first.labels.flow) == {"forward", "backward"}
-    assert first.scene.pool.test_fraction > 0 and first.scene.textures.test_fraction > 0
-    text = (FOLDER / name).read_text()
-    assert "output.split=test" in text and f"--seed {first.seed + 1}" in text
+    """Backward flow for time reversal; train and test differ in trajectories (each group has its own seed) and, by content hash, in
+    meshes and textures."""
+    groups = [g for g in all_groups(load_run(REPOSITORY / "configs" / name)) if g.enabled]
+    sides = {side: [g.template.check() for g in groups if g.template.tree["output"].get("split", "train") == side] for side in ("train", "test")}
+    seeds = {side: {g.template.seed for g in groups if g.template.tree["output"].get("split", "train") == side} for side in sides}
+    assert sides["train"] and sides["test"] and not seeds["train"] & seeds["test"]
+    for first in sides["train"]:
+        assert set(first.labels.flow) == {"forward", "backward"}
+        assert first.scene.pool.test_fraction > 0 and first.scene.textures.test_fraction > 0
+
+
+@pytest.mark.parametrize("text", [*(f"configs/eflow/{n}" for n in TRAINING), *(f"configs/{n}" for n in DATA), "docs/eflow.md", "README.md"])
+def test_documented_commands_do_not_refuse_each_other(text):
+    """One folder takes one recipe; a training configuration reads the folders that its own commands make."""
+    content = (REPOSITORY / text).read_text(encoding="utf-8")
+    made: dict[str, set[str]] = {}
+    for config, folder in re.findall(r"generate (\S+) --out (\S+)", content):
+        assert (REPOSITORY / config).is_file(), config
+        made.setdefault(folder, set()).add(config)
+    assert all(len(configs) == 1 for configs in made.values()), made
+    if Path(text).name in TRAINING:
+        config = load_train_config(REPOSITORY / text)
+        read = {Path(s.path).resolve().relative_to(REPOSITORY) for s in (*config.data.train, *config.data.validate_on)}
+        said = made or {"out/blinkflow": set()}  # the baselines refer to eflowformer.yaml
+        assert {p.parent.as_posix() for p in read} == set(said) and {p.name for p in read} == {"train", "test"}
 
 
 def test_one_per_network_and_a_smoke_run():

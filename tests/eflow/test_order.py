@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 
 from blinkgl.errors import BlinkGLError, ConfigError  # noqa: E402
 from eflow.config import AugmentConfig  # noqa: E402
-from eflow.data.dataset import FlowDataset, Key, Mixture, StepSampler, collate, cropped, loader, scaled  # noqa: E402
+from eflow.data.dataset import FlowDataset, Key, Mixture, StepSampler, batches, collate, cropped, scaled  # noqa: E402
 from eflow.data.representation import VoxelGrid  # noqa: E402
 from eflow.data.sources import open_source  # noqa: E402
 from flow_data import blinkflow_set, blinkgl_set, dsec_set  # noqa: E402
@@ -64,7 +64,7 @@ def test_a_sample_is_a_function_of_its_key(source):
 def test_workers_change_nothing(source):
     dataset = FlowDataset([source], VoxelGrid(), augment=STRONG, crop=(96, 112))
     sampler = StepSampler(Mixture([len(source)], [1], 0), 3, 1, 4)
-    alone, with_workers = list(loader(dataset, sampler, 0)), list(loader(dataset, sampler, 2))
+    alone, with_workers = list(batches(dataset, sampler, 0)), list(batches(dataset, sampler, 2))
     assert len(alone) == 3 and all(equal(a, b) for a, b in zip(alone, with_workers, strict=True))
 
 

@@ -11,6 +11,7 @@ uninterrupted run would have been: data order and augmentation are functions of 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import os
 import signal
@@ -71,6 +72,8 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
     out = Path(out)
     rank, world, device = _setup(config)
     lead = rank == 0
+    if lead:
+        importlib.import_module("torch.utils.tensorboard")  # where it is missing, nothing has been written yet
     if lead and not resume:
         refuse_existing(out)
 

@@ -194,9 +194,17 @@ def test_bench_reports_every_row(tmp_path, capsys):
     assert [r["mode"] for r in rows] == ["forward"] and all(r["ms"] > 0 and r["peak_mib"] > 50 and r["gmacs"] > 0.3 for r in rows)
 
 
+def test_bench_of_a_training_step():
+    from eflow.bench import measure
+
+    step, forward = (measure("ev_flownet", 48, 64, training=t, repeats=1, warmup=0) for t in (True, False))
+    assert (step["mode"], forward["mode"]) == ("train", "forward") and step["gmacs"] == forward["gmacs"] and step["ms"] > 0
+
+
 @pytest.mark.parametrize("arguments, message", [
     (["evaluate", "{tmp}/none", "{data}"], "none: no such checkpoint"),
     (["evaluate", "{net}", "{tmp}/none"], "none: no such data set"),
+    (["evaluate", "{net}", "{bare}"], "thun_00_a/000002: no ground truth"),
     (["evaluate", "{net}", "{data}", "--format", "kitti"], "--format: unknown choice"),
     (["predict", "{net}", "{tmp}/none.h5"], "none.h5: no such file"),
     (["predict", "{net}", "{tmp}/x.docx"], "unknown event file ending"),
@@ -208,7 +216,8 @@ def test_bench_reports_every_row(tmp_path, capsys):
     (["bench", "-m", "raft"], "--model: unknown model"),
     (["train", "{tmp}/none.yaml", "--out", "{tmp}/o"], "none.yaml: no such file")])
 def test_one_clear_line(network, data, tmp_path, arguments, message, capsys):
-    filled = [a.format(tmp=tmp_path, data=data, net=network) for a in arguments]
+    bare = dsec_set(tmp_path / "bare", labels=1, test=True) if "{bare}" in arguments else ""
+    filled = [a.format(tmp=tmp_path, data=data, net=network, bare=bare) for a in arguments]
     assert run(filled) == 2
     err = capsys.readouterr().err
     assert err.startswith("error: ") and err.count("\n") == 1 and message in err, err

@@ -68,6 +68,18 @@ def test_workers_change_nothing(source):
     assert len(alone) == 3 and all(equal(a, b) for a, b in zip(alone, with_workers, strict=True))
 
 
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_in_a_loader_process_stays_one_line(tmp_path, workers):
+    root = blinkgl_set(tmp_path, sequences=1)
+    source = open_source(root)
+    path = root / "train/seq_000000/events.h5"
+    path.write_bytes(path.read_bytes()[:1000])
+    stream = batches(FlowDataset([source], VoxelGrid()), StepSampler(Mixture([len(source)], [1], 0), 2, 0, 3), workers)
+    with pytest.raises(BlinkGLError, match=r"events\.h5: truncated") as caught:
+        next(stream)
+    assert "\n" not in str(caught.value)
+
+
 def test_augmented_flow_still_explains_the_events(source):
     """Events of the fabricated set move with exactly its flow: warped to one time they form sharp points, in augmented samples too."""
     from eflow.data.dataset import augmented

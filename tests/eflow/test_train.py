@@ -96,6 +96,22 @@ def test_a_run_folder_is_complete_and_not_overwritten(tmp_path, data, capsys):
     assert load_train_config(out / "config.yaml") == load_train_config(path)
 
 
+def test_resume_from_the_command_line_and_only_from_whole_checkpoints(tmp_path, data, capsys):
+    path, out = config_file(tmp_path, data, steps=3), tmp_path / "run"
+    train(load_train_config(path), out, stop_after=2, quiet=True)
+    folder, before = ckpt.newest(out), (out / "log.jsonl").read_bytes()
+    for name in ("weights.safetensors", "ema.safetensors", "optimizer.safetensors", "state.json"):
+        whole = (folder / name).read_bytes()
+        (folder / name).write_bytes(whole[: len(whole) // 2])
+        assert run(["train", str(path), "--out", str(out), "--resume"]) == 2
+        err = capsys.readouterr().err
+        assert err.startswith(f"error: {folder / name}: ") and err.count("\n") == 1, err
+        (folder / name).write_bytes(whole)
+    assert (out / "log.jsonl").read_bytes() == before  # nothing was touched
+    assert run(["train", str(path), "--out", str(out), "--resume"]) == 0
+    assert "finished at step 3" in capsys.readouterr().err and [r["step"] for r in log(out)] == [1, 2, 3]
+
+
 def test_resuming_with_another_configuration_names_the_key(tmp_path, data):
     path = config_file(tmp_path, data, steps=4)
     train(load_train_config(path), tmp_path / "run", stop_after=1, quiet=True)
@@ -205,6 +221,48 @@ def test_bad_configurations(tmp_path, data, override, message, capsys):
 
     assert re.search(message, err), err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("model, crop, message", [
+    (TINY, [120, 128], r"data\.crop: a size the network cannot train on \(got \(120, 128\)\); expected multiples of 8, at least 128 px"),
+    (TINY, [132, 128], "multiples of 8"), (FAST, [64, 72], "multiples of 16"),
+    (TINY, None, r"data\.crop is not set, train/seq_000000/000000: a size .* \(got \(128, 132\)\)")])
+def test_sizes_are_refused_before_anything_is_written(tmp_path, model, crop, message):
+    small = blinkgl_set(tmp_path / "small", sequences=1, labels=1, width=132)
+    path = config_file(tmp_path, small, model, crop=crop or (128, 128), **({} if crop else {"data__crop": None, "data__augment": None}))
+    with pytest.raises(ConfigError, match=message):
+        train(load_train_config(path), tmp_path / "run", quiet=True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_scaling_needs_a_crop(tmp_path, data):
+    with pytest.raises(ConfigError, match="data: scaled samples differ in size: set crop"):
+        load_train_config(config_file(tmp_path, data, data__crop=None))
+
+
+@pytest.mark.slow
+def test_a_compiled_update_step_computes_the_same(tmp_path, data):
+    losses = []
+    for name in ("eager", "compiled"):
+        config = load_train_config(config_file(tmp_path, data, TINY, steps=2, crop=(128, 128), run__compile=name == "compiled"))
+        train(config, tmp_path / name, quiet=True)
+        losses.append([r["loss"] for r in log(tmp_path / name)])
+    assert losses[1] == pytest.approx(losses[0], rel=1e-3)
+    assert tensors(tmp_path / "eager").keys() == tensors(tmp_path / "compiled").keys()  # no prefixes of the compiler's
+
+
+def test_a_compiler_that_fails_is_one_line(tmp_path, data, monkeypatch):
+    import torch._dynamo.exc as dynamo
+
+    import eflow.train as module
+
+    def broken(*args, **kw):
+        with module._compile_errors(True):
+            raise dynamo.InternalTorchDynamoError("no C++ compiler\nand pages more")
+
+    monkeypatch.setattr(module, "_forward", broken)
+    with pytest.raises(ConfigError, match="^run.compile: torch.compile does not work here: no C.. compiler .got True.; expected false$"):
+        train(load_train_config(config_file(tmp_path, data, steps=1)), tmp_path / "run", quiet=True)
 
 
 def test_missing_data_leaves_nothing(tmp_path, data, capsys):

@@ -45,10 +45,10 @@ def test_documented_commands_do_not_refuse_each_other(text):
     """One folder takes one recipe; a training configuration reads the folders that its own commands make."""
     content = (REPOSITORY / text).read_text(encoding="utf-8")
     made: dict[str, set[str]] = {}
-    for config, folder in re.findall(r"generate (\S+) --out (\S+)", content):
+    for config, folder, options in re.findall(r"generate (\S+) --out (\S+)([^\n#]*)", content):
         assert (REPOSITORY / config).is_file(), config
-        made.setdefault(folder, set()).add(config)
-    assert all(len(configs) == 1 for configs in made.values()), made
+        made.setdefault(folder, set()).add(config + re.sub(r"--(workers \d+|resume)", "", options).rstrip(" \\"))
+    assert all(len(commands) == 1 for commands in made.values()), made
     if Path(text).name in TRAINING:
         config = load_train_config(REPOSITORY / text)
         read = {Path(s.path).resolve().relative_to(REPOSITORY) for s in (*config.data.train, *config.data.validate_on)}

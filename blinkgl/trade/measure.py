@@ -87,7 +87,7 @@ class Measured:
 @dataclass
 class Level:
     """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest error of any
-    setting judged by this one."""
+    setting judged by this one. frame_wall_s, frame_cpu_s : of a path tracer, rendering alone, median."""
 
     scale: int
     max_px: float
@@ -96,6 +96,8 @@ class Level:
     events: Events = field(repr=False)
     movement: dict[str, float] | None = None
     smallest: dict[str, float] | None = None
+    frame_wall_s: float | None = None
+    frame_cpu_s: float | None = None
 
     @property
     def ratio(self) -> dict[str, float]:
@@ -107,7 +109,7 @@ class Level:
 
     def to_dict(self) -> dict:
         return {"scale": self.scale, "max_px": self.max_px, "frames": self.frames, "seconds": self.seconds, "events": len(self.events),
-                "movement": self.movement, "smallest": self.smallest, "ratio": self.ratio, "converged": self.converged}
+                "frame_wall_s": self.frame_wall_s, "frame_cpu_s": self.frame_cpu_s, "movement": self.movement, "smallest": self.smallest, "ratio": self.ratio, "converged": self.converged}
 
 
 class Bench:
@@ -224,6 +226,8 @@ class Bench:
                 times = list(source.times(max_px, self.t0_ns, self.t1_ns))
                 events, frames = reference_events(source, times, self.emulator, self.height, self.width, self.seed, self.mask)
             level = Level(scale, max_px, frames, time.perf_counter() - started, events)
+            if cost := source.cost:
+                level.frame_wall_s, level.frame_cpu_s = float(np.median(cost.wall_s)), float(np.median(cost.cpu_s))
             for result in results:
                 result.errors = self.errors(events, result.events, speeds)
             if levels and results:

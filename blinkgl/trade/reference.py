@@ -49,6 +49,8 @@ def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray
 class FineTiles:
     """Rectangles of a scene's image at ``scale`` x ``scale`` samples a pixel. A context manager; calling it is a FrameSource."""
 
+    cost = None
+
     def __init__(self, gl, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._tiles, self._scale = tiles, scale
         self._shape = (scene.camera.height, scene.camera.width)

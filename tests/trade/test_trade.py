@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from rich.console import Console
 
 from blinkgl.cli import run
 from blinkgl.config.events import V2eConfig, VoltmeterConfig
@@ -22,6 +23,7 @@ from blinkgl.trade.measure import Bench, Level, Options, noiseless
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
 from blinkgl.trade.run import convergence_line, trade
 from blinkgl.trade.settings import Setting, design
+from blinkgl.trade.show import show
 
 CONFIG = {
     "seed": 3, "camera": {"width": 64, "height": 48}, "time": {"duration": 0.1, "label_rate": 20},
@@ -163,6 +165,7 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
 
     def frames(scene, times, settings, cost):
         asked.append((settings.samples, settings.bounces, settings.shadows))
+        cost.wall_s, cost.cpu_s = [2.0, 3.0, 7.0], [5.0]
         with FineTiles(gl, scene, (Rectangle(0, 0, scene.camera.width, scene.camera.height),), 2) as source:
             yield from source(times)
 
@@ -172,6 +175,8 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
     setting = (Setting("displacement 1 px"),)
     result = trade(load_run(config), settings=setting, options=options)
     assert asked == [(4, 4, True), (16, 4, True)] and "16 paths a pixel by Cycles" in convergence_line(result)
+    show(result, Console())
+    assert "Cycles 3.00 (5.00), the settings 0.0" in capsys.readouterr().out
     same = trade(load_run(config), settings=setting, options=replace(options, reference="raster", levels=((2, 0.5), (2, 0.25))))
     assert result["settings"][0]["voxel"] == pytest.approx(same["settings"][0]["voxel"], rel=0.02)
 

@@ -60,7 +60,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
                             seed=config.seed, sequence=index, base=template.base)
         with Renderer(gl, scene, config.render) as renderer:
             result = Explanation(machine=gl.renderer)
-            result.scene = _describe(scene, renderer)
+            result.scene = _describe(renderer.scene, renderer)
             _passes(config, index, scene, renderer, gl, result)
             _left_out(config, scene, result)
     simulated = (scene.t1_ns - scene.t0_ns) * 1e-9
@@ -186,6 +186,10 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         add("anti-aliasing of event frames", "render.antialiasing: none (mip-maps filter textures; edges are not filtered)")
     elif config.render.antialiasing == "msaa4":
         add("super-sampling of event frames", "render.antialiasing: msaa4 (edges are filtered; textures by mip-maps alone)")
+    if not config.render.lod.enabled:
+        add("level of detail", "render.lod.enabled: false (every mesh as it is)")
+    if config.render.antialiasing == "taps4":
+        add("anti-aliasing of silhouettes", "render.antialiasing: taps4 (textures are super-sampled; edges are not filtered)")
     if config.render.anisotropy == 1:
         add("anisotropic filtering", "render.anisotropy: 1")
     if all(p.material.unlit for o in scene.objects for p in o.parts):

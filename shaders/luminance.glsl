@@ -3,6 +3,7 @@
 //
 // Variants   TEXTURED   albedo luminance from a one-channel texture, else the uniform alone
 //            LIT        sun and sky Lambert, else unlit
+//            TAPS4      four texture lookups per pixel instead of one, each one mip level finer
 //            TWO_SIDED  the normal is turned towards the camera on back faces
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's pixels
@@ -69,7 +70,13 @@ in vec3 normal;
 void main()
 {
 #ifdef TEXTURED
+#ifdef TAPS4
+    vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
+    float luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).r + texture(albedo, uv + right - down, -1.0).r
+                            + texture(albedo, uv - right + down, -1.0).r + texture(albedo, uv + right + down, -1.0).r);
+#else
     float luminance = texture(albedo, uv BIAS).r;
+#endif
 #else
     float luminance = albedo;
 #endif
@@ -85,7 +92,13 @@ void main()
     vec2 motion = velocity(rate, local, image_size);
     float change = 0.0;
 #ifdef TEXTURED
+#ifdef TAPS4
+    // One mip level finer is what every second pixel would see.
+    change = 0.25 * (texture_rate(albedo, uv - right - down, motion, 2.0) + texture_rate(albedo, uv + right - down, motion, 2.0)
+                   + texture_rate(albedo, uv - right + down, motion, 2.0) + texture_rate(albedo, uv + right + down, motion, 2.0));
+#else
     change = texture_rate(albedo, uv, motion, float(EVERY));
+#endif
 #endif
 #ifdef LIT
     change = change * light + luminance * irradiance_rate(facing, seen_rate(facing, motion));

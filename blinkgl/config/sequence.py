@@ -19,6 +19,7 @@ from blinkgl.config.draw import draw, extremes
 from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import FramesConfig
 from blinkgl.config.gl import GLConfig
+from blinkgl.config.lod import LodConfig
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import ReadoutConfig, load_sensor
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
@@ -101,17 +102,20 @@ class TimeConfig(Config):
         return [self.t0_ns + (k + 1) * self.interval_ns for k in range(self.label_count + 1)]
 
 
-Antialiasing = Literal["none", "msaa4", "ssaa2", "ssaa4"]
+Antialiasing = Literal["none", "msaa4", "taps4", "ssaa2", "ssaa4"]
+ImageAntialiasing = Literal["none", "msaa4", "ssaa2", "ssaa4"]
 
 
 class RenderConfig(Config):
     """How a frame is drawn."""
 
-    antialiasing: Antialiasing = Field("none", description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel); ssaa2 and ssaa4 "
-                                       "draw 2 x 2 and 4 x 4 finer and average (cost ~n²), textures included. Labels are never filtered")
-    image_antialiasing: Antialiasing = Field("ssaa2", description="the same for the colour images at label times")
+    antialiasing: Antialiasing = Field("none", description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel), taps4 textures (4 "
+                                       "lookups a pixel); ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. Costs: "
+                                       "docs/results.md")
+    image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
     anisotropy: float = Field(1.0, ge=1, le=16, description="texture anisotropy, 1 is off (halves the rate on software GL)")
     mip_bias: float = Field(0.0, ge=-8, le=8, description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more")
+    lod: LodConfig = Field(LodConfig(), description="level of detail of meshes")
 
 
 class LabelsConfig(Config):

@@ -77,7 +77,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
         with clock("write"):
             writer.poses(**poses_of(scene, [t0_ns, *config.time.label_times_ns]))
             writer.t_end_us = t1_ns // 1000
-            writer.info.update(manifest_info(config, index, scene, gl, report, renderer.triangles))
+            writer.info.update(manifest_info(config, index, renderer.scene, gl, report, renderer.triangles))
         clock.seconds.update({"render": renderer.stats.render_s, "read-back": renderer.stats.readback_s})
         report.triangles = renderer.triangles
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files

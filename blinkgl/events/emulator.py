@@ -15,6 +15,8 @@ from blinkgl.events.types import Events
 
 BLOCK = 1024
 """Pixels a kernel takes in one go: everything about them stays in the first cache levels. Threads get whole blocks."""
+SKIPPING_BLOCKS = 64
+"""A thread's least share where still rows are skipped: 65,536 pixels, some 50 µs."""
 INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 """Bit pattern of the largest accepted intensity. Read as unsigned integers, negative numbers, infinities and NaN
 are all larger, so one running maximum per frame checks everything at once."""
@@ -179,6 +181,8 @@ class Emulator(ABC):
         if first >= stop:
             return Events.empty()
         bands = min(numba.get_num_threads(), stop_block - first_block)
+        if stop - first < self.height * self.width:  # so little to do that waking threads takes as long
+            bands = min(bands, max(1, (stop_block - first_block) // SKIPPING_BLOCKS))
         edges = first_block + (stop_block - first_block) * np.arange(bands + 1, dtype=np.int64) // bands
         share = max(BLOCK, self.config.max_events_per_step // self._blocks)
         progress = np.zeros((bands, 3), np.int64)  # next block, events so far, events cut

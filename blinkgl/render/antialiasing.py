@@ -12,10 +12,13 @@ class Samples(NamedTuple):
 
     grid  : the image is drawn grid x grid times finer and averaged (super-sampling: everything is evaluated grid² times).
     multi : coverage samples per drawn pixel (multi-sampling: silhouettes are filtered, the shader runs once per pixel
-            and triangle); 0: one, at the pixel's centre."""
+            and triangle); 0: one, at the pixel's centre.
+    taps  : 1, or 4: texture lookups of a drawn pixel, spread over the pixel, each one mip level finer. The texture is
+            super-sampled, the light and the silhouettes are not. Event frames only: colour is not worth a shader variant."""
 
     grid: int = 1
     multi: int = 0
+    taps: int = 1
 
     @property
     def stored(self) -> int:
@@ -23,7 +26,8 @@ class Samples(NamedTuple):
         return self.grid**2 * max(1, self.multi)
 
 
-ANTIALIASING = {"none": Samples(), "msaa4": Samples(multi=4), "ssaa2": Samples(grid=2), "ssaa4": Samples(grid=4)}
+ANTIALIASING = {"none": Samples(), "msaa4": Samples(multi=4), "taps4": Samples(taps=4), "ssaa2": Samples(grid=2),
+                "ssaa4": Samples(grid=4)}
 
 
 def samples_of(name: str, where: str = "render.antialiasing") -> Samples:

@@ -22,6 +22,7 @@ from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
 from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import Backdrop, Rectangle, screen_rectangle
+from blinkgl.scene.lod import at_level_of_detail
 from blinkgl.scene.types import PosePath, Scene
 
 
@@ -91,11 +92,13 @@ class _Moment:
 class Renderer:
     """Draws one scene. Holds GL resources: use it as a context manager or call :meth:`release`.
 
-    gl : blinkgl.gl.GLContext.   config : blinkgl.config.sequence.RenderConfig (anti-aliasing, anisotropy).
+    gl : blinkgl.gl.GLContext.   config : blinkgl.config.sequence.RenderConfig.
+    scene : as it is drawn, frames and ground truth alike: at the level of detail that the configuration asks for.
     changed : rectangles in which the last :meth:`luminance` may differ from the one before it; None: anywhere.
     """
 
     def __init__(self, gl, scene: Scene, config):
+        scene = at_level_of_detail(scene, config.lod)
         self.gl, self.scene, self.config = gl, scene, config
         self.width, self.height = scene.camera.width, scene.camera.height
         self.stats = RenderStats()
@@ -273,8 +276,9 @@ class Renderer:
 
     def _draw_luminance(self, moment: _Moment, items: list[DrawItem], target, rates: tuple | None = None, every: int = 1) -> None:
         defines = {} if rates is None else {"RATE": 1} if every == 1 else {"RATE": 1, "EVERY": every}
+        textured = defines | {"TAPS4": 1} if self._samples.taps == 4 and every == 1 else defines
         for item in items:
-            uniforms = self._bind("luminance.glsl", item, moment, defines)
+            uniforms = self._bind("luminance.glsl", item, moment, textured if item.textured else defines)
             if item.textured:
                 self._resources.luminance_texture(item.material).use(0)
             else:

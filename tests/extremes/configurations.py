@@ -152,7 +152,7 @@ def runs(draw, emulators=esim):
         "timeline": draw(timelines(interval)),
         "scene": draw(explicit_scenes(interval, time["start"]) | random_scenes()),
         "events": {**draw(emulators), "max_events_per_step": draw(most)},
-        "render": draw(some(antialiasing=st.sampled_from(["none", "msaa4", "ssaa2"]), anisotropy=st.sampled_from([1.0, 16.0]))),
+        "render": draw(some(antialiasing=st.sampled_from(["none", "msaa4", "taps4", "ssaa2"]), anisotropy=st.sampled_from([1.0, 16.0]))),
         "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True, "ids": True, "normals": True,
                    "velocity": True, "images": draw(st.booleans()), "occlusion": draw(st.booleans())},
         "preview": {"enabled": False},

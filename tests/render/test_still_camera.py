@@ -6,11 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.events import Esim
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.still import Rectangle, merged, screen_rectangle
 from blinkgl.scene.paths import KeyframePath
 from blinkgl.scene.types import Camera, Part, SceneObject
+from blinkgl.tools import bench_still
 
 from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
 
@@ -33,6 +36,27 @@ def test_identical_to_the_full_redraw(gl, antialiasing, reuse):
         assert quick._still
         for t in range(0, SECOND, SECOND // 23):
             np.testing.assert_array_equal(quick.luminance(t, out=out), slow.luminance(t))
+
+
+@pytest.mark.parametrize("kind", ["tri/16"])
+def test_a_small_mover_makes_the_events_of_the_full_redraw(gl, kind):
+    """The benchmark's scene (640x480, a ball whose rectangle is at most a twentieth of the image): every event, pixel, time and polarity."""
+    made = bench_still.measure(gl, kind, 0.035, rounds=12, warm_up=8)  # compares the events itself
+    assert made["events"] > 1000 and made["covered"] <= 0.052
+
+
+def test_skipped_rows_do_not_depend_on_the_threads_share():
+    """The kernel wakes fewer threads where rows are skipped; the events are the same for any number."""
+    rng = np.random.default_rng(0)
+    frames = np.repeat(rng.uniform(0.2, 0.9, (1, 300, 400)).astype(np.float32), 5, axis=0)
+    for k in range(1, 5):
+        frames[k, 20:280, 50:350] *= rng.uniform(0.7, 1.4, (260, 300)).astype(np.float32)
+        frames[k:] = frames[k]
+    whole, part = Esim(300, 400, EsimConfig()), Esim(300, 400, EsimConfig())
+    for k, frame in enumerate(frames):
+        a, b = whole.step(frame, 1_000_000 * k), part.step(frame, 1_000_000 * k, (20, 280))
+        for name in ("x", "y", "t", "p"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_other_passes_in_between_do_not_disturb(gl):

@@ -35,7 +35,7 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     status, out, _ = shader("check", "--json")
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
-    assert result["programs"] == {"debug.glsl": 8, "downsample.glsl": 2, "label.glsl": 512, "luminance.glsl": 8}
+    assert result["programs"] == {"debug.glsl": 8, "downsample.glsl": 2, "label.glsl": 512, "luminance.glsl": 24}
 
 
 def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeypatch):
@@ -55,6 +55,8 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     t = 100_000_000
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
         renderer.luminance(t), renderer.colour(t), renderer.velocity(t)
+        with Renderer(gl, world, RenderConfig(antialiasing="taps4")) as tapped:
+            tapped.luminance(t)
         for count in range(1, 7):
             for names in combinations(fields, count):
                 renderer.labels(t, LabelRequest(**dict.fromkeys(names, True)), t + 10**8, t - 10**8)
@@ -159,7 +161,7 @@ def test_a_link_error_is_shown_at_the_declaration(shader, shaders):
 def test_unused_varyings_uniforms_and_attributes_are_listed(shader, shaders):
     edit(shaders / "luminance.glsl", "out vec2 uv;", "out vec2 uv;\nout float left_over;\nuniform float spare;")
     edit(shaders / "luminance.glsl", "    uv = in_uv;", "    uv = in_uv;\n    left_over = 1.0;")
-    edit(shaders / "luminance.glsl", "luminance = texture(albedo, uv).r;", "luminance = 0.5;")
+    edit(shaders / "luminance.glsl", "luminance = texture(albedo, uv BIAS).r;", "luminance = 0.5;")
     edit(shaders / "include/light.glsl", "light_strength.y * (0.5", "0.0 * light_strength.y * (0.5")
     status, out, _ = shader("check", "luminance.glsl", "--shaders", shaders)
     assert status == 0

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
@@ -69,6 +70,9 @@ def open_subject(config: str, *, seed: int | None = None, sequence: int | None =
     check_assets(one.scene, template.base, one.output.split)
     scene = build_scene(one.scene, one.camera, one.time.t0_ns, one.time.t1_ns, split=one.output.split, seed=one.seed, sequence=index,
                         base=template.base)
+    # Here, and not in each renderer: the rays of the reference have to meet the triangles that are drawn.
+    scene = at_level_of_detail(scene, one.render.lod)
+    one = one.model_copy(update={"render": one.render.model_copy(update={"lod": LodConfig()})})
     return Subject(str(config), one, index, scene)
 
 

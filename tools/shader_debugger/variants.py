@@ -34,7 +34,8 @@ def debug_outputs() -> dict[str, int]:
 def variants(program: str) -> list[dict[str, int]] | None:
     """Defines of every variant of a program file; None for a file the renderer does not know."""
     if program == "luminance.glsl":
-        return materials()
+        taps = [material | {"TAPS4": 1} for material in materials() if "TEXTURED" in material]
+        return [material | rate for rate in ({}, {"RATE": 1}) for material in materials() + taps]
     if program == "label.glsl":
         return [outputs | material for outputs in label_outputs() for material in materials()]
     if program == "downsample.glsl":

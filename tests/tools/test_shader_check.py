@@ -9,6 +9,7 @@ import sys
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
 import pytest
 from debugger_scene import copy_shaders, edit
 
@@ -56,7 +57,8 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
         renderer.luminance(t), renderer.colour(t), renderer.velocity(t)
         with Renderer(gl, world, RenderConfig(antialiasing="taps4")) as tapped:
-            tapped.luminance(t)
+            tapped.luminance(t), tapped.luminance(t, rate=np.empty((6, 8), np.float32))
+        renderer.luminance(t, rate=np.empty((6, 8), np.float32))
         for count in range(1, 7):
             for names in combinations(fields, count):
                 renderer.labels(t, LabelRequest(**dict.fromkeys(names, True)), t + 10**8, t - 10**8)
@@ -165,8 +167,8 @@ def test_unused_varyings_uniforms_and_attributes_are_listed(shader, shaders):
     edit(shaders / "include/light.glsl", "light_strength.y * (0.5", "0.0 * light_strength.y * (0.5")
     status, out, _ = shader("check", "luminance.glsl", "--shaders", shaders)
     assert status == 0
-    for words in ("uniform 'spare' is never used in 4 of 8", "varying 'left_over' is written but the fragment stage does not take it",
-                  "uniform 'albedo' is never used in 4 of 8", "varying 'uv' is never read in 4 of 8"):
+    for words in ("uniform 'spare' is never used in 16 of 24", "varying 'left_over' is written but the fragment stage does not take it",
+                  "uniform 'albedo' is never used in 4 of 24", "varying 'uv' is never read in 4 of 24"):
         assert words in out, (words, out)
     line = (shaders / "luminance.glsl").read_text().splitlines().index("uniform float spare;") + 1
     assert f"luminance.glsl:{line}:15: uniform 'spare'" in out

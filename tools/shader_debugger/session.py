@@ -235,7 +235,7 @@ class DebugRenderer(Renderer):
         defines = {f"OUT_{name}": i for i, (name, _) in enumerate(self.OUTPUTS)}
         target = self._target("debug", 1, tuple(fmt for _, fmt in self.OUTPUTS))
         moment = self._moment(t_ns)
-        self._begin(target, moment, 0.0)
+        self._begin(target, moment)
         for item in self._visible(moment):
             uniforms = self._bind(DEBUG_PROGRAM, item, moment, defines)
             uniforms["part_number"].value = self.part_of[id(item)] + 1

@@ -112,7 +112,7 @@ class TimedRenderer(DebugRenderer):
     def start(self, each: bool) -> None:
         self.each, self.result = each, Draws()
 
-    def _begin(self, target, moment, background):
+    def _begin(self, target, moment, background=()):
         if not self.each:
             self._watch.start()
             self._wall, self._running = time.perf_counter(), True

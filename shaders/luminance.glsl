@@ -8,6 +8,10 @@
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's pixels
 
+#if defined(RATE) && (defined(TEXTURED) || defined(LIT))
+#define CHANGES
+#endif
+
 #ifdef VERTEX_SHADER
 in vec3 in_position;
 uniform mat4 mvp;
@@ -20,7 +24,7 @@ out vec2 uv;
 in vec3 in_normal;
 out vec3 normal;
 #endif
-#ifdef RATE
+#ifdef CHANGES
 out vec3 local;
 #endif
 
@@ -33,7 +37,7 @@ void main()
 #ifdef LIT
     normal = in_normal;
 #endif
-#ifdef RATE
+#ifdef CHANGES
     local = in_position;
 #endif
 }
@@ -42,19 +46,20 @@ void main()
 #ifdef FRAGMENT_SHADER
 #ifdef RATE
 layout(location = 0) out vec2 result;
+#else
+layout(location = 0) out float result;
+#endif
+#ifdef CHANGES
 in vec3 local;
 uniform vec2 image_size;
 uniform mat4x3 rate;
 #include "motion.glsl"
 #include "rate.glsl"
-#else
-layout(location = 0) out float result;
 #endif
 #ifdef EVERY
-#define BIAS , -log2(float(EVERY))
+const float every = float(EVERY);
 #else
-#define BIAS
-#define EVERY 1
+const float every = 1.0;
 #endif
 #ifdef TEXTURED
 in vec2 uv;
@@ -74,8 +79,10 @@ void main()
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
     float luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).r + texture(albedo, uv + right - down, -1.0).r
                             + texture(albedo, uv - right + down, -1.0).r + texture(albedo, uv + right + down, -1.0).r);
+#elif defined(EVERY)
+    float luminance = texture(albedo, uv, -log2(every)).r;
 #else
-    float luminance = texture(albedo, uv BIAS).r;
+    float luminance = texture(albedo, uv).r;
 #endif
 #else
     float luminance = albedo;
@@ -89,15 +96,17 @@ void main()
     float light = irradiance(facing);
 #endif
 #ifdef RATE
-    vec2 motion = velocity(rate, local, image_size);
     float change = 0.0;
+#endif
+#ifdef CHANGES
+    vec2 motion = velocity(rate, local, image_size);
 #ifdef TEXTURED
 #ifdef TAPS4
     // One mip level finer is what every second pixel would see.
     change = 0.25 * (texture_rate(albedo, uv - right - down, motion, 2.0) + texture_rate(albedo, uv + right - down, motion, 2.0)
                    + texture_rate(albedo, uv - right + down, motion, 2.0) + texture_rate(albedo, uv + right + down, motion, 2.0));
 #else
-    change = texture_rate(albedo, uv, motion, float(EVERY));
+    change = texture_rate(albedo, uv, motion, every);
 #endif
 #endif
 #ifdef LIT

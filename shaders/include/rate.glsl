@@ -5,14 +5,17 @@
 // then exact, and the quotient rule gives the exact gradient (the plain dFdx of the varying is half a pixel off).
 
 // -(v . grad) of a varying, per second
-#define SEEN_RATE(T) T seen_rate(T value, vec2 v) \
-{ \
-    float W = gl_FragCoord.w; \
-    T scaled = value * W; \
-    return ((dFdx(scaled) - value * dFdx(W)) * v.x + (dFdy(scaled) - value * dFdy(W)) * v.y) / -W; \
+vec3 seen_rate(vec3 value, vec2 v)
+{
+    float W = gl_FragCoord.w;
+    vec3 scaled = value * W;
+    return ((dFdx(scaled) - value * dFdx(W)) * v.x + (dFdy(scaled) - value * dFdy(W)) * v.y) / -W;
 }
-SEEN_RATE(vec2)
-SEEN_RATE(vec3)
+
+vec2 seen_rate(vec2 value, vec2 v)
+{
+    return seen_rate(vec3(value, 0.0), v).xy;
+}
 
 // Half the distance, px, over which a texture's rate is taken: short enough for steps of a fraction of a
 // pixel, and far above the 1/256 texel in which GPUs place a sample.

@@ -15,6 +15,7 @@ import json
 import time
 from dataclasses import replace
 from importlib import resources
+from itertools import islice
 
 import numpy as np
 from rich.console import Console
@@ -28,7 +29,7 @@ from blinkgl.gl import create_context
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.timeline import frame_times
+from blinkgl.timeline import displacement_times
 from blinkgl.trade.matching import match_events
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -109,6 +110,12 @@ def judge(gl, scene: Scene, settings: dict, times: list[int], factor: int, limit
     return {"reference_events": len(true), "settings": out}
 
 
+def displacement_frames(gl, scene: Scene, max_px: float, count: int) -> list[int]:
+    """The first ``count`` times, ns, between which nothing moves further than ``max_px``."""
+    with Renderer(gl, scene, PLAIN) as renderer:
+        return list(islice(displacement_times(max_px, 200_000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: renderer.speed(t, 4)), count))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("config", nargs="?", default=str(resources.files("blinkgl.configs") / "flying_objects.yaml"))
@@ -127,13 +134,7 @@ def main() -> None:
         for index in arguments.sequences:
             config = run.sequence(index)
             scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, seed=config.seed, sequence=index, base=run.base)
-            timeline = config.timeline.model_copy(update={"max_px": arguments.max_px})
-            with Renderer(gl, scene, PLAIN) as renderer:
-                times = []
-                for t_ns in frame_times(timeline, scene.t0_ns, scene.t1_ns, lambda t: renderer.speed(t, 4)):
-                    times.append(t_ns)
-                    if len(times) == arguments.frames:
-                        break
+            times = displacement_frames(gl, scene, arguments.max_px, arguments.frames)
             report["sequences"][index] = judge(gl, scene, SETTINGS, times, arguments.factor, int(arguments.limit * 1e3),
                                                EsimConfig(contrast_threshold=0.2))
     results = [s["settings"] for s in report["sequences"].values()]

@@ -30,8 +30,7 @@ from blinkgl.gl import create_context
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.timeline import frame_times
-from blinkgl.tools.bench_filtering import PLAIN, judge
+from blinkgl.tools.bench_filtering import displacement_frames, judge
 
 MESHES = 12
 
@@ -159,9 +158,7 @@ def main() -> None:
         scene = random_scene(Path(folder), arguments)
         report["machine"] = bench.machine_line(gl.renderer)
         levels = [LodConfig(enabled=True, edge_px=edge, error_px=error) for edge in arguments.edge for error in arguments.error]
-        with Renderer(gl, scene, PLAIN) as renderer:
-            clock = frame_times(_timeline(arguments.max_px), scene.t0_ns, scene.t1_ns, lambda t: renderer.speed(t, 4))
-            times = [t for t, _ in zip(clock, range(max(arguments.frames, arguments.rounds)))]
+        times = displacement_frames(gl, scene, arguments.max_px, max(arguments.frames, arguments.rounds))
         for antialiasing in arguments.antialiasing:
             plain = RenderConfig(antialiasing=antialiasing, image_antialiasing="none")
             settings = {"full meshes": plain} | {f"edge {lod.edge_px:g} px, error {lod.error_px:g} px": plain.model_copy(update={"lod": lod}) for lod in levels}
@@ -172,12 +169,6 @@ def main() -> None:
             print_table(antialiasing, result, report["machine"])
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(report, indent=1), encoding="utf-8")
-
-
-def _timeline(max_px: float):
-    from blinkgl.config.sequence import DisplacementTimeline
-
-    return DisplacementTimeline(max_px=max_px)
 
 
 def print_table(antialiasing: str, result: dict, machine: str) -> None:

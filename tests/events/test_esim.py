@@ -314,3 +314,28 @@ def test_seed_zero_is_a_seed():
     a, b, c = (run(Esim(37, 45, EsimConfig(threshold_sigma=0.05), s), clip, times) for s in (0, 0, 1))
     assert_same(a, b)
     assert len(a) != len(c) or (a.t != c.t).any()
+
+
+@pytest.mark.parametrize("reconstruction, order, intervals", [("pchip", 3, (12, 24, 48)), ("hermite", 4, (2, 3, 4, 6))])
+def test_cubics_converge_faster_than_the_straight_line(reconstruction, order, intervals):
+    """A smooth log intensity, away from its turning points (where any monotone curve is of second order in time), and in
+    so few intervals that the errors stay far above float32's rounding of the frames."""
+    c, period = 0.02, 2000.0  # seconds; so long that 1 us is far below the errors
+    signal = lambda s: np.sin(2 * np.pi * s - 1.0)  # noqa: E731; steep from 0 to 0.3
+    slope = lambda s: 2 * np.pi * np.cos(2 * np.pi * s - 1.0)  # noqa: E731
+    end = 0.3
+    spacings, errors = [], []
+    truth = (np.arcsin(np.sin(-1.0) + c * np.arange(1, 200).clip(max=int((signal(end) - signal(0)) / c))) + 1.0) / (2 * np.pi)
+    truth = np.unique(truth)
+    for n in intervals:
+        s = np.linspace(0, end, n + 1)
+        emulator = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-9), 1, reconstruction)
+        frames = [np.full((1, 1), np.exp(signal(u)), np.float32) for u in s]
+        rates = [f * np.float32(slope(u) / period) for f, u in zip(frames, s)]
+        events = run_cubic(emulator, frames, [round(u * period * 1e9) for u in s], rates)
+        assert len(events) == len(truth)
+        inner = (truth > end / 6) & (truth < end * 5 / 6) | (reconstruction == "hermite")  # pchip's outer intervals have one neighbour only
+        spacings.append(end / n)
+        errors.append(np.sqrt(np.mean((events.t * 1e-6 / period - truth)[inner] ** 2)))
+    found = np.polyfit(np.log(spacings), np.log(errors), 1)[0]
+    assert abs(found - order) < 0.35, (found, errors)

@@ -13,11 +13,11 @@ from blinkgl.events import Esim, Events
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Camera, Material, Texture
 
-from render_scenes import LEVEL, SECOND, drift, quad, scene, still, thing
+from render_scenes import LEVEL, SECOND, drift, mixed_scene, quad, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
 THRESHOLD, PERIODS_PER_SECOND, AMPLITUDE, TEXELS, WIDTH, HEIGHT = 0.1, 4.0, 1.0, 2048, 24, 6
-DURATION = 0.2
+DURATION, FOCAL = 0.2, 6000.0
 RAMP_PER_PERIOD = 3.0  # ln units
 
 
@@ -26,29 +26,31 @@ def profile(kind: str, u: np.ndarray) -> np.ndarray:
     return AMPLITUDE * np.sin(2 * np.pi * u) if kind == "sinusoid" else RAMP_PER_PERIOD * (u - np.floor(u)) - 1.0
 
 
-def wall(kind: str):
+def wall(kind: str, texels: int = TEXELS):
     """One texture period per 2 world units; a pixel covers a fraction of a texel, so that filtering plays no part."""
-    u = (np.arange(TEXELS) + 0.5) / TEXELS
+    u = (np.arange(texels) + 0.5) / texels
     image = np.repeat(np.exp(profile(kind, u)).astype(np.float32)[None, :, None], 3, axis=2)
     texture = Texture(np.repeat(image, 2, axis=0))
-    sheet = quad(8.0, 8.0)  # 8 periods wide: uv_scale below
+    sheet = quad(2.0, 2.0)  # 2 periods wide: uv_scale below
     speed = 2.0 * PERIODS_PER_SECOND * DURATION
     start = 0.2 if kind == "ramp" else 0.0  # the ramp's jump stays out of sight
     facing = drift((start, -1.0, 0.0), (start + speed, -1.0, 0.0), LEVEL, LEVEL, DURATION)
     upright = LEVEL * LEVEL.from_euler("x", 180, degrees=True)  # the quad's +z towards the camera, its +x to the right
-    material = Material(texture, unlit=True, uv_scale=(8.0, 8.0))
-    return scene([thing("wall", 1, sheet, still(rotation=upright), material)], Camera(WIDTH, HEIGHT, 6000.0, 6000.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, facing))
+    material = Material(texture, unlit=True, uv_scale=(2.0, 2.0))
+    return scene([thing("wall", 1, sheet, still(rotation=upright), material)], Camera(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, facing))
 
 
-def simulate(gl, kind: str, step_ns: int, world) -> Events:
-    emulator = Esim(HEIGHT, WIDTH, EsimConfig(contrast_threshold=THRESHOLD, threshold_sigma=0.0, log_eps=1e-9), seed=1)
-    with Renderer(gl, world, PLAIN) as renderer:
-        return Events.concatenate([emulator.step(renderer.luminance(t), t) for t in range(0, int(DURATION * SECOND) + 1, step_ns)])
+def simulate(gl, kind: str, step_ns: int, world, reconstruction: str = "linear", config=PLAIN) -> Events:
+    emulator = Esim(HEIGHT, WIDTH, EsimConfig(contrast_threshold=THRESHOLD, threshold_sigma=0.0, log_eps=1e-9), 1, reconstruction)
+    rate = np.empty((HEIGHT, WIDTH), np.float32) if emulator.needs_rate else None
+    with Renderer(gl, world, config) as renderer:
+        chunks = [emulator.step(renderer.luminance(t, rate=rate), t, None, rate) for t in range(0, int(DURATION * SECOND) + 1, step_ns)]
+        return Events.concatenate([*chunks, emulator.flush()])
 
 
 def closed_form(kind: str, column: int, polarity_of_motion: float) -> tuple[np.ndarray, np.ndarray]:
     """Times (s) and polarities of every crossing at one column, from ln(luminance) as a function of time alone."""
-    x = (column - (WIDTH - 1) / 2) / 6000.0  # world offset of the pixel's ray on the wall, one unit away
+    x = (column - (WIDTH - 1) / 2) / FOCAL  # world offset of the pixel's ray on the wall, one unit away
     start = 0.2 if kind == "ramp" else 0.0
     t = np.linspace(0, DURATION, 400_001)
     u = (start + 2.0 * PERIODS_PER_SECOND * t + x) / 2.0 * polarity_of_motion + 4.0
@@ -100,3 +102,36 @@ def test_a_sinusoid_converges_with_second_order(gl, direction):
     order = np.polyfit(np.log(steps), np.log(medians), 1)[0]
     assert abs(order - 2) < 0.3, f"order {order:.2f}, median errors {medians} µs"
     assert medians[-1] < 50
+
+
+@pytest.mark.parametrize("reconstruction, least, most", [("pchip", 2.3, 4.2), ("hermite", 3.0, 4.6)])
+def test_cubics_converge_faster_on_rendered_frames(gl, direction, monkeypatch, reconstruction, least, most):
+    """Medians, so that the intervals with a turning point, where monotone curves stay of second order, do not decide."""
+    monkeypatch.setitem(globals(), "DURATION", 2.0)  # ten times slower, so that a microsecond is far below the errors
+    monkeypatch.setitem(globals(), "PERIODS_PER_SECOND", PERIODS_PER_SECOND / 10)
+    monkeypatch.setitem(globals(), "FOCAL", 500.0)
+    # Rasterisers place samples on 1/256 of a texel: texels far smaller than a pixel, looked up without mip-maps, make that small.
+    world, config = wall("sinusoid", 16384), RenderConfig(image_antialiasing="none", mip_bias=-8.0)
+    steps = [200_000_000, 166_666_667, 125_000_000]
+    medians = [np.median(errors(simulate(gl, "sinusoid", step, world, reconstruction, config), "sinusoid", direction)) for step in steps]
+    straight = [np.median(errors(simulate(gl, "sinusoid", step, world), "sinusoid", direction)) for step in steps]
+    order = np.polyfit(np.log(steps), np.log(medians), 1)[0]
+    assert least < order < most, f"order {order:.2f}, median errors {medians} µs, linear {straight} µs"
+    assert all(m < 0.5 * s for m, s in zip(medians, straight))
+
+
+def test_rates_are_those_of_finer_and_finer_differences(gl):
+    """dL/dt of the shader against central differences of rendered frames, on curved, lit, textured, turning things."""
+    world = mixed_scene()
+    rate, h = np.empty((120, 160), np.float32), 100_000
+    with Renderer(gl, world, PLAIN) as renderer:
+        frame = renderer.luminance(SECOND // 3, rate=rate)
+        np.testing.assert_array_equal(frame, renderer.luminance(SECOND // 3))
+        ahead, behind = (renderer.luminance(SECOND // 3 + s).astype(float) for s in (h, -h))
+        small = renderer.brightness(SECOND // 3, 4)
+    difference = (ahead - behind) / (2e-9 * h)
+    off = np.abs(rate - difference)
+    assert np.median(off) < 0.03 * np.median(np.abs(difference)) and np.percentile(off, 85) < 0.1 * np.percentile(np.abs(difference), 85)
+    # The small picture sees the same rates, though its own pixels are four times as large.
+    for q in (50, 90):
+        assert np.percentile(np.abs(small[..., 1]), q) == pytest.approx(np.percentile(np.abs(rate), q), rel=0.1)

@@ -38,6 +38,7 @@ def test_identical_to_the_full_redraw(gl, antialiasing, reuse):
             np.testing.assert_array_equal(quick.luminance(t, out=out), slow.luminance(t))
 
 
+
 @pytest.mark.parametrize("kind", ["tri/16"])
 def test_a_small_mover_makes_the_events_of_the_full_redraw(gl, kind):
     """The benchmark's scene (640x480, a ball whose rectangle is at most a twentieth of the image): every event, pixel, time and polarity."""
@@ -57,6 +58,20 @@ def test_skipped_rows_do_not_depend_on_the_threads_share():
         a, b = whole.step(frame, 1_000_000 * k), part.step(frame, 1_000_000 * k, (20, 280))
         for name in ("x", "y", "t", "p"):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+@pytest.mark.parametrize("antialiasing", ["none", "ssaa2"])
+def test_rates_are_identical_to_the_full_redraw(gl, antialiasing):
+    config = SimpleNamespace(**{**vars(PLAIN), "antialiasing": antialiasing})
+    world = mixed_scene(camera_moves=False)
+    out, rate, full_rate = (np.empty((120, 160), np.float32) for _ in range(3))
+    with Renderer(gl, world, config) as quick, full_redraw(gl, world, config) as slow:
+        for k, t in enumerate(range(0, SECOND, SECOND // 17)):
+            np.testing.assert_array_equal(quick.luminance(t, out=out, rate=rate), slow.luminance(t, rate=full_rate))
+            np.testing.assert_array_equal(rate, full_rate)
+            assert (rate != 0).any()
+            if k % 5 == 4:
+                quick.luminance(t, out=np.empty_like(out))  # another kind of frame in between
 
 
 def test_other_passes_in_between_do_not_disturb(gl):

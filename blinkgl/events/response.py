@@ -10,30 +10,33 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 
 
 class Response(NamedTuple):
-    """The signal gain * ln(I + offset), linear below I + offset = ``floor``, which fires every ``threshold`` (the smallest nominal one)."""
+    """The signal gain * ln(I + offset), below the luminance ``joint`` a straight line, which fires every ``threshold`` (the smallest nominal one)."""
 
     threshold: float
     gain: float
     offset: float
-    floor: float
+    joint: float = 0.0
+    low_slope: float = 0.0
 
     def signal(self, luminance: np.ndarray) -> np.ndarray:
         """float32."""
-        above = np.maximum(luminance + np.float32(self.offset), np.float32(self.floor))
-        return np.float32(self.gain) * (np.log(above) + (luminance + np.float32(self.offset) - above) / np.float32(self.floor))
+        joint = np.float32(self.joint)
+        log = np.float32(self.gain) * np.log(np.maximum(luminance, joint) + np.float32(self.offset))
+        return log + np.float32(self.low_slope) * np.minimum(luminance - joint, 0) if self.low_slope else log
 
     def change(self, luminance: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """d(signal)/dt of luminances and their rates of change, in the rates' unit of time."""
-        return rate * (np.float32(self.gain) / np.maximum(luminance + np.float32(self.offset), np.float32(self.floor)))
+        slope = np.float32(self.gain) / (np.maximum(luminance, np.float32(self.joint)) + np.float32(self.offset))
+        return rate * (np.where(luminance > self.joint, slope, np.float32(self.low_slope)) if self.low_slope else slope)
 
 
 def response_of(config) -> Response:
     """Of ``EsimConfig``, ``V2eConfig`` or ``VoltmeterConfig``."""
     if isinstance(config, EsimConfig):
-        return Response(_smallest(config), 1.0, config.log_eps, 1e-30)
-    if isinstance(config, V2eConfig):  # lin-log: linear below 20 digital numbers
-        return Response(_smallest(config), 1.0, 0.0, 20.0 / np.log(20.0) / config.full_scale)
-    return Response(1.0, config.k1, config.k2 / config.full_scale, 1e-30)
+        return Response(_smallest(config), 1.0, config.log_eps)
+    if isinstance(config, V2eConfig):  # lin-log: linear up to 20 digital numbers
+        return Response(_smallest(config), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale)
+    return Response(1.0, config.k1, config.k2 / config.full_scale)
 
 
 def _smallest(config) -> float:

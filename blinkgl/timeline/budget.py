@@ -27,6 +27,8 @@ _HIGHEST = {"linear": 1.0, "pchip": 2.0, "hermite": 3.0}
 """m of smooth signals, the largest that is believed."""
 FORGET, STIFFNESS, SPREAD = 0.9, 1.0, 0.15
 """Share of a measurement left after the next one; weight of the prior m, in squared units of log d; smallest variance of it."""
+FOLLOW, CORRECTION = 0.3, (-0.7, 3.0)
+"""Step of the correction per measurement with too many events beyond the target; its limits, log of the target's reduction."""
 _EDGES = np.logspace(-3, 8, 1101)
 
 
@@ -73,17 +75,15 @@ class TimeError:
         g, self.m = _PRIOR[reconstruction]
         self._sums = np.array([1.0, 0.0, np.log(g), 0.0, 0.0])  # of 1, x, y, x^2, xy; x = log d, y = log g
         self._us, self._px = np.zeros(len(_EDGES) + 1), np.zeros(len(_EDGES) + 1)
-        self.measurements = 0
+        self.measurements, self._correction, self._mean_change = 0, 0.0, 0.0
 
     def pace(self, speed: float) -> float:
         """Steps per second that meet the target at an image speed, px/s."""
         if speed <= 0:
             return 0.0
         x, y, m = self._line()
-        if self.in_px:  # d g(d) = target
-            log_d = (np.log(self.target) - y + m * x) / (1 + m)
-        else:  # d / speed g(d) = target
-            log_d = (np.log(self.target * speed) - y + m * x) / (1 + m)
+        wanted = self.target if self.in_px else self.target * speed  # d g(d) = target px, or d / speed g(d) = target s
+        log_d = (np.log(wanted) - self._correction - y + m * x) / (1 + m)
         return float(speed / np.exp(min(log_d, x + np.log(2.0))))
 
     def _line(self) -> tuple[float, float, float]:
@@ -129,10 +129,17 @@ class TimeError:
         self._sums = FORGET * self._sums + np.array([1.0, x, y, x * x, x * y])
         self.m = self._line()[2]
         self.measurements += 1
+        beyond = 0.0
         for part, change in ((s, before), (1 - s, after)):
             seconds = error[ok] * step * part ** (1 + self.m)
+            beyond += change[ok][(seconds * speed[ok] if self.in_px else seconds) > self.target].sum()
             self._us += np.bincount(np.searchsorted(_EDGES, seconds * 1e6), change[ok], len(self._us))
             self._px += np.bincount(np.searchsorted(_EDGES, seconds * speed[ok]), change[ok], len(self._px))
+        total = float((before + after)[ok].sum())
+        self._mean_change = total if self._mean_change == 0 else FORGET * self._mean_change + (1 - FORGET) * total
+        if total > 0:
+            off = (beyond / total - (1 - self.percentile / 100)) * min(total / self._mean_change, 3.0)
+            self._correction = float(np.clip(self._correction + FOLLOW * off, *CORRECTION))
 
     def info(self) -> dict[str, Any]:
         """The achieved errors as estimated: percentiles over the events of the whole sequence."""
@@ -145,5 +152,5 @@ class TimeError:
         wanted = {"median": 50.0, "p95": 95.0, f"p{self.percentile:g}": self.percentile}
         return {"time_error": {
             "reconstruction": self.reconstruction, "percentile": self.percentile, ("target_px" if self.in_px else "target_us"):
-            self.target if self.in_px else self.target * 1e6, "measurements": self.measurements, "order": round(1 + self.m, 2),
+            float(f"{self.target if self.in_px else self.target * 1e6:.9g}"), "measurements": self.measurements, "order": round(1 + self.m, 2),
             **{f"{name}_us": of(self._us, p) for name, p in wanted.items()}, **{f"{name}_px": of(self._px, p) for name, p in wanted.items()}}}

@@ -1,0 +1,166 @@
+"""Displacement, brightness and budget on rendered scenes: what they promise, against what the frames then do."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, DisplacementTimeline, UniformTimeline
+from blinkgl.dataset.event_pass import EventPass
+from blinkgl.events import Events
+from blinkgl.events.response import response_of
+from blinkgl.events.v2e_model import lin_log
+from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.timeline import make_timeline
+from blinkgl.timeline.budget import TimeError, contraharmonic_mean, weighted_percentile
+from blinkgl.timeline.strategy import PROBE_EVERY
+from blinkgl.trade.matching import match_events
+from tests.render.render_scenes import mixed_scene
+
+MS = 1_000_000
+PLAIN = RenderConfig(image_antialiasing="none")
+ESIM = EsimConfig(threshold_sigma=0.0)
+
+
+@pytest.fixture(scope="module")
+def world():
+    """Everything moves for 0.15 s, turning round in between."""
+    from dataclasses import replace
+
+    return replace(mixed_scene(96, 72), t1_ns=150 * MS)
+
+
+def times_of(config, renderer, response=response_of(ESIM)) -> np.ndarray:
+    scene = renderer.scene
+    return np.array(list(make_timeline(config, scene.t0_ns, scene.t1_ns, renderer, response)))
+
+
+@pytest.mark.parametrize("config, inside", [
+    (DisplacementTimeline(max_px=0.5, sample_every=1), [(100, 0.5)]),
+    (DisplacementTimeline(max_px=0.3, percentile=50, sample_every=2), [(50, 0.3)]),
+    (DisplacementTimeline(max_px=0.3, percentile=50, max_px_peak=0.4, sample_every=1), [(50, 0.3), (100, 0.4)])])
+def test_displacement_over_whole_intervals(gl, world, config, inside):
+    """The exact flow from each frame to the next keeps to the percentile's bound and to the peak's."""
+    with Renderer(gl, world, PLAIN) as renderer:
+        times = times_of(config, renderer)
+        assert times[0] == 0 and times[-1] == 150 * MS and (np.diff(times) > 0).all()
+        for a, b in zip(times[:-1:3].tolist(), times[1::3].tolist()):
+            if b - a <= config.min_step_us * 1000:
+                continue
+            flow = renderer.labels(a, LabelRequest(flow_forward=True), b).forward
+            moved = np.linalg.norm(flow.flow, axis=-1)[flow.valid]
+            for percent, bound in inside:
+                assert np.percentile(moved[moved > 0], percent) <= bound * 1.05
+
+
+def test_a_still_background_has_no_say_in_the_percentile():
+    class Picture:
+        def motion(self, t_ns, every):
+            speed = np.zeros((10, 10, 2), np.float32)
+            speed[0, :5, 0] = [100, 100, 100, 100, np.inf]
+            return speed
+
+    t = make_timeline(DisplacementTimeline(max_px=1.0, percentile=50), 0, 100 * MS, Picture(), response_of(ESIM))
+    assert t.pace(0) == pytest.approx(100) and set(np.diff(list(t))) == {10 * MS} and t.looks >= 11
+
+
+@pytest.mark.parametrize("fraction, percent", [(0.3, 95), (0.15, 80)])
+def test_brightness_bound_holds_between_frames(gl, world, fraction, percent):
+    """|dL| from frame to frame of the pixels that show the same surface: the percentile keeps to the fraction of C."""
+    config = BrightnessTimeline(max_fraction_of_threshold=fraction, percentile=percent, sample_every=1, min_step_us=20)
+    with Renderer(gl, world, PLAIN) as renderer:
+        times = times_of(config, renderer).tolist()
+        worst = 0.0
+        for a, b in zip(times[:-1:4], times[1::4]):
+            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t) + 1e-3), renderer.labels(t, LabelRequest(ids=True)).ids) for t in (a, b)))
+            change = np.abs(lb - la)[(ia == ib)]
+            worst = max(worst, np.percentile(change[change > 0], percent))
+        assert 0.4 * fraction * 0.2 < worst <= 1.1 * fraction * 0.2
+        fewer = times_of(BrightnessTimeline(max_fraction_of_threshold=2 * fraction, percentile=percent, sample_every=4, min_step_us=20), renderer)
+        assert len(fewer) == pytest.approx(len(times) / 2, rel=0.15)
+
+
+def test_response_is_the_emulators_own_slope():
+    luminance = np.array([0.0, 0.003, 0.02, 0.07, 0.09, 0.5, 2.0], np.float32)
+    for config, signal in ((EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2), lambda i: np.log(i + 1e-3)),
+                           (V2eConfig(), lambda i: np.array([lin_log(np.float32(v * V2eConfig().full_scale)) for v in i], float)),
+                           (VoltmeterConfig(), lambda i: VoltmeterConfig().k1 * np.log(i * VoltmeterConfig().full_scale + VoltmeterConfig().k2))):
+        response, h = response_of(config), 1e-3 * luminance.astype(float) + 1e-6
+        slope = response.change(luminance, np.ones_like(luminance))
+        np.testing.assert_allclose(slope, (signal(luminance + h) - signal(luminance + 0.0)) / h, rtol=0.02)
+        drawn = response.signal(luminance)
+        np.testing.assert_allclose(np.diff(drawn), np.diff(signal(luminance.astype(float))), rtol=1e-3, atol=1e-5)
+    assert response_of(EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2)).threshold == 0.2
+
+
+@pytest.mark.parametrize("reconstruction", ["linear", "pchip", "hermite"])
+def test_budget_keeps_to_its_target_and_its_estimate_to_the_truth(gl, world, reconstruction):
+    """Against a much denser run: the promised percentile is within a factor 2 of the estimate and of the target, the median within 3."""
+    target = 200.0
+    config = BudgetTimeline(max_time_error_us=target, reconstruction=reconstruction, min_step_us=50, sample_every=2)
+    with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="none")) as renderer:
+        dense = Events.concatenate([e for _, e in EventPass(UniformTimeline(fps=8000), ESIM, renderer, 1)])
+        run = EventPass(config, ESIM, renderer, 1)
+        events = Events.concatenate([e for _, e in run])
+    matching = match_events(dense, events, 72, 96, 3_000)
+    true, median = (np.percentile(np.abs(matching.dt_us[matching.matched]), q) for q in (75, 50))
+    said = run.timeline.info()["time_error"]
+    assert said["measurements"] > 10 and said["target_us"] == target and said["reconstruction"] == reconstruction
+    assert 0.5 < true / said["p75_us"] < 2 and 0.5 < true / target < 2 and 1 / 3 < median / said["median_us"] < 3
+    assert said["median_us"] <= said["p75_us"] <= said["p95_us"] and said["median_px"] <= said["p95_px"]
+    assert run.frames < 0.5 * 1200
+
+
+def test_less_error_takes_more_frames(gl, world):
+    with Renderer(gl, world, PLAIN) as renderer:
+        counts = []
+        for px in (0.02, 0.08, 0.32):
+            run = EventPass(BudgetTimeline(max_time_error_px=px, min_step_us=20), ESIM, renderer, 1)
+            list(run)
+            counts.append(run.frames)
+    assert counts[0] > 1.5 * counts[1] > 2 * counts[2]
+
+
+def test_budget_finds_the_order_and_the_step_of_a_smooth_signal():
+    """A picture of drifting sinusoids, linear in between: the error of a step is known in closed form, up to the turning points."""
+    x = np.linspace(0, 2 * np.pi, 4000, endpoint=False)[None]
+    speed_px, wavelength = 50.0, 40.0
+    rate = speed_px / wavelength * 2 * np.pi
+    signal = lambda t: np.sin(x - rate * t).astype(np.float32)  # noqa: E731
+    error, t = TimeError("linear", 0.5e-3, in_px=False, percentile=50.0), 0.0
+    steps = []
+    for k in range(80):
+        step = 1 / error.pace(speed_px)
+        error.observe(round(t * 1e9), signal(t), None, np.full_like(x, speed_px))
+        if k % PROBE_EVERY == 0:
+            t += step / 2
+            error.observe(round(t * 1e9), signal(t), None, np.full_like(x, speed_px))
+            t += step / 2
+        else:
+            t += step
+        steps.append(step)
+    # Linear: |t error| = h^2/8 |L''/L'| = h^2/8 rate |tan|, weighted by the events, |cos|: the median of |tan| is at sin = 1/2.
+    expected = math.sqrt(0.5e-3 * 8 / (rate * math.tan(math.pi / 6)))
+    assert steps[-1] == pytest.approx(expected, rel=0.2) and error.m == pytest.approx(1.0, abs=0.25)
+
+
+def test_nothing_moves_nothing_is_measured():
+    still = SimpleNamespace(motion=lambda t, n: np.zeros((3, 4, 2), np.float32))
+    timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, response_of(ESIM))
+    count = 0
+    for t in timeline:
+        timeline.observe(t, np.ones((12, 16), np.float32))
+        count += 1
+    said = timeline.info()["time_error"]
+    assert count == 11 and said["measurements"] == 0 and said["median_us"] is None
+
+
+def test_means_and_percentiles():
+    assert contraharmonic_mean(np.array([0, 1, 3, np.inf])) == 2.5 and contraharmonic_mean(np.zeros(3)) == 0.0
+    assert weighted_percentile(np.array([3.0, 1, 2]), np.array([1.0, 8, 1]), 50) == 1
+    assert weighted_percentile(np.array([3.0, 1, 2]), np.array([1.0, 8, 1]), 95) == 3

@@ -158,7 +158,7 @@ def main() -> None:
     console = Console()
     console.width = max(console.width, 130)
     if missing := available():  # `make bench` runs all benchmarks, and this extra is rarely there
-        console.print(f"nothing measured: {missing}", highlight=False, soft_wrap=True)
+        console.print(f"nothing measured: {missing}", highlight=False, soft_wrap=True, markup=False)
         return
     template = load_run(options.config, options.overrides)
     config = template.sequence(options.sequence)

@@ -33,7 +33,7 @@ from blinkgl.timeline import displacement_times
 from blinkgl.trade.matching import match_events
 
 PLAIN = RenderConfig(image_antialiasing="none")
-SETTINGS = {name: RenderConfig.model_construct(**{**PLAIN.model_dump(), **changes}) for name, changes in {
+SETTINGS = {name: RenderConfig(image_antialiasing="none", **changes) for name, changes in {
     "none, mip -1": {"mip_bias": -1.0},
     "none, mip -0.5": {"mip_bias": -0.5},
     "none": {},

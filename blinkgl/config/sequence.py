@@ -20,6 +20,7 @@ from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.frames import FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.lod import LodConfig
+from blinkgl.config.quality import Quality, with_quality
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import ReadoutConfig, load_sensor
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
@@ -155,6 +156,8 @@ class SequenceConfig(Config):
     output: OutputConfig = Field(OutputConfig(), description="where sequences go")
     camera: CameraConfig = Field(CameraConfig(), description="resolution and intrinsics")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
+    quality: Quality | None = Field(None, description="fast, balanced, accurate or reference: gives timeline and render the values of a measured "
+                                    "point of speed against accuracy (docs/trade.md); what is said beside it wins")
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="when event frames are drawn")
     scene: SceneConfig = Field(RandomSceneConfig(), description="what is in front of the camera and how it moves")
     frames: FramesConfig | None = Field(None, description="recorded frames to convert; then nothing is rendered, and `camera`, `time`, "
@@ -201,7 +204,8 @@ class RunTemplate:
 
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
-    """SequenceConfig of plain data, with the values of a named sensor filled in where the tree says nothing."""
+    """SequenceConfig of plain data, with the values of a named quality and sensor filled in where the tree says nothing."""
+    tree = with_quality(tree)
     config = _possible(validate(SequenceConfig, tree))
     if config.sensor is None:
         return config

@@ -44,8 +44,8 @@ class Options:
     rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
 
     clip_s: float = 0.0
-    tiles: tuple[int, int, int, int] = (3, 3, 64, 48)
-    levels: tuple[tuple[int, float], ...] = ((8, 0.1), (16, 0.05), (32, 0.03), (64, 0.02))
+    tiles: tuple[int, int, int, int] = (4, 3, 24, 18)
+    levels: tuple[tuple[int, float], ...] = ((8, 0.12), (16, 0.08), (32, 0.056), (64, 0.04))
     reference_s: float = 1200.0
     rounds: int = 3
     rounds_s: float = 1200.0
@@ -55,7 +55,7 @@ class Options:
 
 
 TRACED_LEVELS = ((8, 0.5), (16, 0.25), (32, 0.125))
-QUICK = Options(tiles=(3, 2, 32, 24), levels=((8, 0.12), (16, 0.06), (32, 0.04)), reference_s=60.0, rounds=3, rounds_s=40.0, clip_s=0.05)
+QUICK = Options(tiles=(3, 2, 24, 18), levels=((8, 0.12), (16, 0.08), (32, 0.056)), reference_s=60.0, rounds=3, rounds_s=60.0, clip_s=0.05)
 
 
 @dataclass
@@ -124,7 +124,7 @@ class Bench:
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
-        self._template = RunTemplate(apply_overrides(template.tree, _sized(base, SIZES[size])), template.base)
+        self._template = RunTemplate(apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])]), template.base)
         # Labels and previews take no part in this; noise would drown the errors that are asked for.
         self.emulator = noiseless(base.events)
         self._scenes: dict[str, Scene] = {}

@@ -1,0 +1,56 @@
+"""quality: fills what the YAML does not say, and nothing else."""
+
+from __future__ import annotations
+
+import pytest
+import yaml
+
+from blinkgl.config.quality import QUALITIES, load_quality, with_quality
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.report import config_yaml
+from blinkgl.errors import ConfigError
+
+
+def sequence(tmp_path, tree: dict, *overrides: str):
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(tree))
+    return load_run(tmp_path / "c.yaml", overrides).sequence(0)
+
+
+@pytest.mark.parametrize("name", QUALITIES)
+def test_a_preset_is_what_its_file_says(tmp_path, name):
+    config, preset = sequence(tmp_path, {"quality": name}), load_quality(name)
+    for table in ("timeline", "render"):
+        assert {k: v for k, v in getattr(config, table).model_dump().items() if k in preset[table]} == preset[table]
+
+
+def test_what_is_said_wins(tmp_path):
+    preset = load_quality("balanced")
+    assert preset["timeline"]["kind"] == "displacement", "or choose another timeline below"
+    config = sequence(tmp_path, {"quality": "balanced", "timeline": {"max_px": 0.3}, "render": {"antialiasing": "msaa4"}})
+    assert (config.timeline.max_px, config.render.antialiasing) == (0.3, "msaa4")
+    assert config.timeline.min_step_us == preset["timeline"].get("min_step_us", 200.0)
+    config = sequence(tmp_path, {"quality": "balanced"}, "timeline={kind: uniform, fps: 77}")
+    assert (config.timeline.kind, config.timeline.fps) == ("uniform", 77)
+    assert config.render.antialiasing == preset["render"]["antialiasing"]
+
+
+def test_no_quality_changes_nothing(tmp_path):
+    tree = {"timeline": {"kind": "uniform", "fps": 50}}
+    assert with_quality(tree) is tree and with_quality({**tree, "quality": None})["timeline"] == tree["timeline"]
+    assert sequence(tmp_path, {"quality": None}) == sequence(tmp_path, {})
+
+
+def test_a_preset_is_resolved_in_what_is_written(tmp_path):
+    config = sequence(tmp_path, {"quality": "accurate", "render": {"anisotropy": 2}})
+    (tmp_path / "again.yaml").write_text(config_yaml(config, 0))
+    assert load_run(tmp_path / "again.yaml").sequence(0) == config
+
+
+def test_errors(tmp_path):
+    with pytest.raises(ConfigError, match="quality: .*'fast', 'balanced', 'accurate' or 'reference'"):
+        sequence(tmp_path, {"quality": "best"})
+    for bad, where in (({"timeline": 3}, "timeline"), ({"render": [1]}, "render"), ({"timeline": {"max_pxx": 1}}, "timeline.max_pxx")):
+        with pytest.raises(ConfigError, match=where):
+            sequence(tmp_path, {"quality": "fast", **bad})
+    with pytest.raises(ConfigError):
+        sequence(tmp_path, {"quality": ["fast"]})

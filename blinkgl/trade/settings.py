@@ -4,9 +4,9 @@ Not the full product: it would be thousands of settings, most of them silly. Wha
 
 1. displacement x anti-aliasing, in full: the two axes that matter most, and they interact, because each hides the other's error.
 2. reconstruction x displacement at one anti-aliasing: a better curve between frames trades against more frames and nothing else ...
-3. ... and the same curves at the other anti-aliasings for the coarse steps, where presets are looked for.
+3. ... and the same curves, with sharper mip maps, at the other anti-aliasings for the coarse steps, where presets are looked for.
 4. every other way to choose the times (uniform, brightness, budget) at one anti-aliasing, so that each is a curve to compare.
-5. mip bias, anisotropy, level of detail and texture size one at a time: they change what a frame is, not when it is drawn.
+5. anisotropy, level of detail and texture size one at a time: they change what a frame is, not when it is drawn.
 6. half the image size: another data set, with a reference of its own; it says what a pixel costs.
 """
 
@@ -17,8 +17,10 @@ from dataclasses import dataclass
 SAMPLINGS = {
     **{f"uniform {fps}/s": (f"timeline={{kind: uniform, fps: {fps}}}",) for fps in (50, 100, 200, 400, 800, 1600)},
     **{f"displacement {px:g} px": (f"timeline={{kind: displacement, max_px: {px}, min_step_us: 20}}",) for px in (4, 2, 1, 0.5, 0.25, 0.125)},
+    **{f"brightness {c:g} C": (f"timeline={{kind: brightness, max_fraction_of_threshold: {c}, min_step_us: 20}}",) for c in (4, 2, 1)},
+    **{f"budget {px:g} px": (f"timeline={{kind: budget, max_time_error_px: {px}, min_step_us: 20}}",) for px in (0.1, 0.05, 0.025)},
 }
-RECONSTRUCTIONS = {"linear": ()}
+RECONSTRUCTIONS = {"linear": (), "pchip": ("timeline.reconstruction=pchip",), "hermite": ("timeline.reconstruction=hermite",)}
 ANTIALIASINGS = {name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "ssaa2", "ssaa4")}
 OTHERS = {
     "": (),
@@ -58,21 +60,23 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
     uniform = lambda *fps: [f"uniform {f}/s" for f in fps]  # noqa: E731
     curves = [r for r in RECONSTRUCTIONS if r != "linear"]
     extra = [s for s in SAMPLINGS if not s.startswith(("uniform", "displacement"))]
-    centre = displacement(0.5)[0]
     others = [o for o in OTHERS if o and (random_scene or not o.startswith("textures"))]
+    sharper = ("mip bias -0.5", "mip bias -1")
     if quick:
         points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2")]
         points += [Setting(s, r, "ssaa2") for s in displacement(2, 1) for r in curves]
         points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "ssaa4")]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 400)]
-        points += [Setting(s, curves[0] if curves else "linear", "ssaa2") for s in extra[1::3]]
-        points += [Setting(displacement(1)[0], antialiasing="none", other=o) for o in others if not o.startswith(("anisotropy", "textures 128", "mip bias -1"))]
+        points += [Setting(s, "pchip", "ssaa2") for s in extra[1::3]]
+        points += [Setting(displacement(1)[0], antialiasing=a, other=sharper[0]) for a in ("none", "ssaa2")]
+        points += [Setting(displacement(1)[0], antialiasing="none", other=o) for o in others if o not in sharper and not o.endswith(("4", "128 px"))]
     else:
-        points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5, 0.25) for a in ANTIALIASINGS]
-        points += [Setting(s, r, "ssaa2") for s in displacement(4, 2, 1, 0.5, 0.25) for r in curves]
-        points += [Setting(s, r, a) for s in displacement(2, 1, 0.5) for r in curves for a in ("none", "ssaa4")]
+        points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5, 0.25) for a in ANTIALIASINGS if (s, a) != (displacement(0.25)[0], "ssaa4")]
+        points += [Setting(s, r, "ssaa2") for s in displacement(4, 2, 1, 0.5) for r in curves]
+        points += [Setting(s, r, "ssaa4") for s in displacement(4, 2, 1) for r in curves]
+        points += [Setting(s, "pchip", a, o) for s in displacement(4, 2, 1) for a in ("none", "ssaa2", "ssaa4") for o in sharper]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]
-        points += [Setting(s, r, "ssaa2") for s in extra for r in (curves or ["linear"])]
-        points += [Setting(centre, antialiasing=a, other=o) for o in others for a in ("none", "ssaa2")]
-        points += [Setting(s, antialiasing=a, size="half size") for s, a in zip(displacement(1, 0.5, 0.5), ("none", "none", "ssaa2"))]
+        points += [Setting(s, r, "ssaa2") for s in extra for r in ("linear", "pchip")]
+        points += [Setting(displacement(1)[0], "pchip", a, o) for o in others if o not in sharper for a in ("none", "ssaa2")]
+        points += [Setting(s, "pchip", a, size="half size") for s, a in zip(displacement(2, 1, 1), ("none", "none", "ssaa2"))]
     return tuple(dict.fromkeys(points))

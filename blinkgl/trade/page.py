@@ -103,7 +103,8 @@ def _terms(result: dict, size: dict) -> str:
         "flow": "Optical-flow labels against float64 ray casting into the scene with all its triangles, off silhouettes.",
         "displacement, uniform, brightness, budget": "How frame times are chosen: so that nothing moves further, at a fixed rate, so that no pixel changes more, to an error.",
         "linear, pchip, hermite": "The curve that brightness is taken to follow between frames.",
-        "none, msaa4, ssaa2, ssaa4": "Samples per pixel: one; 4 at silhouettes; 2×2 and 4×4 everywhere.",
+        "none, msaa4, taps4, ssaa2, ssaa4": "Samples per pixel: one; 4 at silhouettes; 4 of textures; 2×2 and 4×4 of everything.",
+        "mip bias, lod, textures": "Sharper mip maps; meshes decimated until their triangles are not far below a pixel; smaller textures.",
     }
     what = ", ".join(f"{k} {v:g}" for k, v in size["emulator"].items() if isinstance(v, float) and k.startswith(("contrast", "threshold_sigma")))
     return ("<h2>Words</h2><dl>" + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in terms.items())

@@ -21,11 +21,13 @@ SAMPLINGS = {
     **{f"budget {px:g} px": (f"timeline={{kind: budget, max_time_error_px: {px}, min_step_us: 20}}",) for px in (0.1, 0.05, 0.025)},
 }
 RECONSTRUCTIONS = {"linear": (), "pchip": ("timeline.reconstruction=pchip",), "hermite": ("timeline.reconstruction=hermite",)}
-ANTIALIASINGS = {name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "ssaa2", "ssaa4")}
+ANTIALIASINGS = {name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")}
 OTHERS = {
     "": (),
     "mip bias -0.5": ("render.mip_bias=-0.5",),
     "mip bias -1": ("render.mip_bias=-1",),
+    "lod": ("render.lod.enabled=true",),
+    "lod 0.25 px": ("render.lod={enabled: true, error_px: 0.25}",),
     "anisotropy 4": ("render.anisotropy=4",),
     "textures 256 px": ("scene.textures.max_size=256",),
     "textures 128 px": ("scene.textures.max_size=128",),
@@ -65,16 +67,16 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
     if quick:
         points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2")]
         points += [Setting(s, r, "ssaa2") for s in displacement(2, 1) for r in curves]
-        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "ssaa4")]
+        points += [Setting(displacement(1)[0], antialiasing=a) for a in ("msaa4", "taps4", "ssaa4")]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 400)]
         points += [Setting(s, "pchip", "ssaa2") for s in extra[1::3]]
         points += [Setting(displacement(1)[0], antialiasing=a, other=sharper[0]) for a in ("none", "ssaa2")]
-        points += [Setting(displacement(1)[0], antialiasing="none", other=o) for o in others if o not in sharper and not o.endswith(("4", "128 px"))]
+        points += [Setting(displacement(1)[0], antialiasing="none", other=o) for o in others if o not in sharper and not o.endswith(("4", "128 px", "0.25 px"))]
     else:
         points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5, 0.25) for a in ANTIALIASINGS if (s, a) != (displacement(0.25)[0], "ssaa4")]
         points += [Setting(s, r, "ssaa2") for s in displacement(4, 2, 1, 0.5) for r in curves]
         points += [Setting(s, r, "ssaa4") for s in displacement(4, 2, 1) for r in curves]
-        points += [Setting(s, "pchip", a, o) for s in displacement(4, 2, 1) for a in ("none", "ssaa2", "ssaa4") for o in sharper]
+        points += [Setting(s, "pchip", a, o) for s in displacement(4, 2, 1) for a in ("none", "taps4", "ssaa2", "ssaa4") for o in ("", *sharper)]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]
         points += [Setting(s, r, "ssaa2") for s in extra for r in ("linear", "pchip")]
         points += [Setting(displacement(1)[0], "pchip", a, o) for o in others if o not in sharper for a in ("none", "ssaa2")]

@@ -34,6 +34,12 @@ def test_what_is_said_wins(tmp_path):
     assert config.render.antialiasing == preset["render"]["antialiasing"]
 
 
+def test_emulators_that_follow_straight_lines(tmp_path):
+    assert sequence(tmp_path, {"quality": "accurate"}).timeline.reconstruction != "linear", "or this test shows nothing"
+    config = sequence(tmp_path, {"quality": "accurate", "events": {"emulator": "v2e"}})
+    assert config.timeline.reconstruction == "linear" and config.render.antialiasing == load_quality("accurate")["render"]["antialiasing"]
+
+
 def test_no_quality_changes_nothing(tmp_path):
     tree = {"timeline": {"kind": "uniform", "fps": 50}}
     assert with_quality(tree) is tree and with_quality({**tree, "quality": None})["timeline"] == tree["timeline"]

@@ -124,6 +124,7 @@ def trade(
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")] = "trade",
     quick: Annotated[bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")] = False,
     only: Annotated[Optional[list[str]], typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated.")] = None,
+    skip: Annotated[Optional[list[str]], typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated.")] = None,
     overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
     seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
     sequence: Annotated[Optional[int], typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
@@ -138,7 +139,7 @@ def trade(
     """Measure what accuracy costs: settings timed and judged against a converged reference, as a table, a plot and a page."""
     from blinkgl.trade.show import trade_and_show
 
-    trade_and_show(config, out, overrides=overrides or [], quick=quick, only=only or [], sequence=sequence, clip=clip, limit_ms=limit_ms, rounds=rounds,
+    trade_and_show(config, out, overrides=overrides or [], quick=quick, only=only or [], skip=skip or [], sequence=sequence, clip=clip, limit_ms=limit_ms, rounds=rounds,
                    minutes=minutes, cost=cost, reference=reference, seed=seed)
 
 

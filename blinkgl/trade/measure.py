@@ -44,7 +44,7 @@ class Options:
     rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
 
     clip_s: float = 0.0
-    tiles: tuple[int, int, int, int] = (4, 3, 24, 18)
+    tiles: tuple[int, int, int, int] = (4, 3, 20, 15)
     levels: tuple[tuple[int, float], ...] = ((8, 0.12), (16, 0.08), (32, 0.056), (64, 0.04))
     reference_s: float = 1200.0
     rounds: int = 3

@@ -24,16 +24,17 @@ COLUMNS = ("name", "wall_s", "cpu_s", "frames_per_s", "triangles", "time_median_
            "extra", "wrong", "count", "voxel", "flow_median_px", "flow_max_px", "events", "reference_events", "on_front")
 
 
-def chosen(settings: tuple[Setting, ...], only: list[str]) -> tuple[Setting, ...]:
-    """The settings whose name contains one of ``only`` (all, when there is none). Raises ConfigError when none does."""
-    found = tuple(s for s in settings if not only or any(text.lower() in s.name.lower() for text in only))
+def chosen(settings: tuple[Setting, ...], only: list[str], skip: list[str] = ()) -> tuple[Setting, ...]:
+    """The settings whose name contains one of ``only`` (all, when there is none) and none of ``skip``. Raises ConfigError when none is left."""
+    has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)  # noqa: E731
+    found = tuple(s for s in settings if (not only or has(s, only)) and not has(s, skip))
     if not found:
-        raise ConfigError("no setting is called that", where="--only", value=", ".join(only), accepted="part of a name such as "
+        raise ConfigError("no setting is called that", where="--only, --skip", value=", ".join([*only, *skip]), accepted="part of a name such as "
                           + ", ".join(f"'{s.name}'" for s in settings[:3]))
     return found
 
 
-def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None = None, options: Options | None = None,
+def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None = None, skip: list[str] | None = None, options: Options | None = None,
           cost: str = "wall_s", settings: tuple[Setting, ...] | None = None, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
     """The whole measurement as plain data (what trade.json holds).
 
@@ -42,7 +43,7 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
     started = time.perf_counter()
     options = options or (QUICK if quick else Options())
     base = template.sequence(options.sequence)
-    settings = chosen(settings or design(quick, isinstance(base.scene, RandomSceneConfig)), only or [])
+    settings = chosen(settings or design(quick, isinstance(base.scene, RandomSceneConfig)), only or [], skip or [])
     rows: list[dict] = []
     sizes: dict[str, dict] = {}
     with create_context(base.gl.backend, base.gl.device) as gl:
@@ -64,7 +65,7 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
     best = {r["name"] for r in front([r for r in rows if r["size"] == main], cost, "voxel")}
     for r in rows:
         r["on_front"] = r["name"] in best
-    return {"machine": machine, "config": template.tree, "sequence": options.sequence, "quick": quick, "reference": options.reference, "only": only or [], "cost": cost,
+    return {"machine": machine, "config": template.tree, "sequence": options.sequence, "quick": quick, "reference": options.reference, "only": only or [], "skip": skip or [], "cost": cost,
             "error": "voxel", "size": main or "full", "limit_us": options.limit_us, "enough": ENOUGH, "rounds": max(len(r["wall_rounds"]) for r in rows),
             "seconds": time.perf_counter() - started, "sizes": sizes, "settings": rows, "front": [r["name"] for r in sorted(rows, key=lambda r: r[cost])
                                                                                                 if r["on_front"]]}

@@ -13,7 +13,7 @@ from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options
 from blinkgl.trade.run import convergence_line, trade, write
 
 
-def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, only: list[str], sequence: int | None, clip: float | None,
+def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, only: list[str], skip: list[str], sequence: int | None, clip: float | None,
                    limit_ms: float, rounds: int | None, minutes: float | None, cost: str, reference: str = "raster",
                    seed: int | None = None) -> None:
     """Measures, writes the files, and names the settings that nothing beats. Raises BlinkGLError."""
@@ -34,7 +34,7 @@ def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, 
         changes |= {"rounds_s": minutes * 30, "reference_s": minutes * 30}
     console = Console()
     say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
-    result = trade(template, quick=quick, only=only, options=replace(options, **changes), cost=f"{cost}_s", say=say)
+    result = trade(template, quick=quick, only=only, skip=skip, options=replace(options, **changes), cost=f"{cost}_s", say=say)
     show(result, console)
     paths = write(result, out)
     say(f"written to {out}: " + ", ".join(p.name for p in paths))

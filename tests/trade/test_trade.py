@@ -148,7 +148,7 @@ def test_files_of_the_command(result):
 
 
 def test_errors(config, tmp_path, capsys):
-    for arguments, message in ((["--only", "raytracing"], "--only: no setting is called that"), (["--cost", "euros"], "--cost: unknown cost"),
+    for arguments, message in ((["--only", "raytracing"], "--only, --skip: no setting is called that"), (["--cost", "euros"], "--cost: unknown cost"),
                                (["--set", "render.antialiasing=fxaa"], "render.antialiasing")):
         assert run(["trade", str(config), "-o", str(tmp_path / "x"), *arguments]) == 2
         error = capsys.readouterr().err

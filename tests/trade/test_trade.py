@@ -21,7 +21,7 @@ from blinkgl.tools import peer_cycles
 from blinkgl.trade.front import dominating, front
 from blinkgl.trade.measure import Bench, Level, Options, noiseless
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
-from blinkgl.trade.run import convergence_line, trade
+from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
 from blinkgl.trade.show import show
 
@@ -113,6 +113,12 @@ def test_design():
         assert {s.antialiasing for s in settings} == {"none", "msaa4", "taps4", "ssaa2", "ssaa4"}
     assert len(design(True)) < 30 < len(design(False))
     assert not any("textures" in s.other for s in design(False, random_scene=False))
+
+
+def test_only_and_skip():
+    settings = design(False)
+    assert {s.antialiasing for s in chosen(settings, ["ssaa2", "taps4"], ["MSAA"])} == {"ssaa2", "taps4"}
+    assert not any(s.size for s in chosen(settings, [], ["half size"]))
 
 
 def test_every_setting_is_a_valid_configuration(config):

@@ -65,7 +65,7 @@ def _panel(ax, rows: list[dict], cost: str, key: str, factor: float, unit: str, 
         low, high = ax.get_xlim()
         ax.set_xlim(low * (low / high) ** 0.28, high)
         low, high = ax.get_ylim()
-        ax.set_ylim(low * (low / high) ** 0.12, high)
+        ax.set_ylim(low * (low / high) ** 0.12, high * (high / low) ** 0.3)  # and for the legend
 
 
 def _legend(ax, rows: list[dict]) -> None:
@@ -76,7 +76,7 @@ def _legend(ax, rows: list[dict]) -> None:
     used = {r["reconstruction"] for r in rows}
     handles += [Line2D([], [], marker=m, ls="", color="0.4", label=f"between frames: {n}") for n, m in MARKERS.items() if n in used]
     handles.append(Line2D([], [], marker="o", ls="-", color="0.25", mfc="white", mec="black", mew=1.4, ms=10, label="not beaten by any other setting"))
-    ax.legend(handles=handles, loc="upper right", fontsize=10, framealpha=0.9)
+    ax.legend(handles=handles, loc="upper right", fontsize=10, framealpha=0.9, ncols=2)
 
 
 def _label(ax, rows: list[dict], cost: str, renderer) -> None:

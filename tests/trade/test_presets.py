@@ -70,7 +70,7 @@ RIVALS = [Setting(f"displacement {px:g} px", r, a, o) for px, r, a, o in (
 def test_no_rival_beats_a_preset_measured_again(gl, tmp_path):
     """Cost is what a busy machine cannot change: samples drawn. A rival has to be better by 15 % in both to count: the scene is small."""
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(CONFIG))
-    bench = Bench(gl, load_run(tmp_path / "c.yaml"), Options(clip_s=0.04, tiles=(1, 1, 96, 72), levels=((8, 0.1),), rounds=1))
+    bench = Bench(gl, load_run(tmp_path / "c.yaml"), Options(clip_s=0.03, tiles=(1, 1, 96, 72), levels=((8, 0.1),), rounds=1))
     presets = [_Preset(name) for name in QUALITIES]
     results = bench.measure([*presets, *RIVALS])
     bench.judge(results, bench.speeds())

@@ -145,7 +145,7 @@ def test_files_of_the_command(result):
     data = json.loads((result / "trade.json").read_text())
     assert "NaN" not in (result / "trade.json").read_text()
     names = [s["name"] for s in data["settings"]]
-    assert data["front"] and set(data["front"]) <= set(names) and len(names) == 2
+    assert data["front"] and set(data["front"]) <= set(names) and len(names) == 3
     rows = list(csv.DictReader((result / "trade.csv").open()))
     assert [r["name"] for r in rows] == names and float(rows[0]["wall_s"]) > 0 and rows[0]["flow_median_px"]
     assert (result / "pareto.png").read_bytes()[:4] == b"\x89PNG"

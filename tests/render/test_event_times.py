@@ -120,11 +120,12 @@ def test_cubics_converge_faster_on_rendered_frames(gl, direction, monkeypatch, r
     assert all(m < 0.5 * s for m, s in zip(medians, straight))
 
 
-def test_rates_are_those_of_finer_and_finer_differences(gl):
+@pytest.mark.parametrize("antialiasing", ["none", "taps4", "msaa4", "ssaa2"])
+def test_rates_are_those_of_finer_and_finer_differences(gl, antialiasing):
     """dL/dt of the shader against central differences of rendered frames, on curved, lit, textured, turning things."""
     world = mixed_scene()
     rate, h = np.empty((120, 160), np.float32), 100_000
-    with Renderer(gl, world, PLAIN) as renderer:
+    with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
         frame = renderer.luminance(SECOND // 3, rate=rate)
         np.testing.assert_array_equal(frame, renderer.luminance(SECOND // 3))
         ahead, behind = (renderer.luminance(SECOND // 3 + s).astype(float) for s in (h, -h))

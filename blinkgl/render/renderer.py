@@ -17,6 +17,7 @@ import moderngl
 import numpy as np
 
 from blinkgl.render.antialiasing import Samples, samples_of
+from blinkgl.render.frames import Flow, LabelFrame, LabelRequest, RenderStats
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, frustum_planes, mat4_bytes, projection, rows_xyw_bytes
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
@@ -24,59 +25,6 @@ from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import Backdrop, Rectangle, screen_rectangle
 from blinkgl.scene.lod import at_level_of_detail
 from blinkgl.scene.types import PosePath, Scene
-
-
-@dataclass(frozen=True)
-class LabelRequest:
-    """Which buffers :meth:`Renderer.labels` returns; what is not asked for is not computed."""
-
-    colour: bool = False
-    depth: bool = False
-    ids: bool = False
-    normals: bool = False
-    velocity: bool = False
-    flow_forward: bool = False
-    flow_backward: bool = False
-    occlusion: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Flow:
-    """flow : (H, W, 2) float32 px, +x right, +y down, from t to t' at reference t; 0 where not valid.
-    valid : (H, W) bool, something is hit and it is in front of the camera at t'.
-    occluded : (H, W) bool or None, valid but not visible at t' (hidden by a surface, or outside the image)."""
-
-    flow: np.ndarray
-    valid: np.ndarray
-    occluded: np.ndarray | None
-
-
-@dataclass(frozen=True, eq=False)
-class LabelFrame:
-    """Ground truth at t_ns. Buffers that were not requested are None.
-
-    colour : (H, W, 3) float32 linear radiance.     depth : (H, W) float32 Z along the optical axis; inf: nothing hit.
-    ids : (H, W) uint32; 0: nothing hit.            normals : (H, W, 3) float32 unit, camera axes (OpenCV), facing the camera.
-    velocity : (H, W, 2) float32 px/s at t."""
-
-    t_ns: int
-    colour: np.ndarray | None = None
-    depth: np.ndarray | None = None
-    ids: np.ndarray | None = None
-    normals: np.ndarray | None = None
-    velocity: np.ndarray | None = None
-    forward: Flow | None = None
-    backward: Flow | None = None
-
-
-@dataclass
-class RenderStats:
-    """Wall seconds since the renderer was made; triangles counts what was submitted after culling."""
-
-    frames: int = 0
-    triangles: int = 0
-    render_s: float = 0.0
-    readback_s: float = 0.0
 
 
 @dataclass(eq=False)

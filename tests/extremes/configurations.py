@@ -39,13 +39,17 @@ times = st.builds(
 def timelines(interval: float):
     """At most some tens of event frames per label interval."""
     uniform = st.builds(lambda n: {"kind": "uniform", "fps": min(n / interval, 1e9)}, magnitude(0.5, 20.0))
-    adaptive = st.builds(
-        lambda px, steps, longest, percentile: {
-            "kind": "displacement", "max_px": px, "min_step_us": max(interval / steps * 1e6, 0.001),
-            "max_step_us": max(interval * longest * 1e6, interval / steps * 1e6, 0.001), "percentile": percentile,
-        },
-        magnitude(1e-3, 1e4), magnitude(1.0, 20.0), magnitude(0.1, 10.0), st.sampled_from([50.0, 99.0, 100.0]),
+    steps = st.builds(
+        lambda n, longest: {"min_step_us": max(interval / n * 1e6, 0.001), "max_step_us": max(interval * longest * 1e6, interval / n * 1e6, 0.001)},
+        magnitude(1.0, 20.0), magnitude(0.1, 10.0),
     )  # fmt: skip
+    percentile = st.sampled_from([50.0, 99.0, 100.0])
+    displacement = st.builds(lambda px, peak, p: {"kind": "displacement", "max_px": px, "max_px_peak": peak, "percentile": p},
+                             magnitude(1e-3, 1e4), st.none() | magnitude(1e-3, 1e4), percentile)
+    brightness = st.builds(lambda part, p: {"kind": "brightness", "max_fraction_of_threshold": part, "percentile": p}, magnitude(1e-3, 100), percentile)
+    budget = st.builds(lambda unit, most: {"kind": "budget", f"max_time_error_{unit}": most}, st.sampled_from(["us", "px"]), magnitude(1e-3, 1e4))
+    adaptive = st.builds(lambda way, how, longest: {**way, **longest, **how}, displacement | brightness | budget,
+                         some(sample_every=st.sampled_from([1, 4, 64])), steps)
     return uniform | adaptive
 
 
@@ -145,14 +149,16 @@ voltmeter = some(preset=st.sampled_from(["DVS346", "DVS240"]), k1=magnitude(1e-2
 def runs(draw, emulators=esim):
     time = draw(times)
     interval = 1.0 / time["label_rate"]
+    reconstructions = st.sampled_from(["linear", "pchip", "hermite"] if emulators is esim else ["linear"] * 9 + ["pchip", "hermite"])
     return {
         "seed": draw(st.integers(0, 2**63 - 1)),
         "camera": draw(cameras),
         "time": time,
-        "timeline": draw(timelines(interval)),
+        "timeline": {**draw(timelines(interval)), "reconstruction": draw(reconstructions)},
         "scene": draw(explicit_scenes(interval, time["start"]) | random_scenes()),
         "events": {**draw(emulators), "max_events_per_step": draw(most)},
-        "render": draw(some(antialiasing=st.sampled_from(["none", "msaa4", "taps4", "ssaa2"]), anisotropy=st.sampled_from([1.0, 16.0]))),
+        "render": draw(some(antialiasing=st.sampled_from(["none", "msaa4", "taps4", "ssaa2"]), anisotropy=st.sampled_from([1.0, 16.0]),
+                            mip_bias=st.sampled_from([-8.0, -0.5, 8.0]), lod=st.sampled_from([{"enabled": True}, {"enabled": True, "edge_px": 100.0}]))),
         "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True, "ids": True, "normals": True,
                    "velocity": True, "images": draw(st.booleans()), "occlusion": draw(st.booleans())},
         "preview": {"enabled": False},

@@ -78,6 +78,7 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
         points += [Setting(s, r, "ssaa4") for s in displacement(4, 2, 1) for r in curves]
         points += [Setting(s, "pchip", a, o) for s in displacement(2, 1) for a in ("none", "taps4", "ssaa2", "ssaa4") for o in ("", *sharper)]
         points += [Setting(s, "pchip", a, sharper[1]) for s in displacement(0.5, 0.25) for a in ("ssaa2", "ssaa4") if (s, a) != (displacement(0.25)[0], "ssaa2")]
+        points += [Setting(s, antialiasing=a, other=o) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2") for o in sharper]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]
         points += [Setting(s, r, "ssaa2") for s in extra for r in ("linear", "pchip")]
         points += [Setting(displacement(1)[0], "pchip", a, o) for o in others if o not in sharper for a in ("none", "ssaa2")]

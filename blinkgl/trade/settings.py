@@ -4,7 +4,7 @@ Not the full product: it would be thousands of settings, most of them silly. Wha
 
 1. displacement x anti-aliasing, in full: the two axes that matter most, and they interact, because each hides the other's error.
 2. reconstruction x displacement at one anti-aliasing: a better curve between frames trades against more frames and nothing else ...
-3. ... and the same curves, with sharper mip maps, at the other anti-aliasings for the coarse steps, where presets are looked for.
+3. ... and both, pchip at the coarse steps, with sharper mip maps: where presets are looked for.
 4. every other way to choose the times (uniform, brightness, budget) at one anti-aliasing, so that each is a curve to compare.
 5. anisotropy, level of detail and texture size one at a time: they change what a frame is, not when it is drawn.
 6. half the image size: another data set, with a reference of its own; it says what a pixel costs.
@@ -78,7 +78,7 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
         points += [Setting(s, r, "ssaa4") for s in displacement(4, 2, 1) for r in curves]
         points += [Setting(s, "pchip", a, o) for s in displacement(2, 1) for a in ("none", "taps4", "ssaa2", "ssaa4") for o in ("", *sharper)]
         points += [Setting(s, "pchip", a, sharper[1]) for s in displacement(0.5, 0.25) for a in ("ssaa2", "ssaa4") if (s, a) != (displacement(0.25)[0], "ssaa2")]
-        points += [Setting(s, antialiasing=a, other=o) for s in displacement(2, 1, 0.5) for a in ("none", "ssaa2") for o in sharper]
+        points += [Setting(s, antialiasing=a, other=o) for s in displacement(2, 1, 0.5) for a in ("none", "taps4", "ssaa2", "ssaa4") for o in sharper]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]
         points += [Setting(s, r, "ssaa2") for s in extra for r in ("linear", "pchip")]
         points += [Setting(displacement(1)[0], "pchip", a, o) for o in others if o not in sharper for a in ("none", "ssaa2")]

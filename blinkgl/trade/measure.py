@@ -45,7 +45,7 @@ class Options:
 
     clip_s: float = 0.0
     tiles: tuple[int, int, int, int] = (4, 3, 20, 15)
-    levels: tuple[tuple[int, float], ...] = ((8, 0.12), (16, 0.08), (32, 0.056), (64, 0.04))
+    levels: tuple[tuple[int, float], ...] = ((8, 0.12), (16, 0.08), (32, 0.056), (64, 0.04), (128, 0.028))
     reference_s: float = 1200.0
     rounds: int = 3
     rounds_s: float = 1200.0

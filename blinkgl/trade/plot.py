@@ -35,7 +35,17 @@ def pareto(result: dict) -> bytes:
     axes[0].set_ylabel("error of the events: difference of the voxel grids a network sees, relative")
     _legend(axes[0], rows)
     canvas.draw()
-    _label(axes[0], [r for r in rows if r["on_front"]], cost, canvas.get_renderer())
+    for _ in range(8):  # until the names, whose length on the axis is not known beforehand, have room left of their points
+        names = _label(axes[0], [r for r in rows if r["on_front"]], cost, canvas.get_renderer())
+        if all(name.get_window_extent(canvas.get_renderer()).x0 > axes[0].bbox.x0 + 5 for name in names):
+            break
+        for name in names:
+            name.remove()
+        low, high = axes[0].get_xlim()
+        axes[0].set_xlim(low * (low / high) ** 0.1, high)
+        canvas.draw()
+    else:
+        _label(axes[0], [r for r in rows if r["on_front"]], cost, canvas.get_renderer())
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=100, metadata={"Software": None})
     return out.getvalue()
@@ -79,11 +89,11 @@ def _legend(ax, rows: list[dict]) -> None:
     ax.legend(handles=handles, loc="upper right", fontsize=10, framealpha=0.9, ncols=2)
 
 
-def _label(ax, rows: list[dict], cost: str, renderer) -> None:
+def _label(ax, rows: list[dict], cost: str, renderer) -> list:
     """Names of the front's settings, below and left of their points, where by definition there is nothing; pushed down until they
     do not overlap."""
     factor, floor = PANELS[0][2], np.inf
-    height = None
+    height, names = None, []
     for r in sorted(rows, key=lambda r: r[cost]):
         x, y = ax.transData.transform((r[cost], r["voxel"] * factor))
         at = min(y - 14, floor)
@@ -92,3 +102,5 @@ def _label(ax, rows: list[dict], cost: str, renderer) -> None:
                            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75})
         height = height or text.get_window_extent(renderer).height
         floor = at - height - 3
+        names.append(text)
+    return names

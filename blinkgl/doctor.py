@@ -22,6 +22,7 @@ from blinkgl.errors import BlinkGLError
 
 EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "check": (("pyrender",), "an independent renderer to compare with"),
+    "cycles": (("bpy",), "Blender's path tracer to compare with; better in an environment of its own, see README"),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
     "cluster": (("ray",), "many machines"),
     "formats": (("faery", "dv-processing"), "EVT2, EVT3 and AEDAT4 files"),
@@ -29,7 +30,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "urdf": (("pybullet",), "its random meshes as an object pool"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
 }
-_PINNED = {"torch": "torch==2.13.0"}
+_PINNED = {"torch": "torch==2.13.0", "bpy": "'bpy>=4.5,<4.6'"}
 
 
 @dataclass(frozen=True)

@@ -103,12 +103,13 @@ class Budget(Timeline):
         return self.error.pace(contraharmonic_mean(speed))
 
     def observe(self, t_ns: int, luminance: np.ndarray, rate: np.ndarray | None = None) -> None:
-        n = self.config.sample_every
         if not self._speeds:  # the first frame is drawn before anything is asked about it
             self.pace(t_ns)
         nearest = min(self._speeds, key=lambda t: abs(t - t_ns))
         speed = self._speeds[nearest]
-        pick = lambda a: np.ascontiguousarray(a[n // 2 :: n, n // 2 :: n][: speed.shape[0], : speed.shape[1]])  # noqa: E731
+        # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of the stride or smaller than the stride.
+        rows, columns = (((np.arange(few) + 0.5) * many / few).astype(np.intp) for few, many in zip(speed.shape, luminance.shape))
+        pick = lambda a: a[np.ix_(rows, columns)]  # noqa: E731
         small = pick(luminance)
         slope = self.response.change(small, pick(rate)) if rate is not None else None
         self.error.observe(t_ns, self.response.signal(small), slope, speed)

@@ -160,6 +160,16 @@ def test_nothing_moves_nothing_is_measured():
     assert count == 11 and said["measurements"] == 0 and said["median_us"] is None
 
 
+@pytest.mark.parametrize("shape, small", [((1, 1), (1, 1)), ((1, 16), (1, 4)), ((24, 1), (6, 1)), ((15, 23), (3, 5)), ((3, 5), (1, 1))])
+def test_images_smaller_than_the_sampling_or_no_multiple_of_it(shape, small):
+    """The small picture of speeds is max(1, size // n) pixels a side; the signal is looked up at the same places."""
+    world = SimpleNamespace(motion=lambda t, n: np.full((*small, 2), 50.0, np.float32))
+    timeline = make_timeline(BudgetTimeline(max_time_error_us=100.0, max_step_us=1000), 0, 10 * MS, world, response_of(ESIM))
+    for t in timeline:
+        timeline.observe(t, np.full(shape, 1 + 0.5 * math.sin(t * 1e-6), np.float32))
+    assert timeline.info()["time_error"]["measurements"] > 0
+
+
 def test_means_and_percentiles():
     assert contraharmonic_mean(np.array([0, 1, 3, np.inf])) == 2.5 and contraharmonic_mean(np.zeros(3)) == 0.0
     assert weighted_percentile(np.array([3.0, 1, 2]), np.array([1.0, 8, 1]), 50) == 1

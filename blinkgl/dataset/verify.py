@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
-import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
 import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, load_run
@@ -26,6 +24,7 @@ from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.hdf5 import open_hdf5
 from blinkgl.io.images import read_image
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
 
@@ -100,7 +99,7 @@ def check_sequence(folder: Path) -> list[str]:
     if "events.h5" in manifest["files"]:
         try:
             problems += check_events(folder / "events.h5", manifest)
-        except (OSError, KeyError, TypeError, ValueError) as error:
+        except (BlinkGLError, OSError, KeyError, TypeError, ValueError) as error:
             problems.append(f"events.h5: cannot be read: {' '.join(str(error).split())[:120]}")
     try:
         problems += _check_labels(folder, manifest)
@@ -112,7 +111,7 @@ def check_sequence(folder: Path) -> list[str]:
 def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
     """Sorted, inside the sensor and the sequence's time, counted as the manifest says, and ``ms_to_idx`` right at every millisecond."""
     problems = []
-    with h5py.File(path) as file:
+    with open_hdf5(path) as file:
         columns = {k: file[f"events/{k}"] for k in "xytp"}
         ms_to_idx, offset = file["ms_to_idx"][()].astype(np.int64), int(file["t_offset"][()])
         counts = {k: len(c) for k, c in columns.items()}

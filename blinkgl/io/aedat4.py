@@ -6,11 +6,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import check_events, events_of
 
 MAGIC = b"#!AER-DAT4"
 
@@ -53,7 +52,7 @@ class Aedat4Reader:
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """All events, packet by packet, joined to about ``size``."""
         recording = self._open()
-        pending, count = [], 0
+        first, pending, count = 0, [], 0
         while True:
             try:
                 batch = recording.getNextEventBatch()
@@ -61,12 +60,11 @@ class Aedat4Reader:
                 raise self._broken(error) from error
             if batch is not None and batch.size():
                 a = batch.numpy()
-                pending.append(Events(a["x"].astype(np.uint16), a["y"].astype(np.uint16), a["timestamp"].astype(np.int64),
-                                      a["polarity"].astype(np.uint8)))
+                pending.append(events_of(a["x"], a["y"], a["timestamp"], a["polarity"], str(self.path), first + count))
                 count += len(a)
             if pending and (batch is None or count >= size):
                 yield Events.concatenate(pending)
-                pending, count = [], 0
+                first, pending, count = first + count, [], 0
             if batch is None:
                 return
 
@@ -78,7 +76,8 @@ class Aedat4Writer:
         if height > 32767 or width > 32767:
             raise EventDataError("AEDAT4 has 15-bit coordinates", where=str(path), value=(height, width))
         dv = _dv(OutputError, path)
-        self.path, self._store = Path(path), dv.EventStore
+        self.path, self._store, self._size = Path(path), dv.EventStore, (height, width)
+        self._count, self._last = 0, None
         with output_errors(path):
             open(path, "wb").close()  # dv's own message for an unwritable path does not say why
             try:
@@ -89,6 +88,8 @@ class Aedat4Writer:
     def append(self, events: Events) -> None:
         if not len(events):
             return
+        self._last = check_events(events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last)
+        self._count += len(events)
         store = self._store()
         push = store.push_back
         for t, x, y, p in zip(events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.astype(bool).tolist()):

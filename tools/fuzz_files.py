@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import faulthandler
 import fnmatch
 import gc
 import json
@@ -190,6 +191,7 @@ class _Task:
 
     def _child(self, indices: list[int | None], pipe: int) -> None:
         try:
+            faulthandler.disable()
             os.setpgid(0, 0)
             null = os.open(os.devnull, os.O_RDWR)
             for stream in (0, 1, 2):

@@ -98,7 +98,7 @@ def _as_stored(folder: Path, name: str) -> dict[str, np.ndarray] | None:
     if path.suffix in (".npz", ".npy"):
         data = np.load(path, allow_pickle=False)
         t = np.asarray(data["t"])
-        return {"x": data["x"], "y": data["y"], "t": np.rint(t * 1e6) if t.dtype.kind == "f" else t, "p": (data["p"] > 0) * 1}
+        return {"x": data["x"], "y": data["y"], "t": np.rint(t.astype(float) * 1e6) if t.dtype.kind == "f" else t, "p": (data["p"] > 0) * 1}
     if path.suffix in (".txt", ".csv"):
         lines = [line for line in path.read_bytes().split(b"\n") if line.strip() and line.strip()[:1] not in b"#%"]
         events = [f for line in lines if len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit() or f[0][:1] in b"."]

@@ -142,7 +142,7 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
         if entry.file is None:
             return Asset(entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)).normalised()
         asset = load_asset(entry.file, max_faces=config.max_faces, max_bytes=limit, keep_materials=config.keep_materials,
-                           max_texture=max_texture, source_hash=entry.source_hash)
+                           max_texture=max_texture, source_hash=entry.source_hash, up=config.up)
         _same_content(entry, content_hash(entry.file.read_bytes(), *dependencies(entry.file)))
         return asset.normalised()
 

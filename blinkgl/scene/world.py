@@ -38,6 +38,7 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     rng, rng_motion, rng_texture = (generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE))
     objects, textures = pools(config, base)
     log: list[str] = []
+    omissions: dict[str, None] = {}
     floor = config.ground.height if config.ground else 0.0
     unlit = config.light.unlit
 
@@ -60,7 +61,7 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     backdrop += [(f"wall-{k}", "wall", parts, StaticPath(T, t0_ns, t1_ns))
                  for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))]
 
-    placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log)
+    placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log, omissions)
     centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
     radii = np.array([radius for *_, radius, _ in placed])
     half = config.region.width / 2
@@ -88,7 +89,7 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
     return Scene(objects=result.objects, camera=make_camera(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
-                 light=make_light(config.light, rng), background=config.background, log=tuple(log))
+                 light=make_light(config.light, rng), background=config.background, log=tuple(log), omissions=tuple(omissions))
 
 
 def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
@@ -117,11 +118,8 @@ def near_corner(camera) -> float:
 
 def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:
     """Sun direction drawn where the configuration leaves it open and ``rng`` is given."""
-    drawn = (60.0, 40.0) if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
-    elevation = math.radians(drawn[0] if config.sun_elevation is None else config.sun_elevation)
-    azimuth = math.radians(drawn[1] if config.sun_azimuth is None else config.sun_azimuth)
-    direction = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation))
-    return Light(direction, config.sun, config.sky)
+    drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
+    return Light(config.sun_direction(*drawn), config.sun, config.sky)
 
 
 def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +135,7 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
     return T, target
 
 
-def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log):
+def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log, omissions):
     """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
     placed: list[tuple] = []
@@ -170,6 +168,7 @@ def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, spli
         radii.append(radius)
         placed.append((f"{asset.name}#{k}", parts, T, radius, resting))
         log.extend(line for line in asset.log if line not in log)
+        omissions.update(dict.fromkeys(asset.omissions))
     return placed
 
 

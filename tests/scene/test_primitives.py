@@ -26,6 +26,10 @@ def volume(mesh):
 
 
 @pytest.mark.parametrize("kind", PRIMITIVE_KINDS)
+def test_every_parameter_is_documented():
+    assert {name for kind in P.BUILDERS for name in P.parameters(kind)} == set(P.PARAMETERS)
+
+
 def test_closed_outward_unit_normals(kind):
     mesh = P.BUILDERS[kind]()
     assert mesh.closed and volume(mesh) > 0

@@ -1,0 +1,29 @@
+"""What goes wrong while a file is read, as one line that names the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from blinkgl.errors import AssetError, BlinkGLError
+
+
+@contextmanager
+def reading(what: str, where: str) -> Iterator[None]:
+    """Everything that reading a ``what`` (mesh, image, scene) from the file ``where`` raises becomes an AssetError about it.
+
+    The readers check what they know to check and say what is wrong. What is left is what nobody thought of, and what the
+    parsers of other packages raise on broken files: ValueError, KeyError, IndexError, struct.error, OSError, SyntaxError, …
+    The cause is kept for ``--debug``.
+    """
+    try:
+        yield
+    except BlinkGLError:
+        raise
+    except MemoryError as error:
+        raise AssetError(f"the {what} does not fit into memory", where=where) from error
+    except RecursionError as error:
+        raise AssetError(f"the {what} is corrupt (nested too deeply)", where=where) from error
+    except Exception as error:
+        detail = f"{type(error).__name__}: {' '.join(str(error).split())[:80]}"
+        raise AssetError(f"the {what} is corrupt or of an unknown format ({detail})", where=where) from error

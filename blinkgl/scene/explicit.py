@@ -17,6 +17,7 @@ from blinkgl.scene.meshes import transform_mesh
 from blinkgl.scene.paths import KeyframePath, StaticPath
 from blinkgl.scene.pool import resolve
 from blinkgl.scene.primitives import BUILDERS
+from blinkgl.scene.reading import contents
 from blinkgl.scene.textures import procedural_texture
 from blinkgl.scene.trajectories import look_rotation
 from blinkgl.scene.types import Material, Part, PosePath, Scene, SceneObject, Texture
@@ -138,5 +139,5 @@ def _material(config: MaterialConfig, base: Path, where: str) -> Material:
 def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:
     if not path.is_file():
         raise ConfigError("no such file", where=where, value=given, accepted="an image file")
-    data = path.read_bytes()
+    data = contents(path, "image")
     return Texture(decode_image(data, max_size, str(path)), path.name, content_hash(data))

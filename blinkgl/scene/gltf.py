@@ -26,7 +26,7 @@ from blinkgl.errors import AssetError
 from blinkgl.scene import gltf_schema
 from blinkgl.scene.images import content_hash, decode_image
 from blinkgl.scene.omissions import Omissions
-from blinkgl.scene.reading import reading
+from blinkgl.scene.reading import contents, reading
 from blinkgl.scene.types import Material, Texture
 from blinkgl.srgb import linear_from_srgb
 
@@ -45,7 +45,6 @@ _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125:
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_NODES, _MAX_DEPTH = 200_000, 256
 _MAX_ZEROS = 64_000_000     # bytes of an accessor that has no buffer behind it (all zeros): nothing in the file bounds them
-_MAX_FILE = 2_000_000_000   # bytes of the file, and of each file it refers to
 _WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 _NEAREST = 9728
 _MAX_TIME = 1e7             # s, of an animation's keys
@@ -370,7 +369,7 @@ def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, m
     path = Path(path)
     where = str(path)
     with reading("scene", where):
-        data = _contents(path, where) if data is None else data
+        data = contents(path, "scene") if data is None else data
         tree, binary = _parse(data, where)
         for name in tree.get("extensionsRequired", []):
             if name not in _DRAWN | _LIGHT_ONLY | _INVISIBLE:
@@ -390,15 +389,6 @@ def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, m
 def _needs(extension: str, where: str) -> AssetError:
     return AssetError(f"the file needs the extension {extension}, which BlinkGL does not draw", where=where,
                       accepted="a glTF 2.0 export without it (uncompressed, PNG or JPEG images)")
-
-
-def _contents(path: Path, where: str) -> bytes:
-    try:
-        if path.stat().st_size > _MAX_FILE:
-            raise AssetError("the file is too large", where=where, value=f"{path.stat().st_size / 1e6:.0f} MB", accepted=f"at most {_MAX_FILE // 10**6} MB")
-        return path.read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror or error}", where=where) from None
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
@@ -480,7 +470,7 @@ def _fetch(uri: str, path: Path, what: str) -> bytes:
             raise AssetError(f"the embedded {what} is corrupt", where=str(path)) from None
     if "://" in uri:
         raise AssetError(f"the {what} is on a network", where=str(path), value=uri, accepted="a file beside it")
-    return _contents(inside(path.parent, unquote(uri), str(path)), str(path))
+    return contents(inside(path.parent, unquote(uri), str(path)), what, str(path))
 
 
 def _nodes(tree: dict, where: str) -> dict[int, Node]:

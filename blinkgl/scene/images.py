@@ -19,7 +19,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.reading import reading
+from blinkgl.scene.reading import contents, reading
 from blinkgl.srgb import DECODE_8BIT, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr")
@@ -60,11 +60,7 @@ def load_image(path: Path, max_size: int | None = None, where: str | None = None
     While it is reduced, an image takes at most 7 bytes per pixel of the file (HDR: 20), and some 100 MB beside it.
     Raises :class:`AssetError` naming the file when it is missing, corrupt, truncated or beyond :data:`MAX_PIXELS`.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read the image: {error.strerror or error}", where=where or str(path)) from None
-    return decode_image(data, max_size, where or str(path))
+    return decode_image(contents(Path(path), "image", where), max_size, where or str(path))
 
 
 def decode_image(data: bytes, max_size: int | None, where: str) -> np.ndarray:

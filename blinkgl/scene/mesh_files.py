@@ -22,11 +22,10 @@ from blinkgl.scene import gltf
 from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, decode_image, shrink
 from blinkgl.scene.meshes import closed_together, concatenate, make_mesh, normalise
 from blinkgl.scene.omissions import Omissions
-from blinkgl.scene.reading import reading
+from blinkgl.scene.reading import MAX_BYTES, contents, reading
 from blinkgl.scene.types import Material, Part, Texture
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
-MAX_BYTES = 2_000_000_000
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)     # its warnings say nothing a user could act on
 
 
@@ -73,14 +72,7 @@ def _load(path: Path, max_faces: int, max_bytes: int, keep_materials: bool, max_
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise AssetError("unknown kind of mesh file", where=where, value=suffix, accepted=" ".join(MESH_SUFFIXES))
-    try:
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise AssetError("the mesh file is too large", where=where, value=f"{size / 1e6:.0f} MB",
-                             accepted=f"at most {max_bytes / 1e6:.0f} MB")
-        data = path.read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read the mesh: {error.strerror or error}", where=where) from None
+    data = contents(path, "mesh", max_bytes=max_bytes)
     digest = source_hash or content_hash(data, *dependencies(path, data))
     log: list[str] = []
     if suffix in (".glb", ".gltf"):
@@ -120,7 +112,7 @@ def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
     """Contents of the buffer files that a .gltf refers to (they are part of what it is); [] for other files."""
     if path.suffix.lower() != ".gltf":
         return []
-    return gltf.buffer_contents(path, path.read_bytes() if data is None else data)
+    return gltf.buffer_contents(path, contents(path, "mesh") if data is None else data)
 
 
 def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, omissions: Omissions) -> list[gltf.Piece]:
@@ -215,10 +207,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
     def get(self, name: str) -> bytes:
         try:
             file = gltf.inside(self.folder, str(name), self.where)
-            data = file.read_bytes()
-        except OSError as error:
-            self.refused = self.refused or AssetError(f"cannot read '{name}': {error.strerror or error}", where=self.where)
-            raise self.refused from None
+            data = contents(file, "file")
         except AssetError as error:         # trimesh swallows it; _trimesh_pieces raises it
             if "missing" in error.problem:
                 self.omissions.add(f"'{name}', which is missing")
@@ -307,6 +296,11 @@ def _check_ply(data: bytes, max_faces: int, where: str) -> None:
 
 def _check_obj(data: bytes, max_faces: int, where: str) -> None:
     _limit(data.count(b"\nf ") + data.startswith(b"f "), max_faces, where)
+    # trimesh allocates as many vertices as the largest index of a face says; a file cannot have more of them than lines.
+    lines = data.count(b"\n") + data.count(b"\r") + 1
+    found = re.search(rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1), data.replace(b"\\\n", b" ") if b"\\\n" in data else data)
+    if found:
+        raise AssetError("a face refers to a vertex that does not exist", where=where, value=found[1][:20].decode(), accepted=f"at most {lines}")
 
 
 def _limit(faces: int, max_faces: int, where: str) -> None:

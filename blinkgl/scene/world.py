@@ -18,11 +18,12 @@ from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, Wall
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.collision import resolve_collisions
-from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, cube_faces, decode_image, shrink, SKY_SIDES
+from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, cube_faces, load_image, shrink, SKY_SIDES
 from blinkgl.scene.meshes import scale_mesh
 from blinkgl.scene.paths import StaticPath
 from blinkgl.scene.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
 from blinkgl.scene.primitives import cuboid, grid, parameter_hash, square
+from blinkgl.scene.reading import contents
 from blinkgl.scene.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
 
@@ -241,13 +242,13 @@ def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[
         if not path.exists():
             raise ConfigError("no such file or folder", where=where, value=given, accepted="an equirectangular image or a folder of them")
         files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
-    hashed = sorted({content_hash(f.read_bytes()): f for f in files}.items())
+    hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
     mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
     if not mine:
         raise ConfigError(f"none of the {len(hashed)} panoramas falls to split '{split}'", where="scene.sky.panoramas",
                           accepted="more panoramas, or another scene.textures.test_fraction")
     digest, file = mine[int(rng.integers(len(mine)))]
-    image = shrink(decode_image(file.read_bytes(), None, str(file)), 4096)
+    image = shrink(load_image(file), 4096)
     image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
     sides = cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN)
     return [Texture(side, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)]

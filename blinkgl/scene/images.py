@@ -57,7 +57,7 @@ def load_image(path: Path, max_size: int | None = None, where: str | None = None
     """(h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr``; the longer side at most ``max_size`` px.
 
     HDR images are exposed so that their 90th percentile is 0.8 and clipped at :data:`HDR_WHITE`.
-    While it is reduced, an image takes at most 7 bytes per pixel of the file (HDR: 20), and some 100 MB beside it.
+    While it is reduced, an image takes at most 7 bytes per pixel of the file (HDR: 25), and some 100 MB beside it.
     Raises :class:`AssetError` naming the file when it is missing, corrupt, truncated or beyond :data:`MAX_PIXELS`.
     """
     return decode_image(contents(Path(path), "image", where), max_size, where or str(path))

@@ -191,6 +191,28 @@ def test_headers_of_evt(tmp_path):
         open_events(tmp_path / "e.raw")
 
 
+def test_a_decoder_that_crashes_or_hangs_is_an_error_of_one_line(tmp_path, monkeypatch):
+    """dv-processing does both on damaged files. Here it is replaced by something that does so at once."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: True)
+    (tmp_path / "dv_processing.py").write_text("import os, signal\nclass io:\n  def MonoCameraRecording(path):\n    text = open(path).read()\n"
+                                               "    if 'loop' in text: signal.setitimer(signal.ITIMER_PROF, 0.05)\n    while 'loop' in text: pass\n"
+                                               "    if 'crash' in text: os.kill(os.getpid(), signal.SIGSEGV)\n    raise RuntimeError('no\\nstream')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    for text, message in (("crash", "crashed on it"), ("loop", "does not come to an end"), ("else", "damaged AEDAT4 file: no stream")):
+        (tmp_path / "e.aedat4").write_bytes(b"#!AER-DAT4.0\r\n" + text.encode())
+        with pytest.raises(AssetError, match=f"e.aedat4: damaged AEDAT4 file: .*{message}|{message}"):
+            open_events(tmp_path / "e.aedat4")
+
+
+def test_the_command_writes_microseconds(tmp_path, capsys):
+    from blinkgl.cli import run
+    (tmp_path / "a.txt").write_text("0.000005 1 2 0\n")
+    assert run(["convert", str(tmp_path / "a.txt"), str(tmp_path / "b.csv"), "--time-unit", "us"]) == 0
+    assert (tmp_path / "b.csv").read_text() == "t,x@240,y@180,on\n5,1,2,0\n"
+    assert run(["convert", str(tmp_path / "a.txt"), str(tmp_path / "c.csv"), "--time-unit", "ms"]) == 2
+    assert "unit of time (got 'ms'); expected s or us" in capsys.readouterr().err and not (tmp_path / "c.csv").exists()
+
+
 def test_every_value_that_fits_comes_through():
     edge = events_of(np.array([0, 65535.0]), np.array([True, False]), np.array([-(1 << 62), 1 << 62]), np.array([-1, 1]), "f", signed=True)
     assert edge.x.tolist() == [0, 65535] and edge.y.tolist() == [1, 0] and edge.p.tolist() == [0, 1] and edge.t.tolist() == [-(1 << 62), 1 << 62]

@@ -81,7 +81,7 @@ def _system() -> Iterator[Check]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     yield Check("System", "cores, memory", "info", f"{cores} cores, {memory:.1f} GiB")
-    names = ("LP_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER", "OMP_NUM_THREADS")
+    names = ("LP_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR", "OMP_NUM_THREADS")
     changed = [f"{name}={value}" for name, value in sorted(os.environ.items())
                if name in names or name.startswith(("GLCONTEXT_", "LIBGL_", "GALLIUM_", "MESA_", "__EGL_", "EGL_"))]
     if changed:
@@ -224,19 +224,23 @@ def _numba() -> Iterator[Check]:
 
         return f"{numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads"
 
-    def layer() -> str:
+    def threads() -> str:
         import numba
 
-        @numba.njit(parallel=True)
-        def total(n):
-            s = 0
-            for i in numba.prange(n):
-                s += i
-            return s
+        from blinkgl.events.threads import run, take_part
 
-        if total(1000) != 499500:
-            raise ValueError("a parallel sum came out wrong")
-        return numba.threading_layer()
+        @numba.njit(nogil=True)
+        def mark(taken, start, counts):
+            part = take_part(taken, start)
+            while part >= 0:
+                counts[part] += part
+                part = take_part(taken, start)
+
+        count, sums = numba.get_num_threads(), np.zeros(1000, np.int64)
+        run(mark, len(sums), (sums,), count)
+        if not np.array_equal(sums, np.arange(len(sums))):
+            raise ValueError("work divided between threads came out wrong")
+        return f"{count}, asleep when idle"
 
     def simd() -> str:
         from llvmlite import binding
@@ -247,7 +251,7 @@ def _numba() -> Iterator[Check]:
 
     mend = f"{_python()} -m pip install --force-reinstall numba"
     yield _try(section, "numba", version, mend)
-    yield _try(section, "threading layer", layer, mend)
+    yield _try(section, "threads", threads, mend)
     yield _try(section, "SIMD", simd, mend)
 
 

@@ -19,7 +19,7 @@ from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
-app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(shader_app)
 
 

@@ -321,13 +321,14 @@ _MARKS = {"ok": ("ok", "green"), "missing": ("MISSING", "bold red"), "absent": (
 
 def show(report: Report) -> None:
     """Print for people: sections, then what is missing with the commands that mend it."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
+    from blinkgl.terminal import plain_console
+
+    console = plain_console(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=200)  # piped: one check, one line, for grep
+        console = plain_console(highlight=False, width=200)  # piped: one check, one line, for grep
     table = Table.grid(padding=(0, 2))
     for _ in range(3):
         table.add_column(overflow="fold")

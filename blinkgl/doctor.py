@@ -19,19 +19,7 @@ import numpy as np
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
-
-EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
-    "check": (("pyrender",), "an independent renderer to compare with"),
-    "cycles": (("bpy",), "Blender's path tracer to compare with; better in an environment of its own, see README"),
-    "learn": (("torch", "safetensors", "tensorboard"), "training"),
-    "cluster": (("ray",), "many machines"),
-    "formats": (("faery", "dv-processing"), "EVT2, EVT3 and AEDAT4 files"),
-    "viz": (("rerun-sdk",), "3D viewer"),
-    "urdf": (("pybullet",), "its random meshes as an object pool"),
-    "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
-}
-_PINNED = {"torch": "torch==2.13.0", "bpy": "'bpy>=4.5,<4.6'"}
-
+from blinkgl.extras import EXTRAS, install, python
 
 @dataclass(frozen=True)
 class Check:
@@ -249,7 +237,7 @@ def _numba() -> Iterator[Check]:
         widest = next((name for name in ("avx512f", "avx2", "avx", "sse4.2", "sve", "neon") if features.get(name)), "none found")
         return f"{widest} on {binding.get_host_cpu_name()}"
 
-    mend = f"{_python()} -m pip install --force-reinstall numba"
+    mend = f"{python()} -m pip install --force-reinstall numba"
     yield _try(section, "numba", version, mend)
     yield _try(section, "threads", threads, mend)
     yield _try(section, "SIMD", simd, mend)
@@ -289,7 +277,7 @@ def _codecs() -> Iterator[Check]:
             raise ValueError("read other values than written")
         return f"round trip (OpenCV {cv2.__version__})"
 
-    pip = f"{_python()} -m pip install --force-reinstall"
+    pip = f"{python()} -m pip install --force-reinstall"
     yield _try(section, "HDF5 blosc-zstd", blosc, f"{pip} h5py hdf5plugin")
     yield _try(section, "libx264 video", x264, f"{pip} imageio-ffmpeg")
     yield _try(section, "16-bit RGB PNG", png16, f"{pip} opencv-python-headless")
@@ -304,14 +292,8 @@ def _extras() -> Iterator[Check]:
             except metadata.PackageNotFoundError:
                 lacking.append(name)
         value = ", ".join(found + [f"no {name}" for name in lacking]) + f" ({purpose})"
-        remedy = f"{_python()} -m pip install {' '.join(_PINNED.get(name, name) for name in lacking)}" if lacking else ""
+        remedy = install(*lacking) if lacking else ""
         yield Check("Optional extras", f"[{extra}]", "absent" if lacking else "ok", value, remedy)
-
-
-def _python() -> str:
-    """This interpreter, as one would type it here."""
-    relative = os.path.relpath(sys.executable)
-    return relative if len(relative) < len(sys.executable) else sys.executable
 
 
 # --- show -------------------------------------------------------------------------------------------------------------

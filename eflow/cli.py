@@ -12,6 +12,7 @@ import typer
 from blinkgl import __version__
 from blinkgl.cli import _user_line
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.extras import EXTRAS, install
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -272,7 +273,7 @@ def run(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors", "tensorboard"):
             raise
-        print(f"error: {error.name} is not installed; run pip install 'blinkgl[learn]'", file=sys.stderr)
+        print(f"error: {error.name} is not installed; run {install(*EXTRAS['learn'][0])}", file=sys.stderr)
         return BlinkGLError.exit_status
     except Exception as error:
         line = _user_line(error)

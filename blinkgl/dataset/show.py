@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
 from blinkgl.config.sequence import load_run
@@ -17,6 +17,7 @@ from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
+from blinkgl.terminal import plain_column, plain_console
 
 STAGES = ("scene", "render", "read-back", "events", "write", "preview")
 MAX_NOTES = 20
@@ -30,7 +31,7 @@ def generate_with_progress(config: str, out: str, *, num: int | None = None, see
                            time_limit_s: float = 0.0) -> Outcome:
     """:func:`~blinkgl.dataset.run.run_dataset` behind a display. Raises what it raises."""
     template = load_run(config, overrides, seed=seed)
-    console = Console(quiet=quiet)
+    console = plain_console(quiet=quiet)
     outcome = run_dataset(template, out, executor, num=num, resume=resume, mixed=mixed, time_limit_s=time_limit_s,
                           listener=None if quiet else Display(console, Path(out)))
     show_outcome(console, outcome, Path(out))
@@ -43,8 +44,8 @@ class Display:
 
     def __init__(self, console: Console, out: Path):
         self._console, self._out = console, out
-        self._bars = Progress(TextColumn("{task.description}"), BarColumn(bar_width=30), TextColumn("{task.percentage:>3.0f}%"),
-                              TextColumn("{task.fields[detail]}"), TimeElapsedColumn(), console=console, transient=True,
+        self._bars = Progress(plain_column("{task.description}"), BarColumn(bar_width=30), plain_column("{task.percentage:>3.0f}%"),
+                              plain_column("{task.fields[detail]}"), TimeElapsedColumn(), console=console, transient=True,
                               disable=not console.is_terminal)
         self._tasks: dict[str, TaskID] = {}
         self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames, events of what is being made

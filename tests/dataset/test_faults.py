@@ -1,8 +1,10 @@
 """What others do to a run while it is on: stopped workers, deleted files, clocks that jump, second drivers, links, refusals."""
 
+import fcntl
 import json
 import os
 import re
+import select
 import shutil
 import signal
 import subprocess
@@ -282,6 +284,19 @@ def test_a_stopped_worker_is_named_and_waited_for(reference, tmp_path, monkeypat
     assert_same(tmp_path / "out", reference)
 
 
+def test_a_worker_says_that_it_lives_whatever_it_does(tmp_path):
+    """Here: waits for its first order."""
+    process = executor_module._Process(0, tmp_path / "log", dict(os.environ))
+    try:
+        assert select.select([process.channel], [], [], 60)[0], "no word in a minute"
+        assert process.read() == ([{"kind": "alive"}], False)
+        assert process.silence() is None, "nothing was asked of it"
+    finally:
+        process.popen.kill()
+        process.popen.wait()
+        process.close()
+
+
 # ---- files deleted under a run ----------------------------------------------------------------------------------------
 
 
@@ -421,6 +436,23 @@ def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
             with pytest.raises(OutputError, match="deleted"):
                 first.check_in_place()
     assert not out.exists()
+
+
+def test_a_folder_that_goes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    """Another run was refused just then, and took away the empty folder that we had opened."""
+    out, flock, calls = tmp_path / "out", fcntl.flock, []
+
+    def late(handle, how):
+        if not calls:
+            out.rmdir()
+        calls.append(handle)
+        flock(handle, how)
+
+    monkeypatch.setattr(run_folder_module.fcntl, "flock", late)
+    with RunFolder(out).locked():
+        with pytest.raises(OutputError, match="another run is at work"), RunFolder(out).locked():
+            raise AssertionError
+    assert len(calls) == 3
 
 
 def test_a_live_temporary_of_another_user_stays(tmp_path, monkeypatch):

@@ -58,4 +58,8 @@ class OutputError(BlinkGLError):
 
 
 class EventDataError(BlinkGLError):
-    """Frames or events outside the emulator's or a format's contract (time order, range, shape)."""
+    """Frames or events outside the emulator's or a format's contract (time order, range, shape).
+
+    pixel : (x, y) of the pixel of a frame that is at fault, where it is one."""
+
+    pixel: tuple[int, int] | None = None

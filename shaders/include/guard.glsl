@@ -21,10 +21,10 @@ void drop_artefact()
 // Texture coordinates that differences between neighbours may be taken of. Beside a surface that ends at the horizon the
 // neighbour outside may have 1/w = 0; it then counts as far away, so that the coarsest mip level is chosen.
 const uint REPEATS = 0x4e6e6b28u; // bits of 1e9, beyond which a float tells nothing about a texture
-vec2 within_reach(vec2 uv)
+vec2 within_reach(vec2 at)
 {
-    uvec2 size = floatBitsToUint(uv) & 0x7fffffffu;
-    return max(size.x, size.y) < REPEATS ? uv : vec2(1e6);
+    uvec2 size = floatBitsToUint(at) & 0x7fffffffu;
+    return max(size.x, size.y) < REPEATS ? at : vec2(1e6);
 }
 
 // 0 for what is no number.

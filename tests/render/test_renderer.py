@@ -221,3 +221,32 @@ def test_occlusion_by_hand():
     gone = occlusion_mask(flow, depth, valid, ids, np.full_like(depth, 4), np.ones_like(ids))
     np.testing.assert_array_equal(gone[0], [False, False, False, True, True, True]), "outside the image is not visible"
     assert not occlusion_mask(flow, depth, ~valid, ids, depth_next, ids_next).any()
+
+
+def flat_patch(depths, size=6):
+    """(ids, depth) of an image that shows object 1 alone, at one depth or one per column."""
+    return np.ones((size, size), np.uint32), np.broadcast_to(np.asarray(depths, np.float32), (size, size)).copy()
+
+
+@pytest.mark.parametrize("nearer_id", [1, 2])
+@pytest.mark.parametrize("by, hidden", [(0.002, True), (0.01, True), (0.0005, False)])
+def test_a_surface_nearer_by_more_than_a_thousandth_hides(nearer_id, by, hidden):
+    """Whether it is another object or another side of the same one: leaves of a book, a cup's wall behind its front."""
+    ids, depth = flat_patch(2.0)
+    shown, at = np.full_like(ids, nearer_id), depth * np.float32(1 - by)
+    mask = occlusion_mask(np.full((6, 6, 2), 0.3, np.float32), depth, np.ones((6, 6), bool), ids, at, shown)
+    assert (mask[1:-1, 1:-1] == hidden).all()
+
+
+@pytest.mark.parametrize("spreads, hidden", [(0.45, False), (0.55, True), (1.5, True), (-3.0, False)])
+def test_half_of_the_spread_around_is_allowed_to_a_curved_surface(spreads, hidden):
+    """1/Z at t' goes up by a tenth per column; the point lies that many times a column's difference behind the mean of its neighbours
+    (besides a thousandth of tolerance)."""
+    inverse = 0.5 * (1 + 0.1 * np.arange(6))
+    ids, depth_next = flat_patch(1 / inverse)
+    flow = np.full((6, 6, 2), 0.5, np.float32)  # between two columns: the mean of both
+    mean = (inverse[:-1] + inverse[1:]) / 2
+    w_next = np.full((6, 6), 1.0, np.float32)
+    w_next[:, :-1] = 1 / ((mean - spreads * 0.05) / 1.001)
+    mask = occlusion_mask(flow, w_next, np.ones((6, 6), bool), ids, depth_next, ids)
+    assert (mask[:-1, :-1] == hidden).all()

@@ -144,10 +144,11 @@ class Renderer:
         return image
 
     def brightness(self, t_ns: int, every: int = 1) -> np.ndarray:
-        """(H // every, W // every, 2) float32: luminance and d(luminance)/dt per second on every n-th pixel in x and y, textures
-        filtered as for the whole image."""
+        """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures filtered as for the
+        whole image. h = max(1, H // every), w likewise: the small picture covers the whole image, so that its pixels are H / h and W / w
+        pixels apart, a little more than ``every`` where that is no divisor."""
         started = time.perf_counter()
-        target = self._target("brightness", 1 / every, ("RG32F",))
+        target = self._target("brightness", 1, ("RG32F",), every=every)
         moment = self._moment(t_ns)
         self._begin(target, moment, (self.scene.background, 0.0))
         self._draw_luminance(moment, self._visible(moment), target, self._rates(t_ns, moment), every)
@@ -159,15 +160,15 @@ class Renderer:
         return largest_speed(self.motion(t_ns, sample_every), percentile)
 
     def motion(self, t_ns: int, every: int = 1) -> np.ndarray:
-        """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone."""
+        """:meth:`velocity` of what moves, (h, w, 2) float32 px/s, for the time sampling: with a still camera of the moving objects alone."""
         return self.velocity(t_ns, every, moving_only=self._still)
 
     def velocity(self, t_ns: int, reduce: int = 1, moving_only: bool = False) -> np.ndarray:
-        """Image velocity at t_ns in px/s (of the full-size image), (H // reduce, W // reduce, 2) float32, 0 where
-        nothing is hit. ``reduce`` samples every n-th pixel: enough to find the largest motion, at 1/n² the cost.
+        """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit.
+        ``reduce`` samples every n-th pixel, h and w as for :meth:`brightness`: enough to find the largest motion, at 1/n² the cost.
         ``moving_only`` leaves out objects that stand still, also where they hide something."""
         started = time.perf_counter()
-        target = self._target("velocity", 1 / reduce, ("RG32F",))
+        target = self._target("velocity", 1, ("RG32F",), every=reduce)
         moment = self._moment(t_ns)
         rate, _ = self._rates(t_ns, moment)
         self._begin(target, moment)
@@ -395,10 +396,11 @@ class Renderer:
 
     # ---- GL state ----------------------------------------------------------------------------------------------
 
-    def _target(self, name: str, scale: float, formats: tuple[str, ...], samples: int = 0):
-        key = (name, scale, samples)
+    def _target(self, name: str, scale: int, formats: tuple[str, ...], samples: int = 0, every: int = 1):
+        """Of ``scale`` times the image's size, or of the small pictures' (:meth:`brightness`)."""
+        key = (name, scale, samples, every)
         if key not in self._targets:
-            width, height = max(1, int(self.width * scale)), max(1, int(self.height * scale))
+            width, height = (max(1, size * scale // every) for size in (self.width, self.height))
             self._targets[key] = self.gl.framebuffer(width, height, colour=formats, depth=True, samples=samples)
         return self._targets[key]
 

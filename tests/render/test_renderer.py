@@ -13,7 +13,7 @@ from blinkgl.render.statistics import largest_speed
 from blinkgl.scene import primitives
 from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObject, Texture
 
-from render_scenes import LEVEL, SECOND, curve, still
+from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")
 
@@ -153,6 +153,20 @@ def test_reduced_velocity_samples_the_full_one(gl):
     with Renderer(gl, world(width=192, height=144), PLAIN) as renderer:
         full, reduced = largest_speed(renderer.velocity(0)), largest_speed(renderer.velocity(0, reduce=4))
     assert 0.7 * full < reduced <= 1.05 * full
+
+
+@pytest.mark.parametrize("width, height, every", [(98, 147, 49), (23, 15, 4), (3, 5, 7), (12, 8, 4)])
+def test_small_pictures_cover_the_whole_image(gl, width, height, every):
+    """(98 * (1 / 49) is 1.9999999999999998.) Pixels are W / w apart: a wall that drifts shows its velocity at exactly those places."""
+    small = (max(1, height // every), max(1, width // every))
+    wall = SceneObject("wall", 1, (Part(primitives.cuboid(), Material(unlit=True)),), drift((-1.0, 4, 0), (1.0, 4.5, 0)))
+    camera = Camera(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2, still(rotation=LEVEL))
+    with Renderer(gl, Scene((wall,), camera, 0, SECOND), PLAIN) as renderer:
+        made = renderer.velocity(0, every), renderer.motion(0, every), renderer.brightness(0, every)
+        assert all(a.shape == (*small, 2) and a.dtype == np.float32 for a in made)
+    fewer = Camera(small[1], small[0], camera.fx * small[1] / width, camera.fy * small[0] / height, (small[1] - 1) / 2, (small[0] - 1) / 2, camera.path)
+    with Renderer(gl, Scene((wall,), fewer, 0, SECOND), PLAIN) as renderer:
+        np.testing.assert_allclose(made[0], renderer.velocity(0) * (width / small[1], height / small[0]), rtol=1e-4, atol=1e-4)
 
 
 # ---- matrices ----------------------------------------------------------------------------------------------------

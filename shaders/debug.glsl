@@ -62,6 +62,7 @@ uniform float albedo_luminance;
 in vec3 normal;
 #include "light.glsl"
 #endif
+#include "guard.glsl"
 
 void main()
 {
@@ -88,5 +89,6 @@ void main()
     triangle = uint(gl_PrimitiveID) + 1u;
     local_position = vec4(local, part_number);
     window = gl_FragCoord;
+    drop_artefact();
 }
 #endif

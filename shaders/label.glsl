@@ -93,6 +93,7 @@ uniform mat4x3 difference_forward;
 layout(location = OUT_FLOW_BACKWARD) out vec4 flow_backward;
 uniform mat4x3 difference_backward;
 #endif
+#include "guard.glsl"
 
 void main()
 {
@@ -106,6 +107,7 @@ void main()
 #ifdef OUT_COLOUR
     vec3 radiance = base_color;
 #ifdef TEXTURED
+    vec2 uv = within_reach(uv); // hides the varying
     radiance *= texture(albedo, uv).rgb;
 #endif
 #ifdef LIT
@@ -132,5 +134,6 @@ void main()
 #ifdef OUT_FLOW_BACKWARD
     flow_backward = vec4(displacement(difference_backward, local, image_size), 1.0);
 #endif
+    drop_artefact();
 }
 #endif

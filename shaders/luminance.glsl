@@ -71,10 +71,12 @@ uniform float albedo;
 in vec3 normal;
 #include "light.glsl"
 #endif
+#include "guard.glsl"
 
 void main()
 {
 #ifdef TEXTURED
+    vec2 uv = within_reach(uv); // hides the varying
 #ifdef TAPS4
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
     float luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).r + texture(albedo, uv + right - down, -1.0).r
@@ -117,9 +119,10 @@ void main()
     luminance *= light;
 #endif
 #ifdef RATE
-    result = vec2(luminance, change);
+    result = vec2(luminance, finite(change));
 #else
     result = luminance;
 #endif
+    drop_artefact();
 }
 #endif

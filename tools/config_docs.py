@@ -43,7 +43,8 @@ def _primitives() -> str:
              "All stand upright (z is their axis) and are centred on the origin; sizes are in the world's units (m), before the object's `scale`.\n\n",
              "| kind | parameters and defaults | what it is |\n|---|---|---|\n"]
     for kind, build in BUILDERS.items():
-        values = ", ".join(f"`{name}: {list(value) if isinstance(value, tuple) else value}`" for name, value in parameters(kind).items())
+        values = ", ".join(f"`{name}: {list(value) if isinstance(value, tuple) else value}`" for name,
+                           value in parameters(kind).items())
         lines.append(f"| `{kind}` | {values} | {' '.join((build.__doc__ or '').split()).replace('``', '`')} |\n")
     lines.append("\n| parameter | meaning |\n|---|---|\n")
     lines += [f"| `{name}` | {meaning} |\n" for name, meaning in PARAMETERS.items()]

@@ -1,4 +1,4 @@
-"""AEDAT4 (iniVation) through dv-processing (``pip install dv-processing``, also in the extra [formats])."""
+"""AEDAT4 (iniVation) through dv-processing, an optional package of its own."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
 from blinkgl.events.types import Events
+from blinkgl.extras import install
 from blinkgl.io import aedat4_decode
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of
@@ -26,7 +27,7 @@ MAGIC = b"#!AER-DAT4"
 
 
 def _missing(error: type[BlinkGLError], path) -> BlinkGLError:
-    return error("AEDAT4 needs dv-processing, which is not installed", where=str(path), accepted="run pip install dv-processing")
+    return error("AEDAT4 needs dv-processing, which is not installed", where=str(path), accepted=f"run {install('dv-processing')}")
 
 
 class Aedat4Reader:

@@ -209,6 +209,8 @@ def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
         stamps.append((t_ns, fields[1] if len(fields) > 1 else None))
     if not stamps:
         raise EventDataError("no time stamps", where=str(path))
+    if len({name is None for _, name in stamps}) > 1:
+        raise EventDataError("times with a name and times without one", where=str(path), accepted="'time', or 'time name', in every line")
     return stamps
 
 

@@ -24,6 +24,8 @@ _MAX_CHUNK_BYTES = 1 << 28
 """HDF5 unpacks a chunk whole, however little of it is asked for."""
 
 _LEVEL, _BIT_SHUFFLE = 1, hdf5plugin.Blosc.BITSHUFFLE
+_BLOSC_VALUES = 4
+"""Parameters that Blosc's filter reads without asking how many there are; with fewer it crashes."""
 
 
 def open_hdf5(path: Path) -> h5py.File:
@@ -96,8 +98,12 @@ def dataset(file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, 
         wanted = {"iu": "integers", "iub": "integers", "f": "floats"}.get(kinds, "numbers")
         raise AssetError(f"dataset '{name}' has the wrong shape or type", where=str(path), value=f"{found.dtype} {found.shape}",
                          accepted=f"{wanted} ({', '.join('N' if n is None else str(n) for n in shape)})")
+    layout = found.id.get_create_plist()
+    for code, _, values, _ in (layout.get_filter(k) for k in range(layout.get_nfilters())):
+        if code == hdf5plugin.Blosc.filter_id and len(values) < _BLOSC_VALUES:
+            raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks what Blosc needs to unpack it", where=str(path))
     if found.chunks is None:
-        whole = found.id.get_create_plist().get_layout() == h5py.h5d.COMPACT or found.id.get_storage_size() >= found.nbytes
+        whole = layout.get_layout() == h5py.h5d.COMPACT or found.id.get_storage_size() >= found.nbytes
     else:
         if math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
             raise AssetError(f"dataset '{name}' has chunks too large to unpack", where=str(path), value=found.chunks,

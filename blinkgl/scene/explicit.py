@@ -66,7 +66,8 @@ def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, 
             raise ConfigError(f"{result.at_start[0]}, at the start", where="scene.collisions",
                               accepted="bodies apart at the start, or collisions: false")
         objects, path, log = result.objects, result.camera_path, log + list(result.log)
-    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background, tuple(log), tuple(omissions))
+    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background,
+                 tuple(log), tuple(omissions))
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
@@ -118,7 +119,8 @@ def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_f
     path = resolve(config.file, base)
     if not path.is_file():
         raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a mesh file")
-    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs, uv_size=config.uv_size, up=config.up)
+    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs,
+                      uv_size=config.uv_size, up=config.up)
 
 
 def _material(config: MaterialConfig, base: Path, where: str) -> Material:

@@ -33,10 +33,11 @@ from blinkgl.srgb import linear_from_srgb
 # Columns: the file's x, y, z axes in a z-up world.
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
 _DRAWN = {"KHR_materials_unlit", "KHR_texture_transform", "KHR_mesh_quantization"}
-# Not drawn, and yet no reason to refuse a file that requires them: shape, base colour and motion are what they would be,
-# only light is missing from the surface. Everything else that is required (compressed geometry or images, instances, other
-# material models, what nobody has heard of) would be a scene that is not the file's.
-_LIGHT_ONLY = {"KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_materials_clearcoat", "KHR_materials_sheen",
+# Not drawn, and yet no reason to refuse a file that requires them: shape, base colour and motion are what they would
+# be, only light is missing from the surface. Everything else that is required (compressed geometry or images,
+# instances, other material models, what nobody has heard of) would be a scene that is not the file's.
+_LIGHT_ONLY = {"KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_materials_clearcoat",
+               "KHR_materials_sheen",
                "KHR_materials_specular", "KHR_materials_ior", "KHR_materials_iridescence", "KHR_materials_anisotropy",
                "KHR_materials_dispersion"}
 # Nothing to be seen in these.
@@ -44,7 +45,7 @@ _INVISIBLE = {"KHR_xmp_json_ld", "KHR_xmp"}
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_NODES, _MAX_DEPTH = 200_000, 256
-_MAX_ZEROS = 64_000_000     # bytes of an accessor that has no buffer behind it (all zeros): nothing in the file bounds them
+_MAX_ZEROS = 64_000_000     # bytes of an accessor without a buffer behind it (all zeros): nothing in the file bounds them
 _WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 _NEAREST = 9728
 _MAX_TIME = 1e7             # s, of an animation's keys
@@ -186,7 +187,8 @@ class Document:
             if "JOINTS_0" in attributes:
                 self.omissions.add("skins (the rest shape is drawn)")
             material, uv_set, uv_matrix = self.material(primitive.get("material"))
-            normals, uvs = (self._attribute(primitive, key, width, len(vertices)) for key, width in (("NORMAL", 3), (f"TEXCOORD_{uv_set}", 2)))
+            normals = self._attribute(primitive, "NORMAL", 3, len(vertices))
+            uvs = self._attribute(primitive, f"TEXCOORD_{uv_set}", 2, len(vertices))
             if uvs is not None and uv_matrix is not None:
                 uvs = uvs @ uv_matrix[:2, :2].T + uv_matrix[:2, 2]
             if self.materials:
@@ -196,7 +198,7 @@ class Document:
         return pieces
 
     def _attribute(self, primitive: dict, name: str, width: int, count: int) -> np.ndarray | None:
-        """(count, width) float64, None without it. Its length is checked before it is read: positions are what is counted."""
+        """(count, width) float64, None without it. Its length is checked before it is read."""
         if name not in primitive["attributes"]:
             return None
         index = primitive["attributes"][name]
@@ -230,13 +232,16 @@ class Document:
         settings = _item(self.tree, "samplers", sampler, self.where)
         for axis, key in enumerate(("wrapS", "wrapT")):
             # Inside the image all modes show the same, but for the outermost half pixel.
-            if (name := _WRAPS.get(settings.get(key))) and (uvs[:, axis].min() < -1e-3 or uvs[:, axis].max() > 1 + 1e-3):
+            outside = uvs[:, axis].min() < -1e-3 or uvs[:, axis].max() > 1 + 1e-3
+            if outside and (name := _WRAPS.get(settings.get(key))):
                 self.omissions.add(f"texture wrap mode {name} (repeated)")
         if settings.get("magFilter") == _NEAREST:
             self.omissions.add("unfiltered textures (drawn smooth)")
 
     def _base_colour(self, material: int | None) -> dict:
-        return {} if material is None else _item(self.tree, "materials", material, self.where).get("pbrMetallicRoughness", {})
+        if material is None:
+            return {}
+        return _item(self.tree, "materials", material, self.where).get("pbrMetallicRoughness", {})
 
     def pieces(self) -> list[Piece]:
         """The whole scene at rest as one object, in the file's axes."""
@@ -289,10 +294,12 @@ class Document:
             transform = info.get("extensions", {}).get("KHR_texture_transform") or {}
             material = Material(texture=self._texture(info["index"]) if info and self.materials else None,
                                 base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
-                                unlit="KHR_materials_unlit" in m.get("extensions", {}), double_sided=m.get("doubleSided", False))
+                                unlit="KHR_materials_unlit" in m.get("extensions", {}),
+                                double_sided=m.get("doubleSided", False))
             if self.materials:
                 self._note_material(m, pbr)
-            self._materials[index] = (material, transform.get("texCoord", info.get("texCoord", 0)), _texture_transform(transform))
+            self._materials[index] = (material, transform.get("texCoord", info.get("texCoord", 0)),
+                                      _texture_transform(transform))
         return self._materials[index]
 
     def _note_material(self, m: dict, pbr: dict) -> None:
@@ -322,7 +329,8 @@ class Document:
             image = _item(self.tree, "images", source, self.where)
             if "bufferView" in image:
                 v = _item(self.tree, "bufferViews", image["bufferView"], self.where)
-                buffer, begin = self.buffers[_index(v["buffer"], len(self.buffers), "buffer", self.where)], v.get("byteOffset", 0)
+                buffer = self.buffers[_index(v["buffer"], len(self.buffers), "buffer", self.where)]
+                begin = v.get("byteOffset", 0)
                 data = buffer[begin : begin + v.get("byteLength", 0)]
             else:
                 data = _fetch(image.get("uri", ""), self.path, "image")
@@ -351,20 +359,23 @@ class Document:
             per_key = 3 if kind == "CUBICSPLINE" else 1
             keys, given = (_item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
             # Lengths first: the two are as long as the file says, whatever is behind them.
-            fits = keys["type"] == "SCALAR" and given["count"] == per_key * keys["count"] > 0 and _WIDTHS[given["type"]] == width
+            fits = (keys["type"] == "SCALAR" and given["count"] == per_key * keys["count"] > 0
+                    and _WIDTHS[given["type"]] == width)
             times = self.accessor(sampler["input"]).astype(np.float64).ravel() if fits else np.zeros(0)
             values = self.accessor(sampler["output"]).astype(np.float64) if fits else np.zeros(0)
-            if (not fits or not np.isfinite(values).all() or not (np.abs(times) < _MAX_TIME).all() or (np.diff(times) <= 0).any()
-                    or np.abs(values).max() > 1e12):
+            if (not fits or not (np.abs(values) <= 1e12).all() or not (np.abs(times) < _MAX_TIME).all()
+                    or (np.diff(times) <= 0).any()):      # NaN compares false
                 raise AssetError(f"the animation of {path} of node '{self.nodes[node].name}' is corrupt", where=self.where)
             values = values.reshape(-1, per_key, width)
             if path == "rotation" and (np.linalg.norm(values[:, per_key // 2], axis=1) < 1e-9).any():
-                raise AssetError(f"the animation of node '{self.nodes[node].name}' has a rotation of zero", where=self.where)
+                raise AssetError(f"the animation of node '{self.nodes[node].name}' has a rotation of zero",
+                                 where=self.where)
             found.append(Channel(node, path, times, values if per_key == 3 else values[:, 0], kind))
         return found
 
 
-def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, max_texture: int = 2048, materials: bool = True) -> Document:
+def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, max_texture: int = 2048,
+         materials: bool = True) -> Document:
     """Parses a file, checks its shape and its counts. Raises AssetError naming it."""
     path = Path(path)
     where = str(path)
@@ -379,7 +390,8 @@ def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, m
         _check_faces(document, max_faces)
         for name in tree.get("extensionsUsed", []):
             # What belongs to materials and textures is said where one is used, and lights by what they are.
-            if name not in _DRAWN | _LIGHT_ONLY | _INVISIBLE and not name.startswith(("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_")):
+            said_there = name.startswith(("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_"))
+            if name not in _DRAWN | _LIGHT_ONLY | _INVISIBLE and not said_there:
                 document.omissions.add(name)
         if any("KHR_lights_punctual" in tree["nodes"][i].get("extensions", {}) for i in document.nodes):
             document.omissions.add("lights (the configuration's sun and sky shine)")
@@ -488,7 +500,8 @@ def _nodes(tree: dict, where: str) -> dict[int, Node]:
     while stack:
         i, parent, depth = stack.pop()
         if i in nodes or depth > _MAX_DEPTH:
-            raise AssetError("the nodes are no tree" if i in nodes else f"the nodes are nested more than {_MAX_DEPTH} deep", where=where, value=i)
+            raise AssetError("the nodes are no tree" if i in nodes
+                             else f"the nodes are nested more than {_MAX_DEPTH} deep", where=where, value=i)
         n = raw[_index(i, len(raw), "node", where)]
         matrix = np.array(n["matrix"], float).reshape(4, 4).T if n.get("matrix") else None
         rest = [tuple(map(float, n.get(k, d))) for k, d in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))]
@@ -509,7 +522,9 @@ def _check_faces(document: Document, max_faces: int) -> None:
             for primitive in _item(tree, "meshes", node.mesh, where)["primitives"]:
                 position = primitive["attributes"].get("POSITION")
                 vertices = _item(tree, "accessors", position, where)["count"] if position is not None else 0
-                corners = _item(tree, "accessors", primitive["indices"], where)["count"] if "indices" in primitive else vertices
+                corners = vertices
+                if "indices" in primitive:
+                    corners = _item(tree, "accessors", primitive["indices"], where)["count"]
                 total += max(corners // (3 if primitive.get("mode", 4) == 4 else 1), vertices // 3)
             per_mesh[node.mesh] = total
     total = sum(per_mesh[n.mesh] for n in document.nodes.values() if n.mesh is not None)

@@ -1,7 +1,8 @@
 """Image files as :class:`~blinkgl.scene.types.Texture` images: limits checked before decoding, corrupt files refused.
 
-Pillow's guard against decompression bombs is a module-wide number far below what ``max_size`` allows, and changing it would
-change it for the whole process. So files are opened by Pillow's readers themselves, and the guard is :data:`MAX_PIXELS`.
+Pillow's guard against decompression bombs is a module-wide number far below what ``max_size`` allows, and changing it
+would change it for the whole process. So files are opened by Pillow's readers themselves, and the guard is
+:data:`MAX_PIXELS`.
 """
 
 from __future__ import annotations
@@ -82,10 +83,12 @@ def _open(data: bytes, where: str) -> Image.Image:
         try:
             return factory(stream, "")
         except Image.DecompressionBombError:        # some readers ask the guard themselves
-            raise AssetError(f"the image is too large for a {name} file", where=where, accepted="a PNG, or fewer pixels") from None
+            raise AssetError(f"the image is too large for a {name} file", where=where,
+                             accepted="a PNG, or fewer pixels") from None
         except (SyntaxError, IndexError, TypeError, struct.error):     # not this format after all: as Image.open does
             continue
-    raise AssetError("the image is corrupt or of an unknown format", where=where, accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR")
+    raise AssetError("the image is corrupt or of an unknown format", where=where,
+                     accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR")
 
 
 def _decode_ldr(data: bytes, where: str) -> np.ndarray:
@@ -142,7 +145,7 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
     factor = max_size / max(height, width)
     new_width, new_height = max(1, round(width * factor)), max(1, round(height * factor))
     made = np.empty((new_height, new_width, 3), image.dtype)
-    # A block of the result at a time, across and then down: in one piece, the linear light would take four times the image.
+    # A block of the result at a time, across and then down: in one piece, linear light takes four times the image.
     for rows in _blocks(new_height, math.ceil(width * height / new_height)):
         top, bottom = rows.start * height / new_height, rows.stop * height / new_height
         source = slice(math.floor(top), min(math.ceil(bottom - 1e-9), height))
@@ -150,7 +153,8 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
         linear = cv2.resize(linear, (new_width, len(linear)), interpolation=cv2.INTER_AREA)
         edges = np.arange(rows.start, rows.stop + 1)[:, None] * (height / new_height)
         pixel = np.arange(source.start, source.stop)[None]
-        share = np.clip(np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel), 0, None) * (new_height / height)
+        overlap = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
+        share = np.clip(overlap, 0, None) * (new_height / height)
         average = np.tensordot(share.astype(np.float32), linear, axes=1)
         made[rows] = average if image.dtype == np.float32 else to_srgb8(average)
     return made

@@ -65,10 +65,12 @@ def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: 
     """
     with reading("scene", str(path)):
         document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture)
-        return _from_document(document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light, background)
+        return _from_document(document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light,
+                              background)
 
 
-def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light, background) -> Scene:
+def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation,
+                   light, background) -> Scene:
     channels = _channels(document, animation)
     objects = []
     for index, node in document.nodes.items():
@@ -90,7 +92,8 @@ def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, c
             camera_path, _ = _motion(document, index, channels, t0_ns, t1_ns, CV_FROM_GL)
         if intrinsics == "file":
             changes = _gltf_intrinsics(document, index, camera)
-    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, document.log, document.omissions)
+    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, document.log,
+                  document.omissions)
 
 
 def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
@@ -282,7 +285,8 @@ def _camera_node(document: gltf.Document, name: str | int | None) -> int:
     for i, n in found.items():
         cameras = document.tree.get("cameras", [])
         if n.camera >= len(cameras):
-            raise AssetError("the file is no valid glTF (a reference to cameras that does not exist)", where=document.where, value=n.camera)
+            raise AssetError("the file is no valid glTF (a reference to cameras that does not exist)",
+                             where=document.where, value=n.camera)
         names.setdefault(str(cameras[n.camera].get("name", n.name)), i)
         names.setdefault(n.name, i)
     order = list(found)
@@ -307,7 +311,8 @@ def _gltf_intrinsics(document: gltf.Document, node: int, camera) -> dict:
                          accepted="intrinsics: config")
     focal = camera.height / 2 / np.tan(yfov / 2)
     znear = perspective.get("znear", camera.near)
-    return dict(fx=focal, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2, near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near)
+    return dict(fx=focal, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2,
+                near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near)
 
 
 # ---- pyrender

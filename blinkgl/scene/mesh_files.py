@@ -34,7 +34,7 @@ class Asset:
     """A loaded object: its parts in object coordinates, z up.
 
     has_materials : the parts carry the file's own materials.   log : repairs made.
-    omissions : what the file asks for and is not drawn, in one line (:class:`~blinkgl.scene.omissions.Omissions`), or empty.
+    omissions : what the file asks for and is not drawn, in one line (:mod:`blinkgl.scene.omissions`), or empty.
     """
 
     name: str
@@ -51,11 +51,12 @@ class Asset:
 
 
 def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_BYTES, keep_materials: bool = True, max_texture: int = 2048,
-               source_hash: str | None = None, project_uvs: bool = False, uv_size: float | None = None, up: str = "auto") -> Asset:
+               source_hash: str | None = None, project_uvs: bool = False, uv_size: float | None = None,
+               up: str = "auto") -> Asset:
     """One object from a file.
 
-    up : the file's axis that points up and becomes z, "y" or "z"; "auto" is y for glb and gltf, whose standard says so, and z
-        for the others, which say nothing.
+    up : the file's axis that points up and becomes z, "y" or "z"; "auto" is y for glb and gltf, whose standard says so,
+        and z for the others, which say nothing.
     keep_materials : parts with the file's materials; else one part, white, with texture coordinates that can carry any
         texture (projected where the file has none or degenerate ones).
     project_uvs : replace the file's texture coordinates; ``uv_size`` is the edge of one repeat.
@@ -63,10 +64,12 @@ def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_B
     bytes, references outside its folder, an extension required that is not drawn.
     """
     with reading("mesh", str(path)):
-        return _load(Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size, up)
+        return _load(Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size,
+                     up)
 
 
-def _load(path: Path, max_faces: int, max_bytes: int, keep_materials: bool, max_texture: int, source_hash: str | None, project_uvs: bool,
+def _load(path: Path, max_faces: int, max_bytes: int, keep_materials: bool, max_texture: int, source_hash: str | None,
+          project_uvs: bool,
           uv_size: float | None, up: str) -> Asset:
     where = str(path)
     suffix = path.suffix.lower()
@@ -115,17 +118,20 @@ def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
     return gltf.buffer_contents(path, contents(path, "mesh") if data is None else data)
 
 
-def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, omissions: Omissions) -> list[gltf.Piece]:
+def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None,
+                    omissions: Omissions) -> list[gltf.Piece]:
     where = str(path)
     {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj}[kind](data, max_faces, where)
     resolver = FolderResolver(path.parent, where, kind, omissions)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False, maintain_order=True,
+        loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False,
+                                    maintain_order=True,
                                     skip_materials=max_texture is None)
     if max_texture is not None and resolver.refused is not None:
         raise resolver.refused
-    pieces = [piece_of_trimesh(g, max_texture=max_texture, where=where, file_normals=True, omissions=omissions, resolver=resolver)
+    pieces = [piece_of_trimesh(g, max_texture=max_texture, where=where, file_normals=True, omissions=omissions,
+                               resolver=resolver)
               for g in loaded.geometry.values() if isinstance(g, trimesh.Trimesh)]
     if not pieces:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
@@ -134,7 +140,8 @@ def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_text
     return pieces
 
 
-def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: str, file_normals: bool, omissions: Omissions,
+def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: str, file_normals: bool,
+                     omissions: Omissions,
                      resolver: FolderResolver | None = None) -> gltf.Piece:
     """Raw triangles and material of a ``trimesh.Trimesh``.
 
@@ -151,7 +158,8 @@ def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: s
                       None if max_texture is None else _material(mesh.visual, max_texture, where, omissions, resolver))
 
 
-def _material(visual, max_texture: int, where: str, omissions: Omissions, resolver: FolderResolver | None) -> Material | None:
+def _material(visual, max_texture: int, where: str, omissions: Omissions,
+              resolver: FolderResolver | None) -> Material | None:
     material = getattr(visual, "material", None)
     if material is None:
         kind = getattr(visual, "kind", None)
@@ -179,7 +187,8 @@ def _material(visual, max_texture: int, where: str, omissions: Omissions, resolv
             omissions.add("emissive light")
     texture = None
     if image is not None:
-        texture = resolver.texture(image, max_texture) if resolver is not None else texture_of(image, max_texture, where)
+        opened = resolver is None       # by whoever made the mesh
+        texture = texture_of(image, max_texture, where) if opened else resolver.texture(image, max_texture)
     return Material(texture=texture, base_color=colour, double_sided=bool(getattr(material, "doubleSided", False)))
 
 
@@ -193,8 +202,9 @@ def texture_of(image, max_texture: int, where: str) -> Texture:
 class FolderResolver(trimesh.resolvers.Resolver):
     """Reads material and image files beside a mesh; refuses what leads out of its folder.
 
-    trimesh opens images with Pillow as it finds them, and does without those that it cannot open. So it is given a pixel in
-    place of each, whose colour is the image's number; :meth:`texture` decodes the file by the rules of all other textures.
+    trimesh opens images with Pillow as it finds them, and does without those that it cannot open. So it is given a
+    pixel in place of each, whose colour is the image's number; :meth:`texture` decodes the file by the rules of all
+    other textures.
     """
 
     def __init__(self, folder: Path, where: str, kind: str, omissions: Omissions):
@@ -259,8 +269,10 @@ class FolderResolver(trimesh.resolvers.Resolver):
         return [p.name for p in self.folder.iterdir() if p.suffix.lower() in (".mtl", *IMAGE_SUFFIXES)]
 
 
-_MTL_MAPS = {"map_bump": "normal maps", "bump": "normal maps", "norm": "normal maps", "map_d": "transparency (drawn opaque)",
-             "map_ke": "emissive light", "map_ks": "shine (drawn matt)", "map_pr": "shine (drawn matt)", "map_pm": "shine (drawn matt)"}
+_MTL_MAPS = {"map_bump": "normal maps", "bump": "normal maps", "norm": "normal maps",
+             "map_d": "transparency (drawn opaque)",
+             "map_ke": "emissive light", "map_ks": "shine (drawn matt)", "map_pr": "shine (drawn matt)",
+             "map_pm": "shine (drawn matt)"}
 # Statement -> what it asks for, unless all its values are this.
 _MTL_VALUES = {"ke": ("emissive light", 0.0), "ks": ("shine (drawn matt)", 0.0), "pm": ("shine (drawn matt)", 0.0),
                "d": ("transparency (drawn opaque)", 1.0), "tr": ("transparency (drawn opaque)", 0.0)}
@@ -286,21 +298,25 @@ def _check_ply(data: bytes, max_faces: int, where: str) -> None:
     for name, digits in re.findall(rb"element\s+(\w+)\s+(\d+)", data[:end]):
         what = "faces" if name == b"face" else f"{name.decode(errors='replace')} elements"
         if len(digits) > 18:
-            raise AssetError(f"the mesh has too many {what}", where=where, value=f"a number of {len(digits)} digits", accepted=f"at most {max_faces} faces")
+            raise AssetError(f"the mesh has too many {what}", where=where, value=f"a number of {len(digits)} digits",
+                             accepted=f"at most {max_faces} faces")
         count = int(digits)
         if count > (max_faces if name == b"face" else 3 * max_faces + 1_000_000):
-            raise AssetError(f"the mesh has too many {what}", where=where, value=count, accepted=f"at most {max_faces} faces")
+            raise AssetError(f"the mesh has too many {what}", where=where, value=count,
+                             accepted=f"at most {max_faces} faces")
         if count > len(data) - end:       # an element takes a byte at least
             raise AssetError(f"the mesh is truncated: {count} {what} in {len(data)} bytes", where=where)
 
 
 def _check_obj(data: bytes, max_faces: int, where: str) -> None:
     _limit(data.count(b"\nf ") + data.startswith(b"f "), max_faces, where)
-    # trimesh allocates as many vertices as the largest index of a face says; a file cannot have more of them than lines.
+    # trimesh allocates as many vertices as the largest index of a face says; a file has no more of them than lines.
     lines = data.count(b"\n") + data.count(b"\r") + 1
-    found = re.search(rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1), data.replace(b"\\\n", b" ") if b"\\\n" in data else data)
+    found = re.search(rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1),
+                      data.replace(b"\\\n", b" ") if b"\\\n" in data else data)
     if found:
-        raise AssetError("a face refers to a vertex that does not exist", where=where, value=found[1][:20].decode(), accepted=f"at most {lines}")
+        raise AssetError("a face refers to a vertex that does not exist", where=where, value=found[1][:20].decode(),
+                         accepted=f"at most {lines}")
 
 
 def _limit(faces: int, max_faces: int, where: str) -> None:

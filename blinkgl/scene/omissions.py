@@ -1,4 +1,4 @@
-"""What a file asks for and BlinkGL does not draw. A loader collects it, and a run says it: once per file, in one line."""
+"""What a file asks for and BlinkGL does not draw: a loader collects it, a run says it, in one line per file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Omissions:
     found: dict[str, None] = field(default_factory=dict)
 
     def add(self, what: str) -> None:
-        """``what``: a few words a user knows from the file's own world, with what is done instead: "alpha BLEND (drawn opaque)"."""
+        """``what``: a few words from the file's own world, with what is done instead: "alpha BLEND (drawn opaque)"."""
         self.found[what] = None
 
     def lines(self) -> tuple[str, ...]:

@@ -162,7 +162,8 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
                               accepted="run 'pip install scikit-image', or set it to false")
         entries += [Entry(content_hash(file.read_bytes()), name, "photographs", file) for name, file in bundled.items()]
     for i, folder in enumerate(config.folders):
-        entries += _folder_entries(resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, MAX_BYTES, "image", config.bad_assets)
+        entries += _folder_entries(resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, MAX_BYTES,
+                                   "image", config.bad_assets)
 
     def load(entry: Entry) -> Texture:
         if entry.file is None:
@@ -201,7 +202,8 @@ def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...],
     return files
 
 
-def _folder_entries(folder: Path, where: str, given: str, suffixes, limit: int, what: str, bad_assets: str) -> Iterable[Entry]:
+def _folder_entries(folder: Path, where: str, given: str, suffixes, limit: int, what: str,
+                    bad_assets: str) -> Iterable[Entry]:
     entries = []
     for file in files_below(folder, where, given, suffixes, "meshes" if what == "mesh" else "images"):
         try:

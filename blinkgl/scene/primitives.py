@@ -33,7 +33,7 @@ PARAMETERS = {
     "sides": "corners of the polygon",
     "subdivisions": "cells per edge; icosphere: how often each of 20 triangles is cut into four, 0 to 7",
 }
-"""What the builders' parameters mean, for the documentation. Metres are units of the world, before the object's scale."""
+"""What the builders' parameters mean, for the documentation. Metres are world units, before the object's scale."""
 
 _LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1}
 _MAX_SEGMENTS = 4096

@@ -13,11 +13,11 @@ MAX_BYTES = 2_000_000_000
 
 @contextmanager
 def reading(what: str, where: str) -> Iterator[None]:
-    """Everything that reading a ``what`` (mesh, image, scene) from the file ``where`` raises becomes an AssetError about it.
+    """Everything that reading a ``what`` (mesh, image, scene) from the file ``where`` raises becomes an AssetError.
 
-    The readers check what they know to check and say what is wrong. What is left is what nobody thought of, and what the
-    parsers of other packages raise on broken files: ValueError, KeyError, IndexError, struct.error, OSError, SyntaxError, …
-    The cause is kept for ``--debug``.
+    The readers check what they know to check and say what is wrong. What is left is what nobody thought of, and what
+    the parsers of other packages raise on broken files: ValueError, KeyError, IndexError, struct.error, OSError,
+    SyntaxError, … The cause is kept for ``--debug``.
     """
     try:
         yield
@@ -33,12 +33,13 @@ def reading(what: str, where: str) -> Iterator[None]:
 
 
 def contents(path: Path, what: str, where: str | None = None, max_bytes: int = MAX_BYTES) -> bytes:
-    """The bytes of a file. AssetError naming it (as ``where``) when it cannot be read or is longer than ``max_bytes``."""
+    """The bytes of a file. AssetError naming it (``where``): it cannot be read, or is longer than ``max_bytes``."""
     where = where or str(path)
     try:
         size = path.stat().st_size
         if size > max_bytes:
-            raise AssetError(f"the {what} file is too large", where=where, value=f"{size / 1e6:.0f} MB", accepted=f"at most {max_bytes / 1e6:.0f} MB")
+            raise AssetError(f"the {what} file is too large", where=where, value=f"{size / 1e6:.0f} MB",
+                             accepted=f"at most {max_bytes / 1e6:.0f} MB")
         return path.read_bytes()
     except (OSError, ValueError) as error:
         raise AssetError(f"cannot read the {what}: {getattr(error, 'strerror', None) or error}", where=where) from None

@@ -156,7 +156,8 @@ class Scene:
 
     background : linear radiance where nothing is hit.
     log        : one line per decision worth keeping (collisions cut, objects dropped), for the manifest.
-    omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and the manifest.
+    omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and
+    the manifest.
     """
 
     objects: tuple[SceneObject, ...]

@@ -90,7 +90,8 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
     return Scene(objects=result.objects, camera=make_camera(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
-                 light=make_light(config.light, rng), background=config.background, log=tuple(log), omissions=tuple(omissions))
+                 light=make_light(config.light, rng), background=config.background, log=tuple(log),
+                 omissions=tuple(omissions))
 
 
 def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
@@ -136,7 +137,8 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
     return T, target
 
 
-def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log, omissions):
+def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log,
+           omissions):
     """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
     placed: list[tuple] = []

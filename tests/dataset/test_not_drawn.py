@@ -13,11 +13,15 @@ from blinkgl.explain import explain
 from tests.scene.gltf_files import GltfBuilder, triangle
 
 LINE = "card.glb asks for what is not drawn: alpha BLEND (drawn opaque); metal and roughness (drawn matt)"
-SMALL = {"camera": {"width": 32, "height": 24}, "time": {"duration": 0.05, "label_rate": 20}, "timeline": {"kind": "uniform", "fps": 100},
+SMALL = {"camera": {"width": 32, "height": 24}, "time": {"duration": 0.05, "label_rate": 20},
+         "timeline": {"kind": "uniform", "fps": 100},
          "output": {"sequences": 3}, "preview": {"enabled": False}, "labels": {"flow": []}}
-EXPLICIT = {"kind": "explicit", "meshes": {"card": {"file": "assets/card.glb"}}, "objects": [{"mesh": "card"}, {"mesh": "card"}], "camera": {"position": [-3, 0, 1]}}
-RANDOM = {"kind": "random", "objects": {"count": 3}, "pool": {"primitives": [], "folders": ["assets"], "keep_materials": True, "test_fraction": 0},
-          "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 16, "test_fraction": 0}}
+EXPLICIT = {"kind": "explicit", "meshes": {"card": {"file": "assets/card.glb"}},
+            "objects": [{"mesh": "card"}, {"mesh": "card"}], "camera": {"position": [-3, 0, 1]}}
+RANDOM = {"kind": "random", "objects": {"count": 3},
+          "pool": {"primitives": [], "folders": ["assets"], "keep_materials": True, "test_fraction": 0},
+          "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 16,
+                       "test_fraction": 0}}
 
 
 def recipe(tmp_path, scene):

@@ -213,6 +213,13 @@ def test_the_command_writes_microseconds(tmp_path, capsys):
     assert "unit of time (got 'ms'); expected s or us" in capsys.readouterr().err and not (tmp_path / "c.csv").exists()
 
 
+def test_times_with_and_without_names(tmp_path):
+    from blinkgl.io.frames import read_timestamps
+    (tmp_path / "t.txt").write_text("0 a.png\n10000\n")
+    with pytest.raises(EventDataError, match="t.txt: times with a name and times without one"):
+        read_timestamps(tmp_path / "t.txt")
+
+
 def test_every_value_that_fits_comes_through():
     edge = events_of(np.array([0, 65535.0]), np.array([True, False]), np.array([-(1 << 62), 1 << 62]), np.array([-1, 1]), "f", signed=True)
     assert edge.x.tolist() == [0, 65535] and edge.y.tolist() == [1, 0] and edge.p.tolist() == [0, 1] and edge.t.tolist() == [-(1 << 62), 1 << 62]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from blinkgl.errors import AssetError, BlinkGLError
-from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.dsec import DsecEventReader, identity_rectify_map, write_rectify_map
 from blinkgl.io.formats import open_events, write_events
 from blinkgl.io.hdf5 import blosc_dataset, dataset, open_hdf5, write_rows
 from eflow.data.sources import FolderSource
@@ -130,6 +131,19 @@ def test_a_filter_that_is_not_installed_is_named(tmp_path):
         made.write_direct_chunk((0,), np.zeros(3, np.uint16).tobytes())
     with pytest.raises(AssetError, match="compressed with an HDF5 filter that is not installed .*hdf5plugin"):
         open_events(path).read()
+
+
+def test_blosc_without_its_parameters_does_not_crash(tmp_path):
+    """Found by the fuzz: the filter reads them without asking how many there are."""
+    path = tmp_path / "m.h5"
+    write_rectify_map(path, identity_rectify_map(24, 32))
+    data = bytearray(path.read_bytes())
+    at = data.find(struct.pack("<H", hdf5plugin.Blosc.filter_id))
+    assert struct.unpack_from("<HH", data, at + 4) == (1, 7)  # optional, seven parameters
+    data[at + 6] = 0
+    path.write_bytes(data)
+    with open_hdf5(path) as file, pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'rectify_map' lacks what Blosc needs"):
+        dataset(file, "rectify_map", path, shape=(24, 32, 2), kinds="f")
 
 
 def test_rows_written_here_are_those_of_the_filter(tmp_path):

@@ -1,4 +1,5 @@
-"""Files that claim too much, are of the wrong shape, or are cut and flipped at random: one line that names the file, little memory."""
+"""Files that claim too much, are of the wrong shape, or are cut and flipped at random: one line that names the file,
+little memory."""
 
 import json
 import os
@@ -30,11 +31,14 @@ def everything() -> GltfBuilder:
     builder.tree["samplers"] = [{"wrapS": 33071}]
     builder.tree["textures"] = [{"source": 0, "sampler": 0}]
     builder.tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.02}}]
-    node = builder.node(mesh=triangle(builder, normals=[[0, 0, 1]] * 3, uvs=[[0, 0], [1, 0], [0, 1]], material=0), translation=[0, 0, 0],
+    node = builder.node(mesh=triangle(builder, normals=[[0, 0, 1]] * 3, uvs=[[0, 0], [1, 0], [0, 1]], material=0),
+                        translation=[0, 0, 0],
                         rotation=[0, 0, 0, 1], scale=[1, 1, 1])
     builder.node(camera=0)
-    times, turns = builder.array(np.array([0, 1], "f4"), "SCALAR"), builder.array(np.array([[0, 0, 0, 1]] * 2, "f4"), "VEC4")
-    builder.tree["animations"] = [{"samplers": [{"input": times, "output": turns}], "channels": [{"sampler": 0, "target": {"node": node, "path": "rotation"}}]}]
+    times, turns = builder.array(np.array([0, 1], "f4"), "SCALAR"), builder.array(np.array([[0, 0, 0, 1]] * 2, "f4"),
+                                                                                  "VEC4")
+    builder.tree["animations"] = [{"samplers": [{"input": times, "output": turns}],
+                                   "channels": [{"sampler": 0, "target": {"node": node, "path": "rotation"}}]}]
     return builder
 
 
@@ -50,7 +54,8 @@ def places(tree, path=()):
         yield from places(tree[key], (*path, key))
 
 
-JUNK = [None, True, -1, 1.5, 10**30, int("9" * 4000), "", "x" * 5000, [], {}, [None], [0.0] * 16, [0, 0, 0, 0], 1e308, float("nan"), 2**31, 10**9]
+JUNK = [None, True, -1, 1.5, 10**30, int("9" * 4000), "", "x" * 5000, [], {}, [None], [0.0] * 16, [0, 0, 0, 0], 1e308,
+        float("nan"), 2**31, 10**9]
 
 
 def test_every_place_of_a_gltf_may_hold_anything(tmp_path):
@@ -71,7 +76,8 @@ def test_every_place_of_a_gltf_may_hold_anything(tmp_path):
                 read_all(path)
             except BlinkGLError as error:
                 refused += 1
-                assert "\n" not in str(error) and ("a.glb" in str(error) or str(error).startswith("scene.")), (place, junk)
+                assert "\n" not in str(error) and ("a.glb" in str(error) or str(error).startswith("scene.")), (place,
+                                                                                                               junk)
     assert refused > 200
 
 
@@ -82,13 +88,17 @@ def test_every_place_of_a_gltf_may_hold_anything(tmp_path):
     (lambda t: t["nodes"][0].update(mesh=True), "nodes.0.mesh: input should be a valid integer) (got True)"),
     (lambda t: t["nodes"][1].update(camera=9), "a reference to cameras that does not exist) (got 9)"),
     (lambda t: t["cameras"][0].update(perspective=[]), "cameras.0.perspective"),
-    (lambda t: t["cameras"][0]["perspective"].update(yfov="wide"), "cameras.0.perspective.yfov: input should be a valid number) (got 'wide')"),
+    (lambda t: t["cameras"][0]["perspective"].update(yfov="wide"),
+     "cameras.0.perspective.yfov: input should be a valid number) (got 'wide')"),
     (lambda t: t["animations"][0].update(channels=3), "animations.0.channels: input should be a valid list) (got 3)"),
-    (lambda t: t["animations"][0]["samplers"][0].update(output=0), "the animation of rotation of node 'node-0' is corrupt"),
+    (lambda t: t["animations"][0]["samplers"][0].update(output=0),
+     "the animation of rotation of node 'node-0' is corrupt"),
     (lambda t: t["animations"][0]["samplers"][0].update(input=10**9), "a reference to accessors that does not exist"),
-    (lambda t: t["meshes"][0]["primitives"][0]["attributes"].update(NORMAL=2), "NORMAL does not fit the positions) (got '3 VEC2'); expected 3 VEC3"),
+    (lambda t: t["meshes"][0]["primitives"][0]["attributes"].update(NORMAL=2),
+     "NORMAL does not fit the positions) (got '3 VEC2'); expected 3 VEC3"),
     (lambda t: t["meshes"][0]["primitives"][0].update(indices=0), "the indices of mesh 0 are no whole numbers"),
-    (lambda t: t.update(nodes=[{"children": [k + 1]} for k in range(400)] + [{"mesh": 0}], scenes=[{"nodes": [0]}]), "nested more than 256 deep"),
+    (lambda t: t.update(nodes=[{"children": [k + 1]} for k in range(400)] + [{"mesh": 0}], scenes=[{"nodes": [0]}]),
+     "nested more than 256 deep"),
     (lambda t: t["images"][0].update(uri="x" * 5000), "refers to a file that is missing"),
     (lambda t: t["images"][0].update(uri="data:image/png;base64,AAAA"), "the image is corrupt or of an unknown format"),
 ])
@@ -113,7 +123,8 @@ def unbacked(accessor: dict) -> None:
     (lambda t: unbacked(t["accessors"][1]), "does not fit the positions"),
     (lambda t: unbacked(t["accessors"][3]), "too many faces"),
     (lambda t: [unbacked(t["accessors"][k]) for k in (4, 5)], "has no buffer and too many values"),
-    (lambda t: t["accessors"][0].update(sparse={"count": 10**9, "indices": {"bufferView": 3, "componentType": 5125}, "values": {"bufferView": 0}}), "reaches outside its buffer"),
+    (lambda t: t["accessors"][0].update(sparse={"count": 10**9, "indices": {"bufferView": 3, "componentType": 5125},
+                                                "values": {"bufferView": 0}}), "reaches outside its buffer"),
     (lambda t: t["accessors"][0].update(count=10**9), "too many faces"),
     (lambda t: t["bufferViews"][0].update(byteLength=2**40, byteOffset=2**40), "reaches outside its buffer"),
     (lambda t: t["bufferViews"][0].update(byteStride=65536), "reaches outside its buffer"),
@@ -144,12 +155,15 @@ PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty floa
 @pytest.mark.parametrize("name, text, problem", [
     ("a.ply", PLY.format("9" * 5000, 1), "too many vertex elements (got 'a number of 5000 digits')"),
     ("a.ply", PLY.format(3, 1).replace("3 0 1 2", "3 0 1 99999999"), "a face refers to a vertex outside 0..2"),
-    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 4294967295/1\n", "a face refers to a vertex that does not exist (got '4294967295'); expected at most 6"),
+    ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nf 1/1 2/1 4294967295/1\n",
+     "a face refers to a vertex that does not exist (got '4294967295'); expected at most 6"),
     ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 " + "9" * 5000 + "\n", "a face refers to a vertex that does not exist"),
     ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 x\n", "corrupt"),
     ("a.gltf", "[" * 100_000, "JSON cannot be read"),
-    ("a.gltf", '{"asset": {"version": "2.0"}, "extras": ' + "[" * 500 + "]" * 500 + ', "scene": 1' + "0" * 5000 + "}", "JSON cannot be read"),
-    ("a.gltf", '{"asset": {"version": "2.0"}, "buffers": [{"uri": "' + "x" * 5000 + '", "byteLength": 4}]}', "refers to a file that is missing"),
+    ("a.gltf", '{"asset": {"version": "2.0"}, "extras": ' + "[" * 500 + "]" * 500 + ', "scene": 1' + "0" * 5000 + "}",
+     "JSON cannot be read"),
+    ("a.gltf", '{"asset": {"version": "2.0"}, "buffers": [{"uri": "' + "x" * 5000 + '", "byteLength": 4}]}',
+     "refers to a file that is missing"),
     ("a.gltf", '{"asset": []}', "asset: input should be a valid dictionary"),
     ("a.gltf", "[]", "its JSON: input should be a valid dictionary"),
 ])
@@ -192,11 +206,13 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
         contents(tmp_path / "a\0.obj", "mesh")
     with open(tmp_path / "b.bin", "wb") as file:
         file.truncate(3_000_000_000)      # sparse
-    with pytest.raises(AssetError, match="b.bin: the buffer file is too large .got '3000 MB'.; expected at most 2000 MB"):
+    with pytest.raises(AssetError,
+                       match="b.bin: the buffer file is too large .got '3000 MB'.; expected at most 2000 MB"):
         contents(tmp_path / "b.bin", "buffer")
 
 
-@pytest.mark.parametrize("error", [ValueError("a\nb"), KeyError("a"), MemoryError(), RecursionError(), struct.error("x"), OverflowError(), UnboundLocalError("x"), SystemError("x")])
+@pytest.mark.parametrize("error", [ValueError("a\nb"), KeyError("a"), MemoryError(), RecursionError(),
+                                   struct.error("x"), OverflowError(), UnboundLocalError("x"), SystemError("x")])
 def test_whatever_a_loader_raises_names_the_file(error):
     with pytest.raises(AssetError) as raised:
         with reading("mesh", "a.obj"):
@@ -211,7 +227,10 @@ def test_whatever_a_loader_raises_names_the_file(error):
 def test_cut_and_flipped_files(tmp_path, name):
     """A hundred mutants each: loaded or refused in a line about the file."""
     ball = trimesh.creation.icosphere(subdivisions=1, radius=0.5)
-    exported = everything().glb() if name == "a.glb" else ball.export(file_type="stl_ascii" if name == "b.stl" else name[2:], **({"encoding": "ascii"} if name == "b.ply" else {}))
+    exported = everything().glb() if name == "a.glb" else ball.export(file_type="stl_ascii" if name == "b.stl"
+                                                                      else name[2:],
+                                                                      **({"encoding": "ascii"} if name == "b.ply"
+                                                                         else {}))
     whole = exported.encode() if isinstance(exported, str) else exported
     rng, refused = random.Random(name), 0
     for k in range(100):

@@ -116,7 +116,8 @@ def test_materials_meshes_and_scale(tmp_path):
 
 
 @pytest.mark.parametrize("suffix, up, expected", [
-    ("glb", "auto", "y"), ("glb", "y", "y"), ("glb", "z", "z"), ("obj", "auto", "z"), ("obj", "z", "z"), ("obj", "y", "y"),
+    ("glb", "auto", "y"), ("glb", "y", "y"), ("glb", "z", "z"), ("obj", "auto", "z"), ("obj", "z", "z"),
+    ("obj", "y", "y"),
 ])
 def test_which_axis_of_a_file_points_up(tmp_path, suffix, up, expected):
     """The file's (x, y, z) = (1, 2, 3) is drawn there, or at (x, -z, y) when y points up."""
@@ -135,7 +136,8 @@ def test_which_axis_of_a_file_points_up(tmp_path, suffix, up, expected):
 
 
 @pytest.mark.parametrize("before, after, step", [
-    ([0, 0, 0], [0, 0, 40000], "40000 degrees about z"), (None, [0, 200, 0], "200 degrees about y"), ([-90, 0, 0], [90, 0, 0], "180 degrees about x"),
+    ([0, 0, 0], [0, 0, 40000], "40000 degrees about z"), (None, [0, 200, 0], "200 degrees about y"),
+    ([-90, 0, 0], [90, 0, 0], "180 degrees about x"),
     ([0, 0, 179], [0, 0, -179], "358 degrees about z"),
 ])
 def test_a_turn_that_has_no_shortest_way_is_refused(tmp_path, before, after, step):
@@ -152,7 +154,8 @@ def test_a_turn_goes_as_far_as_is_said(tmp_path, interpolation):
     """Two and a half turns in steps of 150 degrees: the integrated rate is 900 degrees."""
     keys = [{"time": k / 6, "euler": [0, 0, 150 * k]} for k in range(7)]
     path = build(tmp_path, objects=[{"mesh": "box", "keyframes": keys, "interpolation": interpolation}]).objects[0].path
-    rates = [body_rate(path.pose(t), path.derivative(t))[2] for t in np.linspace(0, 1e9, 1000, endpoint=False).astype(int)]
+    rates = [body_rate(path.pose(t), path.derivative(t))[2] for t in np.linspace(0, 1e9, 1000,
+                                                                                 endpoint=False).astype(int)]
     assert np.degrees(np.mean(rates)) == pytest.approx(900, rel=1e-3)
 
 

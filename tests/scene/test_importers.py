@@ -190,7 +190,8 @@ def test_cubic_splines_leave_a_key_by_its_out_tangent(tmp_path):
     node = builder.node(mesh=triangle(builder))
     into, values, out = ([0, 7, 0], [0, -3, 0]), ([0, 0, 0], [0, 1, 0]), ([0, 5, 0], [0, 9, 0])
     rows = np.array([into[0], values[0], out[0], into[1], values[1], out[1]], "f4")
-    builder.tree["animations"] = [{"samplers": [{"input": builder.array(np.array([0, 2], "f4"), "SCALAR"), "output": builder.array(rows, "VEC3"),
+    builder.tree["animations"] = [{"samplers": [{"input": builder.array(np.array([0, 2], "f4"), "SCALAR"),
+                                                 "output": builder.array(rows, "VEC3"),
                                                  "interpolation": "CUBICSPLINE"}],
                                    "channels": [{"sampler": 0, "target": {"node": node, "path": "translation"}}]}]
     (tmp_path / "a.glb").write_bytes(builder.glb())
@@ -217,11 +218,13 @@ def test_a_mirrored_node_faces_and_shines_outwards(tmp_path, flip):
     # An ellipsoid's normal: its vertices' unit sphere stretched by the inverse factors. The y axis becomes z.
     size = np.abs([flip[0], flip[2], flip[1]])
     normal = points / size**2
-    np.testing.assert_allclose(part.mesh.normals @ turn.T, normal / np.linalg.norm(normal, axis=1, keepdims=True), atol=1e-5)
+    np.testing.assert_allclose(part.mesh.normals @ turn.T, normal / np.linalg.norm(normal, axis=1, keepdims=True),
+                               atol=1e-5)
     (piece,) = gltf.read(tmp_path / "scene.glb").pieces()
     assert (piece.normals * piece.vertices).sum(axis=1).min() > 0
     corners = piece.vertices[piece.faces]       # before make_mesh, which would mend a closed body
-    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(axis=1).min() > 0
+    assert (np.cross(corners[:, 1] - corners[:, 0],
+                     corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(axis=1).min() > 0
 
 
 def test_animation_choices_and_limits(tmp_path):
@@ -273,16 +276,19 @@ def broken(change):
 @pytest.mark.parametrize("change, problem", [
     (lambda t: t["nodes"].append({"children": [2]}) or t["scenes"][0]["nodes"].append(2), "the nodes are no tree"),
     (lambda t: t["nodes"][1].update(mesh=9), "a reference to meshes that does not exist"),
-    (lambda t: t["nodes"][1].update(translation=[float("nan"), 0, 0]), "nodes.1.translation.0: input should be a finite number"),
+    (lambda t: t["nodes"][1].update(translation=[float("nan"), 0, 0]),
+     "nodes.1.translation.0: input should be a finite number"),
     (lambda t: t["nodes"][1].update(scale=[0, 0, 0]), "singular"),
     (lambda t: t["nodes"][1].update(rotation="no"), "no valid glTF"),
     (lambda t: t["meshes"][0]["primitives"][0].update(material=4), "a reference to materials that does not exist"),
     (lambda t: t["accessors"][0].update(bufferView=77), "a reference to bufferViews that does not exist"),
-    (lambda t: t["accessors"][0].update(byteOffset=-8), "accessors.0.byteOffset: input should be greater than or equal to 0) (got -8)"),
+    (lambda t: t["accessors"][0].update(byteOffset=-8),
+     "accessors.0.byteOffset: input should be greater than or equal to 0) (got -8)"),
     (lambda t: t["accessors"][0].update(byteOffset=8), "reaches outside its buffer"),
     (lambda t: t["accessors"][0].update(type="VEC9"), "accessors.0.type: input should be"),
     (lambda t: t["accessors"][0].update(count="3"), "accessors.0.count: input should be a valid integer) (got '3')"),
-    (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs the extension KHR_draco_mesh_compression, which BlinkGL does not draw"),
+    (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+     "needs the extension KHR_draco_mesh_compression, which BlinkGL does not draw"),
     (lambda t: t.update(meshes={"a": 1}), "no valid glTF"),
     (lambda t: t["cameras"][0].update(type="orthographic"), "not a perspective one"),
 ])

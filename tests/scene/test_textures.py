@@ -146,7 +146,9 @@ def large_png(width: int, height: int) -> bytes:
 
     packer, row = zlib.compressobj(9), b"\0" * (1 + (width + 7) // 8)
     data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR",
+                                        struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)) + chunk(b"IDAT",
+                                                                                                       data) + chunk(b"IEND", b"")
 
 
 def test_pillows_guard_is_not_ours_and_stays_as_it_is(monkeypatch):
@@ -180,7 +182,8 @@ def test_shrinking_in_blocks_is_shrinking_at_once(monkeypatch):
         whole = I.shrink(image, max_size)
         monkeypatch.setattr(I, "_BLOCK_PIXELS", 2000)
         assert len(I._blocks(301, 217)) > 10
-        assert np.abs(I.shrink(image, max_size).astype(int) - whole).max() <= 1      # the float32 sums differ in their last bit
+        assert np.abs(I.shrink(image,
+                               max_size).astype(int) - whole).max() <= 1      # the float32 sums differ in their last bit
         monkeypatch.undo()
         linear = linear_from_srgb(image / 255.0).astype(np.float32)
         reference = cv2.resize(linear, whole.shape[1::-1], interpolation=cv2.INTER_AREA)

@@ -163,6 +163,7 @@ def test_a_link_error_is_shown_at_the_declaration(shader, shaders):
 def test_unused_varyings_uniforms_and_attributes_are_listed(shader, shaders):
     edit(shaders / "luminance.glsl", "out vec2 uv;", "out vec2 uv;\nout float left_over;\nuniform float spare;")
     edit(shaders / "luminance.glsl", "    uv = in_uv;", "    uv = in_uv;\n    left_over = 1.0;")
+    edit(shaders / "luminance.glsl", "    vec2 uv = within_reach(uv); // hides the varying\n", "")
     edit(shaders / "luminance.glsl", "luminance = texture(albedo, uv).r;", "luminance = 0.5;")
     edit(shaders / "include/light.glsl", "light_strength.y * (0.5", "0.0 * light_strength.y * (0.5")
     status, out, _ = shader("check", "luminance.glsl", "--shaders", shaders)

@@ -7,8 +7,10 @@ a line of JSON, {} or {"problem": …}. Imports nothing of BlinkGL, so as to sta
 
 import json
 import os
+import resource
 import signal
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -16,10 +18,15 @@ ROW = np.dtype([("t", "<i8"), ("x", "<i8"), ("y", "<i8"), ("p", "u1")])
 _SECONDS, _BYTES_PER_SECOND = 3.0, 20e6
 """Processor time for a batch, or for opening: a file without its table is searched whole."""
 
+_MEMORY = 1 << 28
+
 
 def main(path: str) -> None:
     import dv_processing
 
+    # The library allocates what a packet's header claims before it looks whether the file is that long.
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY + 64 * os.path.getsize(path),) * 2)
     out = sys.stdout.buffer
     allowance = _SECONDS + os.path.getsize(path) / _BYTES_PER_SECOND
     begun = False

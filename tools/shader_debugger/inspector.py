@@ -17,7 +17,7 @@ from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass
+from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass, open_reference
 from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
 from blinkgl.tools.shader_debugger.session import Snapshot, Subject, When, check_pixel, files_of, moment, open_folder, open_renderer
 
@@ -85,7 +85,7 @@ class Inspector:
         return _kept(self._gpu, key, lambda: GpuMoment(self.renderer, when, self.subject.log_eps))
 
     def reference(self, when: When) -> ReferenceMoment:
-        return _kept(self._reference, when.t_ns, lambda: ReferenceMoment(self.subject.scene, when, self.subject.log_eps))
+        return _kept(self._reference, when.t_ns, lambda: open_reference(self.subject, when))
 
     def _moment(self, source: str, when: When):
         if source not in SOURCES:

@@ -87,13 +87,13 @@ def moment(subject: Subject, seconds: float | None = None, step_us: float | None
     if seconds is None:
         t_ns = timing.label_times_ns[0]
     else:
-        t_ns = round(seconds * NS_PER_S) if math.isfinite(seconds) else None
+        t_ns = round(seconds * NS_PER_S) if math.isfinite(seconds * NS_PER_S) else None
         if t_ns is None or not scene.t0_ns <= t_ns <= scene.t1_ns:
             raise ConfigError("outside the sequence", where="--time", value=seconds,
                               accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s")
     if step_us is None:
         step = max(1000, timing.interval_ns // STEP_FRACTION)
-    elif math.isfinite(step_us) and step_us * 1000 >= 1:
+    elif math.isfinite(step_us * 1000) and step_us * 1000 >= 1:
         step = round(step_us * 1000)
     else:
         raise ConfigError("not a time step", where="--step", value=step_us, accepted="at least 0.001 µs")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import errno
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
-from debugger_scene import HEIGHT, MISTAKES, WIDTH, edit
+from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -19,9 +21,10 @@ from blinkgl.scene.build import build_scene
 from blinkgl.scene.paths import KeyframePath, StaticPath
 from blinkgl.scene.primitives import grid
 from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject, Texture
-from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe
+from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session
 from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
 
+DEMO = str(Path(__file__).parents[2] / "configs/demo.yaml")
 T, T_NEXT, T_LAST = 100_000_000, 200_000_000, 0
 
 
@@ -315,6 +318,48 @@ def test_a_broken_shader_is_found(shader, config, shaders, mistake):
     status, out, _ = shader("probe", config, "--shaders", shaders, "--pixel", f"{worst['x']},{worst['y']}")
     marked = [line for line in out.splitlines() if line.startswith("!!")]
     assert status == 0 and any(line[3:].startswith(title) for line in marked)
+
+
+@pytest.mark.parametrize("mistake", LOOKUP_MISTAKES)
+def test_a_mistaken_look_up_is_named_as_such(shader, config, shaders, mistake):
+    edits, buffer, suspicion, objects = LOOKUP_MISTAKES[mistake]
+    for file, right, wrong in edits:
+        edit(shaders / file, right, wrong)
+    status, out, _ = shader("diff", config, "--shaders", shaders)
+    lines = out.splitlines()
+    assert status == 1
+    assert lines[0].startswith(f"The first that is wrong: {moments.PASSES[buffer].title} (")
+    assert "it looks as if: " in lines[1] and suspicion in lines[1]
+    named = lines[0].partition(", on ")[2].split(", ")
+    assert set(named) == objects
+    for name in objects:  # one line each, with a pixel to look at
+        row = [line for line in lines if line.startswith(f"  {name} ") and moments.PASSES[buffer].title in line]
+        assert len(row) == 1 and re.search(r"\(\d+, \d+\)", row[0])
+
+
+@pytest.mark.parametrize("who, objects", [("ball", {"ball"}), ("passing", {"passing"}), ("camera", {"floor", "ball", "box", "passing"})])
+def test_a_stale_pose_is_named_with_its_time(shader, config, monkeypatch, who, objects):
+    class Stale(DebugRenderer):
+        def __init__(self, gl, scene, render):
+            super().__init__(gl, with_stale_pose(scene, who, 20_000_000), render)
+
+    monkeypatch.setattr(session, "DebugRenderer", Stale)
+    status, out, _ = shader("diff", config, "--json")
+    found = json.loads(out)
+    assert status == 1 and found["first"]["buffer"] == "local" and set(found["first"]["objects"]) == objects
+    who = "the camera is" if who == "camera" else f"{who} is drawn"
+    assert found["first"]["suspicions"] == [f"{who} where it is at t = 0.08 s, 0.02 s earlier: a stale pose"]
+
+
+@pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0")])
+def test_right_shaders_raise_no_suspicion(shader, config, more):
+    status, out, _ = shader("diff", config, *more)
+    assert status == 0 and "looks as if" not in out and "FAIL" not in out
+
+
+def test_right_shaders_raise_no_suspicion_in_a_random_scene(shader):
+    status, out, _ = shader("diff", DEMO, "--set", "camera.width=120", "--set", "camera.height=90", "--time", "0.1")
+    assert status == 0 and "looks as if" not in out, out
 
 
 def pretend(comparison, name: str, wrong: np.ndarray) -> list[str]:

@@ -379,13 +379,31 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         status, out, _ = shader("probe", config, "--shaders", folder, "--time", 0.3, "--pixel", f"{x},{y}")
         assert status == 0
         for name, info in PASSES.items():
-            if name == "triangle":
+            if name in ("triangle", "local"):  # told below
                 continue
             line = next(row[3:] for row in out.splitlines() if row[3:].startswith(f"{info.title} "))
             for side in ("gpu", "reference"):
                 value = page.text(f"#probe [data-{side}={name}]")
                 assert value and f" {value} " in line, (name, side, value, line)
         assert "GPU drew" in page.text("#probe")
+
+        page.run("document.querySelector('#compare').click()")
+        page.wait("return document.querySelector('#verdict').className === 'good'", timeout=60)
+        assert "all 22 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
+        good = (folder / "luminance.glsl").read_text()
+        edit(folder / "luminance.glsl", "float luminance = texture(albedo, uv).r;", "float luminance = texture(albedo, uv, 1.0).r;")
+        page.wait("return document.querySelector('#verdict').textContent.includes('has changed')")  # the verdict was of other shaders
+        page.run("document.querySelector('#compare').click()")
+        page.wait("return document.querySelector('#verdict').className === 'bad'", timeout=60)
+        assert "level of luminance" in page.text("#verdict") and "a mip bias of +1" in page.text("#verdict")
+        rows = page.run("return [...document.querySelectorAll('#objects tr')].slice(1).map((tr) => [...tr.children].map((td) => td.textContent))")
+        assert {cells[0] for cells in rows} == {"floor", "ball"} and all(cells[1] == "level of luminance" for cells in rows)
+        page.run("document.querySelector('#objects a').click()")
+        page.wait("return document.querySelector('#probe').dataset.pixel === arguments[0]", rows[0][4].replace(" ", ""))
+        (folder / "luminance.glsl").write_text(good)
+        page.wait("return document.querySelector('#verdict').textContent.includes('has changed')")
+        page.click_at("#pane-a img", (40 + 0.5) / WIDTH, (45 + 0.5) / HEIGHT)
+        page.wait("return document.querySelector('#probe').dataset.pixel === '40,45'")
 
         good = (folder / "include/motion.glsl").read_text()
         edit(folder / "include/motion.glsl", "return gl_FragCoord.xy / image_size * 2.0 - 1.0;", "return gl_FragCoord.xy / imagesize * 2.0 - 1.0;")

@@ -87,6 +87,16 @@ LOOKUP_MISTAKES = {
     "uv off by half a texel": (
         [("luminance.glsl", _UV, _UV.replace("uv)", "uv + 0.5 / vec2(textureSize(albedo, 0)))"))],
         "luminance_uv", "shifted by half a texel (+0.5, +0.5)", {"floor", "ball"}),
+    # thought of when the debugger was done
+    "normal not normalised": (
+        [("include/light.glsl", "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    return", "vec3 n = normal;\n    return")],
+        "luminance_light", "the interpolated normal is not normalised", {"ball"}),
+    "width and height exchanged": (
+        [("include/motion.glsl", "vec3(flow_ndc * 0.5 * image_size, w_next)", "vec3(flow_ndc * 0.5 * image_size.yx, w_next)")],
+        "flow_forward", "x is 0.75 times, y 1.333 times", {"floor", "ball", "box"}),
+    "two-sided normal reversed": (
+        [("luminance.glsl", "gl_FrontFacing ? normal : -normal", "gl_FrontFacing ? -normal : normal")],
+        "luminance_light", "the normal points the other way", {"floor"}),
 }  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl import create_context
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.resources import SceneResources
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.paths import KeyframePath, StaticPath
 from blinkgl.scene.primitives import grid
@@ -349,6 +350,26 @@ def test_a_stale_pose_is_named_with_its_time(shader, config, monkeypatch, who, o
     assert status == 1 and found["first"]["buffer"] == "local" and set(found["first"]["objects"]) == objects
     who = "the camera is" if who == "camera" else f"{who} is drawn"
     assert found["first"]["suspicions"] == [f"{who} where it is at t = 0.08 s, 0.02 s earlier: a stale pose"]
+
+
+def test_a_backward_flow_that_runs_forward_is_named(shader, config, monkeypatch):
+    class Forward(DebugRenderer):
+        def labels(self, t_ns, request, t_forward_ns=None, t_backward_ns=None):
+            return super().labels(t_ns, request, t_forward_ns, t_forward_ns)
+
+    monkeypatch.setattr(session, "DebugRenderer", Forward)
+    status, out, _ = shader("diff", config, "--json")
+    first = json.loads(out)["first"]
+    assert status == 1 and first["buffer"] == "flow_backward" and first["suspicions"][0].startswith("the forward flow (")
+
+
+def test_another_object_s_texture_is_named(shader, config, monkeypatch):
+    own = SceneResources.luminance_texture
+    monkeypatch.setattr(SceneResources, "luminance_texture", lambda self, material: own(self, next(i.material for i in self.items if i.textured)))
+    status, out, _ = shader("diff", config, "--json")
+    first = json.loads(out)["first"]
+    assert status == 1 and (first["buffer"], first["objects"]) == ("luminance_albedo", ["floor"])
+    assert first["suspicions"][0].startswith("the texture of ball (")
 
 
 @pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0")])

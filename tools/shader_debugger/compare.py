@@ -25,6 +25,7 @@ import numpy as np
 
 from blinkgl.errors import ConfigError
 from blinkgl.render import reference
+from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass, lookup_of, luma_of
 from blinkgl.tools.shader_debugger.poses import displaced, pose_suspicions
@@ -251,21 +252,22 @@ class Comparison:
             return gpu[name], np.where(hit, shaded, ref[name])
         return gpu[name], ref[name]
 
-    def twin(self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates, moved by ``texels`` of the full
-        resolution, at its own level plus ``level``; 0 where it drew nothing."""
-        out = self.twin_colour(of, level, texels)
+    def twin(self, of: str, **more) -> np.ndarray:
+        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates; 0 where it drew nothing.
+        more : as for :meth:`twin_colour`."""
+        out = self.twin_colour(of, **more)
         return out if of == "colour" else luma_of(out)
 
-    def twin_colour(self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
-        """:meth:`twin` in colour, for the luminance, too."""
+    def twin_colour(self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0), material: Material | None = None) -> np.ndarray:
+        """:meth:`twin` in colour, for the luminance, too. Mistakes: a number of levels too coarse; coordinates moved by texels of the
+        full resolution; another material everywhere."""
         gpu = self.gpu
         out = np.zeros((*gpu["part"].shape, 3))
         for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):
             on = gpu["part"] == p
-            texture = part.material.texture
-            move = 0.0 if texture is None else np.asarray(texels) / texture.image.shape[1::-1]
-            out[on] = mipmapped_albedo(part.material, np.nan_to_num(gpu[f"{of}_uv"][on].astype(np.float64)) + move,
+            used = material or part.material
+            move = 0.0 if used.texture is None else np.asarray(texels) / used.texture.image.shape[1::-1]
+            out[on] = mipmapped_albedo(used, np.nan_to_num(gpu[f"{of}_uv"][on].astype(np.float64)) + move,
                                        gpu[f"{of}_level"][on].astype(np.float64) + level)
         return out
 

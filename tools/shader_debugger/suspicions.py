@@ -79,12 +79,12 @@ def _candidates(comparison, report, r, g, on) -> Candidates:
     """(text, what the GPU would have written) pairs; r, g : (N[, C]) at the pixels ``on``."""
     name = report.quantity.name
     of, what = lookup_of(name)
-    yield ("the pass looks nothing up here" if what in ("uv", "level") else "everything is zero"), np.zeros_like(r)
     specific = {"uv": _uv, "level": _level, "albedo": _albedo, "light": _light}.get(what) or {
         "depth": _depth, "normals": _normals, "luminance": _shaded, "colour": _shaded, "velocity": _velocity,
         "flow_forward": _flow, "flow_backward": _flow}.get(name)
     if specific is not None:
         yield from specific(comparison, name, r, g, on)
+    yield ("the pass looks nothing up here" if what in ("uv", "level") else "everything is zero"), np.zeros_like(r)
     if what in ("uv", "level"):
         return
     yield "the sign is wrong", -r
@@ -151,9 +151,13 @@ def _screen_weights(comparison, on) -> np.ndarray:
 
 
 def _on_screen(comparison, on, attribute: str) -> np.ndarray:
-    """(N, C) "uvs" (times uv_scale), "normals" or "vertices" of the mesh, interpolated linearly on the screen."""
+    """:func:`_interpolated` linearly on the screen."""
+    return _interpolated(comparison, on, attribute, _screen_weights(comparison, on))
+
+
+def _interpolated(comparison, on, attribute: str, weights: np.ndarray) -> np.ndarray:
+    """(N, C) "uvs" (times uv_scale), "normals" or "vertices" of the mesh, weighted by (N, 3) weights of the corners."""
     ref = comparison.ref
-    weights = _screen_weights(comparison, on)
     part, triangle = ref.frame.part[on], ref.frame.triangle[on]
     out = np.full((len(part), 2 if attribute == "uvs" else 3), np.nan)
     for p, (_, own) in enumerate(reference.scene_parts(ref.scene)):
@@ -269,6 +273,11 @@ def _albedo(comparison, name, r, g, on) -> Candidates:
             yield text, np.repeat((comparison.twin_colour(of)[on] @ np.asarray(weights))[:, None], 3, axis=1)
     light = ref["light"][on][:, None]
     yield "the light is multiplied in already", r * light
+    seen = set()
+    for thing, own in reference.scene_parts(ref.scene):
+        if own.material.texture is not None and id(own.material) not in seen:
+            seen.add(id(own.material))
+            yield f"the texture of {thing.name or f'object {thing.instance_id}'}", comparison.twin(of, material=own.material)[on]
 
 
 def _light(comparison, name, r, g, on) -> Candidates:
@@ -284,6 +293,9 @@ def _light(comparison, name, r, g, on) -> Candidates:
     yield "the sun shines from the other side", light.sun * np.maximum(0.0, -facing) + light.sky * (0.5 + 0.5 * up)
     yield "the sky lights from below", light.sun * np.maximum(0.0, facing) + light.sky * (0.5 - 0.5 * up)
     yield "the same sky light everywhere", light.sun * np.maximum(0.0, facing) + light.sky
+    blend = _interpolated(comparison, on, "normals", ref.frame.bary[on])
+    length = np.linalg.norm(blend, axis=1)
+    yield "the interpolated normal is not normalised", light.sun * np.maximum(0.0, facing * length) + light.sky * (0.5 + 0.5 * up * length)
     # in a frame of its own each: what the sun or the zenith is when it is left in world axes while the normal is in the object's
     local = _turned(comparison, on, normal, transposed=True)
     yield "the sun's direction is not turned into the object's axes", \

@@ -92,8 +92,8 @@ LOOKUP_MISTAKES = {
         [("include/light.glsl", "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    return", "vec3 n = normal;\n    return")],
         "luminance_light", "the interpolated normal is not normalised", {"ball"}),
     "width and height exchanged": (
-        [("include/motion.glsl", "vec3(flow_ndc * 0.5 * image_size, w_next)", "vec3(flow_ndc * 0.5 * image_size.yx, w_next)")],
-        "flow_forward", "x is 0.75 times, y 1.333 times", {"floor", "ball", "box"}),
+        [("include/motion.glsl", "* gl_FragCoord.w * 0.5 * image_size;", "* gl_FragCoord.w * 0.5 * image_size.yx;")],
+        "velocity", "x is 0.75 times, y 1.333 times", {"floor", "ball", "box", "passing"}),
     "two-sided normal reversed": (
         [("luminance.glsl", "gl_FrontFacing ? normal : -normal", "gl_FrontFacing ? -normal : normal")],
         "luminance_light", "the normal points the other way", {"floor"}),

@@ -19,7 +19,7 @@ from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
-app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(shader_app)
 
 
@@ -68,7 +68,7 @@ def generate(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
     workers: Annotated[Optional[int], typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
     executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
-    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: a local one).")] = None,
+    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
     gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
     devices: Annotated[Optional[str], typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,
@@ -262,6 +262,7 @@ def run(arguments: list[str]) -> int:
         return BlinkGLError.exit_status
 
 
+OUT_OF_MEMORY = "out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process ('ulimit -v' shows it)"
 _MACHINE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG,
                    errno.EMFILE, errno.ENFILE, errno.EFBIG}
 
@@ -275,6 +276,9 @@ def _user_line(error: Exception) -> str | None:
         command = context.command_path if context is not None else "blinkgl"
         message = " ".join(error.format_message().split()).rstrip(".")
         return f"{message}; see '{command} --help'"
+    if is_out_of_memory(error):
+        asked = " ".join(str(error).split())
+        return OUT_OF_MEMORY + (f" ({asked[:120]})" if asked else "")
     if isinstance(error, OSError):
         code = error.errno
         if code is None and "No space left" in str(error):  # h5py keeps the number inside its text
@@ -282,6 +286,21 @@ def _user_line(error: Exception) -> str | None:
         if code in _MACHINE_ERRNOS:
             return f"{error.filename}: {os.strerror(code).lower()}" if error.filename else os.strerror(code).lower()
     return None
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """MemoryError (NumPy's too), ENOMEM, and what C++ libraries make of it: OpenCV, LLVM, torch and HDF5 say it in words only."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            return True
+        text = str(error).lower()
+        if any(words in text for words in ("cannot allocate memory", "can't allocate memory", "insufficient memory", "bad_alloc", "out of memory",
+                                           "unable to allocate", "failed to map segment")):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def main() -> None:

@@ -198,7 +198,7 @@ def simulate(
 @app.command()
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
-    b: Annotated[Optional[str], typer.Argument(metavar="B", help="Event file, or frames (video, folder, .npy).")] = None,
+    b: Annotated[Optional[str], typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")] = None,
     frames: Annotated[Optional[str], typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
     out: Annotated[Optional[str], typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
     fps: Annotated[Optional[float], typer.Option(help="Frame rate of the frames.")] = None,
@@ -208,7 +208,7 @@ def compare(
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
 ) -> None:
-    """Compare two recordings, or a recording with frames: counts, rates, intervals, polarity against brightness."""
+    """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against brightness."""
     from blinkgl import commands
 
     commands.compare(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,

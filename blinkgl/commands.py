@@ -44,6 +44,7 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
 
 def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
     """:func:`blinkgl.simulation.simulate_file` with a progress bar and a summary."""
+    from blinkgl.compiling import compiled_s, compiling_line
     from blinkgl.simulation import simulate_file
 
     console = plain_console(quiet=quiet)
@@ -65,6 +66,8 @@ def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
         say(str(report.displacement))
     elif report.steps > report.frames:
         say(f"{report.steps - report.frames} of the frames were interpolated, not recorded")
+    if line := compiling_line(compiled_s()):
+        say(line)
     if report.lost:
         say(f"{report.lost:,} events were lost in the sensor's read-out")
     if report.saturated:

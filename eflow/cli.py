@@ -74,6 +74,7 @@ def evaluate(
 
     _one_of("--empty", empty, ("error", "skip"))
     model = _model(checkpoint, device, raw, precision, iterations)
+    precision = _precision(model, precision)
     source = open_source(dataset, _format(format), dt=dt)
     console = plain_console(stderr=True)
     with console.status("evaluating") as status:
@@ -111,6 +112,7 @@ def predict(
 
     _one_of("--empty", empty, ("error", "zero"))
     model = _model(checkpoint, device, raw, precision, iterations)
+    precision = _precision(model, precision)
     file = infer.open_sized(events, _size(size))
     if whole:
         window, factor = infer.whole_file(file)
@@ -173,6 +175,7 @@ def submit(
 
     _one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
     model = _model(checkpoint, device, False, precision)
+    precision = _precision(model, precision)
     with plain_console(stderr=True).status("predicting") as status:
         options = {"precision": precision, "progress": lambda i, n: status.update(f"{i}/{n} flows")}
         count = submit_dsec(model, dataset, out, **options) if benchmark == "dsec" else submit_blinkflow(model, dataset, out, full=full, **options)
@@ -236,6 +239,12 @@ def _model(checkpoint: str, device: str, raw: bool, precision: str, iterations: 
             raise ConfigError("this network has no iterations", where="--iterations", value=model.config.name)
         model.config = model.config.model_copy(update={"iterations": iterations})
     return model.to("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _precision(model, wanted: str) -> str:
+    from eflow.precision import precision_on
+
+    return precision_on(next(model.parameters()).device, wanted)
 
 
 def _format(name: str) -> str:

@@ -144,7 +144,7 @@ class RunConfig(Config):
     """How it runs and what it writes."""
 
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    precision: Literal["fp32", "bf16"] = Field("fp32", description="bf16: autocast with fp32 islands")
+    precision: Literal["fp32", "bf16"] = Field("fp32", description="bf16: autocast with fp32 islands; fp32 where the device has no bf16 instructions")
     channels_last: bool = False
     compile: bool = Field(False, description="torch.compile of the update step")
     threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's choice")
@@ -153,7 +153,7 @@ class RunConfig(Config):
     checkpoint_every: int = Field(2000, ge=1)
     keep_checkpoints: int = Field(3, ge=1, description="older ones are deleted")
     picture_every: int = Field(2000, ge=1, description="steps between sample pictures")
-    time_limit: float | None = Field(None, gt=0, description="minutes after which training stops with a checkpoint; null: none")
+    time_limit: float | None = Field(None, gt=0, description="minutes after which training stops with a last validation and a checkpoint; null: none")
 
 
 class TrainConfig(Config):

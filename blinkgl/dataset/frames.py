@@ -115,7 +115,7 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
             report.frames, report.events = counted.steps, counted.events
             writer.info.update(_manifest(config, index, folder, files, report, time_of(len(files) - 1)))
     report.simulated_s = time_of(len(files) - 1) * 1e-9
-    report.seconds, report.total_s = clock.seconds, clock.total
+    report.seconds, report.total_s, report.compile_s = clock.seconds, clock.total, clock.compile_s
     return report
 
 

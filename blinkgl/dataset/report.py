@@ -29,6 +29,9 @@ class SequenceReport:
     labels: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     total_s: float = 0.0
+    """without ``compile_s``"""
+    compile_s: float = 0.0
+    """compiling kernels; 0 but for a machine's first sequence of a kind"""
     timeline: dict = field(default_factory=dict)
     """what an adaptive timeline says it achieved"""
     omissions: tuple[str, ...] = ()

@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import yaml
-
-from blinkgl.config.draw import extremes
 from blinkgl.config.base import validate
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
@@ -99,13 +97,14 @@ class Plan:
 
     def recipe_text(self) -> str:
         """The recipe with all overrides, as YAML that ``load_run`` takes."""
-        return yaml.safe_dump(self.template.tree, sort_keys=False, allow_unicode=True)
+        return to_yaml(self.template.tree)
 
 
 def _check_group(group: Group, tasks: Iterable[Task], hashes: dict[str, str]) -> None:
     base = group.template.base
-    for tree in extremes(group.template.tree):
-        config = validate(SequenceConfig, tree)
+    # What check_assets looks at, and which folders there are.
+    for config in group.template.corners_of("frames", "scene.kind", "scene.pool", "scene.textures", "scene.sky", "scene.objects.count",
+                                            "scene.meshes", "scene.materials", "scene.path"):
         if config.frames is not None:
             folders = matching_folders(config.frames, base)
             needed = [task.index for task in tasks if task.group == group.name]

@@ -70,6 +70,8 @@ def all_groups(template: RunTemplate) -> tuple[Group, ...]:
         where = f"groups.{name}"
         if not isinstance(name, str) or not isinstance(own, dict):
             raise ConfigError("not a group", where=where, value=own, accepted="a table of keys")
+        if "groups" in own:
+            raise ConfigError("a group cannot hold groups", where=f"{where}.groups")
         own = dict(own)
         enabled = own.pop("enabled", True)
         if not isinstance(enabled, bool):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,8 +15,8 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import matching_folders
-from blinkgl.errors import ConfigError, OutputError
+from blinkgl.dataset.frames import matching_folders, used_images
+from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
 from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.mesh_files import dependencies
@@ -112,6 +113,8 @@ def _check_group(group: Group, tasks: Iterable[Task], hashes: dict[str, str]) ->
                 raise ConfigError(f"{len(folders)} folders are too few for sequence {max(needed)}", where="frames.folders",
                                   value=list(config.frames.folders), accepted=f"at least {max(needed) + 1} folders, or fewer output.sequences")
             for folder in folders:
+                with suppress(AssetError):  # one bad folder is set aside alone; frames too far apart are the recipe's fault
+                    used_images(config.frames, folder)
                 for path in sorted(folder.rglob("*")):
                     if path.is_file():
                         hashes[f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"] = f"{path.stat().st_size} bytes"

@@ -86,7 +86,7 @@ class TimeConfig(Config):
     duration: float = Field(1.0, gt=0, le=86400 * 2, description="labelled time, s; with a label interval before and one after at most 71.6 minutes, which is "
                             "what an event file can hold")
     label_rate: float = Field(10.0, gt=0, le=1e5, description="labels (flow, images) per second, Hz")
-    start: float = Field(0.0, ge=0, le=8e6, description="clock at the start of the pre-roll, s")
+    start: float = Field(0.0, ge=0, le=1e7, description="clock at the start of the pre-roll, s")
 
     @rule("duration", "label_rate")
     def _labels(duration, rate):
@@ -221,6 +221,11 @@ class SequenceConfig(Config):
         if rate is not None and span_s(duration, label_rate) + 1e-6 * drain_us(rate, row_ns, queue) > MAX_SPAN_S:
             raise Refused("events that wait for the read-out would leave it after the end of the file", where="time.duration", value=duration,
                           accepted=f"at most {MAX_SPAN_S - 1 / label_rate - 1e-6 * drain_us(rate, row_ns, queue):.6g}")
+
+    @rule("time.start", "?readout")
+    def _picoseconds_fit(start, readout):
+        if readout and start > 8e6:
+            raise Refused("too late for the read-out, which counts picoseconds", where="time.start", value=start, accepted="at most 8000000")
 
     @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
     def _room_for_the_camera(kind, height, clearance, camera):

@@ -98,7 +98,7 @@ def test_seeds_that_are_none(tmp_path, given, message):
     ("{duration: 5000}", "time.duration: with one label interval before and one after, 5000.1 s are more than the 4295.0 s (71.6 minutes)"),
     ("{duration: 4000, label_rate: 0.001}", "time.duration: with one label interval"),
     ("{duration: 100, label_rate: 1e5}", "time.label_rate: 10000000 labels (got 100000.0); expected duration * label_rate of at most 1000000"),
-    ("{start: 1e7}", "time.start: too large"),
+    ("{start: 1.1e7}", "time.start: too large"), ("{start: 9e6}\nreadout: {events_per_second: 1e6}", "time.start: too late for the read-out"),
 ])
 def test_what_no_file_can_hold_is_known_when_it_is_read(tmp_path, time, message):
     with pytest.raises(ConfigError) as caught:

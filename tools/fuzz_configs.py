@@ -10,7 +10,7 @@ distribution). It is read as ``blinkgl generate`` reads it, and if that accepts 
 accepted is generated and verified.
 
 Everything but these is a defect, and exit status 1: an error that is no BlinkGLError, or has several lines; a refusal of something that
-was accepted before; a sequence that does not verify; a process that dies, needs more than --memory or more than --cpu processor seconds.
+was accepted before (but for bodies that touch at the start, or find no free space: that is known when the scene is built); a sequence that does not verify; a process that dies, needs more than --memory or more than --cpu processor seconds.
 Each failure is printed with the command that repeats it, and its YAML is kept in OUT. The same seed and version make the same
 configurations.
 """
@@ -18,6 +18,8 @@ configurations.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import copy
 import json
 import math
 import os
@@ -49,7 +51,7 @@ from blinkgl.config.quality import QUALITIES
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import SequenceConfig, load_run
-from blinkgl.errors import BlinkGLError
+from blinkgl.errors import BlinkGLError, ConfigError
 
 DRAWS = 12
 """Sequences drawn of every accepted configuration."""
@@ -225,7 +227,7 @@ def make(seed: int, what: str, number: int) -> Case:
     for _ in range(rng.choice([0, 0, 1, 2])):
         _damage(rng, tree)
     if rng.random() < 0.1:
-        case.tree = {**tree, "groups": {"a": {}, "b": {k: tree.pop(k) for k in list(tree)[:2]}, **({"c": rng.choice(_WRONG)} if rng.random() < 0.2 else {})}}
+        case.tree = {**tree, "groups": {"a": {}, "b": {k: tree.pop(k) for k in list(tree)[:2]}, **({"c": copy.deepcopy(rng.choice(_WRONG))} if rng.random() < 0.2 else {})}}
     if rng.random() < 0.15:
         paths = [p for p in _paths(SequenceConfig) if p]
         for _ in range(rng.choice([1, 2])):
@@ -261,7 +263,7 @@ def _damage(rng: random.Random, tree: dict[str, Any]) -> None:
     """One defect at a random place of ``tree``."""
     places = list(_places(tree))
     if not places:
-        tree[rng.choice(["seed", "camera", "scene", "wrong", "uniform"])] = rng.choice(_WRONG)
+        tree[rng.choice(["seed", "camera", "scene", "wrong", "uniform"])] = copy.deepcopy(rng.choice(_WRONG))
         return
     path = rng.choice(places)
     node: Any = tree
@@ -273,11 +275,11 @@ def _damage(rng: random.Random, tree: dict[str, Any]) -> None:
     elif what == "gone" and isinstance(node, dict):
         del node[path[-1]]
     elif what == "distribution":
-        node[path[-1]] = rng.choice(_BAD_DISTRIBUTIONS)
+        node[path[-1]] = copy.deepcopy(rng.choice(_BAD_DISTRIBUTIONS))
     elif what == "scaled" and isinstance(node[path[-1]], (int, float)):
         node[path[-1]] = node[path[-1]] * rng.choice([-1, 1e3, 1e-3, 1e9])
     else:
-        node[path[-1]] = rng.choice(_WRONG)
+        node[path[-1]] = copy.deepcopy(rng.choice(_WRONG))
 
 
 def _shrink(rng: random.Random, tree: dict[str, Any]) -> None:
@@ -366,7 +368,8 @@ def attempt(what: str, number: int, case: Case, folder: Path, gl: Any = None) ->
             message = _generate(template, tasks, folder, gl)
             kind = "made" if not message else "unclean"
     except BlinkGLError as error:
-        kind, message, detail = ("late" if accepted else "refused"), str(error), traceback.format_exc()
+        geometry = isinstance(error, ConfigError) and error.where in ("scene", "scene.collisions")
+        kind, message, detail = ("late" if accepted and not geometry else "refused"), str(error), traceback.format_exc()
         kind = "lines" if "\n" in message or len(message) > 1000 else kind
         return Outcome(what, number, kind, message, time.process_time() - started, "" if kind == "refused" else detail)
     except MemoryError as error:
@@ -452,8 +455,9 @@ class Worker:
         if self.process is None:
             self.process = subprocess.Popen(self.arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.said, text=True, bufsize=1)
         process = self.process
-        process.stdin.write(f"{what} {number}\n")
-        process.stdin.flush()
+        with contextlib.suppress(BrokenPipeError):  # it is dead; what it said comes below
+            process.stdin.write(f"{what} {number}\n")
+            process.stdin.flush()
         first, started = None, time.monotonic()
         while not select.select([process.stdout], [], [], 1.0)[0]:
             spent = _cpu_seconds(process.pid)
@@ -475,7 +479,8 @@ class Worker:
         if self.process is not None:
             self.process.send_signal(signal.SIGKILL)
             self.process.wait()
-            self.process.stdin.close()
+            with contextlib.suppress(BrokenPipeError):
+                self.process.stdin.close()
             self.process.stdout.close()
             self.process = None
 

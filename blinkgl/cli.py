@@ -16,11 +16,11 @@ from typing import Annotated, Optional
 import typer
 
 from blinkgl import __version__
-from blinkgl.console import never_fail_to_print
 from blinkgl.errors import BlinkGLError
+from blinkgl.terminal import never_fail_to_print
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
-app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 app.add_typer(shader_app)
 
 
@@ -264,6 +264,7 @@ def run(arguments: list[str]) -> int:
         return BlinkGLError.exit_status
 
 
+OUT_OF_MEMORY = "out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process ('ulimit -v' shows it)"
 _MACHINE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG,
                    errno.EMFILE, errno.ENFILE, errno.EFBIG}
 
@@ -277,6 +278,9 @@ def _user_line(error: Exception) -> str | None:
         command = context.command_path if context is not None else "blinkgl"
         message = " ".join(error.format_message().split()).rstrip(".")
         return f"{message}; see '{command} --help'"
+    if is_out_of_memory(error):
+        asked = " ".join(str(error).split())
+        return OUT_OF_MEMORY + (f" ({asked[:120]})" if asked else "")
     if isinstance(error, OSError):
         code = error.errno
         if code is None and "No space left" in str(error):  # h5py keeps the number inside its text
@@ -284,6 +288,21 @@ def _user_line(error: Exception) -> str | None:
         if code in _MACHINE_ERRNOS:
             return f"{error.filename}: {os.strerror(code).lower()}" if error.filename else os.strerror(code).lower()
     return None
+
+
+def is_out_of_memory(error: BaseException | None) -> bool:
+    """MemoryError (NumPy's too), ENOMEM, and what C++ libraries make of it: OpenCV, LLVM, torch and HDF5 say it in words only."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
+            return True
+        text = str(error).lower()
+        if any(words in text for words in ("cannot allocate memory", "can't allocate memory", "insufficient memory", "bad_alloc", "out of memory",
+                                           "unable to allocate", "failed to map segment")):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def main() -> None:

@@ -7,12 +7,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.errors import ConfigError
+from blinkgl.terminal import plain_column, plain_console
 
 
 def emulator_options(name: str, config: str | None, overrides: list[str], sensor: str | None = None) -> dict[str, Any]:
@@ -41,8 +41,8 @@ def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
     """:func:`blinkgl.simulation.simulate_file` with a progress bar and a summary."""
     from blinkgl.simulation import simulate_file
 
-    console = Console(quiet=quiet)
-    bar = Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[detail]}"), TimeElapsedColumn(),
+    console = plain_console(quiet=quiet)
+    bar = Progress(plain_column("{task.description}"), BarColumn(), plain_column("{task.fields[detail]}"), TimeElapsedColumn(),
                    TimeRemainingColumn(), console=console, transient=True, disable=quiet or not console.is_terminal)
     with bar:
         task = bar.add_task(Path(target).name, total=None, detail="")
@@ -72,7 +72,7 @@ def compare(a: str, b: str | None, out: str | None = None, **options) -> None:
     from blinkgl.io.atomic import atomic_file
 
     result = run(a, b, **options)
-    console = Console()
+    console = plain_console()
     intervals = len(result.edges_us) - 1
     table = Table(title=f"{result.duration_s:.6g} s from {result.edges_us[0] / 1e6:.6f} s in {intervals} interval{'s' * (intervals > 1)}; "
                         f"mean (min … max) over them; polarity sums blurred by {BLUR_PX:g} px", title_justify="left")

@@ -19,19 +19,7 @@ import numpy as np
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
-
-EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
-    "check": (("pyrender",), "an independent renderer to compare with"),
-    "cycles": (("bpy",), "Blender's path tracer to compare with; better in an environment of its own, see README"),
-    "learn": (("torch", "safetensors", "tensorboard"), "training"),
-    "cluster": (("ray",), "many machines"),
-    "formats": (("faery", "dv-processing"), "EVT2, EVT3 and AEDAT4 files"),
-    "viz": (("rerun-sdk",), "3D viewer"),
-    "urdf": (("pybullet",), "its random meshes as an object pool"),
-    "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
-}
-_PINNED = {"torch": "torch==2.13.0", "bpy": "'bpy>=4.5,<4.6'"}
-
+from blinkgl.extras import EXTRAS, install, python
 
 @dataclass(frozen=True)
 class Check:
@@ -81,7 +69,7 @@ def _system() -> Iterator[Check]:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     yield Check("System", "cores, memory", "info", f"{cores} cores, {memory:.1f} GiB")
-    names = ("LP_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_THREADING_LAYER", "OMP_NUM_THREADS")
+    names = ("LP_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR", "OMP_NUM_THREADS")
     changed = [f"{name}={value}" for name, value in sorted(os.environ.items())
                if name in names or name.startswith(("GLCONTEXT_", "LIBGL_", "GALLIUM_", "MESA_", "__EGL_", "EGL_"))]
     if changed:
@@ -224,19 +212,23 @@ def _numba() -> Iterator[Check]:
 
         return f"{numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads"
 
-    def layer() -> str:
+    def threads() -> str:
         import numba
 
-        @numba.njit(parallel=True)
-        def total(n):
-            s = 0
-            for i in numba.prange(n):
-                s += i
-            return s
+        from blinkgl.events.threads import run, take_part
 
-        if total(1000) != 499500:
-            raise ValueError("a parallel sum came out wrong")
-        return numba.threading_layer()
+        @numba.njit(nogil=True)
+        def mark(taken, start, counts):
+            part = take_part(taken, start)
+            while part >= 0:
+                counts[part] += part
+                part = take_part(taken, start)
+
+        count, sums = numba.get_num_threads(), np.zeros(1000, np.int64)
+        run(mark, len(sums), (sums,), count)
+        if not np.array_equal(sums, np.arange(len(sums))):
+            raise ValueError("work divided between threads came out wrong")
+        return f"{count}, asleep when idle"
 
     def simd() -> str:
         from llvmlite import binding
@@ -245,9 +237,9 @@ def _numba() -> Iterator[Check]:
         widest = next((name for name in ("avx512f", "avx2", "avx", "sse4.2", "sve", "neon") if features.get(name)), "none found")
         return f"{widest} on {binding.get_host_cpu_name()}"
 
-    mend = f"{_python()} -m pip install --force-reinstall numba"
+    mend = f"{python()} -m pip install --force-reinstall numba"
     yield _try(section, "numba", version, mend)
-    yield _try(section, "threading layer", layer, mend)
+    yield _try(section, "threads", threads, mend)
     yield _try(section, "SIMD", simd, mend)
 
 
@@ -285,7 +277,7 @@ def _codecs() -> Iterator[Check]:
             raise ValueError("read other values than written")
         return f"round trip (OpenCV {cv2.__version__})"
 
-    pip = f"{_python()} -m pip install --force-reinstall"
+    pip = f"{python()} -m pip install --force-reinstall"
     yield _try(section, "HDF5 blosc-zstd", blosc, f"{pip} h5py hdf5plugin")
     yield _try(section, "libx264 video", x264, f"{pip} imageio-ffmpeg")
     yield _try(section, "16-bit RGB PNG", png16, f"{pip} opencv-python-headless")
@@ -300,14 +292,8 @@ def _extras() -> Iterator[Check]:
             except metadata.PackageNotFoundError:
                 lacking.append(name)
         value = ", ".join(found + [f"no {name}" for name in lacking]) + f" ({purpose})"
-        remedy = f"{_python()} -m pip install {' '.join(_PINNED.get(name, name) for name in lacking)}" if lacking else ""
+        remedy = install(*lacking) if lacking else ""
         yield Check("Optional extras", f"[{extra}]", "absent" if lacking else "ok", value, remedy)
-
-
-def _python() -> str:
-    """This interpreter, as one would type it here."""
-    relative = os.path.relpath(sys.executable)
-    return relative if len(relative) < len(sys.executable) else sys.executable
 
 
 # --- show -------------------------------------------------------------------------------------------------------------
@@ -317,13 +303,14 @@ _MARKS = {"ok": ("ok", "green"), "missing": ("MISSING", "bold red"), "absent": (
 
 def show(report: Report) -> None:
     """Print for people: sections, then what is missing with the commands that mend it."""
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    console = Console(highlight=False)
+    from blinkgl.terminal import plain_console
+
+    console = plain_console(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=200)  # piped: one check, one line, for grep
+        console = plain_console(highlight=False, width=200)  # piped: one check, one line, for grep
     table = Table.grid(padding=(0, 2))
     for _ in range(3):
         table.add_column(overflow="fold")

@@ -27,6 +27,7 @@ from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
 from blinkgl.simulation import SimulationReport, simulate
+from blinkgl.terminal import plain_console
 from blinkgl.timeline import make_timeline
 
 PROBES = 12
@@ -131,6 +132,7 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
         "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit" if lit else "none: every surface is unlit",
         "notes": "; ".join(scene.log) or "–",
+        **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
 
 
@@ -253,7 +255,7 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
 
 def show(result: Explanation, console: Console | None = None) -> None:
     """Prints an explanation as three tables."""
-    console = console or Console()
+    console = console or plain_console()
     scene = Table(title="what is modelled", title_justify="left", show_header=False)
     for key, value in result.scene.items():
         scene.add_row(key, value)

@@ -11,10 +11,11 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.cli import _user_line
-from blinkgl.console import never_fail_to_print
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.terminal import never_fail_to_print
+from blinkgl.extras import EXTRAS, install
 
-app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
@@ -68,15 +69,14 @@ def evaluate(
     device: Device = "auto",
 ) -> None:
     """Score a network on a data set, beside zero flow and constant flow."""
-    from rich.console import Console
-
+    from blinkgl.terminal import plain_console
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
     _one_of("--empty", empty, ("error", "skip"))
     model = _model(checkpoint, device, raw, precision, iterations)
     source = open_source(dataset, _format(format), dt=dt)
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     with console.status("evaluating") as status:
         result = score(model, source, out, pictures=pictures, empty=empty, precision=precision, limit=limit,
                        progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"))
@@ -169,13 +169,12 @@ def submit(
     device: Device = "auto",
 ) -> None:
     """Write a benchmark's submission file; it is checked before it gets its name."""
-    from rich.console import Console
-
+    from blinkgl.terminal import plain_console
     from eflow.submit import submit_blinkflow, submit_dsec
 
     _one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
     model = _model(checkpoint, device, False, precision)
-    with Console(stderr=True).status("predicting") as status:
+    with plain_console(stderr=True).status("predicting") as status:
         options = {"precision": precision, "progress": lambda i, n: status.update(f"{i}/{n} flows")}
         count = submit_dsec(model, dataset, out, **options) if benchmark == "dsec" else submit_blinkflow(model, dataset, out, full=full, **options)
     typer.echo(f"written and checked: {out}, {count} files")
@@ -192,9 +191,9 @@ def bench(
     precision: Precision = "fp32",
 ) -> None:
     """Milliseconds, GMACs and peak memory per model and resolution; each measured in a process of its own."""
-    from rich.console import Console
     from rich.table import Table
 
+    from blinkgl.terminal import plain_console
     from eflow import bench as benchmark
     from eflow.evaluate import write_json
 
@@ -216,7 +215,7 @@ def bench(
         mode = "training step" if r.get("training") or r.get("mode") == "train" else "forward, plain" if r.get("plain") else "forward"
         cells = [r["error"], "", "", ""] if "error" in r else [f"{r['ms']:.0f}", f"{r['gmacs']:.1f}", f"{r['parameters'] / 1e6:.2f}", f"{r['peak_mib']:.0f}"]
         table.add_row(r["model"], f"{r['width']}x{r['height']}", mode, *cells)
-    Console().print(table)
+    plain_console().print(table)
     if json_out:
         write_json(Path(json_out), {"rows": rows})
 
@@ -276,7 +275,7 @@ def run(arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "safetensors", "tensorboard"):
             raise
-        print(f"error: {error.name} is not installed; run pip install 'blinkgl[learn]'", file=sys.stderr)
+        print(f"error: {error.name} is not installed; run {install(*EXTRAS['learn'][0])}", file=sys.stderr)
         return BlinkGLError.exit_status
     except Exception as error:
         line = _user_line(error)

@@ -17,6 +17,7 @@ from rich.table import Table
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
+from blinkgl.terminal import plain_console
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
 from eflow.infer import predict
@@ -105,7 +106,7 @@ def write_json(path: Path, tree: dict) -> None:
 
 def show(result: dict[str, Any], console: Console | None = None) -> None:
     """Two tables: all metrics of the network and the baselines; the network scene by scene. Fits 80 columns."""
-    console = console or Console()
+    console = console or plain_console()
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
     table = Table(title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on {result['device']}")
     table.add_column("")

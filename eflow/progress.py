@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 import time
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress
+
+from blinkgl.terminal import plain_column, plain_console
 
 _QUIET_S = 15.0
 
@@ -18,12 +19,12 @@ class TrainProgress:
         self.steps, self.batch, self.enabled = steps, batch, enabled
         self.rate, self._loss, self._epe = 0.0, None, None
         self._step, self._time, self._said = start, time.monotonic(), 0.0
-        self._console = Console(file=sys.stderr)
+        self._console = plain_console(file=sys.stderr)
 
     def __enter__(self) -> "TrainProgress":
         self._live = None
         if self.enabled and self._console.is_terminal:
-            self._live = Progress(TextColumn("step {task.completed}/{task.total}"), BarColumn(), TextColumn("{task.fields[text]}"), console=self._console)
+            self._live = Progress(plain_column("step {task.completed}/{task.total}"), BarColumn(), plain_column("{task.fields[text]}"), console=self._console)
             self._task = self._live.add_task("train", total=self.steps, completed=self._step, text="")
             self._live.start()
         return self

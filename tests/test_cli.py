@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import typer
 
@@ -116,3 +118,29 @@ def test_help_imports_nothing_heavy():
 def test_a_reader_that_leaves_early_is_no_error():
     done = subprocess.run(f"{sys.executable} -m blinkgl.cli --help | true", shell=True, capture_output=True, text=True, timeout=60)
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("error", [MemoryError(), MemoryError("Unable to allocate 7.45 GiB for an array"),
+                                   OSError(12, "Cannot allocate memory"), RuntimeError("LLVM ERROR: out of memory"),
+                                   RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")])
+@pytest.mark.parametrize("program", ["blinkgl", "eflow"])
+def test_no_memory_left_is_one_line_that_says_what_helps(program, error, capsys, monkeypatch):
+    from eflow import cli as eflow_cli
+
+    def fail(*_, **__):
+        raise RuntimeError("while doing something") from error
+
+    module = cli if program == "blinkgl" else eflow_cli
+    monkeypatch.setattr(module, "app", fail)
+    status = module.run(["doctor"])
+    err = capsys.readouterr().err
+    assert status == 2 and err.count("\n") == 1 and "error: out of memory; use a smaller image" in err and "ulimit -v" in err
+
+
+def test_a_memory_limit_ends_a_command_in_one_line(tmp_path):
+    """simulate of frames that do not fit into what 'ulimit -v' leaves."""
+    np.lib.format.open_memmap(tmp_path / "frames.npy", "w+", np.uint8, (2, 30_000, 30_000))[:1, :1, :1] = 1
+    command = f"ulimit -v 3000000; exec {sys.executable} -m blinkgl.cli simulate {tmp_path}/frames.npy --fps 100 -o {tmp_path}/e.npz"
+    done = subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+    assert done.returncode == 2 and done.stderr.startswith("error: out of memory; ") and done.stderr.count("\n") == 1, done.stderr
+    assert not (tmp_path / "e.npz").exists()

@@ -25,7 +25,7 @@ def test_this_machine_passes_every_required_check(report):
     assert report.ok, [check for check in report.checks if check.status == "missing"]
     checks = by_name(report)
     for name in ("OpenGL/context", "OpenGL/version", "OpenGL/32F depth, reversed-Z", "OpenGL/R32F target", "OpenGL/RG32F target",
-                 "OpenGL/RGBA32F target", "Kernels/numba", "Kernels/threading layer", "Kernels/SIMD", "Codecs/HDF5 blosc-zstd",
+                 "OpenGL/RGBA32F target", "Kernels/numba", "Kernels/threads", "Kernels/SIMD", "Codecs/HDF5 blosc-zstd",
                  "Codecs/libx264 video", "Codecs/16-bit RGB PNG"):
         assert checks[name].status == "ok", checks[name]
 

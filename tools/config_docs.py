@@ -20,6 +20,7 @@ from pydantic_core import PydanticUndefined
 
 from blinkgl.config.base import tag_of
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.scene.primitives import BUILDERS, PARAMETERS, parameters
 from eflow.config import TrainConfig
 
 HEADER = """# Every key of the YAML
@@ -48,7 +49,21 @@ nearest known one. Paths start from the YAML file's folder. Examples: `configs/e
 
 def page() -> str:
     """The whole page of ``blinkgl generate``'s YAML as Markdown."""
-    return HEADER + "".join(_section(SequenceConfig, "", set()))
+    return HEADER + "".join(_section(SequenceConfig, "", set())) + _primitives()
+
+
+def _primitives() -> str:
+    """What `scene.meshes.<name>.parameters` may hold, from the builders' own signatures."""
+    lines = ["\n## Primitives\n\n", "`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, parameters: {radius: 0.2, height: 2}}`. "
+             "All stand upright (z is their axis) and are centred on the origin; sizes are in the world's units (m), before the object's `scale`.\n\n",
+             "| kind | parameters and defaults | what it is |\n|---|---|---|\n"]
+    for kind, build in BUILDERS.items():
+        values = ", ".join(f"`{name}: {list(value) if isinstance(value, tuple) else value}`" for name,
+                           value in parameters(kind).items())
+        lines.append(f"| `{kind}` | {values} | {' '.join((build.__doc__ or '').split()).replace('``', '`')} |\n")
+    lines.append("\n| parameter | meaning |\n|---|---|\n")
+    lines += [f"| `{name}` | {meaning} |\n" for name, meaning in PARAMETERS.items()]
+    return "".join(lines)
 
 
 def eflow_page() -> str:

@@ -52,6 +52,7 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import SequenceConfig, load_run
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.terminal import plain_console
 
 DRAWS = 12
 """Sequences drawn of every accepted configuration."""
@@ -495,7 +496,7 @@ def _cpu_seconds(pid: int) -> float:
 
 def fuzz(seed: int, count: int, runs: int, out: Path | None = None, *, memory_mb: int = 2000, cpu_s: float = 20.0, console: Console | None = None) -> dict[str, Any]:
     """Tries ``count`` configurations to read and ``runs`` to generate; returns the report. The failures' YAML goes to ``out``."""
-    console = console or Console(quiet=True)
+    console = console or plain_console(quiet=True)
     worker = Worker(seed, memory_mb, cpu_s)
     outcomes: list[Outcome] = []
     try:
@@ -504,7 +505,7 @@ def fuzz(seed: int, count: int, runs: int, out: Path | None = None, *, memory_mb
             outcomes.append(outcome)
             if not outcome.good:
                 command = f"python -m blinkgl.tools.fuzz_configs --seed {seed} --only {what}:{number}"
-                console.print(f"{outcome.kind}: {outcome.message}\n    {command}", highlight=False, soft_wrap=True, markup=False)
+                console.print(f"{outcome.kind}: {outcome.message}\n    {command}", highlight=False, soft_wrap=True)
                 if out is not None:
                     out.mkdir(parents=True, exist_ok=True)
                     case = make(seed, what, number)
@@ -541,7 +542,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.worker:
         work(options.seed, options.memory)
         return 0
-    console = Console()
+    console = plain_console()
     if options.only:
         return _only(options.seed, *options.only.split(":"))
     report = fuzz(options.seed, options.count, options.runs, options.out, memory_mb=options.memory, cpu_s=options.cpu, console=console)

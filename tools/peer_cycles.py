@@ -46,7 +46,7 @@ from blinkgl.scene.types import Camera, Material, Scene
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 WORKER = Path(__file__).with_name("cycles_worker.py")
 REMEDY = (f"run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter in {ENVIRONMENT} "
-          "(or pip install 'blinkgl[cycles]')")
+          "(or install it here)")
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
 CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 

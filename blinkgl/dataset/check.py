@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from rich.console import Console
 
 from blinkgl.dataset.verify import verify_dataset
+from blinkgl.terminal import plain_console
 
 _MOST_LINES = 20
 
 
 def verify_and_show(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -> bool:
     """:func:`~blinkgl.dataset.verify.verify_dataset` in words; True when nothing was found."""
-    console = Console()
+    console = plain_console()
     say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
     with console.status("looking") as status:
         result = verify_dataset(folder, deep=deep, seed=seed, base=base, progress=lambda number, name: status.update(f"{number}: {name}"))

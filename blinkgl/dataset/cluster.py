@@ -14,6 +14,7 @@ from typing import Any
 
 from blinkgl.dataset.work import Job, Maker, Message, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.extras import install
 
 _HELLO_S = 600.0
 _STOP_S = 15.0
@@ -35,7 +36,7 @@ class RayCluster:
         try:
             import ray
         except ImportError:
-            raise ConfigError("Ray is not installed", where="--executor", value="ray", accepted="run 'pip install blinkgl[cluster]'") from None
+            raise ConfigError("Ray is not installed", where="--executor", value="ray", accepted=f"run {install('ray')}") from None
         self._ray, self._workers, self._address, self._gpus = ray, workers, address, gpus
         self.listener: Callable[[Message], None] = lambda message: None
         self._ours = False

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from blinkgl.io.index import sequence_folders
 from blinkgl.errors import AssetError, OutputError
@@ -28,6 +27,7 @@ from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
+from blinkgl.terminal import plain_console
 
 _EXTRAS = {"back.png": "flow/backward", "image.png": "images", "occlusion.png": "occlusion/forward"}
 
@@ -100,7 +100,7 @@ def _npz(events: Events) -> bytes:
 
 def export_and_show(root: str, out: str, *, shard_bytes: int, seed: int) -> None:
     """What ``blinkgl export`` shows."""
-    console = Console()
+    console = plain_console()
     with console.status("writing shards"):
         written = export_shards(root, out, shard_bytes=shard_bytes, seed=seed)
     for split, counts in written.items():

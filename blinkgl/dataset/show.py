@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
 from blinkgl.config.sequence import load_run
@@ -16,8 +17,11 @@ from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
+from blinkgl.terminal import plain_column, plain_console
 
 STAGES = ("scene", "render", "read-back", "events", "write", "preview")
+MAX_NOTES = 20
+"""Files of which it is said what is not drawn; beyond, that there are more."""
 SET_ASIDE = 3
 """Exit status of a run that is over but lacks sequences."""
 
@@ -27,7 +31,7 @@ def generate_with_progress(config: str, out: str, *, num: int | None = None, see
                            time_limit_s: float = 0.0) -> Outcome:
     """:func:`~blinkgl.dataset.run.run_dataset` behind a display. Raises what it raises."""
     template = load_run(config, overrides, seed=seed)
-    console = Console(quiet=quiet)
+    console = plain_console(quiet=quiet)
     outcome = run_dataset(template, out, executor, num=num, resume=resume, mixed=mixed, time_limit_s=time_limit_s,
                           listener=None if quiet else Display(console, Path(out)))
     show_outcome(console, outcome, Path(out))
@@ -40,12 +44,13 @@ class Display:
 
     def __init__(self, console: Console, out: Path):
         self._console, self._out = console, out
-        self._bars = Progress(TextColumn("{task.description}"), BarColumn(bar_width=30), TextColumn("{task.percentage:>3.0f}%"),
-                              TextColumn("{task.fields[detail]}"), TimeElapsedColumn(), console=console, transient=True,
+        self._bars = Progress(plain_column("{task.description}"), BarColumn(bar_width=30), plain_column("{task.percentage:>3.0f}%"),
+                              plain_column("{task.fields[detail]}"), TimeElapsedColumn(), console=console, transient=True,
                               disable=not console.is_terminal)
         self._tasks: dict[str, TaskID] = {}
         self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames, events of what is being made
         self._done = self._frames = self._events = self._bytes = self._given_up = 0
+        self._notes: set[str] = set()
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
         self._todo, self._outcome, self._started = len(plan.tasks) - outcome.found, outcome, time.monotonic()
@@ -58,6 +63,7 @@ class Display:
 
     def message(self, name: str, message: Message) -> None:
         kind = message["kind"]
+        self._note(message.get("omissions") or message.get("report", {}).get("omissions") or ())
         if kind == "progress":
             self._at_work[name] = (message["fraction"], message["frames"], message["events"])
             if name not in self._tasks:
@@ -98,6 +104,17 @@ class Display:
             if expected - self._bytes > room:
                 parts.append(f"DISK: only {_size(room)} free")
         return ", ".join(parts)
+
+    def _note(self, lines: Iterable[str]) -> None:
+        """Says what is not drawn, once, however many sequences and workers use the file."""
+        for line in lines:
+            if line in self._notes:
+                continue
+            self._notes.add(line)
+            if len(self._notes) <= MAX_NOTES:
+                self._say(f"note: {line}")
+            elif len(self._notes) == MAX_NOTES + 1:
+                self._say("note: more files ask for what is not drawn; the manifests name them under not_drawn")
 
     def _say(self, text: str) -> None:
         self._console.print(text, highlight=False, soft_wrap=True, markup=False)

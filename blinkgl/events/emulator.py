@@ -5,18 +5,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
-import numba
 import numpy as np
 
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import LOG_MAX_INPUT
 from blinkgl.events.packing import MAX_INTERVAL_NS, PackedBuffer
+from blinkgl.events.threads import run, thread_count
 from blinkgl.events.types import Events
 
 BLOCK = 1024
 """Pixels a kernel takes in one go: everything about them stays in the first cache levels. Threads get whole blocks."""
-SKIPPING_BLOCKS = 64
-"""A thread's least share where still rows are skipped: 65,536 pixels, some 50 µs."""
+SHARE_BLOCKS = 64
+"""A thread's least share: 65,536 pixels, 100 µs and more. Waking a thread takes 20 to 50 µs."""
+BANDS_PER_THREAD = 4
+"""A thread that wakes late, or is held up by another program, leaves bands to the others."""
 INTENSITY_LIMIT_BITS = np.uint32(np.float32(LOG_MAX_INPUT).view(np.uint32))
 """Bit pattern of the largest accepted intensity. Read as unsigned integers, negative numbers, infinities and NaN
 are all larger, so one running maximum per frame checks everything at once."""
@@ -169,37 +171,34 @@ class Emulator(ABC):
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events: ...
 
     # -- running the kernels --------------------------------------------------------------------------------
-    def _run(self, serial, parallel, arguments: tuple, base_us: int, span_us: int) -> Events:
-        """Run a band kernel over all blocks, on numba's threads, and sort what it emits.
+    def _run(self, kernel, arguments: tuple, base_us: int, span_us: int) -> Events:
+        """Run a band kernel over all blocks, on up to :func:`~blinkgl.events.threads.thread_count` threads, and sort what it emits.
 
-        ``serial(first_block, stop_block, share, packed, filled, *arguments) -> (next_block, filled, cut)`` works
-        through whole blocks and stops early when ``packed`` might not hold the next one; it then goes on from
+        ``kernel(taken, start, edges, progress, share, packed, *arguments)`` takes bands of whole blocks, [edges[b], edges[b + 1]),
+        by :func:`~blinkgl.events.threads.take_part` until there are none. In band b it goes on from block ``progress[b, 0]`` with
+        ``progress[b, 1]`` events in ``packed[b]`` and stops early when that might not hold the next block; it then goes on from
         there in a larger buffer. ``share`` is the number of events a block may emit.
         """
         first, stop = self._changed if self._still_pixels_sleep else (0, self.height * self.width)
         first_block, stop_block = first // BLOCK, -(-stop // BLOCK)
         if first >= stop:
             return Events.empty()
-        bands = min(numba.get_num_threads(), stop_block - first_block)
-        if stop - first < self.height * self.width:  # so little to do that waking threads takes as long
-            bands = min(bands, max(1, (stop_block - first_block) // SKIPPING_BLOCKS))
-        edges = first_block + (stop_block - first_block) * np.arange(bands + 1, dtype=np.int64) // bands
+        blocks = stop_block - first_block
+        threads = max(1, min(thread_count(), blocks // SHARE_BLOCKS))
+        bands = 1 if threads == 1 else BANDS_PER_THREAD * threads
+        edges = first_block + blocks * np.arange(bands + 1, dtype=np.int64) // bands
         share = max(BLOCK, self.config.max_events_per_step // self._blocks)
         progress = np.zeros((bands, 3), np.int64)  # next block, events so far, events cut
         progress[:, 0] = edges[:-1]
         while True:
             packed = self._buffer.rows(bands, self.height * self.width // (4 * bands))
-            if bands == 1:
-                next_block, filled, cut = serial(progress[0, 0], edges[1], share, packed[0], progress[0, 1], *arguments)
-                progress[0] = next_block, filled, progress[0, 2] + cut
-            else:
-                parallel(edges, progress, share, packed, *arguments)
+            run(kernel, bands, (edges, progress, share, packed, *arguments), threads)
             if (progress[:, 0] >= edges[1:]).all():
                 break
             # No block emits more than its share or, at one event each, its pixels; so this ends, and is bounded.
             self._buffer.grow(bands, 2 * packed.shape[1] + 8 * BLOCK, progress[:, 1])
         self.saturated += int(progress[:, 2].sum())
-        return self._buffer.to_events(progress[:, 1].copy(), base_us, span_us)
+        return self._buffer.to_events(progress[:, 1].copy(), base_us, span_us, threads)
 
     # -- state ----------------------------------------------------------------------------------------------
     def state_dict(self) -> dict[str, np.ndarray]:

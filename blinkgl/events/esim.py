@@ -29,8 +29,9 @@ from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block
 from blinkgl.events.curve import Curve, curve_time, end_slopes, limited, slope_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, NO_LOG, Emulator
-from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT
+from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters
+from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
 
 _I0, _FAR_BELOW = np.int32(0), np.int32(-(2**31))
@@ -195,12 +196,14 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
     return stop_block, filled, cut
 
 
-@numba.njit(**JIT_PARALLEL)
-def _bands(edges, progress, share, packed, frame, codes, table, p, v):
-    for b in numba.prange(edges.size - 1):
+@numba.njit(**JIT)
+def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
+    b = take_part(taken, start)
+    while b >= 0:
         block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v)
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
+        b = take_part(taken, start)
 
 
 @numba.njit(**JIT)
@@ -248,13 +251,15 @@ def _band_curve(first_block, stop_block, share, packed, filled, frame, codes, ta
     return stop_block, filled, cut
 
 
-@numba.njit(**JIT_PARALLEL)
-def _bands_curve(edges, progress, share, packed, frame, codes, table, rate, decode, log_now, curve, p, v):
-    for b in numba.prange(edges.size - 1):
+@numba.njit(**JIT)
+def _bands_curve(taken, start, edges, progress, share, packed, frame, codes, table, rate, decode, log_now, curve, p, v):
+    b = take_part(taken, start)
+    while b >= 0:
         block, filled, cut = _band_curve(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, rate,
                                          decode, log_now, curve, p, v)
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
+        b = take_part(taken, start)
 
 
 def to_q25(value: float | np.ndarray) -> np.ndarray:
@@ -342,9 +347,9 @@ class Esim(Emulator):
         base_us = self.t_ns // 1000
         if self.needs_rate:
             curve = Curve(NO_LOG, NO_LOG, 0.0, 0.0)
-            return self._run(_band_curve, _bands_curve, (*source, rate, self._decode, NO_LOG, curve, levels, interval), base_us,
+            return self._run(_bands_curve, (*source, rate, self._decode, NO_LOG, curve, levels, interval), base_us,
                              t_ns // 1000 - base_us)
-        return self._run(_band, _bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
+        return self._run(_bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
 
     def _advance_late(self, source: tuple, t_ns: int) -> Events:
         """Takes the logarithm of frame k = ``frames`` and returns the events between the two frames before it."""
@@ -379,7 +384,7 @@ class Esim(Emulator):
         base_us = ns(k - 1) // 1000
         arguments = (*(source or (NO_FRAME, NO_CODES, self._table)), NO_FRAME, self._decode, ring(k), curve,
                      self._levels(ring(k - 1)), self._interval(ns(k - 1), ns(k)))
-        return self._run(_band_curve, _bands_curve, arguments, base_us, ns(k) // 1000 - base_us)
+        return self._run(_bands_curve, arguments, base_us, ns(k) // 1000 - base_us)
 
     @property
     def done_ns(self) -> int | None:

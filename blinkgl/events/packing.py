@@ -11,20 +11,21 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from blinkgl.events.threads import run, take_part
 from blinkgl.events.types import Events
 
 T_SHIFT = 33
 MAX_INTERVAL_NS = (2**30 - 1) * 1000
 """Longest interval between two frames: 30 bits of microseconds (the word stays positive), 17 minutes."""
 _SINGLE_PASS_BITS, _DIGIT_BITS = 14, 11
+_EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
+"""Fewer events than that are sorted in the time another thread takes to wake up."""
 
 JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
-JIT_PARALLEL = dict(parallel=True, **JIT)
 
 
 @numba.njit(**JIT)
 def _count_digits(packed, start, stop, shift, mask, histogram):
-    histogram[:] = 0
     for i in range(start, stop):
         histogram[(packed[i] >> shift) & mask] += 1
 
@@ -58,28 +59,34 @@ def _unpack(packed, start, stop, base_us, x, y, t, p):
         ps[i] = np.uint8(word[i] & 1)
 
 
+# The three below work through parts of the events, each taken by the next thread that is free.
+
+
 @numba.njit(**JIT)
-def _sort_pass_serial(packed, starts, counts, shift, mask, histogram, out):
-    for b in range(starts.size):
-        _count_digits(packed, starts[b], starts[b] + counts[b], shift, mask, histogram[b])
-    _histograms_to_offsets(histogram)
-    for b in range(starts.size):
-        _scatter(packed, starts[b], starts[b] + counts[b], shift, mask, histogram[b], out)
+def _count_parts(taken, start, packed, starts, counts, first_row, shift, mask, histogram):
+    part = take_part(taken, start)
+    while part >= 0:
+        histogram[part] = 0
+        for row in range(first_row[part], first_row[part + 1]):
+            _count_digits(packed, starts[row], starts[row] + counts[row], shift, mask, histogram[part])
+        part = take_part(taken, start)
 
 
-@numba.njit(**JIT_PARALLEL)
-def _sort_pass_parallel(packed, starts, counts, shift, mask, histogram, out):
-    for b in numba.prange(starts.size):
-        _count_digits(packed, starts[b], starts[b] + counts[b], shift, mask, histogram[b])
-    _histograms_to_offsets(histogram)
-    for b in numba.prange(starts.size):
-        _scatter(packed, starts[b], starts[b] + counts[b], shift, mask, histogram[b], out)
+@numba.njit(**JIT)
+def _scatter_parts(taken, start, packed, starts, counts, first_row, shift, mask, offsets, out):
+    part = take_part(taken, start)
+    while part >= 0:
+        for row in range(first_row[part], first_row[part + 1]):
+            _scatter(packed, starts[row], starts[row] + counts[row], shift, mask, offsets[part], out)
+        part = take_part(taken, start)
 
 
-@numba.njit(**JIT_PARALLEL)
-def _unpack_parallel(packed, total, base_us, bands, x, y, t, p):
-    for b in numba.prange(bands):
-        _unpack(packed, total * b // bands, total * (b + 1) // bands, base_us, x, y, t, p)
+@numba.njit(**JIT)
+def _unpack_parts(taken, start, packed, edges, base_us, x, y, t, p):
+    part = take_part(taken, start)
+    while part >= 0:
+        _unpack(packed, edges[part], edges[part + 1], base_us, x, y, t, p)
+        part = take_part(taken, start)
 
 
 class PackedBuffer:
@@ -91,7 +98,7 @@ class PackedBuffer:
         self._histogram = np.empty(0, np.int64)
 
     def rows(self, bands: int, capacity: int) -> np.ndarray:
-        """(bands, >= capacity) int64, one row per thread to emit into; keeps its size between steps."""
+        """(bands, >= capacity) int64, one row per band to emit into; keeps its size between steps."""
         if self._rows.shape[0] != bands or self._rows.shape[1] < capacity:
             self._rows = np.empty((bands, max(capacity, self._rows.size // bands, 1)), np.int64)
         return self._rows
@@ -102,35 +109,44 @@ class PackedBuffer:
         for band in range(bands):
             self._rows[band, : filled[band]] = old[band, : filled[band]]
 
-    def to_events(self, counts: np.ndarray, base_us: int, span_us: int) -> Events:
+    def to_events(self, counts: np.ndarray, base_us: int, span_us: int, threads: int = 1) -> Events:
         """The events of ``rows[b, : counts[b]]``, sorted.
 
         counts : (B,) int64, events per row, rows in raster order.
         base_us, span_us : time of offset 0, and the largest offset that can occur.
+        threads : at most so many; few events are sorted by the calling one alone.
         """
-        total, bands = int(counts.sum()), len(counts)
+        total = int(counts.sum())
         if total == 0:
             return Events.empty()
+        threads = max(1, min(threads, total // _EVENTS_PER_THREAD))
+        parts = 1 if threads == 1 else min(_PARTS_PER_THREAD * threads, len(counts))
         bits = max(1, int(span_us).bit_length())
         digit_bits = bits if bits <= _SINGLE_PASS_BITS else _DIGIT_BITS
         if self._sorted.shape[1] < total:
             self._sorted = np.empty((2 if bits > digit_bits else 1, total + total // 4), np.int64)
         if len(self._sorted) < 2 and bits > digit_bits:
             self._sorted = np.empty((2, self._sorted.shape[1]), np.int64)
-        if self._histogram.size < bands << digit_bits:
-            self._histogram = np.empty(bands << digit_bits, np.int64)
-        histogram = self._histogram[: bands << digit_bits].reshape(bands, 1 << digit_bits)
-        sort_pass = _sort_pass_parallel if bands > 1 else _sort_pass_serial
-        source, starts, counts = self._rows.reshape(-1), self._rows.shape[1] * np.arange(bands), counts
+        if self._histogram.size < parts << digit_bits:
+            self._histogram = np.empty(parts << digit_bits, np.int64)
+        histogram = self._histogram[: parts << digit_bits].reshape(parts, 1 << digit_bits)
+        mask, edges = (1 << digit_bits) - 1, total * np.arange(parts + 1) // parts
+        source, starts, first_row = self._rows.reshape(-1), self._rows.shape[1] * np.arange(len(counts)), _even_split(counts, parts)
         for k, low in enumerate(range(0, bits, digit_bits)):
-            target = self._sorted[k % 2]
-            sort_pass(source, starts, counts, T_SHIFT + low, (1 << digit_bits) - 1, histogram, target)
-            source, edges = target, total * np.arange(bands + 1) // bands  # contiguous from now on
-            starts, counts = edges[:-1], np.diff(edges)
+            target, shift = self._sorted[k % 2], T_SHIFT + low
+            run(_count_parts, parts, (source, starts, counts, first_row, shift, mask, histogram), threads)
+            _histograms_to_offsets(histogram)
+            run(_scatter_parts, parts, (source, starts, counts, first_row, shift, mask, histogram, target), threads)
+            source, starts, counts, first_row = target, edges[:-1], np.diff(edges), np.arange(parts + 1)  # contiguous from now on
         x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
         t, p = np.empty(total, np.int64), np.empty(total, np.uint8)
-        if bands > 1:
-            _unpack_parallel(source, total, base_us, bands, x, y, t, p)
-        else:
-            _unpack(source, 0, total, base_us, x, y, t, p)
+        run(_unpack_parts, parts, (source, edges, base_us, x, y, t, p), threads)
         return Events(x, y, t, p)
+
+
+def _even_split(counts: np.ndarray, parts: int) -> np.ndarray:
+    """First row of each part and the end, (parts + 1,) int64: about as many events in each."""
+    if parts == 1:
+        return np.array([0, len(counts)])
+    inner = np.searchsorted(np.cumsum(counts), counts.sum() * np.arange(1, parts) / parts)
+    return np.concatenate(([0], inner, [len(counts)]))

@@ -32,8 +32,9 @@ from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
-from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT
+from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
+from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
 from blinkgl.events.v2e_model import (DARKEST, REBASE, crossing_fraction, curve_of, draw_leaks, draw_start_noise, lin_log,
                                       next_noise, noise_place, relax, relax_gently, shot_draw, shot_factor, shot_tables,
@@ -392,13 +393,15 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
     return stop_block, filled, cut
 
 
-@numba.njit(**JIT_PARALLEL)
-def _bands(edges, progress, share, packed, frame, codes, table, x_table, p, v):
-    for b in numba.prange(edges.size - 1):
+@numba.njit(**JIT)
+def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_table, p, v):
+    b = take_part(taken, start)
+    while b >= 0:
         block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, x_table,
                                    p, v)
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
+        b = take_part(taken, start)
 
 
 class V2e(Emulator):
@@ -491,7 +494,7 @@ class V2e(Emulator):
                             self._shot_unit, self._inverse_threshold,
                             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
-        events = self._run(_band, _bands, (*source, self._table, self._x_table, pixels, interval), base_us,
+        events = self._run(_bands, (*source, self._table, self._x_table, pixels, interval), base_us,
                            t_ns // 1000 - base_us)
         self._brightest[0] = brightest
         if t_ns - epoch >= self._rebase_ns:

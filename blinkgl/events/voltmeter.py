@@ -27,8 +27,9 @@ from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events.arith import exp_f64, select
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.packing import JIT, JIT_PARALLEL, T_SHIFT
+from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal_and_uniform, uniform2
+from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
 
 _F = np.float32
@@ -136,7 +137,7 @@ class Interval(NamedTuple):
     t0_ns: int
     dt_ns: int
     base_us: int
-    k1: float  # (tuples inside tuples do not pass into a parallel loop)
+    k1: float
     k2: float
     k3: float
     k4: float
@@ -265,12 +266,14 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
     return stop_block, filled, cut
 
 
-@numba.njit(**JIT_PARALLEL)
-def _bands(edges, progress, share, packed, frame, codes, table, p, v):
-    for b in numba.prange(edges.size - 1):
+@numba.njit(**JIT)
+def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
+    b = take_part(taken, start)
+    while b >= 0:
         block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v)
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
+        b = take_part(taken, start)
 
 
 class DvsVoltmeter(Emulator):
@@ -305,4 +308,4 @@ class DvsVoltmeter(Emulator):
                             self.width, self.frames, self._refractory_ns,
                             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
-        return self._run(_band, _bands, (*source, self._table, pixels, interval), base_us, t_ns // 1000 - base_us)
+        return self._run(_bands, (*source, self._table, pixels, interval), base_us, t_ns // 1000 - base_us)

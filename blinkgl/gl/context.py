@@ -67,11 +67,6 @@ class GLContext:
         info = self.ctx.info
         self.vendor, self.renderer, self.version = info["GL_VENDOR"], info["GL_RENDERER"], info["GL_VERSION"]
         self.is_software = bool(_SOFTWARE.search(f"{self.vendor} {self.renderer}"))
-        if self.is_software:
-            # numba's OpenMP threads spin for a while after every kernel and would keep this OpenGL's threads off the cores
-            # (measured: event kernels between frames took 18 times as long). libgomp reads this when it is loaded, with
-            # the first parallel kernel; where there is no software OpenGL, spinning is right: kernels are 1.6x faster.
-            os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         _thread.current = weakref.ref(self)
         self.shaders = ShaderLoader(self.ctx)
         self.idle = self.ctx.framebuffer(self.ctx.renderbuffer((1, 1)))  # bound when a target in use is released

@@ -1,4 +1,4 @@
-"""AEDAT4 (iniVation) through dv-processing, an optional extra: ``pip install 'blinkgl[formats]'``."""
+"""AEDAT4 (iniVation) through dv-processing, an optional package of its own."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
 from blinkgl.events.types import Events
+from blinkgl.extras import install
 from blinkgl.io.atomic import output_errors
 
 MAGIC = b"#!AER-DAT4"
@@ -20,7 +21,7 @@ def _dv(error: type[BlinkGLError], path):
         import dv_processing
     except ImportError as problem:
         raise error("AEDAT4 needs dv-processing, which is not installed", where=str(path),
-                    accepted="run pip install 'blinkgl[formats]'") from problem
+                    accepted=f"run {install('dv-processing')}") from problem
     return dv_processing
 
 

@@ -9,6 +9,7 @@ from rich.table import Table
 
 from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
+from blinkgl.terminal import plain_console
 from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options
 from blinkgl.trade.run import convergence_line, trade, write
 
@@ -32,7 +33,7 @@ def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, 
         changes["rounds"] = rounds
     if minutes is not None:
         changes |= {"rounds_s": minutes * 30, "reference_s": minutes * 30}
-    console = Console()
+    console = plain_console()
     say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
     result = trade(template, quick=quick, only=only, skip=skip, options=replace(options, **changes), cost=f"{cost}_s", say=say)
     show(result, console)

@@ -131,6 +131,6 @@ def test_without_ray_the_remedy_is_named(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ConfigError, match=r"Ray is not installed .*pip install blinkgl\[cluster\]"):
+    with pytest.raises(ConfigError, match=r"Ray is not installed .*pip install ray"):
         RayCluster(2)
     assert _first_line(RuntimeError("\n\na\nb")) == "a"

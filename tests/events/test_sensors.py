@@ -52,6 +52,19 @@ def test_bus_equals_slow_twin_at_any_chunking(config):
     assert readout.dropped == 5000 - len(expected)
 
 
+def test_an_idle_bus_pays_for_the_row_again():
+    """Two events of a row back to back: the second pays nothing. One in the same row after a pause finds the bus idle and pays."""
+    times = np.array([10, 10, 50, 50, 50, 90], np.int64)
+    rows = np.array([3, 3, 3, 3, 7, 7], np.uint16)
+    events = Events(np.arange(6, dtype=np.uint16), rows, times, np.zeros(6, np.uint8))
+    readout = Readout(ReadoutConfig(events_per_second=1e6 / 0.6, row_ns=600, queue_events=100))  # 0.6 us an event, 0.6 us a row
+    assert readout.step(events).t.tolist() == [11, 11, 51, 51, 53, 91]
+    lone = Events(*(c[[2]] for c in (events.x, rows, times, events.p)))
+    fresh = Readout(ReadoutConfig(events_per_second=1e7, row_ns=5000, queue_events=100))
+    assert fresh.step(Events(*(c[:2] for c in (events.x, rows, times, events.p)))).t.tolist() == [15, 15]
+    assert fresh.step(lone).t.tolist() == [55], "the same row, but the bus was idle in between"
+
+
 def test_below_the_limit_nothing_changes_but_a_microsecond():
     events = random_events(np.random.default_rng(1), 2000, 1_000_000)
     out = Readout(ReadoutConfig(events_per_second=1e9)).step(events)

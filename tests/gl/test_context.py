@@ -247,3 +247,19 @@ def test_devices_are_listed_without_a_context():
     done = subprocess.run([sys.executable, "-c", "import json; from blinkgl.gl import egl_devices; print(json.dumps(egl_devices()))"],
                           capture_output=True, text=True, timeout=60)
     assert all(isinstance(text, str) and text for text in json.loads(done.stdout))
+
+
+def test_the_environment_of_the_process_is_left_alone():
+    """A library that sets variables changes what the caller's other libraries and child processes do."""
+    script = """if True:
+        import os
+        import cv2  # sets LD_LIBRARY_PATH itself
+        before = dict(os.environ)
+        import blinkgl, numpy as np
+        from blinkgl.gl import create_context
+        with create_context():
+            list(blinkgl.simulate([np.full((4, 4), k, np.uint8) for k in range(3)], fps=100))
+        import blinkgl.cli, blinkgl.commands, blinkgl.comparison, blinkgl.doctor, blinkgl.explain, blinkgl.dataset.run, blinkgl.trade.run
+        assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
+    """
+    subprocess.run([sys.executable, "-c", script], check=True)

@@ -138,7 +138,7 @@ def test_no_blender_is_one_line_that_says_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setenv(peer_cycles.ENVIRONMENT, bare)
     with pytest.raises(BlinkGLError) as error:
         next(frames(mixed_scene(), TIMES))
-    assert "no bpy" in one_line(error) and "blinkgl[cycles]" in str(error.value) and bare in str(error.value)
+    assert "no bpy" in one_line(error) and "'bpy>=4.5,<4.6'" in str(error.value) and bare in str(error.value)
     monkeypatch.setenv(peer_cycles.ENVIRONMENT, str(tmp_path / "nothing"))
     with pytest.raises(BlinkGLError, match="names no interpreter that runs"):
         next(frames(mixed_scene(), TIMES))

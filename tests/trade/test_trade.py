@@ -182,7 +182,7 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
     result = trade(load_run(config), settings=setting, options=options)
     assert asked == [(4, 4, True), (16, 4, True)] and "16 paths a pixel by Cycles" in convergence_line(result)
     show(result, Console())
-    assert "Cycles 3.00 (5.00), the settings 0.0" in capsys.readouterr().out
+    assert re.search(r"Cycles 3\.00 \(5\.00\), the settings \d+\.\d", capsys.readouterr().out), "theirs are timed: whatever they are"
     same = trade(load_run(config), settings=setting, options=replace(options, reference="raster", levels=((2, 0.5), (2, 0.25))))
     assert result["settings"][0]["voxel"] == pytest.approx(same["settings"][0]["voxel"], rel=0.02)
 

@@ -7,7 +7,7 @@ from typing import Annotated, Optional
 
 import typer
 
-app = typer.Typer(name="shader", no_args_is_help=True, help="See what every pass wrote at a pixel, and why.")
+app = typer.Typer(name="shader", no_args_is_help=True, rich_markup_mode=None, help="See what every pass wrote at a pixel, and why.")
 
 Config = Annotated[str, typer.Argument(help="YAML file, as for `blinkgl generate`.")]
 Seed = Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")]

@@ -1,0 +1,31 @@
+"""Optional parts: what they are for, and the command that installs them. BlinkGL itself is on no package index, so a remedy names
+the packages, never ``blinkgl[extra]``."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import sys
+
+EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
+    "check": (("pyrender",), "an independent renderer to compare with"),
+    "cycles": (("bpy",), "Blender's path tracer to compare with; better in an environment of its own, see README"),
+    "learn": (("torch", "safetensors", "tensorboard"), "training"),
+    "cluster": (("ray",), "many machines"),
+    "formats": (("faery", "dv-processing"), "dv-processing: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing"),
+    "viz": (("rerun-sdk",), "3D viewer"),
+    "urdf": (("pybullet",), "its random meshes as an object pool"),
+    "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
+}
+_PINNED = {"torch": "torch==2.13.0", "bpy": "bpy>=4.5,<4.6"}
+
+
+def python() -> str:
+    """This interpreter, as one would type it here."""
+    relative = os.path.relpath(sys.executable)
+    return shlex.quote(relative if len(relative) < len(sys.executable) else sys.executable)
+
+
+def install(*distributions: str) -> str:
+    """The command that installs them for this interpreter, in the versions that fit."""
+    return f"{python()} -m pip install {' '.join(shlex.quote(_PINNED.get(name, name)) for name in distributions)}"

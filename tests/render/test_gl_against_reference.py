@@ -395,7 +395,7 @@ def test_random_world_of_real_meshes_and_photographs(gl):
 )  # fmt: skip
 def test_the_oracle_finds_a_broken_shader(gl, tmp_path, monkeypatch, file, right, wrong):
     """Mistakes that give plausible pictures fail the bounds above by orders of magnitude."""
-    for source in ("label.glsl", "luminance.glsl", *(f"include/{n}.glsl" for n in ("motion", "light", "rate"))):
+    for source in ("label.glsl", "luminance.glsl", *(f"include/{n}.glsl" for n in ("motion", "light", "rate", "guard"))):
         text = (shader_folder() / source).read_text()
         (tmp_path / source).parent.mkdir(exist_ok=True)
         (tmp_path / source).write_text(text.replace(right, wrong) if source == file else text)

@@ -17,6 +17,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
+from blinkgl.terminal import never_fail_to_print
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -235,6 +236,7 @@ def convert(
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:

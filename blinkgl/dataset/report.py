@@ -33,6 +33,11 @@ class SequenceReport:
     """what an adaptive timeline says it achieved"""
 
 
+def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
+    """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
+    return {"events_cut_by_max_events_per_step": saturated, "events_lost_in_readout": dropped, "events_late_in_readout": late}
+
+
 def config_yaml(config: SequenceConfig, index: int) -> str:
     """The resolved configuration as YAML; ``blinkgl generate`` takes it and makes this one sequence again."""
     tree = json.loads(config.model_dump_json())

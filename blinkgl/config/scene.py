@@ -235,7 +235,7 @@ class KeyedMotionConfig(PoseConfig):
             raise ValueError("one key frame is no motion; give two or more, or a fixed pose")
         if any(b - a < 1e-6 for a, b in zip(times, times[1:])):
             raise ValueError("the key frames' times must increase by at least 1e-6 s")
-        if times and (self.model_fields_set & {"position", "quaternion", "euler", "look_at"}):
+        if times and any(getattr(self, k) != PoseConfig.model_fields[k].default for k in ("position", "quaternion", "euler", "look_at")):
             raise ValueError("give a fixed pose or keyframes, not both")
         return self
 

@@ -138,7 +138,7 @@ def test_flow_follows_from_depth_ids_and_poses(sequence):
 
 def test_the_poses_begin_with_the_first_frame(tmp_path):
     """A camera that moves 1 m/s along x on straight lines: its position is the clock, to the nanosecond."""
-    scene = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box", "position": [0, 0, 3]}],
+    scene = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box", "position": [3, 0, 0]}],
              "camera": {"interpolation": "linear", "keyframes": [{"time": t, "position": [t, 0, 0]} for t in (0, 10)]}}
     folder = generate(tmp_path, scene=scene, time={"duration": 0.2, "label_rate": 30, "start": 3.0000005})[0]
     poses = np.load(folder / "poses.npz", allow_pickle=False)

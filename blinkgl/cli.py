@@ -16,6 +16,7 @@ from typing import Annotated, Optional
 import typer
 
 from blinkgl import __version__
+from blinkgl.console import never_fail_to_print
 from blinkgl.errors import BlinkGLError
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
@@ -236,6 +237,7 @@ def convert(
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:

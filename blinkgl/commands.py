@@ -7,12 +7,12 @@ import os
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from blinkgl.errors import AssetError, ConfigError
+from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.errors import ConfigError
 
 
 def emulator_options(name: str, config: str | None, overrides: list[str], sensor: str | None = None) -> dict[str, Any]:
@@ -20,20 +20,13 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
     the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where nothing else is said."""
     data: dict[str, Any] = {}
     if config is not None:
-        try:
-            data = yaml.safe_load(Path(config).read_text(encoding="utf-8")) or {}
-        except OSError as error:
-            raise AssetError(f"cannot read: {error.strerror}", where=config) from error
-        except yaml.YAMLError as error:
-            raise ConfigError("not valid YAML: " + " ".join(str(error).split())[:160], where=config) from error
-        if not isinstance(data, dict):
-            raise ConfigError("not a mapping", where=config, value=data, accepted="emulator parameters, key: value")
+        data = read_table(config, "emulator parameters, key: value")
     data = {"emulator": name, **data}
     for item in overrides:
         key, equals, value = item.partition("=")
         if not equals:
             raise ConfigError("not key=value", where="--set", value=item)
-        data[key.strip()] = yaml.safe_load(value)
+        data[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
     if sensor is None:
         return {"emulator": data, "readout": None}
     from blinkgl.config.sensor import load_sensor

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from blinkgl.config.base import Config, validate
-from blinkgl.config.sequence import MAX_YAML_BYTES, apply_overrides, parse_yaml
-from blinkgl.errors import ConfigError
+from blinkgl.config.base import Config, Refused, one_of, rule, validate
+from blinkgl.config.reader import read_table
+from blinkgl.config.sequence import apply_overrides
 
 
 class VoxelConfig(Config):
@@ -71,7 +71,7 @@ class SteFlowNetConfig(Config):
     sweeps: int = Field(3, ge=1, le=10, description="passes of residual flow decoding")
 
 
-ModelConfig = Annotated[EraftConfig | EFlowFormerConfig | EvFlowNetConfig | SpikeFlowNetConfig | SteFlowNetConfig, Field(discriminator="name")]
+ModelConfig = one_of("name", EraftConfig, EFlowFormerConfig, EvFlowNetConfig, SpikeFlowNetConfig, SteFlowNetConfig)
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -92,11 +92,10 @@ class AugmentConfig(Config):
     scale_probability: Probability = 0.3
     scale: tuple[float, float] = Field((-0.2, 0.5), description="exponent of 2 of the scale factor, [low, high]")
 
-    @model_validator(mode="after")
-    def _ordered(self):
-        if not -3 <= self.scale[0] <= self.scale[1] <= 3:
-            raise ValueError("scale must be [low, high] within [-3, 3]")
-        return self
+    @rule("scale")
+    def _ordered(scale):
+        if not -3 <= scale[0] <= scale[1] <= 3:
+            raise Refused("not a range", where="scale", value=list(scale), accepted="[low, high] within [-3, 3]")
 
 
 class SourceConfig(Config):
@@ -120,11 +119,10 @@ class DataConfig(Config):
     empty: Literal["error", "skip"] = Field("error", description="a sample without events: stop, or take the next one")
     augment: AugmentConfig | None = AugmentConfig()
 
-    @model_validator(mode="after")
-    def _one_size(self):
-        if self.crop is None and self.augment is not None and self.augment.scale_probability > 0:
-            raise ValueError("scaled samples differ in size: set crop, or augment.scale_probability to 0")
-        return self
+    @rule("crop", "augment.scale_probability")
+    def _one_size(crop, scaling):
+        if crop is None and scaling:
+            raise Refused("scaled samples differ in size: set crop, or augment.scale_probability to 0")
 
 
 class OptimConfig(Config):
@@ -171,18 +169,7 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     """Reads a YAML file and applies ``a.b=c`` overrides; data paths become absolute, from the YAML file's folder.
 
     Raises ConfigError: missing file, bad YAML, unknown key, bad value."""
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_YAML_BYTES:
-            raise ConfigError("file is too large for a configuration", where=str(path), accepted=f"at most {MAX_YAML_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), accepted="a YAML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {type(error).__name__}", where=str(path), accepted="a YAML text file in UTF-8") from None
-    tree = parse_yaml(text, str(path))
-    if not isinstance(tree, dict):
-        raise ConfigError("not a table of keys", where=str(path), value=tree, accepted="key: value lines")
+    path, tree = Path(path), read_table(path)
     config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # noqa: E731 - an absolute p stays
     sources = {k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k)) for k in ("train", "validate_on")}

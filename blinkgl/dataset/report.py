@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import yaml
-
 import blinkgl
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import SequenceConfig
 
 Progress = Callable[["SequenceReport", float], None]
@@ -46,4 +45,4 @@ def config_yaml(config: SequenceConfig, index: int) -> str:
         tree.pop("frames", None)
     return (f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
             "# Relative paths start from the folder of the run's own configuration file.\n"
-            + yaml.safe_dump(tree, sort_keys=False))
+            + to_yaml(tree))

@@ -8,14 +8,14 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from blinkgl.config.draw import is_distribution
+from blinkgl.config.reader import read_table
 from blinkgl.io.index import entry, sequence_folders
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import plan_of
-from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.images import read_image, read_npy
@@ -24,7 +24,6 @@ from blinkgl.io.sequence_dir import verify_sequence
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass
@@ -193,9 +192,9 @@ def _parameters(found: Collected, rng: np.random.Generator) -> None:
     configs: dict[str, list[dict]] = {}
     for task in tasks:
         try:
-            configs.setdefault(task.group, []).append(yaml.load((found.root / task.name / "config.yaml").read_text(encoding="utf-8"), Loader=_LOADER))  # noqa: S506
-        except (OSError, yaml.YAMLError) as error:
-            found.unreadable.append(f"{task.name}/config.yaml: {error.__class__.__name__}")
+            configs.setdefault(task.group, []).append(read_table(found.root / task.name / "config.yaml"))
+        except ConfigError as error:
+            found.unreadable.append(f"{task.name}/config.yaml: {error.problem}")
     for group in found.plan.used:
         _walk(group.name, group.template.tree, (), configs.get(group.name, []), found.parameters)
 

@@ -20,9 +20,9 @@ from typing import Protocol
 
 import h5py
 import numpy as np
-import yaml
 
-from blinkgl.errors import AssetError, EventDataError
+from blinkgl.config.reader import read_table
+from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.dsec import DsecEventReader, open_hdf5
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.images import read_npy
@@ -233,9 +233,8 @@ def _fps(path: Path) -> float:
     if not path.is_file():
         return 10.0
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        fps = float(tree.get("fps", 10.0))
-    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError):
+        fps = float(read_table(path).get("fps", 10.0))
+    except (ConfigError, TypeError, ValueError):
         raise AssetError("no readable 'fps'", where=str(path), accepted="duration and fps as YAML") from None
     if not 0 < fps < 1e6:
         raise AssetError("impossible fps", where=str(path), value=fps)

@@ -69,7 +69,7 @@ def generate(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
     workers: Annotated[Optional[int], typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
     executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
-    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: a local one).")] = None,
+    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
     gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
     devices: Annotated[Optional[str], typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,

@@ -8,6 +8,7 @@ traceback. Programming errors stay ordinary exceptions.
 
 from __future__ import annotations
 
+import errno
 from typing import Any
 
 _MAX_VALUE_CHARS = 120
@@ -30,6 +31,8 @@ class BlinkGLError(Exception):
     """
 
     exit_status = 2
+    passing = False
+    """Whether the same work may succeed when it is tried again without anybody mending anything; see :func:`may_pass`."""
 
     def __init__(self, problem: str, *, where: str | None = None, value: Any = ..., accepted: str | None = None):
         self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
@@ -52,10 +55,33 @@ class AssetError(BlinkGLError):
 class GLError(BlinkGLError):
     """No usable OpenGL, or a shader that does not compile."""
 
+    passing = True  # a card that was reset, or that another process fills
+
 
 class OutputError(BlinkGLError):
     """Output that cannot be written: existing folder, full disk, no permission."""
 
+    passing = True
+
 
 class EventDataError(BlinkGLError):
     """Frames or events outside the emulator's or a format's contract (time order, range, shape)."""
+
+
+_MACHINE_TROUBLE = frozenset({errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EBUSY,
+                              errno.ENODEV, errno.ENXIO, errno.EREMOTEIO, errno.ECONNRESET})
+_BUGS = (TypeError, ValueError, LookupError, ArithmeticError, AttributeError, AssertionError, NameError, ImportError, NotImplementedError)
+
+
+def may_pass(error: BaseException) -> bool:
+    """Whether work that failed with ``error`` is worth another attempt with the same input.
+
+    True for what the machine did: memory, a file system that did not answer (also as the cause of another error: an asset that a network
+    disk would not give), output, OpenGL, and whatever has no name here (moderngl and drivers raise bare exceptions). False for what
+    the input decides alone: configuration, assets, events, and bugs."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _MACHINE_TROUBLE):
+            return True
+        cause = cause.__cause__ or cause.__context__
+    return error.passing if isinstance(error, BlinkGLError) else not isinstance(error, _BUGS)

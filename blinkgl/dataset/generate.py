@@ -39,7 +39,7 @@ def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
     are looked at before any work starts."""
     check_output(out)
     plan = Plan.of(template, num)
-    for task in plan.tasks:
+    for _, task in plan.tasks.present(Path(out)):
         refuse_existing(Path(out) / task.name)
     plan.check_assets()
     with ExitStack() as stack:

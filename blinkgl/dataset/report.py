@@ -37,6 +37,35 @@ def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
     return {"events_cut_by_max_events_per_step": saturated, "events_lost_in_readout": dropped, "events_late_in_readout": late}
 
 
+@dataclass
+class Totals:
+    """What many sequences cost together: as large for a million as for one. ``first`` is the first that was added."""
+
+    count: int = 0
+    first: SequenceReport | None = None
+    simulated_s: float = 0.0
+    frames: int = 0
+    events: int = 0
+    labels: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    total_s: float = 0.0
+
+    def __len__(self) -> int:
+        return self.count
+
+    def add(self, report: SequenceReport) -> Totals:
+        self.count += 1
+        self.first = self.first or report
+        self.simulated_s += report.simulated_s
+        self.frames += report.frames
+        self.events += report.events
+        self.labels += report.labels
+        self.total_s += report.total_s
+        for stage, seconds in report.seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        return self
+
+
 def config_yaml(config: SequenceConfig, index: int) -> str:
     """The resolved configuration as YAML; ``blinkgl generate`` takes it and makes this one sequence again."""
     tree = json.loads(config.model_dump_json())

@@ -31,7 +31,7 @@ from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, digest
 from blinkgl.dataset.report import SequenceReport
-from blinkgl.errors import BlinkGLError, ConfigError, OutputError
+from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
 from blinkgl.gl import GLContext, create_context
 
 Message = dict[str, Any]
@@ -110,7 +110,8 @@ class Maker:
             line = str(error) if isinstance(error, BlinkGLError) else f"{type(error).__name__}: {' '.join(str(error).split())}"
             log.write("failed: " + line)
             log.write(traceback.format_exc())
-            return {"kind": "failed", "task": number, "error": line, "expected": isinstance(error, BlinkGLError), "final": isinstance(error, ConfigError), "stop": _disk_is_full(error)}
+            return {"kind": "failed", "task": number, "error": line, "expected": isinstance(error, BlinkGLError),
+                    "final": not may_pass(error), "stop": _disk_is_full(error)}
         size = sum(p.stat().st_size for p in report.path.rglob("*") if p.is_file())
         log.write(f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} labels, {size} bytes; "
                   + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items()))

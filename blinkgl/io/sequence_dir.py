@@ -85,6 +85,7 @@ class SequenceWriter:
         self.flow_lost: dict[str, int] = {}
         self._with_events = events
         self._files: dict[str, dict[str, Any]] = {}
+        self._promised = {"events.h5"} if events else set()
         self._timestamps: dict[str, list[str]] = {}
         self._flow_h5: dict[str, h5py.File] = {}
         self._failure: list[BaseException] = []
@@ -207,6 +208,7 @@ class SequenceWriter:
             path = self.path(name)
             with output_errors(path):
                 save(path)
+        self._promised.add(name)
         self._submit(task)
 
     # ---- machinery -------------------------------------------------------------------------------------------
@@ -253,6 +255,7 @@ class SequenceWriter:
         path = self.path(f"flow/{direction}.h5")
         with output_errors(path):
             if direction not in self._flow_h5:
+                self._promised.add(f"flow/{direction}.h5")
                 file = self._flow_h5[direction] = h5py.File(path, "w", rdcc_nbytes=0)
                 codec = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
                 for name, array in (("flow", flow), ("valid", valid)):
@@ -276,6 +279,7 @@ class SequenceWriter:
         with output_errors(self.final):
             for file in self._flow_h5.values():
                 file.close()
+            self._check_untouched()
             for path in sorted(self._tmp.rglob("*")):
                 name = path.relative_to(self._tmp).as_posix()
                 if path.is_file() and name not in self._files:
@@ -292,6 +296,14 @@ class SequenceWriter:
             refuse_existing(self.final)
             os.rename(self._tmp, self.final)
             fsync(self.final.parent)
+
+    def _check_untouched(self) -> None:
+        """OutputError when a file that was written is gone or cut: somebody tidied up under us. Half of it must not pass for the whole."""
+        sizes = {name: path.stat().st_size if (path := self._tmp / name).is_file() else None for name in self._promised | self._files.keys()}
+        for name, size in sorted(sizes.items()):
+            if size is None or size != self._files.get(name, {"bytes": size})["bytes"]:
+                raise OutputError(f"{name} was deleted or altered while the sequence was being written", where=str(self.final),
+                                  accepted="a folder that nobody else writes to")
 
     def _discard(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)

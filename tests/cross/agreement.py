@@ -42,10 +42,9 @@ class Findings(list):
             self.append(f"{what}: " + ", ".join(f"{k} {v}" for k, v in values.items()))
 
 
-def of_data_set(out: Path, reports: list[SequenceReport], scratch: Path) -> Findings:
+def of_data_set(out: Path, made: dict[str, SequenceReport], scratch: Path) -> Findings:
     """The run's reports against the files, and every reader of the data set against the others."""
     found = Findings()
-    made = {r.path.relative_to(out).as_posix(): r for r in reports}
     verified = verify_dataset(out, deep=len(made))
     found.expect(verified.clean and not verified.notes, f"verify: {verified.problems} {verified.notes}")
     found.same("sequences", run=sorted(made), verify=sorted(verified.deep), index=[line["path"] for line in read_index(out)])

@@ -23,8 +23,8 @@ _POOLS = {"pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": F
           "textures": {"procedural": ["checks", "fbm"], "variants": 8, "photographs": False, "max_size": 32, "test_fraction": 0.3}}
 _FAST = {"speed": [2, 5], "rotation_rate": [60, 200]}
 _RANDOM = {"kind": "random", **_POOLS, "objects": {"count": 3, "distance": [2, 5]}, "camera_motion": _FAST, "object_motion": _FAST}
-_KEYED = {"keyframes": [{"time": t, "position": [0, 12 * t, 0.1]} for t in (0, 4)], "interpolation": "linear"}
-_CAMERA = {"keyframes": [{"time": t, "position": [-3, 8 * t, 0], "look_at": [0, 8 * t, 0]} for t in (0, 2, 4)]}
+_KEYED = {"keyframes": [{"time": t, "position": [0, 20 * t, 0.1]} for t in (0, 4)], "interpolation": "linear"}
+_CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * t, 0], "look_at": [0, 14 * t, 0]} for t in (0, 2, 4)]}
 _EXPLICIT = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
              "materials": {"checks": {"procedural": "checks", "max_size": 32}},
              "objects": [{"mesh": "box", "material": "checks", **_KEYED}, {"mesh": "ball", "position": [1, 0, 0]}], "camera": _CAMERA}
@@ -75,7 +75,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "readout": {
         "unsaid": NOTHING,
         "ample": {"readout": {"events_per_second": 1e9}},
-        "slow": {"readout": {"events_per_second": 8e3, "row_ns": 50, "queue_events": 30}},
+        "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
     },
     "anti-aliasing": {name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")},
     "images": {**{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")}, "no images": {"labels": {"images": False}}},

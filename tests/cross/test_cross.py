@@ -18,6 +18,7 @@ from blinkgl.dataset.executor import Local
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.work import report_of
 from blinkgl.explain import explain
 from features import (ELSEWHERE, FEATURES, REFUSED, RUN_LEVEL, all_pairs, configuration, covering_rows, merged, options_of_the_schema,
                       options_of_the_table, pairs, refusal)
@@ -39,6 +40,20 @@ def tree(out: Path) -> dict[str, str]:
             for p in sorted(out.rglob("*")) if p.is_file() and p.relative_to(out).parts[0] != ".run"}
 
 
+class Reports(dict):
+    """A run's listener: name -> report of every sequence it made."""
+
+    def begin(self, plan, outcome) -> None:
+        pass
+
+    def message(self, name, message) -> None:
+        if message["kind"] == "done":
+            self[name] = report_of(message)
+
+    def end(self, outcome) -> None:
+        pass
+
+
 # ---- the table --------------------------------------------------------------------------------------------------------
 
 
@@ -58,7 +73,8 @@ def test_every_pair_of_kinds_is_in_a_row():
 
 @pytest.mark.parametrize("pair, said", [pytest.param(pair, said, id=" + ".join(f"{f} {k}" for f, k in pair)) for pair, said in REFUSED.items()])
 def test_what_contradicts_is_refused_in_one_line(assets, tmp_path, capsys, pair, said):
-    path = recipe(assets, "refused", {"g": configuration({"timeline": "uniform", **dict(pair)})})
+    path = assets / "refused.yaml"
+    path.write_text(yaml.safe_dump(configuration(dict(pair))))
     for command in (["generate", str(path), "--out", str(tmp_path / "out")], ["explain", str(path)]):
         assert run(command) == 2
         error = capsys.readouterr().err
@@ -76,10 +92,10 @@ def test_all_agree(assets, tmp_path, batch):
     template = load_run(recipe(assets, f"batch{batch}", groups))
     plan = Plan.of(template)
     out = tmp_path / "out"
-    outcome = run_dataset(template, out)
+    outcome = run_dataset(template, out, listener=(reports := Reports()))
     assert outcome.set_aside == {}
-    found = of_data_set(out, outcome.made, tmp_path)
-    reports = {r.path.relative_to(out).as_posix(): r for r in outcome.made}
+    found = of_data_set(out, reports, tmp_path)
+    found.same("events", run=outcome.made.events, reports=sum(r.events for r in reports.values()))
     for task in plan.tasks:
         config = plan.config(task)
         told = explain(plan.by_name[task.group].template, task.index)
@@ -89,8 +105,8 @@ def test_all_agree(assets, tmp_path, batch):
     shutil.rmtree(out / lost)
     with open(out / damaged / "events.h5", "ab") as file:
         file.write(b"x")
-    again = run_dataset(template, out, resume=True)
-    found.same("resume", made=sorted(r.path.relative_to(out).as_posix() for r in again.made), missing=sorted([lost, damaged]))
+    run_dataset(template, out, resume=True, listener=(again := Reports()))
+    found.same("resume", made=sorted(again), missing=sorted([lost, damaged]))
     (out / "report.html").unlink(missing_ok=True)
     found.expect(tree(out) == before, "resume: other bytes")
     # The configuration as drawn, by hand.

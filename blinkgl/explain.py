@@ -6,6 +6,7 @@ is written.
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from dataclasses import dataclass, field
@@ -106,7 +107,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
                               (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
     labels = config.labels
     for name, on, why in (("images", labels.images, "labels.images: false"), ("forward flow", flows and "forward" in labels.flow, "frames.flow: null, or not in "
-                          "labels.flow"), ("occlusion masks", masks and labels.occlusion, "no mask files, or labels.occlusion: false"),
+                          "labels.flow"), ("occlusion masks", masks and labels.occlusion and "forward" in labels.flow, "no mask files, labels.occlusion: false, or no forward flow"),
                           ("preview", config.preview.enabled, "preview.enabled: false")):
         if not on:
             result.left_out.append((name, why))
@@ -159,7 +160,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     event_s = _timed(lambda t: renderer.luminance(t, out=luminance, rate=rate), times)
     fine = samples_of(config.render.antialiasing).stored
     if timeline.kind == "uniform":
-        result.frames = int(duration * timeline.fps) + 1
+        result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:
         strategy = make_timeline(timeline, t0, t1, renderer, response_of(config.events))
         if timeline.kind == "budget":  # a short stretch, for the first measurements of the error

@@ -80,7 +80,7 @@ def of_sequence(folder: Path, manifest: dict[str, Any]) -> Findings:
     if config.readout is None or config.readout.events_per_second >= 1e6:
         found.expect(lost == 0, f"{lost} events lost without a limit")
     else:
-        found.expect(lost > 0, "a slow bus loses nothing")
+        found.expect(lost > 0 or 2e6 * count < config.readout.events_per_second * manifest["duration_us"], "a slow bus loses nothing")
     for direction in ("forward", "backward"):
         for path in sorted((folder / f"flow/{direction}").glob("*.png")):
             flow, valid = read_flow_png(path)
@@ -139,10 +139,17 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
     manifest = read_manifest(report.path)
     files, passes = manifest["files"], {p.name: p for p in told.passes}
     out = dict(told.left_out)
+    recorded = config.frames is not None  # which have no scene, and so none of the labels that are computed from one
     for what, prefix in LEFT_OUT.items():
+        if recorded and what not in ("images", "forward flow", "occlusion masks", "preview"):
+            found.expect(not any(name.startswith(prefix) for name in files), f"frames: {prefix} are there")
+            continue
         there = any(name.startswith(prefix) for name in files)
         found.expect(there != (what in out), f"explain: {what} {'is' if what in out else 'is not'} left out, files {'are' if there else 'are not'} there")
-    if config.frames is not None:
+    if recorded:
+        found.same("emulator", explain=passes["frames and event kernel"].variants[0], manifest=manifest["emulator"])
+        found.same("size", explain=told.scene["frames"].split(", ")[1], manifest=f"{manifest['width']}x{manifest['height']}")
+        found.same("event frames", explain=told.frames, manifest=manifest["frames"])
         return found
     count = lambda prefix, ending: sum(n.startswith(prefix) and n.endswith(ending) for n in files)  # noqa: E731
     events = next(p for name, p in passes.items() if name.startswith("event frames"))
@@ -158,7 +165,9 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
     if config.timeline.kind == "uniform":
         found.same("event frames", explain=told.frames, manifest=manifest["frames"])
     else:
-        found.expect(abs(told.frames - manifest["frames"]) <= max(10, 0.6 * manifest["frames"]), f"event frames: explain {told.frames}, made {manifest['frames']}")
+        # An estimate, from the pace at a few moments of a clip of 40 ms.
+        low, high = sorted((told.frames, manifest["frames"]))
+        found.expect(high <= 10 + 6 * low, f"event frames: explain {told.frames}, made {manifest['frames']}")
     for what, off in (("level of detail", not config.render.lod.enabled), ("anisotropic filtering", config.render.anisotropy == 1),
                       ("anti-aliasing of event frames", config.render.antialiasing == "none"),
                       ("rates of change in the event frames", config.timeline.reconstruction != "hermite")):

@@ -112,6 +112,10 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
 }
 """Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there they are no contradiction."""
 
+TOO_SLOW: set[tuple[Kind, Kind]] = {(one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))}
+"""Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with multi-sampling and anisotropy (beside a
+triangle that ends at the horizon the footprint of a pixel is endless, and it adds up every texel of it)."""
+
 ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit and whether the camera moves",
     "gl": RUN_LEVEL["gl"],
@@ -147,14 +151,19 @@ def refusal(row: dict[str, str]) -> str | None:
     return next((line for (a, b), line in REFUSED.items() if row.get(a[0]) == a[1] and row.get(b[0]) == b[1]), None)
 
 
+def fits(row: dict[str, str]) -> bool:
+    """Whether a row may be made here."""
+    return refusal(row) is None and not any(row.get(a[0]) == a[1] and row.get(b[0]) == b[1] for a, b in TOO_SLOW)
+
+
 def pairs(row: dict[str, str]) -> set[tuple[Kind, Kind]]:
     return set(itertools.combinations(((f, row[f]) for f in FEATURES if f in row), 2))
 
 
 def all_pairs() -> set[tuple[Kind, Kind]]:
-    """Every pair of kinds of two features that is accepted by itself."""
+    """Every pair of kinds of two features that is accepted by itself and not left out."""
     kinds = [(feature, kind) for feature, those in FEATURES.items() for kind in those]
-    return {(a, b) for a, b in itertools.combinations(kinds, 2) if a[0] != b[0] and refusal(dict((a, b))) is None}
+    return {(a, b) for a, b in itertools.combinations(kinds, 2) if a[0] != b[0] and fits(dict((a, b)))}
 
 
 def covering_rows(seed: int = 0, tries: int = 12) -> list[dict[str, str]]:
@@ -172,7 +181,7 @@ def covering_rows(seed: int = 0, tries: int = 12) -> list[dict[str, str]]:
                 def gain(kind: str) -> int:
                     return sum(((f, k), (feature, kind)) in wanted or ((feature, kind), (f, k)) in wanted for f, k in row.items())
 
-                fit = [kind for kind in FEATURES[feature] if refusal({**row, feature: kind}) is None]
+                fit = [kind for kind in FEATURES[feature] if fits({**row, feature: kind})]
                 most = max(map(gain, fit))
                 row[feature] = rng.choice([kind for kind in fit if gain(kind) == most])
             best = max(best, (len(pairs(row) & wanted), row), key=lambda pair: pair[0])

@@ -108,7 +108,8 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     labels = config.labels
     for name, on, why in (("images", labels.images, "labels.images: false"), ("forward flow", flows and "forward" in labels.flow, "frames.flow: null, or not in "
                           "labels.flow"), ("occlusion masks", masks and labels.occlusion and "forward" in labels.flow, "no mask files, labels.occlusion: false, or no forward flow"),
-                          ("preview", config.preview.enabled, "preview.enabled: false")):
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             result.left_out.append((name, why))
     result.left_out.append(("backward flow, depth, ids, normals, velocity", "recorded frames bring none"))
@@ -227,7 +228,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
                           ("forward flow", "forward" in labels.flow, "not in labels.flow"),
                           ("backward flow", "backward" in labels.flow, "not in labels.flow"),
                           ("occlusion masks", labels.occlusion and labels.flow, "labels.occlusion: false, or no flow"),
-                          ("preview", config.preview.enabled, "preview.enabled: false")):
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             add(name, key)
     if config.render.antialiasing == "none":

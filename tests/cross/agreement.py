@@ -146,6 +146,7 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
             continue
         there = any(name.startswith(prefix) for name in files)
         found.expect(there != (what in out), f"explain: {what} {'is' if what in out else 'is not'} left out, files {'are' if there else 'are not'} there")
+    found.expect(("the sensor's read-out" in out) == (config.readout is None), "explain: read-out")
     if recorded:
         found.same("emulator", explain=passes["frames and event kernel"].variants[0], manifest=manifest["emulator"])
         found.same("size", explain=told.scene["frames"].split(", ")[1], manifest=f"{manifest['width']}x{manifest['height']}")

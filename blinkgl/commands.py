@@ -31,8 +31,10 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
         return {"emulator": data, "readout": None}
     from blinkgl.config.sensor import load_sensor
 
+    from blinkgl.simulation import emulator_config
+
     camera = load_sensor(sensor)
-    return {"emulator": camera.emulator(data.pop("emulator"), **data), "readout": camera.readout}
+    return {"emulator": emulator_config({**camera.values(data["emulator"]), **data}), "readout": camera.readout}
 
 
 def simulate(source: str, target: str, quiet: bool = False, **options) -> None:

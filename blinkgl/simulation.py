@@ -251,7 +251,7 @@ def emulator_config(emulator: str | Config | dict) -> Config:
         return emulator
     data = {"emulator": emulator} if isinstance(emulator, str) else dict(emulator)
     kind = data.get("emulator", "esim")
-    if kind not in EMULATORS:
+    if not isinstance(kind, str) or kind not in EMULATORS:
         raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(EMULATORS))
     return validate(EMULATORS[kind], data, where=kind)
 

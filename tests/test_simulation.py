@@ -270,3 +270,19 @@ def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
     assert run(command) == 0 and "lost in the sensor's read-out" in capsys.readouterr().out
     assert run([*command[:-1], str(tmp_path / "f.h5"), "--sensor", "kodak"]) == 2
     assert "unknown sensor" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text, overrides, message", [
+    ("{1: 2}", [], "esim: a key is not text"), ("emulator: [esim]", [], "emulator: unknown emulator"), ("emulator: {a: 1}", [], "emulator: unknown emulator"),
+    ("- 1", [], "not a table of keys .got .1..; expected emulator parameters"), ("contrast_threshold: [", [], "not valid YAML"),
+    ("", ["preset=[]"], "esim.preset: unknown key"), ("", ["emulator=v2e", "preset=[]"], "v2e.preset: unknown choice"),
+    ("", ["contrast_threshold={"], "--set contrast_threshold.*not valid YAML"), ("", ["emulator=v2e", "contrast_threshold=many"], "not a number"),
+])
+@pytest.mark.parametrize("sensor", [None, "davis346"])
+def test_emulator_parameters_that_cannot_be_used(tmp_path, text, overrides, message, sensor):
+    from blinkgl.commands import emulator_options
+    from blinkgl.simulation import emulator_config
+
+    (tmp_path / "e.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        emulator_config(emulator_options("esim", str(tmp_path / "e.yaml"), overrides, sensor)["emulator"])

@@ -178,7 +178,7 @@ def manifest_info(config: SequenceConfig, index: int, scene: Scene, gl: GLContex
         "frames": report.frames,
         "labels": report.labels,
         "triangles": triangles,
-        "duration_us": scene.t1_ns // 1000 - scene.t0_ns // 1000,  # as the labels' times are rounded, so that none leaves it
+        "duration_us": scene.t1_ns // 1000 - scene.t0_ns // 1000,  # between whole microseconds, as every time in the files
         "objects": [{"name": o.name, "id": o.instance_id, "category": o.category,
                      "source_hashes": sorted({p.mesh.source_hash for p in o.parts})} for o in scene.objects],
         "scene_log": list(scene.log),

@@ -111,3 +111,9 @@ def test_messages(tmp_path, text, message):
     with pytest.raises(ConfigError) as caught:
         load_run(tmp_path / "run.yaml")
     assert str(caught.value).startswith(message)
+
+
+def test_numbers_that_python_will_not_print():
+    for tree in ({"seed": 10**5000}, {"camera": {"width": -(10**5000)}}, {"camera": {"fov": 10**5000}}, {"labels": {"flow": [10**5000]}}):
+        with pytest.raises(ConfigError, match="thousands of digits"):
+            validate(SequenceConfig, tree)

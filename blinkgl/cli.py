@@ -98,7 +98,8 @@ def verify(
     seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
     base: Annotated[Optional[str], typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
 ) -> None:
-    """Check a data set: manifests, checksums, contents. Exit status 2 when something is wrong."""
+    """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is wrong; what could not be compared
+    is noted, and said in the last line."""
     from blinkgl.dataset.check import verify_and_show
 
     if not verify_and_show(folder, deep=sample if deep else 0, seed=seed, base=base):

@@ -65,6 +65,8 @@ def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
         say(line)
     if report.lost:
         say(f"{report.lost:,} events were lost in the sensor's read-out")
+    if report.late:
+        say(f"{report.late:,} events had not left the sensor's read-out when the frames ended")
     if report.saturated:
         say(f"warning: {report.saturated:,} events were cut by max_events_per_step")
 

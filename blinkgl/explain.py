@@ -6,6 +6,7 @@ is written.
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from dataclasses import dataclass, field
@@ -107,8 +108,9 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
                               (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
     labels = config.labels
     for name, on, why in (("images", labels.images, "labels.images: false"), ("forward flow", flows and "forward" in labels.flow, "frames.flow: null, or not in "
-                          "labels.flow"), ("occlusion masks", masks and labels.occlusion, "no mask files, or labels.occlusion: false"),
-                          ("preview", config.preview.enabled, "preview.enabled: false")):
+                          "labels.flow"), ("occlusion masks", masks and labels.occlusion and "forward" in labels.flow, "no mask files, labels.occlusion: false, or no forward flow"),
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             result.left_out.append((name, why))
     result.left_out.append(("backward flow, depth, ids, normals, velocity", "recorded frames bring none"))
@@ -161,7 +163,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     event_s = _timed(lambda t: renderer.luminance(t, out=luminance, rate=rate), times)
     fine = samples_of(config.render.antialiasing).stored
     if timeline.kind == "uniform":
-        result.frames = int(duration * timeline.fps) + 1
+        result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:
         strategy = make_timeline(timeline, t0, t1, renderer, response_of(config.events))
         if timeline.kind == "budget":  # a short stretch, for the first measurements of the error
@@ -228,7 +230,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
                           ("forward flow", "forward" in labels.flow, "not in labels.flow"),
                           ("backward flow", "backward" in labels.flow, "not in labels.flow"),
                           ("occlusion masks", labels.occlusion and labels.flow, "labels.occlusion: false, or no flow"),
-                          ("preview", config.preview.enabled, "preview.enabled: false")):
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             add(name, key)
     if config.render.antialiasing == "none":

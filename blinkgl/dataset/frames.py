@@ -21,7 +21,7 @@ from blinkgl.config.base import Refused
 from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.clock import StageClock
-from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
+from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png
@@ -112,7 +112,8 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
             video.append(PreviewWriter(writer.path("preview.mp4"), height, width, flow=False, rate_hz=rate, fps=rate / config.preview.slowdown))
         try:
             stream = simulate(given(), emulator=config.events, gamma=frames.gamma, interpolate=frames.interpolate, factor=frames.factor,
-                              max_px=frames.max_px, seed=kernel_seed(config.seed, index, Role.EVENTS), report=counted, on_frame=on_frame)
+                              max_px=frames.max_px, seed=kernel_seed(config.seed, index, Role.EVENTS),
+                              readout=config.readout, report=counted, on_frame=on_frame)
             while True:
                 with clock("events"):
                     events = next(stream, None)
@@ -131,6 +132,7 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
             writer.t_end_us = time_of(len(files) - 1) // 1000
             report.frames, report.events = counted.steps, counted.events
             writer.info.update(_manifest(config, index, folder, files, report, time_of(len(files) - 1)))
+            writer.info.update(losses(counted.saturated, counted.lost, counted.late))
     report.simulated_s = time_of(len(files) - 1) * 1e-9
     report.seconds, report.total_s, report.compile_s = clock.seconds, clock.total, clock.compile_s
     return report

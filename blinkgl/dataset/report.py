@@ -37,6 +37,11 @@ class SequenceReport:
     """what files of the scene ask for and is not drawn, a line per file"""
 
 
+def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
+    """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
+    return {"events_cut_by_max_events_per_step": saturated, "events_lost_in_readout": dropped, "events_late_in_readout": late}
+
+
 @dataclass
 class Totals:
     """What many sequences cost together: as large for a million as for one. ``first`` is the first that was added."""

@@ -162,16 +162,19 @@ def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_blinkgl(root: Path) -> list[Sequence]:
-    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds. Flow is taken from
-    the 16-bit PNG (quantum 1/128 px)."""
+    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds; those without forward flow
+    are passed over. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
     found = []
     indexed = (root / INDEX).is_file()
     folders = [root / line["path"] for line in read_index(root)] if indexed else [m.parent for m in sorted(root.rglob("manifest.json"))]
     for folder in folders:
         if any(part.startswith(".") for part in folder.relative_to(root).parts) or not (folder / "events.h5").is_file():
             continue
-        times = read_times(folder / "flow/forward_timestamps.txt")
+        stamps = folder / "flow/forward_timestamps.txt"
         forward, backward = sorted((folder / "flow/forward").glob("*.png")), sorted((folder / "flow/backward").glob("*.png"))
+        if not forward and not stamps.exists():  # made without flow: there is nothing to learn from it, and nothing wrong with it
+            continue
+        times = read_times(stamps)
         _same_count(folder / "flow/forward", forward, times)
         if backward:
             _same_count(folder / "flow/backward", backward, times)

@@ -224,12 +224,13 @@ def convert(
     format: Annotated[Optional[str], typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
     size: Annotated[Optional[str], typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")] = False,
+    time_unit: Annotated[str, typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's).")] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> None:
     """Convert an event file from one format to another."""
     from blinkgl import commands
 
-    commands.convert(source, target, format=format, size=size, zero_time=zero_time, overwrite=overwrite)
+    commands.convert(source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import errno
 from typing import Any
 
 _MAX_VALUE_CHARS = 120
+_MAX_TEXT_CHARS = 400
 
 
 def _short(value: Any) -> str:
@@ -20,6 +21,12 @@ def _short(value: Any) -> str:
     except ValueError:  # Python prints no whole number of more than 4300 digits
         text = "a number of thousands of digits"
     return text if len(text) <= _MAX_VALUE_CHARS else text[: _MAX_VALUE_CHARS - 1] + "…"
+
+
+def _plain(text: str) -> str:
+    """One readable line: what a file or a key is called may hold anything, and be of any length."""
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return text if len(text) <= _MAX_TEXT_CHARS else f"{text[:_MAX_TEXT_CHARS // 2]}…{text[-_MAX_TEXT_CHARS // 2:]}"
 
 
 class BlinkGLError(Exception):
@@ -39,7 +46,7 @@ class BlinkGLError(Exception):
 
     def __init__(self, problem: str, *, where: str | None = None, value: Any = ..., accepted: str | None = None):
         self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
-        line = f"{where}: {problem}" if where else problem
+        line = f"{_plain(where)}: {_plain(problem)}" if where else _plain(problem)
         if value is not ...:
             line += f" (got {_short(value)})"
         if accepted:

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
 import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
@@ -27,8 +26,8 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.gl import GLContext, create_context
-from blinkgl.io.dsec import open_hdf5
 from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.hdf5 import open_hdf5
 from blinkgl.io.images import read_image, read_npy
 from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
 from blinkgl.io.records import open_regular, shown

@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import h5py
-import hdf5plugin
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
@@ -38,6 +37,7 @@ from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_besi
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.flo import encode_flo
 from blinkgl.io.flow_png import encode_flow_png
+from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 
 MANIFEST = "manifest.json"
@@ -257,15 +257,11 @@ class SequenceWriter:
             if direction not in self._flow_h5:
                 self._promised.add(f"flow/{direction}.h5")
                 file = self._flow_h5[direction] = h5py.File(path, "w", rdcc_nbytes=0)
-                codec = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
                 for name, array in (("flow", flow), ("valid", valid)):
-                    file.create_dataset(name, (0, *array.shape), np.float32 if name == "flow" else np.uint8,
-                                        maxshape=(None, *array.shape), chunks=(1, *array.shape), track_times=False, compression=codec)
+                    blosc_dataset(file, name, (0, *array.shape), np.float32 if name == "flow" else np.uint8, (1, *array.shape))
             file = self._flow_h5[direction]
             for name, array in (("flow", np.where(valid[..., None], flow, np.float32(0))), ("valid", valid)):
-                n = len(file[name])
-                file[name].resize(n + 1, axis=0)
-                file[name][n] = array
+                write_rows(file[name], len(file[name]), array[None])
 
     def _finish(self) -> None:
         self._check()

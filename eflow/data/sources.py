@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import h5py
 import numpy as np
 
 from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError, ConfigError, EventDataError
-from blinkgl.io.dsec import DsecEventReader, open_hdf5
+from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.images import read_npy
 from blinkgl.io.index import INDEX, read_index
 from eflow.data.window import RawSample, Window
@@ -114,10 +114,11 @@ class FolderSource:
 
     def _map(self, path: Path) -> np.ndarray:
         if path not in self._maps:
-            with open_hdf5(path) as file:
-                if "rectify_map" not in file or not isinstance(file["rectify_map"], h5py.Dataset) or file["rectify_map"].ndim != 3:
-                    raise AssetError("no (H, W, 2) dataset 'rectify_map'", where=str(path))
-                self._maps[path] = file["rectify_map"][()].astype(np.float32)
+            with open_hdf5(path) as file, hdf5_errors(path):
+                rectify_map = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(np.float32)
+            if not np.isfinite(rectify_map).all():
+                raise AssetError("rectification map with NaN or infinity", where=str(path))
+            self._maps[path] = rectify_map
         return self._maps[path]
 
     @staticmethod

@@ -13,6 +13,7 @@ import argparse
 import ast
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -78,6 +79,7 @@ def _functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, list[str]]]:
             yield node, [a.arg for a in (*node.args.posonlyargs, *node.args.args)]
 
 
+@cache
 def sentences() -> dict[str, list[str]]:
     """Module -> its sentences, each once, in the order of the source."""
     trees = {p.relative_to(ROOT).as_posix(): ast.parse(p.read_text()) for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))}

@@ -84,6 +84,7 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
         "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit" if lit else "none: every surface is unlit",
         "notes": "; ".join(scene.log) or "–",
+        **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
 
 

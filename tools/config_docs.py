@@ -17,6 +17,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.scene.primitives import BUILDERS, PARAMETERS, parameters
 
 HEADER = """# Every key of the YAML
 
@@ -33,7 +34,21 @@ the group's own keys laid over it, and `enabled: false` leaves a group out (`bli
 
 def page() -> str:
     """The whole page as Markdown."""
-    return HEADER + "".join(_section(SequenceConfig, "", set()))
+    return HEADER + "".join(_section(SequenceConfig, "", set())) + _primitives()
+
+
+def _primitives() -> str:
+    """What `scene.meshes.<name>.parameters` may hold, from the builders' own signatures."""
+    lines = ["\n## Primitives\n\n", "`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, parameters: {radius: 0.2, height: 2}}`. "
+             "All stand upright (z is their axis) and are centred on the origin; sizes are in the world's units (m), before the object's `scale`.\n\n",
+             "| kind | parameters and defaults | what it is |\n|---|---|---|\n"]
+    for kind, build in BUILDERS.items():
+        values = ", ".join(f"`{name}: {list(value) if isinstance(value, tuple) else value}`" for name,
+                           value in parameters(kind).items())
+        lines.append(f"| `{kind}` | {values} | {' '.join((build.__doc__ or '').split()).replace('``', '`')} |\n")
+    lines.append("\n| parameter | meaning |\n|---|---|\n")
+    lines += [f"| `{name}` | {meaning} |\n" for name, meaning in PARAMETERS.items()]
+    return "".join(lines)
 
 
 def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> list[str]:

@@ -6,6 +6,7 @@ whether they exist; the models here only know shapes, units and limits.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, Union
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -95,6 +96,9 @@ class PoolConfig(Config):
         "all", description="'all' or a list of kinds; [] for none")
     variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
     folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
+    up: Literal["auto", "y", "z"] = Field("auto",
+                                          description="the axis of the folders' files that points up; auto: y for glb and gltf, "
+                                          "z for obj, ply, stl. Resting objects stand on it")
     urdfs: Annotated[Literal["auto"] | bool, _one_of(("auto", True, False))] = Field(
         False, description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that the same YAML "
         "gives other scenes there")
@@ -167,6 +171,12 @@ class LightConfig(Config):
                                       "(40 where nothing is random)")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
+    def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
+        """Unit vector towards the sun; the arguments (degrees) stand where the configuration leaves the angle open."""
+        e = math.radians(elevation if self.sun_elevation is None else self.sun_elevation)
+        a = math.radians(azimuth if self.sun_azimuth is None else self.sun_azimuth)
+        return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
+
 
 class RandomSceneConfig(Config):
     """A random world, as in the paper: objects from a pool between sky and ground."""
@@ -223,7 +233,9 @@ class KeyframeConfig(PoseConfig):
 
 
 class KeyedMotionConfig(PoseConfig):
-    """A fixed pose, or key frames; before the first and after the last the pose is held."""
+    """A fixed pose, or key frames; before the first and after the last the pose is held. From one key frame to the
+    next a body turns the shortest way (for ``spline``: near it), so ``euler`` may change by less than 180 degrees per
+    step; whole turns need key frames in between."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
     interpolation: Literal["spline", "linear"] = Field("spline", description="between key frames: C2 spline, or straight lines and slerp")
@@ -237,6 +249,14 @@ class KeyedMotionConfig(PoseConfig):
             raise ValueError("the key frames' times must increase by at least 1e-6 s")
         if times and (self.model_fields_set & {"position", "quaternion", "euler", "look_at"}):
             raise ValueError("give a fixed pose or keyframes, not both")
+        for k, (a, b) in enumerate(zip(self.keyframes, self.keyframes[1:])):
+            if all(key.quaternion is None and key.look_at is None for key in (a, b)):
+                # Between poses the body turns the shortest way: half a turn has no shortest way, and more would go
+                # back.
+                steps = [abs(v - u) for u, v in zip(a.euler or (0, 0, 0), b.euler or (0, 0, 0))]
+                if max(steps) >= 180:
+                    raise ValueError(f"euler changes by {max(steps):g} degrees about {'xyz'[steps.index(max(steps))]} from key frame {k} to {k + 1}; "
+                                     "it must be less than 180 (add key frames in between)")
         return self
 
 
@@ -245,8 +265,12 @@ class MeshConfig(Config):
 
     primitive: Literal[PrimitiveKind, "grid"] | None = Field(None, description="kind of primitive")
     parameters: dict[str, Annotated[int | float | Vector3, BeforeValidator(_number_or_three)]] = Field(
-        {}, description="the primitive's keyword arguments, see blinkgl.scene.primitives")
+        {}, description="the primitive's sizes and numbers of faces: see [primitives](#primitives)")
     file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
+    up: Literal["auto", "y", "z"] = Field("auto",
+                                          description="the file's axis that points up, which becomes the world's z: with y, the file's "
+                                          "(x, y, z) is drawn at (x, -z, y). auto: y for glb and gltf, as their standard says; z (the file's own "
+                                          "coordinates) for obj, ply, stl")
     project_uvs: bool = Field(False, description="replace the file's texture coordinates by a box projection")
     uv_size: float = Field(1.0, gt=0, description="edge of one repeat of projected texture coordinates, in the mesh's units")
 
@@ -256,6 +280,8 @@ class MeshConfig(Config):
             raise ValueError("give exactly one of primitive and file")
         if self.file is not None and self.parameters:
             raise ValueError("parameters belong to a primitive, not to a file")
+        if self.file is None and self.up != "auto":
+            raise ValueError("up belongs to a file, not to a primitive")
         return self
 
 
@@ -306,7 +332,9 @@ class ExplicitSceneConfig(Config):
 
 
 class FileSceneConfig(Config):
-    """A finished glTF/GLB scene with its cameras, materials and node animations."""
+    """A finished glTF/GLB scene with its cameras, materials and node animations. The file's y axis points up, as its
+    standard says, and is drawn as the world's z: the file's (x, y, z) is at (x, -z, y). Poses given here are in that
+    z-up world."""
 
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")

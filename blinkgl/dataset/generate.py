@@ -67,6 +67,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
     with clock("scene"):
         scene = build_scene(config.scene, config.camera, t0_ns, t1_ns, split=config.output.split, seed=config.seed,
                             sequence=index, base=base)
+    report.omissions = scene.omissions
     with (
         Renderer(gl, scene, config.render) as renderer,
         SequenceWriter(report.path, scene.camera.height, scene.camera.width, config_yaml=config_yaml(config, index),
@@ -182,4 +183,5 @@ def manifest_info(config: SequenceConfig, index: int, scene: Scene, gl: GLContex
         "objects": [{"name": o.name, "id": o.instance_id, "category": o.category,
                      "source_hashes": sorted({p.mesh.source_hash for p in o.parts})} for o in scene.objects],
         "scene_log": list(scene.log),
+        "not_drawn": list(scene.omissions),
     }

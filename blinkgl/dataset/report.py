@@ -31,6 +31,8 @@ class SequenceReport:
     total_s: float = 0.0
     timeline: dict = field(default_factory=dict)
     """what an adaptive timeline says it achieved"""
+    omissions: tuple[str, ...] = ()
+    """what files of the scene ask for and is not drawn, a line per file"""
 
 
 def config_yaml(config: SequenceConfig, index: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from rich.console import Console
@@ -18,6 +19,8 @@ from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 
 STAGES = ("scene", "render", "read-back", "events", "write", "preview")
+MAX_NOTES = 20
+"""Files of which it is said what is not drawn; beyond, that there are more."""
 SET_ASIDE = 3
 """Exit status of a run that is over but lacks sequences."""
 
@@ -46,6 +49,7 @@ class Display:
         self._tasks: dict[str, TaskID] = {}
         self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames, events of what is being made
         self._done = self._frames = self._events = self._bytes = self._given_up = 0
+        self._notes: set[str] = set()
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
         self._todo, self._outcome, self._started = len(plan.tasks) - outcome.found, outcome, time.monotonic()
@@ -58,6 +62,7 @@ class Display:
 
     def message(self, name: str, message: Message) -> None:
         kind = message["kind"]
+        self._note(message.get("omissions") or message.get("report", {}).get("omissions") or ())
         if kind == "progress":
             self._at_work[name] = (message["fraction"], message["frames"], message["events"])
             if name not in self._tasks:
@@ -98,6 +103,17 @@ class Display:
             if expected - self._bytes > room:
                 parts.append(f"DISK: only {_size(room)} free")
         return ", ".join(parts)
+
+    def _note(self, lines: Iterable[str]) -> None:
+        """Says what is not drawn, once, however many sequences and workers use the file."""
+        for line in lines:
+            if line in self._notes:
+                continue
+            self._notes.add(line)
+            if len(self._notes) <= MAX_NOTES:
+                self._say(f"note: {line}")
+            elif len(self._notes) == MAX_NOTES + 1:
+                self._say("note: more files ask for what is not drawn; the manifests name them under not_drawn")
 
     def _say(self, text: str) -> None:
         self._console.print(text, highlight=False, soft_wrap=True, markup=False)

@@ -4,7 +4,8 @@ A :class:`Job` says what the run is; a :class:`Maker` turns task numbers into se
 (dicts that JSON can carry):
 
     {"kind": "hello", "pid", "environment", "assets"}          ready
-    {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far}
+    {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far,
+     "omissions": what is not drawn}
     {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
     {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use trying again, "stop": nor anything else}
 """
@@ -97,7 +98,7 @@ class Maker:
             if (now := time.monotonic()) - last > _NEWS_EVERY_S:
                 last = now
                 tell({"kind": "progress", "task": number, "frames": report.frames, "events": report.events, "fraction": fraction,
-                      "seconds": dict(report.seconds)})
+                      "seconds": dict(report.seconds), "omissions": list(report.omissions)})
 
         try:
             config = self.plan.config(task)

@@ -17,6 +17,7 @@ from blinkgl.scene.meshes import transform_mesh
 from blinkgl.scene.paths import KeyframePath, StaticPath
 from blinkgl.scene.pool import resolve
 from blinkgl.scene.primitives import BUILDERS
+from blinkgl.scene.reading import contents
 from blinkgl.scene.textures import procedural_texture
 from blinkgl.scene.trajectories import look_rotation
 from blinkgl.scene.types import Material, Part, PosePath, Scene, SceneObject, Texture
@@ -33,6 +34,7 @@ def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, 
     Raises ConfigError (unknown mesh or material name, missing file, bad parameter, name given twice; with ``collisions``,
     bodies that touch at the start) and AssetError."""
     log: list[str] = []
+    omissions: dict[str, None] = {}
     materials = {name: _material(m, base, f"scene.materials.{name}") for name, m in config.materials.items()}
     assets: dict[tuple[str, bool], Asset] = {}
     objects, names = [], set()
@@ -45,6 +47,7 @@ def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, 
         if (item.mesh, own) not in assets:
             assets[item.mesh, own] = _asset(config.meshes[item.mesh], item.mesh, own, base, config.max_faces)
             log += [line for line in assets[item.mesh, own].log if line not in log]
+            omissions.update(dict.fromkeys(assets[item.mesh, own].omissions))
         name = item.name or (item.mesh if item.mesh not in names else f"{item.mesh}#{k}")
         if name in names:
             raise ConfigError("the name is given to two objects", where=f"{where}.name", value=name)
@@ -63,7 +66,8 @@ def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, 
             raise ConfigError(f"{result.at_start[0]}, at the start", where="scene.collisions",
                               accepted="bodies apart at the start, or collisions: false")
         objects, path, log = result.objects, result.camera_path, log + list(result.log)
-    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background, tuple(log))
+    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background,
+                 tuple(log), tuple(omissions))
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
@@ -115,7 +119,8 @@ def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_f
     path = resolve(config.file, base)
     if not path.is_file():
         raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a mesh file")
-    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs, uv_size=config.uv_size)
+    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs,
+                      uv_size=config.uv_size, up=config.up)
 
 
 def _material(config: MaterialConfig, base: Path, where: str) -> Material:
@@ -136,5 +141,5 @@ def _material(config: MaterialConfig, base: Path, where: str) -> Material:
 def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:
     if not path.is_file():
         raise ConfigError("no such file", where=where, value=given, accepted="an image file")
-    data = path.read_bytes()
+    data = contents(path, "image")
     return Texture(decode_image(data, max_size, str(path)), path.name, content_hash(data))

@@ -16,6 +16,7 @@ from blinkgl.scene.types import Mesh
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6        # vertices nearer than this times the extent are one point
 COARSE_WELD_RELATIVE = 1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part by itself
+_MAX_REPEATS = 1e9          # of a texture: float32 has no fraction left, and overflows later
 _MAX_COORDINATE = 1e15      # squares of larger coordinates lose all meaning in float32 and overflow soon after
 
 
@@ -81,7 +82,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
         log.append(f"{label}: the normals are unusable, made new ones")
         normals = None
     if uvs_given:
-        broken = uvs is None or not np.isfinite(uvs[faces]).all()
+        broken = uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all()     # NaN compares false
         if broken or (project_degenerate and uvs_degenerate(vertices, faces, uvs)):
             log.append(f"{label}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones")
             uvs = None

@@ -11,6 +11,7 @@ from blinkgl.config.scene import ExplicitSceneConfig, LightConfig, ObjectsConfig
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
+from blinkgl.scene.types import Light
 from blinkgl.scene.world import make_light, near_corner, pools
 from tests.shared_data import shared
 
@@ -242,3 +243,7 @@ def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_pa
     scene = module.random_world(config(), CAMERA, 0, 10**9, "train", 3, 0, tmp_path)
     assert len(drawn) >= 2 and not np.allclose(drawn[0].pose(5 * 10**8), drawn[1].pose(5 * 10**8))
     assert scene.camera.path is drawn[-1]
+
+
+def test_there_is_one_set_of_light_defaults():
+    assert Light() == make_light(LightConfig()) and Light().sun == LightConfig().sun and Light().sky == LightConfig().sky

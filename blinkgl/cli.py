@@ -17,6 +17,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
+from blinkgl.terminal import never_fail_to_print
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -97,7 +98,8 @@ def verify(
     seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
     base: Annotated[Optional[str], typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
 ) -> None:
-    """Check a data set: manifests, checksums, contents. Exit status 2 when something is wrong."""
+    """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is wrong; what could not be compared
+    is noted, and said in the last line."""
     from blinkgl.dataset.check import verify_and_show
 
     if not verify_and_show(folder, deep=sample if deep else 0, seed=seed, base=base):
@@ -198,7 +200,7 @@ def simulate(
 @app.command()
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
-    b: Annotated[Optional[str], typer.Argument(metavar="B", help="Event file, or frames (video, folder, .npy).")] = None,
+    b: Annotated[Optional[str], typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")] = None,
     frames: Annotated[Optional[str], typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
     out: Annotated[Optional[str], typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
     fps: Annotated[Optional[float], typer.Option(help="Frame rate of the frames.")] = None,
@@ -208,7 +210,7 @@ def compare(
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
 ) -> None:
-    """Compare two recordings, or a recording with frames: counts, rates, intervals, polarity against brightness."""
+    """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against brightness."""
     from blinkgl import commands
 
     commands.compare(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
@@ -236,6 +238,7 @@ def convert(
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:

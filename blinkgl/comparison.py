@@ -1,4 +1,4 @@
-"""Two event recordings side by side, or one against the frames of its scene: how real does a simulation look?
+"""Event recordings side by side, against the frames of their scene, or one by itself: how real does a simulation look?
 
 Everything streams interval by interval; memory is a handful of sensor-sized maps.
 """
@@ -47,6 +47,11 @@ class Side:
     """(K,) change of ln(I + 10) per event: slope through 0 of change on polarity sum"""
 
     @property
+    def size(self) -> str:
+        """"640x480", width first."""
+        return f"{self.counts.shape[1]}x{self.counts.shape[0]}"
+
+    @property
     def on_off_ratio(self) -> float:
         off = self.count - self.on
         return self.on / off if off else float("inf")
@@ -61,7 +66,7 @@ class Side:
 
 @dataclass
 class Comparison:
-    """Result of :func:`compare`. ``b`` is None when a recording was compared with frames only."""
+    """Result of :func:`compare`. ``b`` is None when there was one recording. What is told pixel by pixel is None where the two differ in size."""
 
     edges_us: np.ndarray
     a: Side
@@ -70,6 +75,11 @@ class Comparison:
     """Pearson correlation over the pixels of the event counts of a and b"""
     polarity_correlation: np.ndarray | None = None
     """(K,) Pearson correlation over the pixels of the blurred polarity sums of a and b in each interval"""
+
+    @property
+    def same_size(self) -> bool:
+        """Whether the pixels of two recordings can be compared one by one."""
+        return self.b is not None and self.a.counts.shape == self.b.counts.shape
 
     @property
     def duration_s(self) -> float:
@@ -91,8 +101,10 @@ class Comparison:
         """(quantity, a, b) as text, for a table; quantities of the pair stand in the last column."""
         sides = [self.a] + ([self.b] if self.b else [])
         each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))  # noqa: E731
-        rows = [("events", *each(lambda s: f"{s.count:,}")),
+        rows = [("sensor", *each(lambda s: s.size)),
+                ("events", *each(lambda s: f"{s.count:,}")),
                 ("rate", *each(lambda s: f"{s.count / self.duration_s / 1e6:.4g} M/s")),
+                ("rate of a pixel", *each(lambda s: f"{s.count / self.duration_s / s.counts.size:.4g} Hz")),
                 ("ON / OFF", *each(lambda s: f"{s.on_off_ratio:.3f}")),
                 ("active pixels", *each(lambda s: f"{100 * np.mean(s.counts > 0):.1f} %")),
                 ("median interval of a pixel", *each(lambda s: f"{s.median_iei_us / 1000:.3g} ms"))]
@@ -100,17 +112,18 @@ class Comparison:
             rows += [("polarity sum : Δ ln(I+10), correlation", *each(lambda s: _spread(s.frame_correlation))),
                      ("implied contrast threshold", *each(lambda s: _spread(s.implied_threshold)))]
         if self.b:
-            rows += [("event-rate ratio B / A per interval", "", _spread(self.rate_ratio)),
-                     ("polarity sums A : B per interval, correlation", "", _spread(self.polarity_correlation)),
-                     ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}"),
-                     ("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
+            rows += [("event-rate ratio B / A per interval", "", _spread(self.rate_ratio))]
+            if self.same_size:
+                rows += [("polarity sums A : B per interval, correlation", "", _spread(self.polarity_correlation)),
+                         ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}")]
+            rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
         return rows
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists (maps left out), for JSON."""
         def side(s: Side) -> dict:
             return {k: _plain(v) for k, v in asdict(s).items() if k != "counts"} | {
-                "on_off_ratio": _plain(s.on_off_ratio), "median_iei_us": _plain(s.median_iei_us)}
+                "size": s.size, "on_off_ratio": _plain(s.on_off_ratio), "median_iei_us": _plain(s.median_iei_us)}
         pair = {} if self.b is None else {
             "b": side(self.b), "rate_ratio": _plain(self.rate_ratio), "pixel_correlation": _plain(self.pixel_correlation),
             "polarity_correlation": _plain(self.polarity_correlation), "iei_distance": _plain(self.iei_distance)}
@@ -120,27 +133,25 @@ class Comparison:
 def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames: str | os.PathLike | None = None, fps: float | None = None,
             timestamps: str | os.PathLike | None = None, gamma: str | float = "linear", frame_delay_ms: float = 0.0,
             interval_ms: float = 20.0, zero_time: bool = False) -> Comparison:
-    """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the time they share.
+    """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the time they share; alone, ``a`` is described.
+
+    Recordings of different sensor sizes are described side by side; what needs the same pixels in both is then None.
 
     Intervals are those between frames where frames are given, else ``interval_ms``. ``b`` may itself be frames (a folder, video, .npy of
     frames): anything that is no event file. gamma : of the frames; "linear" takes the codes as intensities, as fits a DAVIS's frames.
     frame_delay_ms : added to the frames' times; a stamp of the exposure's start lags its centre. zero_time : count both recordings from their first event.
 
-    Raises EventDataError: different sensor sizes, no common time. AssetError: unreadable.
+    Raises EventDataError: frames of another size than a recording, no common time. AssetError: unreadable.
     """
     if b is not None and frames is None and not _is_event_file(b):
         b, frames = None, b
-    if b is None and frames is None:
-        raise EventDataError("nothing to compare with", where=str(a), accepted="a second event file, or frames")
     files = [open_events(p).sized() for p in ((a,) if b is None else (a, b))]
-    if len({(f.height, f.width) for f in files}) > 1:
-        raise EventDataError("sensor sizes differ", where=f"{a}, {b}", value=[(f.height, f.width) for f in files])
     spans = [_span(f) for f in files]
     shifts = [s[0] if zero_time else 0 for s in spans]
     start, stop = max(s[0] - d for s, d in zip(spans, shifts)), min(s[1] - d for s, d in zip(spans, shifts))
     changes: Iterator[np.ndarray | None]
     if frames is not None:
-        edges, changes = _frame_intervals(frames, fps, timestamps, gamma, round(frame_delay_ms * 1000), start, stop, files[0])
+        edges, changes = _frame_intervals(frames, fps, timestamps, gamma, round(frame_delay_ms * 1000), start, stop, files)
     else:
         count = int(np.ceil(max(stop - start, 0) / (interval_ms * 1000)))
         edges = start + np.arange(count + 1) * round(interval_ms * 1000)
@@ -153,10 +164,11 @@ def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames:
 
 
 def _accumulate(files: list[EventFile], shifts: list[int], edges: np.ndarray, changes: Iterator[np.ndarray | None]) -> Comparison:
-    shape, intervals = (files[0].height, files[0].width), len(edges) - 1
+    shapes, intervals = [(f.height, f.width) for f in files], len(edges) - 1
+    same = len(files) == 2 and shapes[0] == shapes[1]
     sides = [Side(str(f.path), counts=np.zeros(shape, np.int64), rate_hz=np.zeros(intervals), iei=np.zeros(len(IEI_EDGES_US) - 1, np.int64))
-             for f in files]
-    last = [np.full(shape, -1, np.int64) for _ in files]
+             for f, shape in zip(files, shapes)]
+    last = [np.full(shape, -1, np.int64) for shape in shapes]
     bins = IEI_EDGES_US
     polarity = np.full(intervals, np.nan)
     frame_correlation = np.full((len(files), intervals), np.nan)
@@ -164,13 +176,13 @@ def _accumulate(files: list[EventFile], shifts: list[int], edges: np.ndarray, ch
     with_frames = False
     streams = [_windows(f, edges + d, d) for f, d in zip(files, shifts)]
     for k, (change, *events) in enumerate(zip(changes, *streams)):
-        sums = [np.zeros(shape, np.int32) for _ in files]
+        sums = [np.zeros(shape, np.int32) for shape in shapes]
         for i, e in enumerate(events):
             sides[i].count += len(e)
             sides[i].on += int(np.count_nonzero(e.p))
             sides[i].rate_hz[k] = len(e) / ((edges[k + 1] - edges[k]) * 1e-6)
             _collect(e.x, e.y, e.t, e.p, edges[0], sides[i].counts, sums[i], last[i], sides[i].iei, len(bins) - 1)
-        smooth = [_blurred(s) for s in sums]
+        smooth = [_blurred(s) for s in sums] if same or change is not None else []
         if change is not None:
             with_frames = True
             change = _blurred(change)
@@ -178,13 +190,15 @@ def _accumulate(files: list[EventFile], shifts: list[int], edges: np.ndarray, ch
                 frame_correlation[i, k] = _correlation(s, change)
                 square = float(np.sum(s * s))
                 threshold[i, k] = float(np.sum(s * change)) / square if square else np.nan
-        if len(files) == 2:
+        if same:
             polarity[k] = _correlation(*smooth)
     if with_frames:
         for i, side in enumerate(sides):
             side.frame_correlation, side.implied_threshold = frame_correlation[i], threshold[i]
     if len(files) == 1:
         return Comparison(edges, sides[0], None)
+    if not same:
+        return Comparison(edges, *sides)
     return Comparison(edges, *sides, pixel_correlation=_correlation(sides[0].counts, sides[1].counts), polarity_correlation=polarity)
 
 
@@ -236,14 +250,14 @@ def _span(file: EventFile) -> tuple[int, int]:
     return first, last + 1
 
 
-def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, stop: int, file: EventFile):
+def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, stop: int, files: list[EventFile]):
     """Edges (µs) of the frame intervals inside [start, stop) and, lazily, the change of ln(I + 10) over each."""
     from blinkgl.io.frames import open_frames
     from blinkgl.simulation import Decoder
     source = open_frames(path, fps=fps, timestamps=timestamps)
-    if (source.height, source.width) != (file.height, file.width):
-        raise EventDataError("frames and sensor differ in size", where=f"{path}, {file.path}",
-                             value=[(source.height, source.width), (file.height, file.width)])
+    if any((f.height, f.width) != (source.height, source.width) for f in files):
+        sizes = "; ".join(f"{name}: {width}x{height}" for name, width, height in [(path, source.width, source.height), *((f.path, f.width, f.height) for f in files)])
+        raise EventDataError(f"frames and recordings differ in size ({sizes})", where="compare", accepted="frames of the recordings' size")
     # The first interval may begin a little before the first event, the last end a little after the last one.
     slack = lambda a, b: (b - a) // 4  # noqa: E731
     times = np.array([t // 1000 + delay_us for _, t, _ in source], np.int64)
@@ -342,10 +356,13 @@ def plot(result: Comparison, path: str | os.PathLike) -> None:
     if result.polarity_correlation is not None:
         ax.plot(middle, result.polarity_correlation, "s--", ms=3, color="0.35", label="A : B")
     ax.set(title="polarity sum per interval, correlation", xlabel="time [s]", ylim=(min(0, *ax.get_ylim()), 1))
-    ax.legend(frameon=False, fontsize=9)
+    if ax.get_lines():
+        ax.legend(frameon=False, fontsize=9)
+    else:
+        ax.axis("off")
 
     ax = axes[1, 2]
-    if result.b:
+    if result.same_size:
         limit = int(top) + 1
         joint = np.histogram2d(np.minimum(result.a.counts, limit).ravel(), np.minimum(result.b.counts, limit).ravel(),
                                bins=min(limit + 1, 60), range=[[0, limit + 1]] * 2)[0]
@@ -353,8 +370,9 @@ def plot(result: Comparison, path: str | os.PathLike) -> None:
         ax.plot([0, limit + 1], [0, limit + 1], ":", color="#d1495b", lw=1)
         ax.set(title=f"events per pixel, r = {result.pixel_correlation:.3f}", xlabel="A", ylabel="B")
     else:
-        axes[0, 2].axis("off")
         ax.axis("off")
+    if result.b is None:
+        axes[0, 2].axis("off")
     for ax in (axes[0, 0], axes[1, 0], axes[1, 1]):
         ax.spines[["top", "right"]].set_visible(False)
         ax.grid(alpha=0.25)

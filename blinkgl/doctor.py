@@ -18,6 +18,7 @@ from importlib import metadata
 import numpy as np
 
 from blinkgl import __version__
+from blinkgl.cpu import bf16_instructions
 from blinkgl.errors import BlinkGLError
 from blinkgl.extras import EXTRAS, install, python
 
@@ -241,6 +242,7 @@ def _numba() -> Iterator[Check]:
     yield _try(section, "numba", version, mend)
     yield _try(section, "threads", threads, mend)
     yield _try(section, "SIMD", simd, mend)
+    yield Check(section, "bf16", "info", bf16_instructions() or "no instructions for it: eflow computes in fp32, whatever a recipe says")
 
 
 def _codecs() -> Iterator[Check]:

@@ -12,6 +12,7 @@ import typer
 from blinkgl import __version__
 from blinkgl.cli import _user_line
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.terminal import never_fail_to_print
 from blinkgl.extras import EXTRAS, install
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -74,6 +75,7 @@ def evaluate(
 
     _one_of("--empty", empty, ("error", "skip"))
     model = _model(checkpoint, device, raw, precision, iterations)
+    precision = _precision(model, precision)
     source = open_source(dataset, _format(format), dt=dt)
     console = plain_console(stderr=True)
     with console.status("evaluating") as status:
@@ -111,6 +113,7 @@ def predict(
 
     _one_of("--empty", empty, ("error", "zero"))
     model = _model(checkpoint, device, raw, precision, iterations)
+    precision = _precision(model, precision)
     file = infer.open_sized(events, _size(size))
     if whole:
         window, factor = infer.whole_file(file)
@@ -173,6 +176,7 @@ def submit(
 
     _one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
     model = _model(checkpoint, device, False, precision)
+    precision = _precision(model, precision)
     with plain_console(stderr=True).status("predicting") as status:
         options = {"precision": precision, "progress": lambda i, n: status.update(f"{i}/{n} flows")}
         count = submit_dsec(model, dataset, out, **options) if benchmark == "dsec" else submit_blinkflow(model, dataset, out, full=full, **options)
@@ -238,6 +242,12 @@ def _model(checkpoint: str, device: str, raw: bool, precision: str, iterations: 
     return model.to("cuda" if device != "cpu" and torch.cuda.is_available() else "cpu")
 
 
+def _precision(model, wanted: str) -> str:
+    from eflow.precision import precision_on
+
+    return precision_on(next(model.parameters()).device, wanted)
+
+
 def _format(name: str) -> str:
     from eflow.data.sources import FORMATS
 
@@ -262,6 +272,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:

@@ -4,25 +4,38 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 
 from rich.progress import BarColumn, Progress
 
 from blinkgl.terminal import plain_column, plain_console
 
-_QUIET_S = 15.0
+_QUIET_S = 10.0
+"""Seconds between lines where there is no terminal."""
 
 
 class TrainProgress:
-    """Shows step, loss, EPE (smoothed), samples/s and time left. ``rate``: samples/s over the last steps."""
+    """Shows step, loss, EPE (smoothed), samples/s and time left: until the last step or, where that comes first, the time limit.
+    The first line comes before the first step, the next after it.
 
-    def __init__(self, steps: int, start: int, batch: int, enabled: bool):
-        self.steps, self.batch, self.enabled = steps, batch, enabled
+    where : device and precision, in words.   minutes : time limit, counted from ``began`` (s on ``clock``).
+    rate : samples/s over the last steps."""
+
+    def __init__(self, steps: int, start: int, batch: int, enabled: bool, where: str = "", minutes: float | None = None,
+                 began: float | None = None, clock: Callable[[], float] = time.monotonic):
+        self.steps, self.batch, self.enabled, self._clock = steps, batch, enabled, clock
         self.rate, self._loss, self._epe = 0.0, None, None
-        self._step, self._time, self._said = start, time.monotonic(), 0.0
+        self._step, self._time, self._said = start, clock(), -float("inf")
+        began = self._time if began is None else began
+        self._deadline = None if minutes is None else began + 60 * minutes
+        self._where = where
         self._console = plain_console(file=sys.stderr)
 
     def __enter__(self) -> "TrainProgress":
         self._live = None
+        if self.enabled:
+            limit = "" if self._deadline is None else f", {_hms(self._deadline - self._clock())} at most"
+            self._print(f"training: {self.steps - self._step} steps of {self.batch} samples on {self._where}{limit}")
         if self.enabled and self._console.is_terminal:
             self._live = Progress(plain_column("step {task.completed}/{task.total}"), BarColumn(), plain_column("{task.fields[text]}"), console=self._console)
             self._task = self._live.add_task("train", total=self.steps, completed=self._step, text="")
@@ -30,7 +43,7 @@ class TrainProgress:
         return self
 
     def update(self, step: int, loss: float, epe: float) -> None:
-        now = time.monotonic()
+        now = self._clock()
         speed = (step - self._step) * self.batch / max(now - self._time, 1e-9)
         self.rate = speed if self.rate == 0 else 0.9 * self.rate + 0.1 * speed
         self._loss = loss if self._loss is None else 0.95 * self._loss + 0.05 * loss
@@ -38,17 +51,26 @@ class TrainProgress:
         self._step, self._time = step, now
         if not self.enabled:
             return
-        left = (self.steps - step) * self.batch / max(self.rate, 1e-9)
-        text = f"loss {self._loss:.2f}  EPE {self._epe:.2f} px  {self.rate:.2f} samples/s  {_hms(left)} left"
+        text = f"loss {self._loss:.2f}  EPE {self._epe:.2f} px  {self.rate:.2f} samples/s  {self._left(now)}"
         if self._live is not None:
             self._live.update(self._task, completed=step, text=text)
-        elif now - self._said > _QUIET_S or step == self.steps:
+        elif now - self._said >= _QUIET_S or step == self.steps:
             self._said = now
-            print(f"step {step}/{self.steps}  {text}", file=sys.stderr, flush=True)
+            self._print(f"step {step}/{self.steps}  {text}")
+
+    def _left(self, now: float) -> str:
+        left = (self.steps - self._step) * self.batch / max(self.rate, 1e-9)
+        if self._deadline is None or now + left <= self._deadline:
+            return f"{_hms(left)} left"
+        left = max(self._deadline - now, 0.0)
+        return f"{_hms(left)} left, the time limit, at about step {self._step + int(left * self.rate / self.batch)}"
+
+    def _print(self, line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
 
     def note(self, step: int, scores: dict[str, float]) -> None:
         """A validation result."""
-        self._time = time.monotonic()  # validation is not training time
+        self._time = self._clock()  # validation is not training time
         if self.enabled:
             line = f"step {step}  " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items())
             self._live.console.print(line) if self._live is not None else print(line, file=sys.stderr, flush=True)

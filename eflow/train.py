@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.distributed as dist
-import yaml
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from blinkgl.config.reader import to_yaml
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
@@ -39,6 +39,7 @@ from eflow.losses import sequence_loss
 from eflow.metrics import frame_metrics
 from eflow.models import FlowModel, build_model
 from eflow.pictures import comparison, events_of, write_picture
+from eflow.precision import precision_on
 from eflow.progress import TrainProgress
 
 
@@ -72,6 +73,8 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
     out = Path(out)
     rank, world, device = _setup(config)
     lead = rank == 0
+    precision = precision_on(device, config.run.precision, quiet=not lead)
+    config = config.model_copy(update={"run": config.run.model_copy(update={"precision": precision})})
     if lead:
         importlib.import_module("torch.utils.tensorboard")  # where it is missing, nothing has been written yet
     if lead and not resume:
@@ -114,7 +117,8 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
     def save() -> Path:
         return ckpt.save_checkpoint(out, step, model, ema, optimizer, {"config": json.loads(config.model_dump_json())}, config.run.keep_checkpoints)
 
-    with _Signals() as signals, _Log(out, start, enabled=lead) as log, TrainProgress(steps, start, config.data.batch, enabled=lead and not quiet) as progress:
+    with _Signals() as signals, _Log(out, start, enabled=lead) as log, TrainProgress(
+            steps, start, config.data.batch, enabled=lead and not quiet, where=f"{device.type}, {precision}", minutes=config.run.time_limit, began=began) as progress:
         for batch in batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"):
             rate = learning_rate(step, steps, config.optim.lr, config.optim.warmup)
             for group in optimizer.param_groups:
@@ -138,13 +142,14 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
                 log.write(step, "train", loss=loss_value, epe=epe, lr=rate, grad_norm=float(norm), samples_per_s=progress.rate)
             if lead and step % config.run.picture_every == 0:
                 _picture(out / "pictures" / f"{step:09d}.png", batch, flow)
-            if lead and validation and (step % config.run.validate_every == 0 or step == steps):
-                scores = validate(model, ema, validation, config.run.precision)
-                log.write(step, "validation", **scores)
-                progress.note(step, scores)
             reason = signals.reason or ("time limit" if _over(began, config.run.time_limit) else None) or ("stop" if last and step < steps else reason)
             if world > 1 and not last:
                 reason = _agree(reason, device)
+            ended = step == steps or reason == "time limit"  # the clock ends a training as its last step does; a signal is in a hurry
+            if lead and validation and (step % config.run.validate_every == 0 or ended):
+                scores = validate(model, ema, validation, config.run.precision)
+                log.write(step, "validation", **scores)
+                progress.note(step, scores)
             if lead and (step % config.run.checkpoint_every == 0 or last or reason != "finished"):
                 path = save()
             if reason != "finished":
@@ -339,7 +344,7 @@ def _agree(reason: str, device: torch.device) -> str:
 
 def _write_config(out: Path, config: TrainConfig) -> None:
     with atomic_file(out / "config.yaml") as path, output_errors(path):
-        Path(path).write_text(yaml.safe_dump(json.loads(config.model_dump_json()), sort_keys=False), encoding="utf-8")
+        Path(path).write_text(to_yaml(json.loads(config.model_dump_json())), encoding="utf-8")
 
 
 class _Signals:

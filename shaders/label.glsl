@@ -6,7 +6,8 @@
 //   OUT_ID        instance id (0: nothing hit)   OUT_NORMAL    unit normal, camera axes, facing it
 //   OUT_VELOCITY  px/s                           OUT_FLOW_FORWARD, OUT_FLOW_BACKWARD
 //                                                (u, v in px, Z at the other time; 0 in .w of unwritten pixels)
-// Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED.
+// Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED. SHOW_LOOKUP, the shader debugger's, goes with
+// OUT_COLOUR 0: see lookup.glsl.
 
 #if defined(OUT_COLOUR) && defined(LIT) || defined(OUT_NORMAL)
 #define NEEDS_NORMAL
@@ -50,6 +51,9 @@ void main()
 #endif
 
 #ifdef FRAGMENT_SHADER
+#ifdef SHOW_LOOKUP
+#include "lookup.glsl"
+#endif
 #ifdef NEEDS_NORMAL
 in vec3 normal;
 #endif
@@ -111,7 +115,15 @@ void main()
     radiance *= texture(albedo, uv).rgb;
 #endif
 #ifdef LIT
-    radiance *= irradiance(facing);
+    float light = irradiance(facing);
+#else
+    const float light = 1.0;
+#endif
+#ifdef SHOW_LOOKUP
+    show_lookup(radiance, light);
+#endif
+#ifdef LIT
+    radiance *= light;
 #endif
     colour = vec4(radiance, 1.0);
 #endif

@@ -7,6 +7,7 @@
 //            TWO_SIDED  the normal is turned towards the camera on back faces
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's pixels
+//            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT))
 #define CHANGES
@@ -44,6 +45,9 @@ void main()
 #endif
 
 #ifdef FRAGMENT_SHADER
+#ifdef SHOW_LOOKUP
+#include "lookup.glsl"
+#endif
 #ifdef RATE
 layout(location = 0) out vec2 result;
 #else
@@ -113,6 +117,13 @@ void main()
 #endif
 #ifdef LIT
     change = change * light + luminance * irradiance_rate(facing, seen_rate(facing, motion));
+#endif
+#endif
+#ifdef SHOW_LOOKUP
+#ifdef LIT
+    show_lookup(vec3(luminance), light);
+#else
+    show_lookup(vec3(luminance), 1.0);
 #endif
 #endif
 #ifdef LIT

@@ -17,10 +17,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from blinkgl.bench import machine_line
-from blinkgl.config.sequence import apply_overrides, load_run
+from blinkgl.config.reader import to_yaml
+from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
 
 BASE = {
@@ -65,7 +65,7 @@ def sums(folder: Path) -> dict[str, str]:
 def sequence(overrides: list[str], scratch: Path) -> dict[str, str]:
     """One rendered sequence of BASE with overrides."""
     recipe = scratch / "recipe.yaml"
-    recipe.write_text(yaml.safe_dump(BASE))
+    recipe.write_text(to_yaml(BASE))
     for _ in generate_run(load_run(recipe, overrides), scratch / "out"):
         pass
     return sums(scratch / "out")

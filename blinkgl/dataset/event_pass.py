@@ -18,14 +18,16 @@ class EventPass:
     """Iterates over (t_ns, events): all events up to t_ns that have not been given before. Frames are drawn as it goes.
 
     timeline, events : ``timeline:`` and ``events:`` configurations.   seed : of the emulator's draws.
-    clock : gets the seconds of the emulator as "events".
+    clock : gets the seconds of the emulator as "events".   window_ns : first and last time; default: the scene's.
 
     emulator : Emulator.   timeline : Timeline, with what it achieved in ``info()``.   frames : drawn so far."""
 
-    def __init__(self, timeline, events, renderer: Renderer, seed: int, clock: StageClock | None = None):
+    def __init__(self, timeline, events, renderer: Renderer, seed: int, clock: StageClock | None = None,
+                 window_ns: tuple[int, int] | None = None):
         self.renderer, self._clock = renderer, clock or StageClock()
         self.emulator: Emulator = make_emulator(events, renderer.height, renderer.width, seed, timeline.reconstruction)
-        self.timeline = make_timeline(timeline, renderer.scene.t0_ns, renderer.scene.t1_ns, renderer, response_of(events))
+        first_ns, last_ns = window_ns or (renderer.scene.t0_ns, renderer.scene.t1_ns)
+        self.timeline = make_timeline(timeline, first_ns, last_ns, renderer, response_of(events))
         self.frames = 0
 
     def __iter__(self) -> Iterator[tuple[int, Events]]:

@@ -20,7 +20,7 @@ from blinkgl.dataset.event_pass import EventPass
 from blinkgl.dataset.frames import convert_sequence
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
-from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
+from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.events.readout import Readout
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
@@ -84,7 +84,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
         flushing = StageClock()  # leaving the block waits for the writers' threads and syncs the files
     clock.add("write", flushing.total)
     report.simulated_s = (t1_ns - t0_ns) * 1e-9
-    report.total_s = clock.total
+    report.total_s, report.compile_s = clock.total, clock.compile_s
     return report
 
 
@@ -98,7 +98,7 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
         for t_ns, events in frames:
             if readout is not None:
                 with clock("events"):
-                    events = readout.step(events)
+                    events = readout.step(events, t_ns // 1000)
             with clock("write"):
                 writer.append_events(events)
             preview.add_events(events)
@@ -111,8 +111,8 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
                 progress(report, (t_ns - t0_ns) / (t1_ns - t0_ns))
     report.timeline = frames.timeline.info()
     writer.info["timeline"] = {"kind": config.timeline.kind, "reconstruction": config.timeline.reconstruction, **report.timeline}
-    writer.info["events_cut_by_max_events_per_step"] = frames.emulator.saturated
-    writer.info["events_lost_in_readout"] = readout.dropped if readout is not None else 0
+    dropped, late = (readout.dropped, readout.late) if readout is not None else (0, 0)
+    writer.info.update(losses(frames.emulator.saturated, dropped, late))
 
 
 def _write_labels(config: SequenceConfig, renderer: Renderer, writer: SequenceWriter, clock: StageClock,
@@ -179,7 +179,7 @@ def manifest_info(config: SequenceConfig, index: int, scene: Scene, gl: GLContex
         "frames": report.frames,
         "labels": report.labels,
         "triangles": triangles,
-        "duration_us": (scene.t1_ns - scene.t0_ns) // 1000,
+        "duration_us": scene.t1_ns // 1000 - scene.t0_ns // 1000,  # between whole microseconds, as every time in the files
         "objects": [{"name": o.name, "id": o.instance_id, "category": o.category,
                      "source_hashes": sorted({p.mesh.source_hash for p in o.parts})} for o in scene.objects],
         "scene_log": list(scene.log),

@@ -8,19 +8,18 @@ import os
 import re
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import yaml
-
-from blinkgl.config.draw import extremes
 from blinkgl.config.base import validate
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import matching_folders
-from blinkgl.errors import ConfigError, OutputError
+from blinkgl.dataset.frames import matching_folders, used_images
+from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
 from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.mesh_files import dependencies
@@ -163,13 +162,14 @@ class Plan:
 
     def recipe_text(self) -> str:
         """The recipe with all overrides, as YAML that ``load_run`` takes."""
-        return yaml.safe_dump(self.template.tree, sort_keys=False, allow_unicode=True)
+        return to_yaml(self.template.tree)
 
 
 def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
     base = group.template.base
-    for tree in extremes(group.template.tree):
-        config = validate(SequenceConfig, tree)
+    # What check_assets looks at, and which folders there are.
+    for config in group.template.corners_of("frames", "scene.kind", "scene.pool", "scene.textures", "scene.sky", "scene.objects.count",
+                                            "scene.meshes", "scene.materials", "scene.path"):
         if config.frames is not None:
             folders = matching_folders(config.frames, base)
             last = group.first + count - 1
@@ -177,6 +177,8 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
                 raise ConfigError(f"{len(folders)} folders are too few for sequence {last}", where="frames.folders",
                                   value=list(config.frames.folders), accepted=f"at least {last + 1} folders, or fewer output.sequences")
             for folder in folders:
+                with suppress(AssetError):  # one bad folder is set aside alone; frames too far apart are the recipe's fault
+                    used_images(config.frames, folder)
                 for path in sorted(folder.rglob("*")):
                     if path.is_file():
                         hashes[f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"] = f"{path.stat().st_size} bytes"

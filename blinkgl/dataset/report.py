@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import yaml
-
 import blinkgl
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import SequenceConfig
 
 Progress = Callable[["SequenceReport", float], None]
@@ -29,10 +28,18 @@ class SequenceReport:
     labels: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     total_s: float = 0.0
+    """without ``compile_s``"""
+    compile_s: float = 0.0
+    """compiling kernels; 0 but for a machine's first sequence of a kind"""
     timeline: dict = field(default_factory=dict)
     """what an adaptive timeline says it achieved"""
     omissions: tuple[str, ...] = ()
     """what files of the scene ask for and is not drawn, a line per file"""
+
+
+def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
+    """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
+    return {"events_cut_by_max_events_per_step": saturated, "events_lost_in_readout": dropped, "events_late_in_readout": late}
 
 
 @dataclass
@@ -72,4 +79,4 @@ def config_yaml(config: SequenceConfig, index: int) -> str:
         tree.pop("frames", None)
     return (f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
             "# Relative paths start from the folder of the run's own configuration file.\n"
-            + yaml.safe_dump(tree, sort_keys=False))
+            + to_yaml(tree))

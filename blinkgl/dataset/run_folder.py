@@ -21,17 +21,56 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from blinkgl.dataset.plan import Plan, Task
 from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
-from blinkgl.errors import OutputError
+from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
+from blinkgl.io.records import parse, read_text
 from blinkgl.io.sequence_dir import verify_sequence
 
 FORMAT = "blinkgl-run"
 _FORSAKEN_S = 3600.0
 _TEMPORARY = re.compile(r"^\.(.+)\.blinkgl-tmp-")
+
+
+class _Run(BaseModel):
+    """``run.json``."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    format: Literal["blinkgl-run"]
+    format_version: Literal[1]
+    groups: dict[str, str]
+    environment: dict[str, str]
+    mixed: list[dict[str, dict[str, str]]] = []
+    base: str = Field(max_length=4096, pattern=r"^[^\x00]*$")
+    num: int | None = Field(None, ge=1, le=10_000_000)
+
+
+_Amount = Annotated[float, Field(ge=0, le=1e18, allow_inf_nan=False)]
+
+
+class _Cost(BaseModel):
+    """A line of ``costs.jsonl``."""
+
+    model_config = ConfigDict(extra="allow")
+    name: str
+    seconds: dict[str, _Amount]
+    total_s: _Amount
+    simulated_s: _Amount
+    frames: _Amount
+    bytes: _Amount
+    cpu_s: _Amount
+    peak_rss_kib: _Amount
+    attempts: _Amount
+
+
+_TABLE = TypeAdapter(dict[str, str])
+_RECORDS = {"run.json": TypeAdapter(_Run), "assets.json": _TABLE, "failed.json": _TABLE}
+_COST = TypeAdapter(_Cost)
 
 
 class RunFolder:
@@ -236,26 +275,24 @@ class RunFolder:
     def costs(self) -> list[dict[str, Any]]:
         """The last line of each sequence; a line cut by a crash is left out."""
         found: dict[str, dict[str, Any]] = {}
-        with contextlib.suppress(OSError, UnicodeDecodeError):
-            for line in (self.path / "costs.jsonl").read_text(encoding="utf-8").splitlines():
-                with contextlib.suppress(ValueError, KeyError, TypeError):
-                    entry = json.loads(line)
+        with contextlib.suppress(FileNotFoundError, AssetError):
+            for line in read_text(self.path / "costs.jsonl").splitlines():
+                with contextlib.suppress(ValueError):
+                    entry = parse(line, _COST)
                     found[entry["name"]] = entry
         return list(found.values())
 
     def read(self, name: str) -> dict[str, Any] | None:
-        """A JSON file of the folder; None when there is none. OutputError when it is damaged."""
+        """A JSON file of the folder, of the shape it has here; None when there is none. OutputError when it is damaged."""
         path = self.path / name
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-            if not isinstance(data, dict):
-                raise ValueError
-            return data
+            return parse(read_text(path), _RECORDS[name])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError) as error:
-            raise OutputError("the run's record is damaged", where=str(path), accepted="a readable file; without it the run cannot be told "
-                              "from another recipe's") from error
+        except (AssetError, ValueError) as error:
+            problem = error.problem if isinstance(error, AssetError) else error
+            raise OutputError(f"the run's record is damaged: {problem}", where=str(path), accepted="a readable file; without it the run "
+                              "cannot be told from another recipe's") from error
 
     def _write(self, name: str, data: dict[str, Any]) -> None:
         with atomic_file(self.path / name) as path, output_errors(path):

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
+from blinkgl.compiling import compiling_line
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Executor
 from blinkgl.dataset.plan import Plan
@@ -135,6 +136,8 @@ def _size(size: float) -> str:
 
 def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
     """The final table, and what was set aside."""
+    if line := compiling_line(max((report.compile_s for report in outcome.made), default=0.0)):  # workers compile at once, or wait for one
+        console.print(line, highlight=False)
     if outcome.made:
         show_table(console, outcome.made, outcome.elapsed_s)
     else:

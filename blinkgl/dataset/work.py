@@ -27,7 +27,8 @@ from pathlib import Path
 from typing import Any
 
 from blinkgl import __version__
-from blinkgl.config.sequence import RunTemplate, parse_yaml
+from blinkgl.config.reader import parse_yaml
+from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, digest
 from blinkgl.dataset.report import SequenceReport

@@ -71,6 +71,7 @@ class Emulator(ABC):
         """Frames taken so far."""
         self.saturated = 0
         """Events cut by ``max_events_per_step`` so far."""
+        self._rows_before: tuple[int, int] | None = None  # of the last step; None: unknown
         self._decode = np.arange(256, dtype=np.float32) / np.float32(255.0)
         self._buffer = PackedBuffer()
         self._blocks = -(-self.height * self.width // BLOCK)
@@ -106,18 +107,25 @@ class Emulator(ABC):
     def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None, rate: np.ndarray | None = None) -> Events:
         """Events since the last frame; see the class.
 
-        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ),
-        and, with ``rate``, that the rates there are 0. Emulators whose still pixels do nothing skip those rows; the events are the same.
+        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ) and, with ``rate``,
+        that the rates there are 0, whatever they were in the frame before. Emulators whose still pixels do nothing skip those rows and do
+        not look at them, neither for events nor for values that cannot be used; the events are the same.
         rate : (H, W) float32, d(luminance)/dt per second at the frame's time (of ``decode[code]`` for uint8). Only ``hermite`` looks
         at it; a value that is not finite counts as 0."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
         rate = self._checked_rate(rate) if self.needs_rate else None
-        first, stop = (0, self.height) if rows is None or self.t_ns is None else rows
-        self._changed = (max(0, first) * self.width, min(self.height, stop) * self.width)
+        whole = (0, self.height)
+        here = whole if rows is None or self.t_ns is None else (max(0, rows[0]), min(self.height, rows[1]))
+        first, stop = here
+        if self.needs_rate:  # where there was a rate in the frame before there is none now: slopes are part of the state
+            before = self._rows_before or whole
+            if before[0] < before[1]:
+                first, stop = (min(first, before[0]), max(stop, before[1])) if first < stop else before
+        self._changed = (first * self.width, stop * self.width)
         self._check_intensity(frame)
         events = self._start(frame, t_ns, rate) if self.t_ns is None else self._advance(frame, t_ns, rate)
-        self.t_ns = t_ns
+        self.t_ns, self._rows_before = t_ns, here
         self.frames += 1
         return events
 
@@ -220,7 +228,7 @@ class Emulator(ABC):
                 raise EventDataError("saved state is of another emulator", where=name, value=(theirs.dtype, theirs.shape))
             mine[...] = theirs
         started, t_ns, self.frames, self.saturated = (int(v) for v in state["clock"])
-        self.t_ns = t_ns if started else None
+        self.t_ns, self._rows_before = t_ns if started else None, None
 
     @property
     def state_bytes_per_pixel(self) -> float:

@@ -14,12 +14,16 @@ import itertools
 import json
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.records import InsidePath, parse, read_text, shown
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest
 
 INDEX = "index.jsonl"
@@ -101,16 +105,25 @@ def _visible(folder: Path) -> Iterator[Path]:
                 yield Path(found.path)
 
 
+class _Line(BaseModel):
+    """What a reader relies on; "." is the path of a folder that is a sequence itself."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    path: Literal["."] | InsidePath
+
+
+_MODEL = TypeAdapter(_Line)
+
+
 def read_index(root: str | Path) -> list[dict[str, Any]]:
-    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, or a path that leaves the data set."""
+    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves the data set or is listed twice."""
     path = Path(root) / INDEX
     try:
-        entries = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
-        for one in entries:
-            if Path(one["path"]).is_absolute() or ".." in Path(one["path"]).parts:
-                raise ValueError
-        return entries
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise AssetError("damaged index", where=str(path), accepted="run 'blinkgl report' to make it anew") from error
+        entries = [parse(line, _MODEL) for line in read_text(path).splitlines() if line]
+    except FileNotFoundError:
+        raise AssetError("no such file", where=str(path)) from None
+    except ValueError as error:
+        raise AssetError(f"damaged index: {error}", where=str(path), accepted="run 'blinkgl report' to make it anew") from None
+    if twice := [name for name, count in Counter(line["path"] for line in entries).items() if count > 1]:
+        raise AssetError(f"damaged index: {shown(twice[0])} is listed twice", where=str(path), accepted="run 'blinkgl report' to make it anew")
+    return entries

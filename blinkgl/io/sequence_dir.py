@@ -24,10 +24,11 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
@@ -37,8 +38,10 @@ from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.flo import encode_flo
 from blinkgl.io.flow_png import encode_flow_png
 from blinkgl.io.hdf5 import blosc_dataset, write_rows
+from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 
 MANIFEST = "manifest.json"
+_LARGEST = 2**62
 _IN_FLIGHT = 8
 """Labels waiting for the encoder thread: bounds memory at a few tens of MB."""
 
@@ -320,53 +323,92 @@ def refuse_existing(final: str | os.PathLike) -> None:
                           accepted="a new folder name")
 
 
+class _File(BaseModel):
+    """A line of the manifest's ``files``."""
+
+    model_config = ConfigDict(strict=True)
+    bytes: int = Field(ge=0, le=_LARGEST)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class Manifest(BaseModel):
+    """What a manifest must look like, wherever it comes from. Further keys are welcome; a key that its maker left out is None."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    format: Literal["blinkgl-sequence"]
+    format_version: Literal[1]
+    height: int = Field(ge=1, le=65536)
+    width: int = Field(ge=1, le=65536)
+    events: int = Field(ge=0, le=_LARGEST)
+    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
+    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
+    seed: int | None = Field(None, ge=0, lt=2**63)
+    sequence: int | None = Field(None, ge=0, le=_LARGEST)
+    split: str | None = Field(None, max_length=255)
+    emulator: str | None = Field(None, max_length=255)
+    blinkgl: str | None = Field(None, max_length=255)
+    labels: int | None = Field(None, ge=0, le=_LARGEST)
+    frames: int | None = Field(None, ge=0, le=_LARGEST)
+    opengl: dict[str, str] | None = None
+    versions: dict[str, str] | None = None
+    files: dict[InsidePath, _File]
+
+
+_MODEL = TypeAdapter(Manifest)
+
+
 def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> list[str]:
     """Problems of a sequence directory against its manifest, one line each; empty when whole.
 
-    Finds missing, foreign, truncated and altered files; an unreadable manifest is one problem. ``checksums=False`` reads no
-    contents, and so misses what was altered without changing its length."""
+    Finds missing, foreign, truncated and altered files, and what is no file: links, pipes, devices, empty folders. An unreadable
+    manifest is one problem. ``checksums=False`` reads no contents, and so misses what was altered without changing its length."""
     folder = Path(folder)
     try:
         files = read_manifest(folder)["files"]
+        present = {name: (kind, size) for name, kind, size in entries_below(folder)}
     except BlinkGLError as error:
         return [str(error)]
+    except OSError as error:
+        return [f"{shown(error.filename)}: cannot be read: {error.strerror}"]
     problems = []
     for name, expected in sorted(files.items()):
-        path = folder / name
-        if not path.resolve().is_relative_to(folder.resolve()):
-            problems.append(f"{name}: path leaves the sequence")
-        elif not path.is_file():
-            problems.append(f"{name}: missing")
-        elif path.stat().st_size != expected["bytes"]:
-            problems.append(f"{name}: {path.stat().st_size} bytes, manifest says {expected['bytes']}")
-        elif checksums and _digest(path)["sha256"] != expected["sha256"]:
-            problems.append(f"{name}: checksum differs")
-    present = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
-    problems += [f"{name}: not in the manifest" for name in sorted(present - set(files) - {MANIFEST})]
+        kind, size = present.get(name, ("", 0))
+        if kind != "file":
+            problems += [f"{shown(name)}: missing"] if not kind else []
+        elif size != expected["bytes"]:
+            problems.append(f"{shown(name)}: {size} bytes, manifest says {expected['bytes']}")
+        elif checksums:
+            try:
+                if _digest(folder / name)["sha256"] != expected["sha256"]:
+                    problems.append(f"{shown(name)}: checksum differs")
+            except (OSError, BlinkGLError) as error:
+                problems.append(f"{shown(name)}: cannot be read: {getattr(error, 'strerror', error)}")
+    for name, (kind, _) in sorted(present.items()):
+        if kind != "file":
+            problems.append(f"{shown(name)}: a {kind}" if kind[0] != "e" else f"{shown(name)}: an {kind}")
+        elif name not in files and name != MANIFEST:
+            problems.append(f"{shown(name)}: not in the manifest")
     return problems
 
 
 def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
-    """The manifest; AssetError when there is none or it is damaged."""
+    """The manifest, of the shape :class:`Manifest` describes; AssetError when there is none or it is damaged."""
     path = Path(folder) / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        files = manifest["files"]
-        if not all(isinstance(f["bytes"], int) and isinstance(f["sha256"], str) for f in files.values()):
-            raise ValueError
-    except OSError as error:
-        raise AssetError(f"no manifest: {error.strerror}", where=str(path)) from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise AssetError("damaged manifest", where=str(path)) from error
-    return manifest
+        return parse(read_text(path), _MODEL)
+    except FileNotFoundError:
+        raise AssetError("no manifest", where=str(path)) from None
+    except ValueError as error:
+        raise AssetError(f"damaged manifest: {error}", where=str(path)) from None
 
 
 def _digest(path: Path) -> dict[str, Any]:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
+    digest, size = hashlib.sha256(), 0
+    with open(open_regular(path), "rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)
-    return {"bytes": path.stat().st_size, "sha256": digest.hexdigest()}
+            size += len(block)
+    return {"bytes": size, "sha256": digest.hexdigest()}
 
 
 def _plain(value: Any) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
+from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.collision import resolve_collisions
@@ -44,7 +45,7 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     unlit = config.light.unlit
 
     T_cam, target = _viewpoint(config, rng, floor)
-    clearance = max(config.camera_clearance, 1.01 * near_corner(camera))
+    clearance = camera_radius(camera, config.camera_clearance)
     if clearance > config.region.height:
         raise ConfigError("the region is too low for a camera that keeps this far from everything", where="scene.region.height",
                           value=config.region.height, accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
@@ -108,14 +109,6 @@ def make_camera(camera, path, **changes) -> Camera:
     cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
     made = Camera(camera.width, camera.height, float(camera.fx), float(camera.fy), float(cx), float(cy), path, camera.near)
     return replace(made, **changes)
-
-
-def near_corner(camera) -> float:
-    """Distance from the camera centre to the farthest corner of the near rectangle."""
-    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
-    x = max(cx + 0.5, camera.width - 0.5 - cx) / camera.fx
-    y = max(cy + 0.5, camera.height - 0.5 - cy) / camera.fy
-    return camera.near * math.sqrt(1 + x * x + y * y)
 
 
 def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:

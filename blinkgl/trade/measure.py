@@ -9,22 +9,19 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
+from blinkgl.dataset.event_pass import EventPass
 from blinkgl.errors import ConfigError
-from blinkgl.events import make_emulator
-from blinkgl.events.response import response_of
 from blinkgl.events.types import Events
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.timeline import make_timeline
 from blinkgl.trade.labels import flow_errors
 from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors, masked
 from blinkgl.trade.reference import FineTiles, lattice, mask_of, reference_events
@@ -182,15 +179,13 @@ class Bench:
         return results
 
     def _run(self, result: Measured, config: SequenceConfig, renderer: Renderer, first: bool) -> None:
-        new = lambda: make_emulator(self.emulator, self.height, self.width, self.seed, config.timeline.reconstruction)  # noqa: E731
-        end = self.t0_ns + (self.t1_ns - self.t0_ns) // 20
-        for _ in simulate(config, renderer, new(), self.t0_ns, end):  # programs, targets, kernels: made the first time
+        clip = lambda end: EventPass(config.timeline, self.emulator, renderer, self.seed, window_ns=(self.t0_ns, end))  # noqa: E731
+        for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # programs, targets, kernels: made the first time
             pass
-        emulator, drawn = new(), renderer.stats.triangles
+        run, drawn = clip(self.t1_ns), renderer.stats.triangles
         chunks: list[Events] = []
-        frames, wall, cpu = 0, time.perf_counter(), time.process_time()
-        for events in simulate(config, renderer, emulator, self.t0_ns, self.t1_ns):
-            frames += 1
+        wall, cpu = time.perf_counter(), time.process_time()
+        for _, events in run:
             if first:
                 paused = time.perf_counter(), time.process_time()
                 chunks.append(masked(events, self.mask))
@@ -200,8 +195,8 @@ class Bench:
         result.cpu_s.append((time.process_time() - cpu) / self.duration_s)
         if first:
             result.events = Events.concatenate(chunks)
-            result.frames_per_s = (frames - emulator.lags) / self.duration_s
-            result.triangles = (renderer.stats.triangles - drawn) / frames
+            result.frames_per_s = run.frames / self.duration_s
+            result.triangles = (renderer.stats.triangles - drawn) / run.frames
 
     # ---- judging -------------------------------------------------------------------------------------------------
 
@@ -254,19 +249,6 @@ class Bench:
     def _affordable(self, levels: list[Level], scale: int, max_px: float, spent: float) -> bool:
         last = levels[-1]
         return spent + last.seconds * (scale / last.scale) ** 2 * last.max_px / max_px <= self.options.reference_s
-
-
-def simulate(config: SequenceConfig, renderer: Renderer, emulator, t0_ns: int, t1_ns: int):
-    """Pass 1 without writing: yields the events that each frame brings, and those that an emulator which lags still held back."""
-    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer, response_of(emulator.config))
-    luminance = np.empty((renderer.height, renderer.width), np.float32)
-    rate = np.empty_like(luminance) if emulator.needs_rate else None
-    for t_ns in timeline:
-        renderer.luminance(t_ns, out=luminance, rate=rate)
-        timeline.observe(t_ns, luminance, rate)
-        yield emulator.step(luminance, t_ns, renderer.changed_rows, rate)
-    if emulator.lags:
-        yield emulator.flush()
 
 
 def noiseless(config) -> EsimConfig:

@@ -54,9 +54,7 @@ def test_same_events_on_cubics(config, reconstruction):
     for k, (frame, changed) in enumerate(zip(frames, rows)):
         rate = rng.normal(0, 500, (H, W)).astype(np.float32)
         first, stop = changed or (0, H)
-        following = (rows + [(0, 0)])[k + 1]
-        first, stop = (max(first, following[0]), min(stop, following[1])) if following else (first, stop)
-        rate[:first], rate[stop:] = 0, 0  # what moves now is among the rows that change next, too
+        rate[:first], rate[stop:] = 0, 0  # that is all the contract asks for: what moved in the frame before may stand still in this one
         chunks.append((told.step(frame, k * 1_000_000, changed, rate), untold.step(frame, k * 1_000_000, None, rate)))
     chunks.append((told.flush(), untold.flush()))
     for a, b in chunks:

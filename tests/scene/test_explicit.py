@@ -188,9 +188,9 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
     ({"materials": {"m": {"texture": "a.png", "procedural": "dots"}}}, "scene.materials.m: only one of texture, procedural, photograph may be given, not texture and procedural"),
     ({"materials": {"m": {"photograph": "lena"}}}, "scene.materials.m.photograph: no such photograph (got 'lena')"),
     ({"camera": {"euler": [0, 0, 0], "look_at": [1, 0, 0]}}, "scene.camera: only one of quaternion, euler, look_at may be given, not euler and look_at"),
-    ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera: a quaternion must not be zero"),
-    ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera: one key frame is no motion"),
-    ({"camera": {"keyframes": [{"time": 1}, {"time": 1}]}}, "scene.camera: the key frames' times must increase"),
+    ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera.quaternion: a quaternion must not be zero"),
+    ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera.keyframes: one key frame is no motion"),
+    ({"camera": {"keyframes": [{"time": 1}, {"time": 1}]}}, "scene.camera.keyframes.1.time: the key frames' times must increase"),
     ({"camera": {"position": [1, 0, 0], "keyframes": [{"time": 0}, {"time": 1}]}}, "scene.camera: give a fixed pose or keyframes, not both"),
 ])
 def test_bad_input(tmp_path, tree, expected):

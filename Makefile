@@ -1,6 +1,7 @@
 # make demo    install into .venv, check OpenGL, generate the demo sequence into out/demo
 # make test    install into .venv, check OpenGL, run the tests
 # make slow    the tests that take long       make bench   the benchmarks
+# make fuzz    damaged files of every format, 1000 each: half an hour; what went wrong lies in out/fuzz
 # make clean   remove what was built (not .venv, not out/)
 #
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
@@ -11,7 +12,7 @@ PIP = .venv/bin/python -m pip --disable-pip-version-check
 INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
 INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 
-.PHONY: demo test slow bench doctor setup opengl clean
+.PHONY: demo test slow bench fuzz doctor setup opengl clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.installed-core opengl
@@ -27,6 +28,9 @@ slow: .venv/.installed-dev opengl
 
 bench: .venv/.installed-dev opengl
 	@for program in tools/bench_*.py; do echo "== $$program"; .venv/bin/python $$program || exit 1; done
+
+fuzz: .venv/.installed-dev
+	.venv/bin/python -m blinkgl.tools.fuzz_files --mutants 1000 --out out/fuzz --json out/fuzz/report.json
 
 doctor: .venv/.installed-core
 	.venv/bin/blinkgl doctor

@@ -17,6 +17,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
+from blinkgl.terminal import never_fail_to_print
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -68,7 +69,7 @@ def generate(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
     workers: Annotated[Optional[int], typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
     executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
-    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: a local one).")] = None,
+    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
     gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
     devices: Annotated[Optional[str], typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,
@@ -97,7 +98,8 @@ def verify(
     seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
     base: Annotated[Optional[str], typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
 ) -> None:
-    """Check a data set: manifests, checksums, contents. Exit status 2 when something is wrong."""
+    """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is wrong; what could not be compared
+    is noted, and said in the last line."""
     from blinkgl.dataset.check import verify_and_show
 
     if not verify_and_show(folder, deep=sample if deep else 0, seed=seed, base=base):
@@ -222,12 +224,13 @@ def convert(
     format: Annotated[Optional[str], typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
     size: Annotated[Optional[str], typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")] = False,
+    time_unit: Annotated[str, typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's).")] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> None:
     """Convert an event file from one format to another."""
     from blinkgl import commands
 
-    commands.convert(source, target, format=format, size=size, zero_time=zero_time, overwrite=overwrite)
+    commands.convert(source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------
@@ -235,6 +238,7 @@ def convert(
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:

@@ -7,11 +7,11 @@ import os
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from blinkgl.errors import AssetError, ConfigError
+from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.errors import ConfigError
 from blinkgl.terminal import plain_column, plain_console
 
 
@@ -20,26 +20,21 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
     the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where nothing else is said."""
     data: dict[str, Any] = {}
     if config is not None:
-        try:
-            data = yaml.safe_load(Path(config).read_text(encoding="utf-8")) or {}
-        except OSError as error:
-            raise AssetError(f"cannot read: {error.strerror}", where=config) from error
-        except yaml.YAMLError as error:
-            raise ConfigError("not valid YAML: " + " ".join(str(error).split())[:160], where=config) from error
-        if not isinstance(data, dict):
-            raise ConfigError("not a mapping", where=config, value=data, accepted="emulator parameters, key: value")
+        data = read_table(config, "emulator parameters, key: value")
     data = {"emulator": name, **data}
     for item in overrides:
         key, equals, value = item.partition("=")
         if not equals:
             raise ConfigError("not key=value", where="--set", value=item)
-        data[key.strip()] = yaml.safe_load(value)
+        data[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
     if sensor is None:
         return {"emulator": data, "readout": None}
     from blinkgl.config.sensor import load_sensor
 
+    from blinkgl.simulation import emulator_config
+
     camera = load_sensor(sensor)
-    return {"emulator": camera.emulator(data.pop("emulator"), **data), "readout": camera.readout}
+    return {"emulator": emulator_config({**camera.values(data["emulator"]), **data}), "readout": camera.readout}
 
 
 def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
@@ -70,6 +65,8 @@ def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
         say(line)
     if report.lost:
         say(f"{report.lost:,} events were lost in the sensor's read-out")
+    if report.late:
+        say(f"{report.late:,} events had not left the sensor's read-out when the frames ended")
     if report.saturated:
         say(f"warning: {report.saturated:,} events were cut by max_events_per_step")
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import zipfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -17,9 +16,10 @@ import cv2
 import numba
 import numpy as np
 
-from blinkgl.errors import EventDataError
+from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.formats import ENDINGS, EventFile, open_events
+from blinkgl.io.images import NpzReader, npy_header, numpy_errors
 
 IEI_EDGES_US = np.logspace(0, 7, 71)
 """Bins of the inter-event interval of a pixel: 1 µs to 10 s, ten per decade."""
@@ -293,9 +293,12 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
 def _is_event_file(path) -> bool:
     path = Path(path)
     if path.suffix.lower() in (".npy", ".npz") and path.is_file():
-        with contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile):  # damaged: the reader will say so
-            data = np.load(path, mmap_mode="r" if path.suffix == ".npy" else None, allow_pickle=False)
-            return "x" in ((data.dtype.names or ()) if isinstance(data, np.ndarray) else data.files)
+        with contextlib.suppress(AssetError), numpy_errors(path):  # damaged: the reader will say so
+            if path.suffix.lower() == ".npz":
+                with NpzReader(path) as arrays:
+                    return "x" in arrays
+            with open(path, "rb") as file:
+                return "x" in (npy_header(file, path.stat().st_size, str(path))[2].names or ())
     return path.suffix.lower() in ENDINGS and not path.is_dir()
 
 

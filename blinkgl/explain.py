@@ -1,19 +1,24 @@
 """``blinkgl explain CONFIG``: what a run will model, what it leaves out and why, and what it is likely to cost.
 
-The scene of one sequence is built and a handful of its frames are drawn and timed; nothing is written.
+The scene of one sequence is built and a handful of its frames are drawn and timed (or, of recorded frames, converted); nothing
+is written.
 """
 
 from __future__ import annotations
 
+import math
+import platform
 import time
 from dataclasses import dataclass, field
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.dataset.frames import flow_files, folder_of, read_frame, used_images
 from blinkgl.events import make_emulator
 from blinkgl.events.response import response_of
 from blinkgl.gl import GLContext, create_context
@@ -22,6 +27,7 @@ from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
+from blinkgl.simulation import SimulationReport, simulate
 from blinkgl.terminal import plain_console
 from blinkgl.timeline import make_timeline
 
@@ -56,6 +62,8 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     """Explains one sequence (default: the first). Raises what generating it would raise."""
     config = template.sequence(template.sequence(0).output.first_index if sequence is None else sequence)
     index = config.output.first_index if sequence is None else sequence
+    if config.frames is not None:
+        return _explain_frames(config, index, template.base)
     with create_context(config.gl.backend, config.gl.device) as gl:
         scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
                             seed=config.seed, sequence=index, base=template.base)
@@ -67,6 +75,47 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     simulated = (scene.t1_ns - scene.t0_ns) * 1e-9
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / simulated
+    return result
+
+
+def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
+    """A sequence that is converted from recorded frames: nothing is rendered; the first few frames are converted and timed."""
+    frames = config.frames
+    folder = folder_of(frames, index, base)
+    files = used_images(frames, folder)
+    flows, masks = flow_files(folder, frames, len(files))
+    height, width = read_frame(files[0]).shape[:2]
+    duration = (len(files) - 1) / frames.fps
+    result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
+    between = {"linear": "no frames in between", "cubic": f"{frames.factor - 1} frames in between, monotone cubics",
+               "motion": f"at most {frames.max_px:g} px per step, dense-flow warp"}[frames.interpolate]
+    result.scene = {
+        "frames": f"{len(files)} of {folder}, {width}x{height}, {frames.fps:g} Hz: {duration:.6g} s", "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
+        "flow": f"{len(flows)} files, {len(masks)} masks of occluded pixels" if flows else "none: no flow labels",
+        "not used": "camera, time, timeline, scene and render: nothing is rendered"}
+    report = SimulationReport()
+    probed = files[:PROBES]
+    started = time.perf_counter()
+    for _ in simulate(((read_frame(f), round(k * 1e9 / frames.fps), str(f)) for k, f in enumerate(probed)), emulator=config.events, gamma=frames.gamma,
+                      interpolate=frames.interpolate, factor=frames.factor, max_px=frames.max_px, report=report,
+                      seed=kernel_seed(config.seed, index, Role.EVENTS), readout=config.readout):
+        pass
+    each = (time.perf_counter() - started) / (len(probed) - 1)
+    scale = (len(files) - 1) / (len(probed) - 1)
+    result.frames = 1 + round((report.steps - 1) * scale)
+    rate = report.events / ((len(probed) - 1) / frames.fps)
+    result.passes.append(Pass("frames and event kernel", f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
+                              (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
+    labels = config.labels
+    for name, on, why in (("images", labels.images, "labels.images: false"), ("forward flow", flows and "forward" in labels.flow, "frames.flow: null, or not in "
+                          "labels.flow"), ("occlusion masks", masks and labels.occlusion and "forward" in labels.flow, "no mask files, labels.occlusion: false, or no forward flow"),
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
+        if not on:
+            result.left_out.append((name, why))
+    result.left_out.append(("backward flow, depth, ids, normals, velocity", "recorded frames bring none"))
+    result.seconds = sum(p.seconds for p in result.passes)
+    result.seconds_per_simulated_second = result.seconds / duration
     return result
 
 
@@ -85,6 +134,7 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
         "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit" if lit else "none: every surface is unlit",
         "notes": "; ".join(scene.log) or "–",
+        **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
 
 
@@ -113,7 +163,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     event_s = _timed(lambda t: renderer.luminance(t, out=luminance, rate=rate), times)
     fine = samples_of(config.render.antialiasing).stored
     if timeline.kind == "uniform":
-        result.frames = int(duration * timeline.fps) + 1
+        result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:
         strategy = make_timeline(timeline, t0, t1, renderer, response_of(config.events))
         if timeline.kind == "budget":  # a short stretch, for the first measurements of the error
@@ -180,7 +230,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
                           ("forward flow", "forward" in labels.flow, "not in labels.flow"),
                           ("backward flow", "backward" in labels.flow, "not in labels.flow"),
                           ("occlusion masks", labels.occlusion and labels.flow, "labels.occlusion: false, or no flow"),
-                          ("preview", config.preview.enabled, "preview.enabled: false")):
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             add(name, key)
     if config.render.antialiasing == "none":

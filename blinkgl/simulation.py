@@ -50,7 +50,9 @@ class SimulationReport:
     saturated: int = 0
     """events cut by the emulator's max_events_per_step"""
     lost: int = 0
-    """events that the sensor's read-out could not carry"""
+    """events that found the queue of the sensor's read-out full"""
+    late: int = 0
+    """events that were still on the read-out's bus when the last frame came"""
     displacement: between.Displacement | None = None
     """for interpolate="motion" """
 
@@ -128,8 +130,8 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
             report.first_ns = t_ns
         events = model.step(luminance, t_ns)
         if bus is not None:
-            events = bus.step(events)
-            report.lost = bus.dropped
+            events = bus.step(events, t_ns // 1000)
+            report.lost, report.late = bus.dropped, bus.late
         report.steps += 1
         report.last_ns = t_ns
         report.events += len(events)
@@ -249,7 +251,7 @@ def emulator_config(emulator: str | Config | dict) -> Config:
         return emulator
     data = {"emulator": emulator} if isinstance(emulator, str) else dict(emulator)
     kind = data.get("emulator", "esim")
-    if kind not in EMULATORS:
+    if not isinstance(kind, str) or kind not in EMULATORS:
         raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(EMULATORS))
     return validate(EMULATORS[kind], data, where=kind)
 

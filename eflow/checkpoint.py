@@ -97,7 +97,7 @@ def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any 
         if metadata["format"] != FORMAT:
             raise AssetError("checkpoint of another format", where=str(file), value=metadata["format"], accepted=FORMAT)
         tree = json.loads(metadata["model"])
-    except (KeyError, ValueError):
+    except (KeyError, ValueError, RecursionError):
         raise AssetError("safetensors file without a model configuration", where=str(file), accepted="a checkpoint of eflow train") from None
     config = model_config(tree)
     if expected is not None:
@@ -116,7 +116,8 @@ def require_same(found: Any, expected: Any, where: str) -> None:
 
 
 def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> None:
-    """Copies tensors into the model. AssetError when a name or shape does not fit; the model is then unchanged."""
+    """Copies tensors into the model. AssetError when a name, shape or type does not fit, or a value is
+    not finite; the model is then unchanged."""
     wanted = model.state_dict()
     for name in sorted(set(wanted) | set(tensors)):
         if name not in tensors:
@@ -126,6 +127,10 @@ def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> No
         if wanted[name].shape != tensors[name].shape:
             raise AssetError(f"tensor '{name}' has another shape", where=where, value=tuple(tensors[name].shape),
                              accepted=str(tuple(wanted[name].shape)))
+        if wanted[name].is_floating_point() != tensors[name].is_floating_point():
+            raise AssetError(f"tensor '{name}' has another type", where=where, value=str(tensors[name].dtype), accepted=str(wanted[name].dtype))
+        if not torch.isfinite(tensors[name]).all():
+            raise AssetError(f"tensor '{name}' holds NaN or infinity", where=where, accepted="a checkpoint from before the training diverged")
     model.load_state_dict(tensors)
 
 
@@ -192,10 +197,10 @@ def read_state(folder: Path) -> dict[str, Any]:
     path = folder / "state.json"
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
-        if state["format"] != FORMAT or not isinstance(state["step"], int):
+        if state["format"] != FORMAT or type(state["step"]) is not int or state["step"] < 0:
             raise ValueError
     except OSError as error:
         raise AssetError("cannot be read", where=str(path)) from error
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         raise AssetError("damaged", where=str(path), accepted="a state.json of eflow train") from None
     return state

@@ -12,6 +12,7 @@ import typer
 from blinkgl import __version__
 from blinkgl.cli import _user_line
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.terminal import never_fail_to_print
 from blinkgl.extras import EXTRAS, install
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -271,6 +272,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line (without the program name); returns the exit status and raises nothing a user can cause."""
+    never_fail_to_print()
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from blinkgl.config.base import Config, validate
-from blinkgl.config.sequence import MAX_YAML_BYTES, apply_overrides, parse_yaml
-from blinkgl.errors import ConfigError
+from blinkgl.config.base import Config, Refused, one_of, rule, validate
+from blinkgl.config.reader import read_table
+from blinkgl.config.sequence import apply_overrides
 
 
 class VoxelConfig(Config):
@@ -23,7 +23,7 @@ class VoxelConfig(Config):
 class _Refined(Config):
     """What E-RAFT and E-FlowFormer share."""
 
-    input: VoxelConfig = VoxelConfig()
+    input: VoxelConfig = Field(VoxelConfig(), description="the voxel grid")
     iterations: int = Field(12, ge=1, le=64, description="GRU iterations in evaluation")
     train_iterations: int = Field(12, ge=1, le=64, description="GRU iterations in training")
     context_norm: Literal["batch", "instance"] = Field("batch", description="norm of the context CNN; instance for batches of one or two")
@@ -71,39 +71,38 @@ class SteFlowNetConfig(Config):
     sweeps: int = Field(3, ge=1, le=10, description="passes of residual flow decoding")
 
 
-ModelConfig = Annotated[EraftConfig | EFlowFormerConfig | EvFlowNetConfig | SpikeFlowNetConfig | SteFlowNetConfig, Field(discriminator="name")]
+ModelConfig = one_of("name", EraftConfig, EFlowFormerConfig, EvFlowNetConfig, SpikeFlowNetConfig, SteFlowNetConfig)
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
 class AugmentConfig(Config):
     """Probabilities and strengths; the draws depend on (seed, epoch, position) alone."""
 
-    horizontal_flip: Probability = 0.5
-    vertical_flip: Probability = 0.1
-    polarity: Probability = Field(0.5, description="all polarities swapped")
+    horizontal_flip: Probability = Field(0.5, description="probability of mirroring left and right")
+    vertical_flip: Probability = Field(0.1, description="probability of turning upside down")
+    polarity: Probability = Field(0.5, description="probability that all polarities are swapped")
     time_reversal: Probability = Field(0.0, description="film backwards, target the backward flow; needs backward labels")
-    drop_probability: Probability = 0.3
+    drop_probability: Probability = Field(0.3, description="probability that events are dropped")
     drop: float = Field(0.3, ge=0, lt=1, description="largest fraction of events dropped")
-    hot_probability: Probability = 0.2
+    hot_probability: Probability = Field(0.2, description="probability that hot pixels are added")
     hot_pixels: int = Field(20, ge=1, le=100_000, description="largest number of hot pixels")
     hot_rate: float = Field(500.0, ge=0, le=1e6, description="largest rate of a hot pixel, events/s")
-    noise_probability: Probability = 0.3
+    noise_probability: Probability = Field(0.3, description="probability that background noise is added")
     noise_rate: float = Field(1.0, ge=0, le=1e4, description="largest rate of background noise, events/s per pixel")
-    scale_probability: Probability = 0.3
+    scale_probability: Probability = Field(0.3, description="probability of another scale; needs data.crop")
     scale: tuple[float, float] = Field((-0.2, 0.5), description="exponent of 2 of the scale factor, [low, high]")
 
-    @model_validator(mode="after")
-    def _ordered(self):
-        if not -3 <= self.scale[0] <= self.scale[1] <= 3:
-            raise ValueError("scale must be [low, high] within [-3, 3]")
-        return self
+    @rule("scale")
+    def _ordered(scale):
+        if not -3 <= scale[0] <= scale[1] <= 3:
+            raise Refused("not a range", where="scale", value=list(scale), accepted="[low, high] within [-3, 3]")
 
 
 class SourceConfig(Config):
     """One data set."""
 
     path: str = Field(description="folder; relative to the YAML file")
-    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = "auto"
+    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field("auto", description="layout of the set; auto: told by its files")
     dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
     weight: float = Field(1.0, gt=0, le=1e6, description="share of this set in the mixture")
 
@@ -111,29 +110,28 @@ class SourceConfig(Config):
 class DataConfig(Config):
     """What is trained and validated on."""
 
-    train: tuple[SourceConfig, ...] = Field(min_length=1)
+    train: tuple[SourceConfig, ...] = Field(min_length=1, description="sets that are trained on, mixed by weight")
     validate_on: tuple[SourceConfig, ...] = Field((), description="validation sets; the first samples of each are used")
     validate_samples: int = Field(64, ge=1, description="samples of each validation set, evenly spaced")
     crop: tuple[int, int] | None = Field(None, description="[height, width] of the random crop, px; null: whole frames")
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
     workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0 loads in the training process")
     empty: Literal["error", "skip"] = Field("error", description="a sample without events: stop, or take the next one")
-    augment: AugmentConfig | None = AugmentConfig()
+    augment: AugmentConfig | None = Field(AugmentConfig(), description="random changes to the training samples; null: none")
 
-    @model_validator(mode="after")
-    def _one_size(self):
-        if self.crop is None and self.augment is not None and self.augment.scale_probability > 0:
-            raise ValueError("scaled samples differ in size: set crop, or augment.scale_probability to 0")
-        return self
+    @rule("crop", "augment.scale_probability")
+    def _one_size(crop, scaling):
+        if crop is None and scaling:
+            raise Refused("scaled samples differ in size: set crop, or augment.scale_probability to 0")
 
 
 class OptimConfig(Config):
     """AdamW with a linear one-cycle schedule."""
 
-    steps: int = Field(200_000, ge=1, le=10**9)
+    steps: int = Field(200_000, ge=1, le=10**9, description="updates of the weights")
     lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
     warmup: float = Field(0.05, ge=0, lt=1, description="fraction of the steps that the rate rises over")
-    weight_decay: float = Field(1e-4, ge=0, le=1)
+    weight_decay: float = Field(1e-4, ge=0, le=1, description="of AdamW, decoupled")
     clip: float = Field(1.0, gt=0, description="largest gradient norm")
     gamma: float = Field(0.8, gt=0, le=1, description="decay of the sequence loss towards early iterations")
     match_weight: float = Field(1.0, ge=0, description="factor on the matching layer's term of the loss")
@@ -143,14 +141,14 @@ class OptimConfig(Config):
 class RunConfig(Config):
     """How it runs and what it writes."""
 
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: a card where there is one")
     precision: Literal["fp32", "bf16"] = Field("fp32", description="bf16: autocast with fp32 islands; fp32 where the device has no bf16 instructions")
-    channels_last: bool = False
+    channels_last: bool = Field(False, description="memory layout that some cards convolve faster in")
     compile: bool = Field(False, description="torch.compile of the update step")
     threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's choice")
     log_every: int = Field(20, ge=1, description="steps between log lines")
-    validate_every: int = Field(2000, ge=1)
-    checkpoint_every: int = Field(2000, ge=1)
+    validate_every: int = Field(2000, ge=1, description="steps between validations")
+    checkpoint_every: int = Field(2000, ge=1, description="steps between checkpoints")
     keep_checkpoints: int = Field(3, ge=1, description="older ones are deleted")
     picture_every: int = Field(2000, ge=1, description="steps between sample pictures")
     time_limit: float | None = Field(None, gt=0, description="minutes after which training stops with a last validation and a checkpoint; null: none")
@@ -159,11 +157,11 @@ class RunConfig(Config):
 class TrainConfig(Config):
     """One training run."""
 
-    seed: int = Field(0, ge=0, lt=2**63)
-    model: ModelConfig
-    data: DataConfig
-    optim: OptimConfig = OptimConfig()
-    run: RunConfig = RunConfig()
+    seed: int = Field(0, ge=0, lt=2**63, description="of weights, order and augmentation; 0 is a seed")
+    model: ModelConfig = Field(description="the network")
+    data: DataConfig = Field(description="what is trained and validated on")
+    optim: OptimConfig = Field(OptimConfig(), description="AdamW with a linear one-cycle schedule")
+    run: RunConfig = Field(RunConfig(), description="how it runs and what it writes")
     init_from: str | None = Field(None, description="checkpoint whose weights training starts from (fine-tuning)")
 
 
@@ -171,18 +169,7 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     """Reads a YAML file and applies ``a.b=c`` overrides; data paths become absolute, from the YAML file's folder.
 
     Raises ConfigError: missing file, bad YAML, unknown key, bad value."""
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_YAML_BYTES:
-            raise ConfigError("file is too large for a configuration", where=str(path), accepted=f"at most {MAX_YAML_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), accepted="a YAML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {type(error).__name__}", where=str(path), accepted="a YAML text file in UTF-8") from None
-    tree = parse_yaml(text, str(path))
-    if not isinstance(tree, dict):
-        raise ConfigError("not a table of keys", where=str(path), value=tree, accepted="key: value lines")
+    path, tree = Path(path), read_table(path)
     config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # noqa: E731 - an absolute p stays
     sources = {k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k)) for k in ("train", "validate_on")}

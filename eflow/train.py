@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.distributed as dist
-import yaml
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 
+from blinkgl.config.reader import to_yaml
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
@@ -344,7 +344,7 @@ def _agree(reason: str, device: torch.device) -> str:
 
 def _write_config(out: Path, config: TrainConfig) -> None:
     with atomic_file(out / "config.yaml") as path, output_errors(path):
-        Path(path).write_text(yaml.safe_dump(json.loads(config.model_dump_json()), sort_keys=False), encoding="utf-8")
+        Path(path).write_text(to_yaml(json.loads(config.model_dump_json())), encoding="utf-8")
 
 
 class _Signals:

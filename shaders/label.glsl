@@ -6,7 +6,8 @@
 //   OUT_ID        instance id (0: nothing hit)   OUT_NORMAL    unit normal, camera axes, facing it
 //   OUT_VELOCITY  px/s                           OUT_FLOW_FORWARD, OUT_FLOW_BACKWARD
 //                                                (u, v in px, Z at the other time; 0 in .w of unwritten pixels)
-// Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED.
+// Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED. SHOW_LOOKUP, the shader debugger's, goes with
+// OUT_COLOUR 0: see lookup.glsl.
 
 #if defined(OUT_COLOUR) && defined(LIT) || defined(OUT_NORMAL)
 #define NEEDS_NORMAL
@@ -50,6 +51,9 @@ void main()
 #endif
 
 #ifdef FRAGMENT_SHADER
+#ifdef SHOW_LOOKUP
+#include "lookup.glsl"
+#endif
 #ifdef NEEDS_NORMAL
 in vec3 normal;
 #endif
@@ -93,6 +97,7 @@ uniform mat4x3 difference_forward;
 layout(location = OUT_FLOW_BACKWARD) out vec4 flow_backward;
 uniform mat4x3 difference_backward;
 #endif
+#include "guard.glsl"
 
 void main()
 {
@@ -106,10 +111,19 @@ void main()
 #ifdef OUT_COLOUR
     vec3 radiance = base_color;
 #ifdef TEXTURED
+    vec2 uv = within_reach(uv); // hides the varying
     radiance *= texture(albedo, uv).rgb;
 #endif
 #ifdef LIT
-    radiance *= irradiance(facing);
+    float light = irradiance(facing);
+#else
+    const float light = 1.0;
+#endif
+#ifdef SHOW_LOOKUP
+    show_lookup(radiance, light);
+#endif
+#ifdef LIT
+    radiance *= light;
 #endif
     colour = vec4(radiance, 1.0);
 #endif
@@ -132,5 +146,6 @@ void main()
 #ifdef OUT_FLOW_BACKWARD
     flow_backward = vec4(displacement(difference_backward, local, image_size), 1.0);
 #endif
+    drop_artefact();
 }
 #endif

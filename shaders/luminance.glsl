@@ -7,6 +7,7 @@
 //            TWO_SIDED  the normal is turned towards the camera on back faces
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's pixels
+//            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT))
 #define CHANGES
@@ -44,6 +45,9 @@ void main()
 #endif
 
 #ifdef FRAGMENT_SHADER
+#ifdef SHOW_LOOKUP
+#include "lookup.glsl"
+#endif
 #ifdef RATE
 layout(location = 0) out vec2 result;
 #else
@@ -71,10 +75,12 @@ uniform float albedo;
 in vec3 normal;
 #include "light.glsl"
 #endif
+#include "guard.glsl"
 
 void main()
 {
 #ifdef TEXTURED
+    vec2 uv = within_reach(uv); // hides the varying
 #ifdef TAPS4
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
     float luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).r + texture(albedo, uv + right - down, -1.0).r
@@ -113,13 +119,21 @@ void main()
     change = change * light + luminance * irradiance_rate(facing, seen_rate(facing, motion));
 #endif
 #endif
+#ifdef SHOW_LOOKUP
+#ifdef LIT
+    show_lookup(vec3(luminance), light);
+#else
+    show_lookup(vec3(luminance), 1.0);
+#endif
+#endif
 #ifdef LIT
     luminance *= light;
 #endif
 #ifdef RATE
-    result = vec2(luminance, change);
+    result = vec2(luminance, finite(change));
 #else
     result = luminance;
 #endif
+    drop_artefact();
 }
 #endif

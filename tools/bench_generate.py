@@ -29,6 +29,7 @@ from blinkgl import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.report import Totals
 from blinkgl.dataset.show import STAGES, summary
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
@@ -126,7 +127,7 @@ def sequence(name: str, quick: bool) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         list(generate_run(load_run(path, ["time.duration=0.1"]), f"{folder}/warm", 1))
         report = list(generate_run(load_run(path, overrides), f"{folder}/timed", 1))[0]
-    return {"config": name, "triangles": report.triangles, **summary([report])}
+    return {"config": name, "triangles": report.triangles, **summary(Totals().add(report))}
 
 
 def peer(gl, quick: bool) -> dict:

@@ -20,8 +20,8 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from blinkgl.config.reader import read_table
 from eflow.config import load_train_config
 
 AGAIN = 75
@@ -127,7 +127,7 @@ def main() -> None:
     runs = {name: train(steps, a, name, data, a.set) for name in a.models}
     rows = []
     for name, run in runs.items():
-        config = yaml.safe_load((run / "config.yaml").read_text(encoding="utf-8"))
+        config = read_table(run / "config.yaml")
         precision, scores, bench = config["run"]["precision"], a.out / f"{name}_scores", a.out / f"{name}_bench.json"
         if not (scores / "results.json").is_file():
             steps.run("eflow.cli", "evaluate", str(run), str(data / "test"), "--out", str(scores), "--empty", "skip", "--precision", precision)

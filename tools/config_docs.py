@@ -1,12 +1,14 @@
-"""Writes docs/configuration.md: every YAML key with its type, default, limits and meaning, from the models themselves.
+"""Writes the pages of every YAML key with its type, default, limits and meaning, from the models themselves.
 
     python -m blinkgl.tools.config_docs > docs/configuration.md
+    python -m blinkgl.tools.config_docs eflow > docs/eflow_configuration.md
 
-A test fails when the page and the models differ.
+A test fails when a page and its models differ.
 """
 
 from __future__ import annotations
 
+import sys
 import types
 import typing
 from typing import Any
@@ -16,24 +18,57 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from blinkgl.config.base import tag_of
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.scene.primitives import BUILDERS, PARAMETERS, parameters
+from eflow.config import TrainConfig
 
 HEADER = """# Every key of the YAML
 
 Made from the configuration models by `python -m blinkgl.tools.config_docs`; do not edit.
 
-Keys that are left out have the default. Where a plain value stands, a distribution may stand instead and is drawn once per
+Keys that are left out have the default, and a table may say only what it changes: without `kind` (or `emulator`) it is of the default one. Where a plain value stands, a distribution may stand instead and is drawn once per
 sequence: `{uniform: [a, b]}`, `{log_uniform: [a, b]}`, `{integer: [a, b]}` (both ends included), `{choice: [x, y, …]}`,
-`{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (dealt out, not rolled). Every sequence's own `config.yaml` records what was drawn.
+`{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (dealt out, not rolled). Every sequence's own `config.yaml` records what was drawn. When the file is read, everything
+that can be drawn is checked: every choice and both ends of every range, in all combinations of those that are looked at together.
+`seed`, `output` and `gl` belong to the whole run and cannot be drawn.
 
 `groups: {name: {…}}` at the top level makes a recipe of several groups of sequences: each is what stands at the top level with
 the group's own keys laid over it, and `enabled: false` leaves a group out (`blinkgl/config/recipe.py`, `configs/blinkflow.yaml`).
 """
 
 
+EFLOW_HEADER = """# Every key of eflow's YAML
+
+Made from the configuration models by `python -m blinkgl.tools.config_docs eflow`; do not edit.
+
+What `eflow train CONFIG` reads; `--set a.b=c` overrides any of it. Keys that are left out have the default; unknown keys are refused with the
+nearest known one. Paths start from the YAML file's folder. Examples: `configs/eflow/`.
+"""
+
+
 def page() -> str:
-    """The whole page as Markdown."""
-    return HEADER + "".join(_section(SequenceConfig, "", set()))
+    """The whole page of ``blinkgl generate``'s YAML as Markdown."""
+    return HEADER + "".join(_section(SequenceConfig, "", set())) + _primitives()
+
+
+def _primitives() -> str:
+    """What `scene.meshes.<name>.parameters` may hold, from the builders' own signatures."""
+    lines = ["\n## Primitives\n\n", "`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, parameters: {radius: 0.2, height: 2}}`. "
+             "All stand upright (z is their axis) and are centred on the origin; sizes are in the world's units (m), before the object's `scale`.\n\n",
+             "| kind | parameters and defaults | what it is |\n|---|---|---|\n"]
+    for kind, build in BUILDERS.items():
+        values = ", ".join(f"`{name}: {list(value) if isinstance(value, tuple) else value}`" for name,
+                           value in parameters(kind).items())
+        lines.append(f"| `{kind}` | {values} | {' '.join((build.__doc__ or '').split()).replace('``', '`')} |\n")
+    lines.append("\n| parameter | meaning |\n|---|---|\n")
+    lines += [f"| `{name}` | {meaning} |\n" for name, meaning in PARAMETERS.items()]
+    return "".join(lines)
+
+
+def eflow_page() -> str:
+    """The whole page of ``eflow train``'s YAML as Markdown."""
+    return EFLOW_HEADER + "".join(_section(TrainConfig, "", set()))
 
 
 def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> list[str]:
@@ -45,9 +80,9 @@ def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> li
         meaning = (info.description or _about(info)).replace("``", "`")
         rows.append(f"| `{name}` | {_type(info)} | {_default(info)} | {meaning} |\n")
         children = _models(info.annotation)
-        tagged = [c for c in children if _tag(c)]
+        tagged = [c for c in children if tag_of(c)]
         for child in children:
-            suffix = f" with `{_tag(child)[0]}: {_tag(child)[1]}`" if child in tagged and len(children) > 1 else ""
+            suffix = f" with `{tag_of(child)[0]}: {tag_of(child)[1]}`" if child in tagged and len(children) > 1 else ""
             marker = (child, inner)
             if marker not in done:
                 done.add(marker)
@@ -59,15 +94,6 @@ def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> li
 
 def _about(info: FieldInfo) -> str:
     return "; ".join(" ".join((m.__doc__ or "").split()).split(". ")[0].rstrip(".") for m in _models(info.annotation)[:1])
-
-
-def _tag(model: type[BaseModel]) -> tuple[str, str] | None:
-    for key in ("kind", "emulator"):
-        if key in model.model_fields:
-            values = typing.get_args(model.model_fields[key].annotation)
-            if len(values) == 1:
-                return key, values[0]
-    return None
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
@@ -120,7 +146,7 @@ def _default(info: FieldInfo) -> str:
         return "required"
     value = info.default if info.default is not PydanticUndefined else info.default_factory()
     if isinstance(value, BaseModel):
-        tag = _tag(type(value))
+        tag = tag_of(type(value))
         return f"`{tag[0]}: {tag[1]}`" if tag and len(_models(info.annotation)) > 1 else "see below"
     if isinstance(value, tuple):
         return "`[" + ", ".join(str(v) for v in value) + "]`"
@@ -128,4 +154,4 @@ def _default(info: FieldInfo) -> str:
 
 
 if __name__ == "__main__":
-    print(page(), end="")
+    print(eflow_page() if sys.argv[1:] == ["eflow"] else page(), end="")

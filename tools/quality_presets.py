@@ -14,9 +14,8 @@ import sys
 from importlib import resources
 from pathlib import Path
 
-import yaml
-
 from blinkgl.config.quality import QUALITIES
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import apply_overrides
 from blinkgl.trade.run import convergence_line
 
@@ -33,7 +32,7 @@ def preset_text(quality: str, row: dict, result: dict) -> str:
                f"voxel grids differ from the reference's by {100 * row['voxel']:.1f} %; {100 * row['missed']:.1f} % of the events missed, {100 * row['extra']:.1f} % extra,",
                f"count {100 * row['count']:+.1f} %; event times {row['time_median_us']:.0f} µs (median), {row['time_p95_us']:.0f} µs (95 %), i.e. {row['shift_median_px']:.3f} px",
                f"and {row['shift_p95_px']:.3f} px. {size['width']}x{size['height']}, {result['date']}; whole measurement: measured.json, docs/trade.md."]
-    return f"# quality: {quality}\n" + "".join(f"# {line}\n" for line in figures) + yaml.safe_dump(tree, sort_keys=False)
+    return f"# quality: {quality}\n" + "".join(f"# {line}\n" for line in figures) + to_yaml(tree)
 
 
 def main() -> None:

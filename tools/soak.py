@@ -1,9 +1,11 @@
 """Injects faults into real runs for as long as one likes, and checks that nothing shows in the end.
 
-    python -m blinkgl.tools.soak [--recipe configs/blinkflow_mini.yaml] [--rounds 3] [--faults kill-worker,disk-full,…] [--json FILE]
+    python -m blinkgl.tools.soak [--recipe configs/blinkflow_mini.yaml] [--tiny] [--rounds 3] [--faults kill-worker,disk-full,…] [--json FILE]
 
 One uninterrupted run in one process is the reference. Then, per round and fault: a run with two workers, the fault at a
 random moment, ``--resume`` as often as it takes, ``verify --deep``, and a comparison of every byte outside ``.run``.
+Faults strike a run in its middle: when at least a third of its sequences is whole, and others are being written. How many were
+whole is said; a run that was over before is done again. ``--tiny``: sequences of a tenth of a second, for many rounds.
 
 | fault | what happens |
 |---|---|
@@ -46,6 +48,8 @@ from blinkgl.scene import primitives
 LOCAL = ("kill-worker", "hang", "kill-driver", "sigterm", "sigint", "disk-full", "corrupt-asset")
 RAY = ("ray-worker", "ray-node")
 MAX_RESUMES = 12
+TINY = ["camera.width=64", "camera.height=48", "time.duration=0.1", "time.label_rate=20", "preview.enabled=false", "scene.textures.photographs=false",
+        "scene.textures.max_size=64", "scene.pool.urdfs=false"]
 
 
 class Soak:
@@ -57,7 +61,8 @@ class Soak:
         self.recipe = recipe
         self.overrides = [*overrides, f"scene.pool.folders=[{self.meshes}]"]
         self.tasks = Plan.of(load_run(recipe, self.overrides)).tasks
-        self.limit_s = 600.0
+        self.limit_s, self.pace_s = 600.0, 0.5
+        self.struck: list[int] = []  # how many sequences were whole at each stroke of this round's fault
 
     def command(self, out: Path, *more: object) -> list[str]:
         sets = [word for option in self.overrides for word in ("--set", option)]
@@ -69,14 +74,19 @@ class Soak:
     def whole(self, out: Path) -> int:
         return sum((out / task.name / "manifest.json").is_file() for task in self.tasks)
 
-    def wait_until_busy(self, driver: subprocess.Popen, out: Path) -> bool:
-        """A random number of sequences is done and another is at work; False when the run was over before."""
-        target = self.dice.randint(0, max(0, len(self.tasks) - 3))
+    def wait_until_busy(self, driver: subprocess.Popen, out: Path, least: int | None = None) -> bool:
+        """At least ``least`` (default: a random number from a third of all on) sequences are whole and another is at work, for up to
+        as long as one takes; False when the run was over before. What was whole then is appended to ``struck``."""
+        count = len(self.tasks)
+        target = least if least is not None else self.dice.randint(-(-count // 3), max(-(-count // 3), count - 5))
         while driver.poll() is None:
             if self.whole(out) >= target and any(out.glob("*/.*blinkgl-tmp-*")):
-                time.sleep(self.dice.uniform(0, 0.5))
-                return driver.poll() is None
-            time.sleep(0.01)
+                time.sleep(self.dice.uniform(0, self.pace_s))
+                if driver.poll() is not None or not any(out.glob("*/.*blinkgl-tmp-*")):
+                    continue
+                self.struck.append(self.whole(out))
+                return True
+            time.sleep(0.005)
         return False
 
     def resume(self, out: Path) -> int:
@@ -92,11 +102,11 @@ Fault = Callable[[Soak, Path], str]
 
 def kill_worker(soak: Soak, out: Path) -> str:
     driver = soak.start(out, "--workers", soak.workers)
-    killed = 0
-    while killed < 3 and soak.wait_until_busy(driver, out):
+    killed, least = 0, None
+    while killed < 3 and soak.wait_until_busy(driver, out, least):
         if workers := workers_of(driver.pid):
             os.kill(soak.dice.choice(workers), signal.SIGKILL)
-            killed += 1
+            killed, least = killed + 1, soak.struck[-1] + 1
     driver.communicate()
     return f"{killed} killed, driver's status {driver.returncode}"
 
@@ -209,6 +219,21 @@ def ray_child(recipe: str, overrides: list[str], out: str, node: bool, skip: int
     print(f"{display.failures} attempts lost, {len(outcome.made)} made, {len(outcome.set_aside)} set aside")
 
 
+IN_THE_MIDDLE = {"kill-worker", "hang", "kill-driver", "sigterm", "sigint", "corrupt-asset"}
+"""Faults at a moment of our choosing. (A disk is full when it is, and Ray's faults count progress messages.)"""
+
+
+def strike(soak: Soak, fault: str, out: Path) -> str:
+    """The fault, on a run that was in its middle; what happened."""
+    for _ in range(10):
+        soak.struck.clear()
+        what = FAULTS[fault](soak, out)
+        if fault not in IN_THE_MIDDLE or soak.struck:
+            return what
+        shutil.rmtree(out)
+    raise SystemExit(f"{fault}: ten runs were over before the fault; longer sequences, or more of them")
+
+
 # ---- the frame -------------------------------------------------------------------------------------------------------
 
 
@@ -262,6 +287,7 @@ def main() -> None:
     parser.add_argument("--recipe", default=str(resources.files("blinkgl.configs").joinpath("blinkflow_mini.yaml")))
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="a.b=c")
     parser.add_argument("--faults", default=",".join(LOCAL + RAY))
+    parser.add_argument("--tiny", action="store_true", help="sequences of a tenth of a second")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0, help="of the moments at which faults strike")
@@ -277,7 +303,7 @@ def main() -> None:
     console, results = Console(), []
     console.print(machine_line(), highlight=False)
     with tempfile.TemporaryDirectory(prefix="blinkgl-soak-") as scratch:
-        soak = Soak(Path(arguments.recipe), arguments.overrides, arguments.workers, Path(scratch).resolve(), random.Random(arguments.seed))
+        soak = Soak(Path(arguments.recipe), (TINY if arguments.tiny else []) + arguments.overrides, arguments.workers, Path(scratch).resolve(), random.Random(arguments.seed))
         reference = Path(scratch) / "reference"
         started = time.monotonic()
         subprocess.run(soak.command(reference, "--quiet"), check=True)
@@ -285,7 +311,7 @@ def main() -> None:
         expected = tree(reference)
         soak.reference_bytes = sum(p.stat().st_size for p in reference.rglob("*") if p.is_file())
         costs = [json.loads(line)["total_s"] for line in (reference / RUN_FOLDER / "costs.jsonl").read_text().splitlines()]
-        soak.limit_s = max(10.0, 8 * max(costs))
+        soak.limit_s, soak.pace_s = max(10.0, 8 * max(costs)), sum(costs) / len(costs)
         console.print(f"reference: {len(soak.tasks)} sequences, {soak.reference_bytes / 1e6:.1f} MB, {elapsed:.0f} s; time limit {soak.limit_s:.0f} s", highlight=False)
         for round_number in range(arguments.rounds):
             for fault in faults:
@@ -294,18 +320,20 @@ def main() -> None:
                         results.append({"round": round_number, "fault": fault, "what": "skipped: not allowed to mount", "ok": None})
                         continue
                     started = time.monotonic()
-                    what = FAULTS[fault](soak, out)
+                    what = strike(soak, fault, out)
                     resumes = soak.resume(out)
                     verified = subprocess.run([sys.executable, "-m", "blinkgl.cli", "verify", str(out), "--deep", "--sample", "2", "--seed", str(round_number)],
                                               capture_output=True, text=True)
                     same = tree(out) == expected
-                    results.append({"round": round_number, "fault": fault, "what": what, "resumes": resumes, "identical": same,
+                    struck = ", ".join(map(str, soak.struck))
+                    results.append({"round": round_number, "fault": fault, "struck at": f"{struck} of {len(soak.tasks)}" if struck else "",
+                                    "what": what, "resumes": resumes, "identical": same,
                                     "verified": verified.returncode == 0, "seconds": round(time.monotonic() - started, 1),
                                     "ok": same and verified.returncode == 0})
                     console.print(f"{results[-1]}", highlight=False, soft_wrap=True)
-    table = Table("fault", "round", "what happened", "resumes", "identical", "verify --deep", "s")
+    table = Table("fault", "round", "whole when struck", "what happened", "resumes", "identical", "verify --deep", "s")
     for r in results:
-        table.add_row(r["fault"], str(r["round"]), r["what"], *(str(r.get(k, "")) for k in ("resumes", "identical", "verified", "seconds")))
+        table.add_row(r["fault"], str(r["round"]), r.get("struck at", ""), r["what"], *(str(r.get(k, "")) for k in ("resumes", "identical", "verified", "seconds")))
     console.print(table)
     if arguments.json:
         Path(arguments.json).write_text(json.dumps({"machine": machine_line(), "results": results}, indent=1) + "\n")

@@ -1,25 +1,195 @@
-"""Base of every config model and the translation of pydantic's errors into one line."""
+"""Base of every config model: what keys it has, what it checks, and errors in one line that a stranger understands.
+
+A model checks one value by its field, and several values *together* by a :func:`rule`, which is given the values of the keys
+that it names and nothing else:
+
+    class AdaptiveTimeline(Config):
+        min_step_us: float = Field(200.0, ge=0.001)
+        max_step_us: float = Field(20000.0, ge=0.001)
+
+        @rule("min_step_us", "max_step_us")
+        def _ordered(least, most):
+            if least > most:
+                raise Refused(f"min_step_us must not exceed max_step_us = {most}")
+
+So what is looked at together is known without running anything, and :mod:`blinkgl.config.corners` tries all combinations of
+the ends of those distributions alone. pydantic's own validators of whole models, which see everything, are refused.
+"""
 
 from __future__ import annotations
 
 import difflib
+import inspect
+import re
 import types
 import typing
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+import annotated_types
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, TypeAdapter, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 
 from blinkgl.errors import ConfigError
+
+Path = tuple[str, ...]
+
+
+class Refused(ValueError):
+    """What a rule raises: the problem, and where it is (a key of the rule's model), the value and what is accepted."""
+
+    def __init__(self, problem: str, *, where: str = "", value: Any = ..., accepted: str | None = None):
+        super().__init__(problem)
+        self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
+
+
+@dataclass(frozen=True)
+class Rule:
+    """``check`` of the values of ``keys``, paths below the rule's model. ``*`` in a key: all entries of a list or table, as a
+    tuple; a leading ``?``: whether there is a value (not null); a leading ``#``: the names in a table, or the numbers of a list's
+    entries, as a tuple. A key below something that is null is None."""
+
+    keys: tuple[str, ...]
+    check: Callable[..., None]
+
+    def paths(self) -> tuple[tuple[Path, bool], ...]:
+        """Path of every key, and whether it is read with all that is below it."""
+        return tuple((tuple(key.lstrip("?#").split(".")), key[0] not in "?#") for key in self.keys)
+
+    def __call__(self, model: "Config") -> None:
+        self.check(*(_value(model, key) for key in self.keys))
+
+
+def rule(*keys: str) -> Callable[[Callable[..., None]], Rule]:
+    """Makes a rule of the model in whose body it stands; the function takes one value per key, in order."""
+    return lambda function: Rule(keys, function)
 
 
 class Config(BaseModel):
     """Frozen; unknown keys, NaN and infinity are refused. Numbers written as strings ("1e-4") are converted,
-    because YAML 1.1 reads ``1e-4`` as a string."""
+    because YAML 1.1 reads ``1e-4`` as a string.
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
+    presets : values that the key ``preset`` of a model gives to those of its other keys that are not given."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,))
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    rules: ClassVar[tuple[Rule, ...]] = ()
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        found = {name: value for base in reversed(cls.__mro__) for name, value in vars(base).items() if isinstance(value, Rule)}
+        cls.rules = tuple(found.values())
+        decorators = cls.__pydantic_decorators__
+        others = {*decorators.model_validators, *decorators.field_validators, *decorators.validators} - {"_fill_preset", "_keep_rules"}
+        if others:
+            raise TypeError(f"{cls.__name__}.{others.pop()}: say by @rule which keys it reads")
+        for name, one in found.items():
+            inspect.signature(one.check).bind(*one.keys)
+            for path, _ in one.paths():
+                if not _fits(cls, path):
+                    raise TypeError(f"{cls.__name__}.{name}: there is no key {'.'.join(path)}")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_preset(cls, data: Any) -> Any:
+        if cls.presets and isinstance(data, dict):
+            name = data.get("preset", cls.model_fields["preset"].default)
+            return {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **data}
+        return data
+
+    @model_validator(mode="after")
+    def _keep_rules(self):
+        for one in self.rules:
+            one(self)
+        return self
 
 
-def validate(model: type[Config], data: Any, *, where: str = "") -> Config:
+def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
+    """Annotation of a field that is one of ``models``, told apart by the value of the key ``tag``; where that key is not given
+    it is ``default``, so that a table may say only what it changes."""
+    union = typing.Union[models]
+    if default is None:
+        return Annotated[union, Discriminator(tag)]
+    return Annotated[union, Discriminator(tag), BeforeValidator(partial(_with_tag, tag, default))]
+
+
+def _with_tag(tag: str, default: str, data: Any) -> Any:
+    return {tag: default, **data} if isinstance(data, dict) and tag not in data else data
+
+
+def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
+    """Key and value that tell the model from the others of its union; None for a model that stands alone."""
+    for key in ("kind", "emulator", "name"):
+        if key in model.model_fields:
+            annotation = model.model_fields[key].annotation
+            if typing.get_origin(annotation) is typing.Literal and len(typing.get_args(annotation)) == 1:
+                return key, typing.get_args(annotation)[0]
+    return None
+
+
+# --- what stands at a path --------------------------------------------------------------------------------------------
+
+
+def members(annotation: Any) -> list[Any]:
+    """Members of a union (through Annotated) without null; another annotation alone."""
+    origin = typing.get_origin(annotation)
+    if origin is Annotated:
+        return members(typing.get_args(annotation)[0])
+    if origin in (typing.Union, types.UnionType):
+        return [x for a in typing.get_args(annotation) if a is not type(None) for x in members(a)]
+    return [annotation]
+
+
+def is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def below(annotation: Any, step: str | int) -> list[Any]:
+    """Annotations of what stands at key or index ``step`` ("*": any) of a value of ``annotation``; [] where nothing can."""
+    if is_model(annotation):
+        info = annotation.model_fields.get(step)
+        return [] if info is None else members(info.annotation)
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is dict:
+        return members(arguments[1])
+    if origin in (tuple, list) and (isinstance(step, int) or step == "*" or str(step).isdigit()):
+        if origin is tuple and arguments and arguments[-1] is not Ellipsis:
+            at = 0 if step == "*" else int(step)
+            return members(arguments[at]) if at < len(arguments) else []
+        return members(arguments[0])
+    return []
+
+
+def _fits(annotation: Any, path: Iterable[str]) -> bool:
+    here = [annotation]
+    for step in path:
+        here = [x for a in here for x in below(a, step)]
+    return bool(here)
+
+
+def _value(model: Any, key: str) -> Any:
+    found = _get(model, key.lstrip("?#").split("."))
+    if key.startswith("?"):
+        return found is not None
+    if key.startswith("#"):
+        return tuple(found) if isinstance(found, dict) else tuple(range(len(found or ())))
+    return found
+
+
+def _get(node: Any, path: list[str]) -> Any:
+    if not path or node is None:
+        return node
+    if path[0] == "*":
+        return tuple(_get(child, path[1:]) for child in (node.values() if isinstance(node, dict) else node))
+    return _get(getattr(node, path[0], None), path[1:])
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def validate(model: type[Config], data: Any, *, where: str = "") -> Any:
     """``model`` built from plain data; raises :class:`ConfigError` naming the first bad path, its value and
     what is accepted (for an unknown key: the nearest valid one)."""
     try:
@@ -28,78 +198,152 @@ def validate(model: type[Config], data: Any, *, where: str = "") -> Config:
         raise _translate(model, error, where) from None
 
 
-def _translate(model: type[BaseModel], error: ValidationError, where: str) -> ConfigError:
+def validate_field(model: type[Config], name: str, value: Any) -> Any:
+    """``value`` as the model's field ``name`` alone would hold it. Raises ConfigError as :func:`validate`."""
+    info = model.model_fields[name]
+    try:
+        return TypeAdapter(Annotated[info.annotation, *info.metadata]).validate_python(value)
+    except ValidationError as error:
+        raise _translate(model, error, "", (name,)) from None
+
+
+PROBLEMS = {
+    "model_type": "not a table of keys", "model_attributes_type": "not a table of keys", "dict_type": "not a table of keys",
+    "invalid_key": "a key is not text",
+    "tuple_type": "not a list", "too_long": "too many entries", "too_short": "too few entries",
+    "int_type": "not a whole number", "int_parsing": "not a whole number", "int_from_float": "not a whole number",
+    "int_parsing_size": "too many digits",
+    "float_type": "not a number", "float_parsing": "not a number", "finite_number": "not a finite number",
+    "bool_type": "not true or false", "bool_parsing": "not true or false",
+    "string_type": "not text", "string_unicode": "not text", "string_too_short": "too short", "string_too_long": "too long",
+    "literal_error": "unknown choice", "none_required": "not null",
+    "greater_than": "too small", "greater_than_equal": "too small", "less_than": "too large", "less_than_equal": "too large",
+    "multiple_of": "not a multiple",
+}
+"""What pydantic's types of error are in plain words; `missing`, `extra_forbidden`, `value_error` and the tags of unions are
+put into words where they are translated."""
+
+
+def _translate(model: type[BaseModel], error: ValidationError, where: str, start: Path = ()) -> ConfigError:
     # Unknown keys first: a misspelt key usually also causes a "missing" error, and the misspelling is the cause.
     problems = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = problems[0]
-    path, owner = _locate(model, first["loc"])
+    kind, context = first["type"], first.get("ctx", {})
+    path, owners, annotations, info = _locate(model, (*start, *first["loc"]), kind)
     dotted = ".".join(filter(None, [where, *path])) or "config"
-    if first["type"] == "extra_forbidden":
-        known = sorted(owner.model_fields) if owner is not None else []
-        near = difflib.get_close_matches(str(path[-1]), known, n=1)
-        hint = f"'{near[0]}' (nearest)" if near else "one of: " + ", ".join(known)
-        return ConfigError("unknown key", where=dotted, accepted=hint)
-    message = first["msg"].removeprefix("Value error, ").rstrip(".")
-    if first["type"] == "missing":
-        return ConfigError("is required", where=dotted)
-    if first["type"] in ("union_tag_invalid", "union_tag_not_found"):
-        context = first.get("ctx", {})
+    if kind == "extra_forbidden":
+        return ConfigError("unknown key", where=dotted, accepted=_nearest(model, path, owners))
+    if kind in ("union_tag_invalid", "union_tag_not_found"):
+        tags = [tag_of(a) for a in annotations if is_model(a)]
         key = context.get("discriminator", "kind").strip("'")
-        return ConfigError("unknown or missing choice", where=f"{dotted}.{key}", value=context.get("tag", first["input"]),
-                           accepted="one of " + context.get("expected_tags", "the documented kinds"))
-    message = message[0].lower() + message[1:]
-    return ConfigError(message, where=dotted, value=first["input"])
+        got = first["input"].get(key, ...) if isinstance(first["input"], dict) else first["input"]
+        return ConfigError("unknown or missing choice", where=f"{dotted}.{key}", value=got,
+                           accepted="one of " + ", ".join(f"'{tag[1]}'" for tag in tags if tag))
+    if kind == "missing":
+        short = path and path[-1].isdigit() and not owners
+        problem, value = ("too few entries", first["input"]) if short else ("is required", ...)
+        return ConfigError(problem, where=".".join(filter(None, [where, *path[:-1]])) if short else dotted, value=value,
+                           accepted=None if short else describe(annotations, info))
+    refused = context.get("error")
+    if isinstance(refused, Refused):
+        there = ".".join(filter(None, [where, *path, refused.where])) or "config"
+        return ConfigError(refused.problem, where=there, value=refused.value, accepted=refused.accepted)
+    if refused is not None:
+        return ConfigError(str(refused), where=dotted, value=first["input"])
+    if kind == "invalid_key":
+        return ConfigError(PROBLEMS[kind], where=dotted, value=first["input"], accepted="text")
+    several = len(annotations) > 1 and not any(is_model(a) for a in annotations)
+    problem = "not accepted" if several else PROBLEMS.get(kind, "not accepted")
+    return ConfigError(problem, where=dotted, value=first["input"], accepted=describe(annotations, info))
 
 
-def _locate(model: type[BaseModel], loc: tuple) -> tuple[list[str], type[BaseModel] | None]:
-    """Config path of a pydantic location without the union tags pydantic inserts, and the model that owns its
-    last key (None when that is not a model)."""
+def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseModel]]) -> str:
+    """What an unknown key may have been: the nearest known one, or the sibling kind that has it."""
+    known = sorted({name for owner in owners for name in owner.model_fields})
+    near = difflib.get_close_matches(path[-1], known, n=1)
+    if near:
+        return f"'{near[0]}' (nearest)"
+    here: list[Any] = [model]
+    for step in path[:-1]:
+        here = [x for a in here for x in below(a, step)]
+    others = [tag_of(m) for m in here if is_model(m) and m not in owners and path[-1] in m.model_fields]
+    also = "".join(f"; it is a key of {key}: {value}" for key, value in filter(None, others))
+    return "one of: " + ", ".join(known) + also
+
+
+def _locate(model: type[BaseModel], loc: tuple, kind: str) -> tuple[list[str], list[type[BaseModel]], list[Any], FieldInfo | None]:
+    """Config path of a pydantic location without the labels that pydantic inserts for members of unions; the models that may
+    own its last key; the annotations that are accepted there; and the field that they are of."""
     path: list[str] = []
-    owner: Any = model
-    candidates: list[Any] = [model]
-    for step in loc:
-        models = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
-        if isinstance(step, int):
+    here: list[Any] = [model]
+    owners: list[type[BaseModel]] = []
+    info: FieldInfo | None = None
+    for number, step in enumerate(loc):
+        models = [a for a in here if is_model(a)]
+        inner = [x for a in here for x in below(a, step)]
+        if inner:
             path.append(str(step))
-            candidates = [a for c in candidates for a in _arguments(c)] or candidates
+            owners = [m for m in models if step in m.model_fields]
+            info = owners[0].model_fields[step] if owners else None
+            here = inner
             continue
-        table = next((c for c in candidates if typing.get_origin(c) is dict), None)
-        if table is not None:
+        tagged = [m for m in models if step in (tag_of(m) or ())[1:]]
+        if tagged:
+            here = tagged
+        elif number == len(loc) - 1 and kind in ("extra_forbidden", "missing"):
             path.append(str(step))
-            candidates = _flatten(typing.get_args(table)[1])
-            owner = next((c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)), owner)
-            continue
-        holder = next((m for m in models if step in m.model_fields), None)
-        if holder is not None:
-            path.append(step)
-            owner = holder
-            candidates = _flatten(holder.model_fields[step].annotation)
-            continue
-        tagged = [m for m in models if _has_tag(m, step) or m.__name__ == step]
-        if tagged and step != loc[-1]:
-            candidates = tagged
-            owner = tagged[0]
-            continue
-        if step == loc[-1] and not (tagged or str(step).startswith(("function-", "constrained-", "tuple[", "list["))):
-            path.append(str(step))
-            owner = models[0] if models else None
-    return path, owner
+            owners = models
+        # anything else is a label: a member of a union, a function, "[key]"
+    return path, owners, here, info
 
 
-def _has_tag(model: type[BaseModel], tag: str) -> bool:
-    return any(tag in typing.get_args(f.annotation) for f in model.model_fields.values()
-               if typing.get_origin(f.annotation) is typing.Literal)
+def describe(annotations: list[Any], info: FieldInfo | None = None) -> str:
+    """What a field accepts, in words."""
+    words = list(dict.fromkeys(_word(a, info) for a in annotations))
+    if info is not None and type(None) in typing.get_args(info.annotation):
+        words.append("null")
+    return _or(words)
 
 
-def _arguments(annotation: Any) -> list[Any]:
-    return [x for a in typing.get_args(annotation) if a is not type(None) for x in _flatten(a)]
+def _or(words: list[str]) -> str:
+    if len(words) == 1:
+        return words[0]
+    comma = "," if any(" " in word for word in words[:-1]) else ""
+    return ", ".join(words[:-1]) + f"{comma} or {words[-1]}"
 
 
-def _flatten(annotation: Any) -> list[Any]:
-    """Union members (through Annotated), other annotations as they are."""
-    origin = typing.get_origin(annotation)
-    if origin is typing.Annotated:
-        return _flatten(typing.get_args(annotation)[0])
-    if origin in (typing.Union, types.UnionType):
-        return [x for a in typing.get_args(annotation) if a is not type(None) for x in _flatten(a)]
-    return [annotation]
+def _word(annotation: Any, info: FieldInfo | None) -> str:
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return _word(arguments[0], info)
+    if origin is typing.Literal:
+        return _or([str(a).lower() if isinstance(a, bool) else repr(a) for a in arguments])
+    if origin in (tuple, list):
+        if origin is tuple and arguments[-1] is not Ellipsis:
+            return "a list of " + _NUMBER_WORDS.get(len(arguments), str(len(arguments))) + " numbers"
+        inner = members(arguments[0])
+        plural = "tables" if any(is_model(a) for a in inner) else "texts" if inner == [str] else describe(inner)
+        example = f", such as [{typing.get_args(inner[0])[0]}]" if typing.get_origin(inner[0]) is typing.Literal else ""
+        return f"a list of {plural}{example}"
+    if origin is dict or is_model(annotation):
+        return "a table of keys"
+    if annotation in (int, float):
+        return ("a whole number" if annotation is int else "a number") + _limits(info)
+    return {str: "text", bool: "true or false"}.get(annotation, "another value")
+
+
+_NUMBER_WORDS = {2: "two", 3: "three", 4: "four"}
+
+
+def _limits(info: FieldInfo | None) -> str:
+    said = []
+    for kind, attribute, words in ((annotated_types.Gt, "gt", "greater than"), (annotated_types.Ge, "ge", "at least"),
+                                   (annotated_types.Lt, "lt", "less than"), (annotated_types.Le, "le", "at most"),
+                                   (annotated_types.MultipleOf, "multiple_of", "a multiple of")):
+        said += [f"{words} {_plain(getattr(m, attribute))}" for m in (info.metadata if info is not None else ()) if isinstance(m, kind)]
+    text = " and ".join(said)
+    return re.sub(r"^ at least (\S+) and at most (\S+)$", r" from \1 to \2", f" {text}") if said else ""
+
+
+def _plain(number: Any) -> str:
+    return str(number) if isinstance(number, int) and abs(number) < 1e6 else f"{number:.7g}"

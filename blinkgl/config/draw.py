@@ -43,24 +43,19 @@ def draw(tree: Any, seed: int, sequence: int) -> Any:
     return _walk(tree, (), lambda path, kind, spec: _draw_one(path, kind, spec, seed, sequence))
 
 
-def extremes(tree: Any) -> list[Any]:
-    """Plain trees that pin all distributions to their lower, then upper ends, and each option of every choice in
-    turn, so that a range whose end is not accepted is refused before any work starts."""
-    most = [1]
-
-    def pick(index: int):
-        def one(path, kind, spec):
-            _check(path, kind, spec)
-            options = [part["value"] for part in spec] if kind == "shares" else list(spec)
-            most[0] = max(most[0], len(options))
-            return options[min(index, len(options) - 1)]
-        return one
-
-    trees, index = [], 0
-    while index < most[0]:
-        trees.append(_walk(tree, (), pick(index)))
-        index += 1
-    return trees
+def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) -> list[Any]:
+    """What stands for all that the distribution ``node`` can draw: both ends of a range, every choice. ``between``: also a value
+    inside the range. Raises ConfigError (with the path) for a malformed one."""
+    kind, spec = next(iter(node.items()))
+    _check(path, kind, spec)
+    if kind == "shares":
+        return [part["value"] for part in spec]
+    if kind in ("choice", "weighted"):
+        return list(spec)
+    low, high = (_number(x) for x in spec)
+    if kind == "integer":
+        return list(dict.fromkeys((int(low), int(high))))
+    return list(dict.fromkeys((low, high, low + 0.381966 * (high - low)) if between else (low, high)))
 
 
 def _walk(node: Any, path: tuple[str, ...], replace) -> Any:
@@ -78,7 +73,10 @@ def _walk(node: Any, path: tuple[str, ...], replace) -> Any:
 def _number(x: Any) -> float:
     if isinstance(x, bool) or not isinstance(x, (int, float, str)):
         raise ValueError
-    value = float(x)
+    try:
+        value = float(x)
+    except OverflowError:
+        raise ValueError from None
     if not math.isfinite(value):
         raise ValueError
     return value
@@ -115,6 +113,8 @@ def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
         low, high = (_number(x) for x in spec)
     except (TypeError, ValueError):
         raise ConfigError("not a range", where=where, value=spec, accepted="[low, high], two finite numbers") from None
+    if not math.isfinite(high - low) or (kind == "integer" and max(abs(low), abs(high)) >= 2**63):
+        raise ConfigError("the range is too wide", where=where, value=spec, accepted="ends whose difference is a number")
     if low > high:
         raise ConfigError("the range is empty", where=where, value=spec, accepted="low <= high")
     if kind == "log_uniform" and low <= 0:
@@ -139,7 +139,7 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     if kind == "integer":
         return int(rng.integers(int(low), int(high), endpoint=True))
     if kind == "log_uniform":
-        return float(math.exp(rng.uniform(math.log(low), math.log(high))))
+        return min(max(float(math.exp(rng.uniform(math.log(low), math.log(high)))), low), high)  # exp(log(b)) may be above b
     return float(rng.uniform(low, high))
 
 

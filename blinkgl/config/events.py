@@ -6,23 +6,17 @@ given beside it wins over the preset.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Union
+from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, Refused, one_of, rule
 
 _MAX_EVENTS = Field(2**25, ge=1_000, le=2**31 - 1, description="Most events one step may emit, shared out equally among blocks "
                     "of 1024 pixels (a block may always emit one per pixel). Where more could fire, each pixel of the block "
                     "is cut to the same number; levels still move, the cut events are counted in `emulator.saturated`. "
                     "2^25 events need about 1 GB while they are sorted.")
 _THRESHOLD = dict(ge=0.001, le=10.0)
-
-
-def _fill_preset(data: Any, presets: dict[str, dict[str, float]]) -> Any:
-    if isinstance(data, dict):
-        return {**presets.get(data.get("preset"), {}), **data}
-    return data
 
 
 class EsimConfig(Config):
@@ -57,6 +51,7 @@ V2E_PRESETS = {
 class V2eConfig(Config):
     """V2E (Hu, Liu, Delbruck, CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period."""
 
+    presets = V2E_PRESETS
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field("default", description="v2e's command-line defaults, or its `clean` "
                                                          "and `noisy` parameter sets.")
@@ -82,16 +77,10 @@ class V2eConfig(Config):
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
     max_events_per_step: int = _MAX_EVENTS
 
-    @model_validator(mode="before")
-    @classmethod
-    def _preset(cls, data: Any) -> Any:
-        return _fill_preset(data, V2E_PRESETS)
-
-    @model_validator(mode="after")
-    def _noise_needs_bandwidth(self) -> V2eConfig:
-        if self.photoreceptor_noise and self.cutoff_hz == 0:
-            raise ValueError("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
-        return self
+    @rule("photoreceptor_noise", "cutoff_hz")
+    def _noise_needs_bandwidth(noise, cutoff_hz):
+        if noise and cutoff_hz == 0:
+            raise Refused("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
 
 
 VOLTMETER_PRESETS = {
@@ -104,6 +93,7 @@ VOLTMETER_PRESETS = {
 class VoltmeterConfig(Config):
     """DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion with drift between two absorbing thresholds."""
 
+    presets = VOLTMETER_PRESETS
     emulator: Literal["voltmeter"] = "voltmeter"
     preset: Literal["DVS346", "DVS240"] = Field("DVS346", description="Camera whose calibrated k1...k6 are the defaults.")
     k1: float = Field(5.265, gt=0, le=100, description="Gain: thresholds per unit of d ln(L + k2); the contrast threshold is "
@@ -118,13 +108,6 @@ class VoltmeterConfig(Config):
     refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time after an event, microseconds (the paper has none).")
     max_events_per_step: int = _MAX_EVENTS
 
-    @model_validator(mode="before")
-    @classmethod
-    def _preset(cls, data: Any) -> Any:
-        if isinstance(data, dict):
-            return _fill_preset({"preset": "DVS346", **data}, VOLTMETER_PRESETS)
-        return data
 
-
-EmulatorConfig = Annotated[Union[EsimConfig, V2eConfig, VoltmeterConfig], Field(discriminator="emulator")]
+EmulatorConfig = one_of("emulator", EsimConfig, V2eConfig, VoltmeterConfig, default="esim")
 """The union as a field annotation; a model holds ``events: EmulatorConfig = EsimConfig()``."""

@@ -6,8 +6,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, Refused, rule
 from blinkgl.config.scene import Paths
+
+MAX_SPAN_S = (2**32 - 1) * 1e-6
+"""Longest recording of one event file, s: DSEC counts its microseconds in 32 bits."""
 
 
 class FramesConfig(Config):
@@ -25,3 +28,14 @@ class FramesConfig(Config):
     interpolate: Literal["linear", "cubic", "motion"] = Field("motion", description="between frames: as `blinkgl simulate --interpolate`")
     max_px: float = Field(1.0, gt=0, le=1e3, description="motion: largest displacement per step, px")
     factor: int = Field(4, ge=1, le=1000, description="cubic: steps per given frame")
+
+    @rule("fps", "count")
+    def _fits_a_file(fps, count):
+        check_span(count or 3, fps)
+
+
+def check_span(frames: int, fps: float) -> None:
+    """Refuses ``frames`` frames at ``fps`` that are longer than one event file can hold."""
+    if (frames - 1) / fps > MAX_SPAN_S:
+        raise Refused(f"{frames} frames at this rate last {(frames - 1) / fps:.6g} s, more than the {MAX_SPAN_S:.1f} s that an event "
+                      "file can hold", where="fps", value=fps, accepted=f"at least {(frames - 1) / MAX_SPAN_S:.4g}, or fewer frames")

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+from functools import lru_cache
 from importlib import resources
 from typing import Any, Literal
 
-import yaml
+from blinkgl.config.reader import parse_yaml
 
 Quality = Literal["fast", "balanced", "accurate", "reference"]
 QUALITIES = ("fast", "balanced", "accurate", "reference")
@@ -13,25 +15,26 @@ QUALITIES = ("fast", "balanced", "accurate", "reference")
 
 def load_quality(name: str) -> dict[str, Any]:
     """``timeline:`` and ``render:`` of a preset, plain data; the figures it was chosen by are comments in its file."""
-    return yaml.safe_load((resources.files("blinkgl.configs") / "quality" / f"{name}.yaml").read_text(encoding="utf-8"))
+    return copy.deepcopy(_shipped(name))
 
 
-def with_quality(tree: dict[str, Any]) -> dict[str, Any]:
-    """``tree`` with the preset's values where it says nothing; as it is when it names no (known) preset.
+@lru_cache
+def _shipped(name: str) -> dict[str, Any]:
+    return parse_yaml((resources.files("blinkgl.configs") / "quality" / f"{name}.yaml").read_text(encoding="utf-8"), f"quality/{name}.yaml")
 
-    A timeline of another kind than the preset's is kept, and takes the preset's reconstruction alone: the other values
+
+def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any) -> dict[str, Any]:
+    """The preset's values for a configuration with this timeline.kind, events.emulator and frames (None: not said); none where
+    ``quality`` names no known one.
+
+    A timeline of another kind than the preset's takes the preset's reconstruction alone: the other values
     mean nothing to it. Emulators that follow straight lines alone take everything but the reconstruction."""
-    if tree.get("quality") not in QUALITIES:
-        return tree
-    preset = load_quality(tree["quality"])
-    mine = {key: tree.get(key) for key in ("timeline", "render")}
-    if any(value is not None and not isinstance(value, dict) for value in mine.values()):
-        return tree  # which is refused
-    timeline, render = mine["timeline"] or {}, mine["render"] or {}
+    if quality not in QUALITIES:
+        return {}
+    preset = load_quality(quality)
     given = preset["timeline"]
-    if timeline.get("kind", given["kind"]) != given["kind"]:
+    if kind not in (None, given["kind"]):
         given = {key: value for key, value in given.items() if key == "reconstruction"}
-    events = tree.get("events")
-    if isinstance(events, dict) and events.get("emulator", "esim") != "esim" and tree.get("frames") is None:
+    if emulator not in (None, "esim") and frames is None:
         given = {key: value for key, value in given.items() if key != "reconstruction"}
-    return {**tree, "timeline": {**given, **timeline}, "render": {**preset["render"], **render}}
+    return {"timeline": given, "render": preset["render"]}

@@ -25,6 +25,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
+from blinkgl.config.base import validate_field
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.errors import ConfigError
@@ -69,6 +70,8 @@ def all_groups(template: RunTemplate) -> tuple[Group, ...]:
         where = f"groups.{name}"
         if not isinstance(name, str) or not isinstance(own, dict):
             raise ConfigError("not a group", where=where, value=own, accepted="a table of keys")
+        if "groups" in own:
+            raise ConfigError("a group cannot hold groups", where=f"{where}.groups")
         own = dict(own)
         enabled = own.pop("enabled", True)
         if not isinstance(enabled, bool):
@@ -76,12 +79,15 @@ def all_groups(template: RunTemplate) -> tuple[Group, ...]:
         tree = merge(common, own)
         if "seed" not in own:
             tree["seed"] = derived_seed(template.seed, name)
+        elif not is_distribution(own["seed"]):
+            tree["seed"] = validate_field(SequenceConfig, "seed", own["seed"])
         if isinstance(tree.setdefault("output", {}), dict):
             tree["output"].setdefault("name", name)
         try:
             made.append(_group(name, tree, template, enabled))
         except ConfigError as error:
-            raise ConfigError(f"in group '{name}': {error.problem}", where=error.where, accepted=error.accepted) from None
+            raise ConfigError(f"in group '{name}': {error.problem}", where=error.where, value=error.value,
+                              accepted=error.accepted) from None
     folders: dict[tuple[str, str], str] = {}
     for group in made:
         output = group.template.tree["output"]
@@ -94,9 +100,6 @@ def all_groups(template: RunTemplate) -> tuple[Group, ...]:
 
 
 def _group(name: str, tree: dict[str, Any], template: RunTemplate, enabled: bool) -> Group:
-    output = tree.get("output") or {}
-    if _holds_distribution(output):
-        raise ConfigError("where a sequence goes cannot be drawn", where="output", value=output, accepted="plain values")
     made = RunTemplate(tree, template.base)
     config: SequenceConfig = made.check()
     return Group(name, made, config.output.first_index, config.output.sequences, enabled)
@@ -114,13 +117,6 @@ def merge(common: Any, own: Any) -> Any:
     if not both or any(tag in own and own[tag] != common.get(tag) for tag in _TAGS):
         return copy.deepcopy(own)
     return {**copy.deepcopy(common), **{key: merge(common.get(key), value) for key, value in own.items()}}
-
-
-def _holds_distribution(node: Any) -> bool:
-    if is_distribution(node):
-        return True
-    children = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
-    return any(_holds_distribution(child) for child in children)
 
 
 def _plain(node: Any) -> Any:

@@ -6,11 +6,12 @@ whether they exist; the models here only know shapes, units and limits.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Union
+import math
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, Refused, one_of, rule
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
 PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
@@ -95,6 +96,9 @@ class PoolConfig(Config):
         "all", description="'all' or a list of kinds; [] for none")
     variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
     folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
+    up: Literal["auto", "y", "z"] = Field("auto",
+                                          description="the axis of the folders' files that points up; auto: y for glb and gltf, "
+                                          "z for obj, ply, stl. Resting objects stand on it")
     urdfs: Annotated[Literal["auto"] | bool, _one_of(("auto", True, False))] = Field(
         False, description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that the same YAML "
         "gives other scenes there")
@@ -167,6 +171,12 @@ class LightConfig(Config):
                                       "(40 where nothing is random)")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
+    def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
+        """Unit vector towards the sun; the arguments (degrees) stand where the configuration leaves the angle open."""
+        e = math.radians(elevation if self.sun_elevation is None else self.sun_elevation)
+        a = math.radians(azimuth if self.sun_azimuth is None else self.sun_azimuth)
+        return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
+
 
 class RandomSceneConfig(Config):
     """A random world, as in the paper: objects from a pool between sky and ground."""
@@ -186,16 +196,21 @@ class RandomSceneConfig(Config):
     camera_clearance: float = Field(0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m")
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
 
-    @model_validator(mode="after")
-    def _fits(self):
-        least = max(1.2 * self.region.width, self.region.width + 2 * self.objects.size[1], 2.2 * self.region.height)
-        if self.sky is not None and self.sky.size < least:
-            raise ValueError(f"sky.size {self.sky.size:g} must be at least {least:g} to hold the region and its objects")
-        if self.region.camera_height[0] >= self.region.height:
-            raise ValueError(f"region.camera_height must begin below region.height {self.region.height:g}")
-        if self.objects.size[0] >= self.region.height:
-            raise ValueError(f"objects.size must begin below region.height {self.region.height:g}")
-        return self
+    @rule("region.width", "region.height", "objects.size", "sky.size")
+    def _sky_holds_everything(width, height, sizes, sky):
+        least = max(1.2 * width, width + 2 * sizes[1], 2.2 * height)
+        if sky is not None and sky < least:
+            raise Refused(f"must be at least {least:g} to hold the region and its objects", where="sky.size", value=sky)
+
+    @rule("region.camera_height", "region.height")
+    def _camera_below_the_ceiling(camera_heights, height):
+        if camera_heights[0] >= height:
+            raise Refused(f"must begin below region.height {height:g}", where="region.camera_height", value=list(camera_heights))
+
+    @rule("objects.size", "region.height")
+    def _objects_below_the_ceiling(sizes, height):
+        if sizes[0] >= height:
+            raise Refused(f"must begin below region.height {height:g}", where="objects.size", value=list(sizes))
 
 
 class PoseConfig(Config):
@@ -206,16 +221,21 @@ class PoseConfig(Config):
     euler: Vector3 | None = Field(None, description="degrees about the fixed x, y, z axes, applied in this order")
     look_at: Position | None = Field(None, description="point that the camera's z axis, or an object's x axis, is turned to")
 
-    @model_validator(mode="after")
-    def _one_orientation(self):
-        given = [k for k in ("quaternion", "euler", "look_at") if getattr(self, k) is not None]
+    @rule("quaternion", "euler", "look_at")
+    def _one_orientation(quaternion, euler, look_at):
+        given = [k for k, v in (("quaternion", quaternion), ("euler", euler), ("look_at", look_at)) if v is not None]
         if len(given) > 1:
-            raise ValueError("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
-        if self.quaternion is not None and sum(q * q for q in self.quaternion) < 1e-12:
-            raise ValueError("a quaternion must not be zero")
-        if self.look_at is not None and max(abs(a - b) for a, b in zip(self.look_at, self.position)) < 1e-9:
-            raise ValueError("look_at must differ from the position")
-        return self
+            raise Refused("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
+
+    @rule("quaternion")
+    def _some_rotation(quaternion):
+        if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
+            raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
+
+    @rule("look_at", "position")
+    def _some_direction(look_at, position):
+        if look_at is not None and max(abs(a - b) for a, b in zip(look_at, position)) < 1e-9:
+            raise Refused("must differ from the position", where="look_at", value=list(look_at))
 
 
 class KeyframeConfig(PoseConfig):
@@ -223,21 +243,37 @@ class KeyframeConfig(PoseConfig):
 
 
 class KeyedMotionConfig(PoseConfig):
-    """A fixed pose, or key frames; before the first and after the last the pose is held."""
+    """A fixed pose, or key frames; before the first and after the last the pose is held. From one key frame to the
+    next a body turns the shortest way (for ``spline``: near it), so ``euler`` may change by less than 180 degrees per
+    step; whole turns need key frames in between."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
     interpolation: Literal["spline", "linear"] = Field("spline", description="between key frames: C2 spline, or straight lines and slerp")
 
-    @model_validator(mode="after")
-    def _keyframes(self):
-        times = [k.time for k in self.keyframes]
+    @rule("keyframes.*.time")
+    def _in_order(times):
         if len(times) == 1:
-            raise ValueError("one key frame is no motion; give two or more, or a fixed pose")
-        if any(b - a < 1e-6 for a, b in zip(times, times[1:])):
-            raise ValueError("the key frames' times must increase by at least 1e-6 s")
-        if times and (self.model_fields_set & {"position", "quaternion", "euler", "look_at"}):
-            raise ValueError("give a fixed pose or keyframes, not both")
-        return self
+            raise Refused("one key frame is no motion; give two or more, or a fixed pose", where="keyframes")
+        for k, (before, after) in enumerate(zip(times, times[1:])):
+            if after - before < 1e-6:
+                raise Refused("the key frames' times must increase by at least 1e-6 s", where=f"keyframes.{k + 1}.time", value=after)
+
+    @rule("#keyframes", "position", "quaternion", "euler", "look_at")
+    def _pose_or_keyframes(keyframes, position, *orientation):
+        if keyframes and (any(position) or any(o is not None for o in orientation)):
+            raise Refused("give a fixed pose or keyframes, not both")
+
+    @rule("keyframes.*.euler", "keyframes.*.quaternion", "keyframes.*.look_at")
+    def _shortest_turns(eulers, quaternions, look_ats):
+        # Between poses the body turns the shortest way: half a turn has no shortest way, and more would go back.
+        otherwise = [q is not None or at is not None for q, at in zip(quaternions, look_ats)]
+        for k in range(len(eulers) - 1):
+            if otherwise[k] or otherwise[k + 1]:
+                continue
+            steps = [abs(v - u) for u, v in zip(eulers[k] or (0, 0, 0), eulers[k + 1] or (0, 0, 0))]
+            if max(steps) >= 180:
+                raise Refused(f"euler changes by {max(steps):g} degrees about {'xyz'[steps.index(max(steps))]} from key frame {k} to {k + 1}; "
+                              "it must be less than 180 (add key frames in between)")
 
 
 class MeshConfig(Config):
@@ -245,18 +281,29 @@ class MeshConfig(Config):
 
     primitive: Literal[PrimitiveKind, "grid"] | None = Field(None, description="kind of primitive")
     parameters: dict[str, Annotated[int | float | Vector3, BeforeValidator(_number_or_three)]] = Field(
-        {}, description="the primitive's keyword arguments, see blinkgl.scene.primitives")
+        {}, description="the primitive's sizes and numbers of faces: see [primitives](#primitives)")
     file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
+    up: Literal["auto", "y", "z"] = Field("auto",
+                                          description="the file's axis that points up, which becomes the world's z: with y, the file's "
+                                          "(x, y, z) is drawn at (x, -z, y). auto: y for glb and gltf, as their standard says; z (the file's own "
+                                          "coordinates) for obj, ply, stl")
     project_uvs: bool = Field(False, description="replace the file's texture coordinates by a box projection")
     uv_size: float = Field(1.0, gt=0, description="edge of one repeat of projected texture coordinates, in the mesh's units")
 
-    @model_validator(mode="after")
-    def _one(self):
-        if (self.primitive is None) == (self.file is None):
-            raise ValueError("give exactly one of primitive and file")
-        if self.file is not None and self.parameters:
-            raise ValueError("parameters belong to a primitive, not to a file")
-        return self
+    @rule("primitive", "file")
+    def _one(primitive, file):
+        if (primitive is None) == (file is None):
+            raise Refused("give exactly one of primitive and file")
+
+    @rule("file", "#parameters")
+    def _parameters_of_a_primitive(file, parameters):
+        if file is not None and parameters:
+            raise Refused("parameters belong to a primitive, not to a file", where="parameters")
+
+    @rule("?file", "up")
+    def _up_of_a_file(file, up):
+        if not file and up != "auto":
+            raise Refused("up belongs to a file, not to a primitive", where="up", value=up)
 
 
 class MaterialConfig(Config):
@@ -272,12 +319,11 @@ class MaterialConfig(Config):
     unlit: bool = Field(False, description="radiance = albedo, whatever the light")
     double_sided: bool = Field(False, description="draw back faces, with the normal turned round")
 
-    @model_validator(mode="after")
-    def _one(self):
-        given = [k for k in ("texture", "procedural", "photograph") if getattr(self, k) is not None]
+    @rule("texture", "procedural", "photograph")
+    def _one(*sources):
+        given = [k for k, v in zip(("texture", "procedural", "photograph"), sources) if v is not None]
         if len(given) > 1:
-            raise ValueError("only one of texture, procedural, photograph may be given, not " + " and ".join(given))
-        return self
+            raise Refused("only one of texture, procedural, photograph may be given, not " + " and ".join(given))
 
 
 class ObjectConfig(KeyedMotionConfig):
@@ -289,6 +335,24 @@ class ObjectConfig(KeyedMotionConfig):
     scale: Annotated[float | Vector3, BeforeValidator(_number_or_three), AfterValidator(_greater_than_zero)] = Field(
         1.0, description="factor on the mesh, one or per axis")
     category: Literal["object", "ground", "wall", "sky"] = Field("object", description="what it is: collisions and drawing order")
+
+
+def _known(used, known, key: str, table: str, at=None) -> None:
+    for number, name in zip(at if at is not None else range(len(used)), used):
+        if name not in known:
+            raise Refused(f"no such name under {table}", where=f"objects.{number}.{key}", value=name,
+                          accepted="one of: " + ", ".join(known) if known else f"a name under {table}")
+
+
+def object_names(names, meshes) -> list[str]:
+    """Names of an explicit scene's objects: as given (None: not), else the mesh's, with the object's number where that is taken."""
+    made: list[str] = []
+    for number, (name, mesh) in enumerate(zip(names, meshes)):
+        name = name or (mesh if mesh not in made else f"{mesh}#{number}")
+        if name in made:
+            raise Refused("the name is given to two objects", where=f"objects.{number}.name", value=name)
+        made.append(name)
+    return made
 
 
 class ExplicitSceneConfig(Config):
@@ -304,9 +368,23 @@ class ExplicitSceneConfig(Config):
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
 
+    @rule("objects.*.mesh", "#meshes")
+    def _meshes_are_known(used, known):
+        _known(used, known, "mesh", "scene.meshes")
+
+    @rule("objects.*.name", "objects.*.mesh")
+    def _names_differ(names, meshes):
+        object_names(names, meshes)
+
+    @rule("objects.*.material", "#materials")
+    def _materials_are_known(used, known):
+        _known([name for name in used if name is not None], known, "material", "scene.materials", at=[k for k, n in enumerate(used) if n is not None])
+
 
 class FileSceneConfig(Config):
-    """A finished glTF/GLB scene with its cameras, materials and node animations."""
+    """A finished glTF/GLB scene with its cameras, materials and node animations. The file's y axis points up, as its
+    standard says, and is drawn as the world's z: the file's (x, y, z) is at (x, -z, y). Poses given here are in that
+    z-up world."""
 
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")
@@ -320,4 +398,4 @@ class FileSceneConfig(Config):
     max_texture_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
 
 
-SceneConfig = Annotated[Union[RandomSceneConfig, ExplicitSceneConfig, FileSceneConfig], Field(discriminator="kind")]
+SceneConfig = one_of("kind", RandomSceneConfig, ExplicitSceneConfig, FileSceneConfig, default="random")

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from importlib import resources
 from typing import Any, Literal
 
-import yaml
 from pydantic import Field
 
-from blinkgl.config.base import Config, validate
+from blinkgl.config.base import Config, Refused, rule, validate
 from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.reader import parse_yaml
 from blinkgl.errors import ConfigError
 
 
 class ReadoutConfig(Config):
     """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`."""
 
-    events_per_second: float = Field(gt=0, le=1e12, description="Peak rate of the bus, events per second.")
+    events_per_second: float = Field(ge=1, le=1e12, description="Peak rate of the bus, events per second.")
     row_ns: float = Field(0.0, ge=0, le=1e6, description="Time to open a row before its events go out, nanoseconds; 0: every "
                           "event is arbitrated by itself.")
     queue_events: int = Field(4096, ge=1, le=2**24, description="Events that may wait for the bus; one that finds the queue full "
                               "is lost.")
+
+    @rule("events_per_second", "row_ns", "queue_events")
+    def _queue_empties(rate, row_ns, queue):
+        if drain_us(rate, row_ns, queue) > 2**32:
+            raise Refused("the last event of a full queue would wait for more than an hour", where="queue_events", value=queue,
+                          accepted="a shorter queue or a faster bus")
+
+    @property
+    def drain_us(self) -> float:
+        """Longest that an event may be late, microseconds: the time that a full queue takes to empty."""
+        return drain_us(self.events_per_second, self.row_ns, self.queue_events)
+
+
+def drain_us(events_per_second: float, row_ns: float, queue_events: int) -> float:
+    """Longest wait for a bus, microseconds (see :class:`ReadoutConfig`)."""
+    return (queue_events + 1) * (1e6 / events_per_second + row_ns / 1000)
 
 
 class SensorConfig(Config):
@@ -40,38 +57,61 @@ class SensorConfig(Config):
     voltmeter: Literal["DVS346", "DVS240"] = Field("DVS346", description="Nearest camera that DVS-Voltmeter was calibrated on.")
     readout: ReadoutConfig = Field(description="Read-out limit.")
 
-    def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
-        """Config of ``esim``, ``v2e`` or ``voltmeter`` with this sensor's values, ``overrides`` on top.
+    def values(self, emulator: str) -> dict[str, Any]:
+        """What this sensor says about the keys of ``esim``, ``v2e`` or ``voltmeter``; of another emulator nothing.
 
         For the Voltmeter k1 = 1 / threshold replaces the calibrated gain only where the sensor is not the
-        calibrated camera itself. Raises ConfigError.
-        """
+        calibrated camera itself."""
         pixel = dict(contrast_threshold=self.contrast_threshold, contrast_threshold_off=self.contrast_threshold_off,
                      threshold_sigma=self.threshold_sigma, refractory_us=self.refractory_us)
         if emulator == "esim":
-            return validate(EsimConfig, {**pixel, **overrides}, where="events")
+            return pixel
         if emulator == "v2e":
-            noise = dict(cutoff_hz=self.cutoff_hz, leak_rate_hz=self.leak_rate_hz, shot_noise_rate_hz=self.shot_noise_rate_hz)
-            return validate(V2eConfig, {**pixel, **noise, **overrides}, where="events")
+            return {**pixel, "cutoff_hz": self.cutoff_hz, "leak_rate_hz": self.leak_rate_hz, "shot_noise_rate_hz": self.shot_noise_rate_hz}
         if emulator == "voltmeter":
-            calibrated = self.name in ("DAVIS346", "DAVIS240C")
-            gain = {} if calibrated else dict(k1=1 / self.contrast_threshold)
-            data = dict(preset=self.voltmeter, refractory_us=self.refractory_us, **gain)
-            return validate(VoltmeterConfig, {**data, **overrides}, where="events")
-        raise ConfigError("unknown emulator", where="events.emulator", value=emulator, accepted="one of esim, v2e, voltmeter")
+            gain = {} if self.name in ("DAVIS346", "DAVIS240C") else {"k1": 1 / self.contrast_threshold}
+            return {"preset": self.voltmeter, "refractory_us": self.refractory_us, **gain}
+        return {}
+
+    def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
+        """Config of ``esim``, ``v2e`` or ``voltmeter`` with this sensor's values, ``overrides`` on top. Raises ConfigError."""
+        models = {"esim": EsimConfig, "v2e": V2eConfig, "voltmeter": VoltmeterConfig}
+        if not isinstance(emulator, str) or emulator not in models:
+            raise ConfigError("unknown emulator", where="events.emulator", value=emulator, accepted="one of " + ", ".join(models))
+        return validate(models[emulator], {**self.values(emulator), **overrides}, where="events")
 
 
-def sensor_names() -> list[str]:
+@lru_cache
+def sensor_names() -> tuple[str, ...]:
     """Names of the shipped sensors, as ``load_sensor`` takes them."""
-    return sorted(f.name.removesuffix(".yaml") for f in (resources.files("blinkgl.configs") / "sensors").iterdir()
-                  if f.name.endswith(".yaml"))
+    return tuple(sorted(f.name.removesuffix(".yaml") for f in (resources.files("blinkgl.configs") / "sensors").iterdir()
+                        if f.name.endswith(".yaml")))
 
 
 def load_sensor(name: str) -> SensorConfig:
     """A shipped sensor by name (case and punctuation do not matter). Raises ConfigError naming the known ones."""
-    plain = lambda s: "".join(c for c in s.lower() if c.isalnum())
-    for known in sensor_names():
-        if plain(known) == plain(name):
-            text = (resources.files("blinkgl.configs") / "sensors" / f"{known}.yaml").read_text(encoding="utf-8")
-            return validate(SensorConfig, yaml.safe_load(text), where=f"sensors/{known}.yaml")
-    raise ConfigError("unknown sensor", where="sensor", value=name, accepted="one of " + ", ".join(sensor_names()))
+    known = known_sensor(name)
+    if known is None:
+        raise ConfigError("unknown sensor", where="sensor", value=name, accepted="one of " + ", ".join(sensor_names()))
+    return _shipped(known)
+
+
+def known_sensor(name: Any) -> str | None:
+    """The name in :func:`sensor_names` that ``name`` means; None for one that is not shipped."""
+    plain = lambda s: "".join(c for c in s.lower() if c.isalnum())  # noqa: E731
+    return next((known for known in sensor_names() if plain(known) == plain(name)), None) if isinstance(name, str) else None
+
+
+@lru_cache
+def _shipped(known: str) -> SensorConfig:
+    text = (resources.files("blinkgl.configs") / "sensors" / f"{known}.yaml").read_text(encoding="utf-8")
+    return validate(SensorConfig, parse_yaml(text, f"sensors/{known}.yaml"), where=f"sensors/{known}.yaml")
+
+
+def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
+    """What the sensor called ``sensor`` says about a configuration with ``emulator`` (None: esim); nothing for an unknown one."""
+    if known_sensor(sensor) is None:
+        return {}
+    camera = load_sensor(sensor)
+    return {"camera": {"width": camera.width, "height": camera.height}, "readout": camera.readout.model_dump(),
+            "events": camera.values("esim" if emulator is None else emulator)}

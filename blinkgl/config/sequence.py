@@ -1,33 +1,39 @@
 """The whole configuration of a generation run, and of one sequence of it.
 
 ``load_run(path, overrides)`` reads a YAML file; ``RunTemplate.sequence(i)`` draws the i-th sequence's parameters
-and returns a frozen, validated :class:`SequenceConfig` of plain values. Nothing else in the project knows YAML.
+and returns a frozen, validated :class:`SequenceConfig` of plain values. What can be drawn is checked when the file is read
+(:mod:`blinkgl.config.corners`).
 """
 
 from __future__ import annotations
 
 import copy
+import math
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field
 
-from blinkgl.config.base import Config, validate
-from blinkgl.config.draw import draw, extremes
+from blinkgl.config.base import Config, Refused, rule, validate, validate_field
+from blinkgl.config.corners import Fill, corners, corners_of, sites
+from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig
-from blinkgl.config.frames import FramesConfig
+from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.lod import LodConfig
-from blinkgl.config.quality import Quality, with_quality
+from blinkgl.config.quality import Quality, fill_quality
+from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
-from blinkgl.config.sensor import ReadoutConfig, load_sensor
+from blinkgl.config.sensor import ReadoutConfig, drain_us, fill_sensor, known_sensor, sensor_names
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.errors import ConfigError
 
 NS_PER_S = 1_000_000_000
-MAX_YAML_BYTES = 4 << 20
+MAX_LABELS = 1_000_000
+"""Files of a sequence have numbers of six digits."""
 
 
 class CameraConfig(Config):
@@ -41,16 +47,13 @@ class CameraConfig(Config):
     cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point y, px; default (height - 1) / 2")
     near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane: nothing nearer is drawn, world units")
 
-    @model_validator(mode="after")
-    def _one_of(self):
-        if self.fov is not None and self.focal is not None:
-            raise ValueError("give fov or focal, not both")
-        return self
+    @rule("fov", "focal")
+    def _one_of(fov, focal):
+        if fov is not None and focal is not None:
+            raise Refused("give fov or focal, not both")
 
     @property
     def fx(self) -> float:
-        import math
-
         if self.focal is not None:
             return self.focal
         return 0.5 * self.width / math.tan(math.radians(self.fov if self.fov is not None else 60.0) / 2)
@@ -63,19 +66,38 @@ class CameraConfig(Config):
                 self.cy if self.cy is not None else (self.height - 1) / 2)
 
 
+def camera_radius(camera: Any, clearance: float) -> float:
+    """How far a random world's camera keeps from everything: its clearance, or a little more than the near plane's corners."""
+    return max(clearance, 1.01 * near_corner(camera))
+
+
+def near_corner(camera: Any) -> float:
+    """Distance from the camera centre to the farthest corner of the near rectangle."""
+    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
+    x = max(cx + 0.5, camera.width - 0.5 - cx) / camera.fx
+    y = max(cy + 0.5, camera.height - 0.5 - cy) / camera.fy
+    return camera.near * math.sqrt(1 + x * x + y * y)
+
+
 class TimeConfig(Config):
     """Labels at ``label_rate`` over ``duration`` seconds; the simulation starts one label interval earlier
     (pre-roll), so that every label has a full window of events before and after it."""
 
-    duration: float = Field(1.0, gt=0, le=86400 * 2, description="labelled time, s")
+    duration: float = Field(1.0, gt=0, le=86400 * 2, description="labelled time, s; with a label interval before and one after at most 71.6 minutes, which is "
+                            "what an event file can hold")
     label_rate: float = Field(10.0, gt=0, le=1e5, description="labels (flow, images) per second, Hz")
     start: float = Field(0.0, ge=0, le=1e7, description="clock at the start of the pre-roll, s")
 
-    @model_validator(mode="after")
-    def _at_least_one(self):
-        if self.duration * self.label_rate < 1 - 1e-9:
-            raise ValueError("duration * label_rate must be at least 1 label")
-        return self
+    @rule("duration", "label_rate")
+    def _labels(duration, rate):
+        if duration * rate < 1 - 1e-9:
+            raise Refused("duration * label_rate must be at least 1 label")
+        if duration * rate > MAX_LABELS:
+            raise Refused(f"{duration * rate:.0f} labels", where="label_rate", value=rate, accepted=f"duration * label_rate of at most {MAX_LABELS}")
+        if span_s(duration, rate) > MAX_SPAN_S:
+            raise Refused(f"with one label interval before and one after, {span_s(duration, rate):.6g} s are more than the {MAX_SPAN_S:.1f} s "
+                          "(71.6 minutes) that an event file can hold", where="duration", value=duration,
+                          accepted="a shorter one, or more sequences")
 
     @property
     def interval_ns(self) -> int:
@@ -95,12 +117,17 @@ class TimeConfig(Config):
     @property
     def t1_ns(self) -> int:
         """End of the last label's interval."""
-        return self.label_times_ns[-1]
+        return self.t0_ns + (self.label_count + 1) * self.interval_ns
 
     @property
-    def label_times_ns(self) -> list[int]:
+    def label_times_ns(self) -> range:
         """label_count + 1 times; flow k runs from label k to label k + 1."""
-        return [self.t0_ns + (k + 1) * self.interval_ns for k in range(self.label_count + 1)]
+        return range(self.t0_ns + self.interval_ns, self.t1_ns + 1, self.interval_ns)
+
+
+def span_s(duration: float, label_rate: float) -> float:
+    """From the start of the pre-roll to the end of the last label's interval, s; at most half a label more than it is."""
+    return duration + 1 / label_rate
 
 
 Antialiasing = Literal["none", "msaa4", "taps4", "ssaa2", "ssaa4"]
@@ -140,13 +167,25 @@ class PreviewConfig(Config):
     slowdown: float = Field(2.0, gt=0, le=1000, description="play-back this many times slower than the simulation")
 
 
+def _file_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", name):
+        raise Refused("not a name for folders", value=name, accepted="a letter or digit, then letters, digits, '_', '-' and '.', at most 100")
+    return name
+
+
 class OutputConfig(Config):
     """Where sequences go below the output folder: `OUT/SPLIT/NAME_000000`, …"""
 
-    name: str = Field("sequence", pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,99}$", description="name of the sequences")
+    name: Annotated[str, AfterValidator(_file_name)] = Field("sequence", description="name of the sequences")
     split: Literal["train", "test"] = Field("train", description="which side of the object and texture pools; disjoint by content")
     sequences: int = Field(1, ge=1, le=10_000_000, description="how many (--num overrides)")
     first_index: int = Field(0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone")
+
+
+def _sensor(name: str) -> str:
+    if known_sensor(name) is None:
+        raise Refused("unknown sensor", value=name, accepted="one of " + ", ".join(sensor_names()))
+    return name
 
 
 class SequenceConfig(Config):
@@ -163,13 +202,47 @@ class SequenceConfig(Config):
     frames: FramesConfig | None = Field(None, description="recorded frames to convert; then nothing is rendered, and `camera`, `time`, "
                                         "`timeline`, `scene` and `render` have no meaning")
     render: RenderConfig = Field(RenderConfig(), description="how a frame is drawn")
-    sensor: str | None = Field(None, description="davis240c, davis346, dvxplorer, gen31_vga or imx636: gives camera.width and height, events and "
+    sensor: Annotated[str, AfterValidator(_sensor)] | None = Field(None, description="davis240c, davis346, dvxplorer, gen31_vga or imx636: gives camera.width and height, events and "
                                "readout the camera's values; what is said beside it wins")
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
     readout: ReadoutConfig | None = Field(None, description="the sensor's bus: events above its rate are late, then lost; null: no limit")
     labels: LabelsConfig = Field(LabelsConfig(), description="which ground truth is written")
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
+
+    @rule("timeline.reconstruction", "events.emulator", "?frames")
+    def _cubics_are_for_esim(path, emulator, frames):
+        if path != "linear" and emulator != "esim" and not frames:
+            raise Refused(f"{emulator} follows straight lines alone", where="timeline.reconstruction", value=path,
+                          accepted="linear, or events.emulator: esim")
+
+    @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
+    def _late_events_fit(duration, label_rate, rate, row_ns, queue):
+        if rate is not None and span_s(duration, label_rate) + 1e-6 * drain_us(rate, row_ns, queue) > MAX_SPAN_S:
+            raise Refused("events that wait for the read-out would leave it after the end of the file", where="time.duration", value=duration,
+                          accepted=f"at most {MAX_SPAN_S - 1 / label_rate - 1e-6 * drain_us(rate, row_ns, queue):.6g}")
+
+    @rule("time.start", "?readout")
+    def _picoseconds_fit(start, readout):
+        if readout and start > 8e6:
+            raise Refused("too late for the read-out, which counts picoseconds", where="time.start", value=start, accepted="at most 8000000")
+
+    @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
+    def _room_for_the_camera(kind, height, clearance, camera):
+        if kind != "random":
+            return
+        least = camera_radius(camera, clearance)
+        if least > height:
+            raise Refused("the region is too low for a camera that keeps this far from everything", where="scene.region.height", value=height,
+                          accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near plane's corners: camera.near "
+                          "and camera.fov)")
+
+
+FILLS = (
+    Fill(("quality", "timeline.kind", "events.emulator", "frames"), ("timeline", "render"), fill_quality),
+    Fill(("sensor", "events.emulator"), ("camera.width", "camera.height", "events", "readout"), fill_sensor),
+)
+_OF_THE_RUN = ("seed", "output", "gl")
 
 
 @dataclass(frozen=True)
@@ -191,95 +264,53 @@ class RunTemplate:
 
     @property
     def seed(self) -> int:
-        seed = self.tree.get("seed", 0)
-        return seed if isinstance(seed, int) and not isinstance(seed, bool) else 0
+        """The run's seed as every sequence has it. Raises ConfigError."""
+        return validate_field(SequenceConfig, "seed", self.tree.get("seed", 0))
 
     def check(self) -> SequenceConfig:
-        """Validates both ends of every range, of every group; returns the first. Raises ConfigError before any work starts."""
+        """Validates what stands for all that can be drawn, in every group; returns the first. Raises ConfigError before any
+        work starts."""
         if "groups" in self.tree:
             from blinkgl.config.recipe import all_groups
 
             return [group.template.check() for group in all_groups(self)][0]
-        return [_validated(tree) for tree in extremes(self.tree)][0]
+        if is_distribution(self.tree):
+            raise ConfigError("the whole file cannot be drawn", where=next(iter(self.tree)), accepted="distributions of single keys")
+        for key in _OF_THE_RUN:
+            if key in self.tree and sites(self.tree[key]):
+                raise ConfigError("belongs to the whole run and cannot be drawn", where=key, value=self.tree[key], accepted="plain values")
+        first = None
+        for tree in corners(SequenceConfig, self.tree, FILLS):
+            config = _validated(tree)
+            first = config if first is None else first
+        assert first is not None
+        return first
+
+    def corners_of(self, *keys: str) -> Iterator[SequenceConfig]:
+        """Configurations with every combination that can be drawn of the choices and ends at or below ``keys``."""
+        for tree in corners_of(keys, SequenceConfig, self.tree, FILLS):
+            yield _validated(tree)
 
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
     """SequenceConfig of plain data, with the values of a named quality and sensor filled in where the tree says nothing."""
-    tree = with_quality(tree)
-    config = _possible(validate(SequenceConfig, tree))
-    if config.sensor is None:
-        return config
-    sensor = load_sensor(config.sensor)
-    table = lambda key: dict(tree[key]) if isinstance(tree.get(key), dict) else {}
-    events = table("events")
-    events = sensor.emulator(events.pop("emulator", "esim"), **events).model_dump()
-    return validate(SequenceConfig, {"readout": sensor.readout.model_dump(), **tree, "events": events,
-                                     "camera": {"width": sensor.width, "height": sensor.height, **table("camera")}})
-
-
-def _possible(config: SequenceConfig) -> SequenceConfig:
-    """The same; ConfigError where two of its tables contradict each other."""
-    path, emulator = config.timeline.reconstruction, config.events.emulator
-    if path != "linear" and emulator != "esim" and config.frames is None:
-        raise ConfigError(f"{emulator} follows straight lines alone", where="timeline.reconstruction", value=path,
-                          accepted="linear, or events.emulator: esim")
-    return config
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """SafeLoader that refuses a key given twice (plain YAML silently keeps the last one)."""
-
-
-def _mapping(loader: _UniqueKeyLoader, node: yaml.MappingNode, deep: bool = False) -> dict:
-    loader.flatten_mapping(node)
-    seen: set = set()
-    for key_node, _ in node.value:
-        key = loader.construct_object(key_node, deep=True)
-        if not isinstance(key, (str, int, float, bool)):
-            raise yaml.constructor.ConstructorError(None, None, "a key is not plain text", key_node.start_mark)
-        if key in seen:
-            raise yaml.constructor.ConstructorError(None, None, f"key '{key}' is given twice", key_node.start_mark)
-        seen.add(key)
-    return yaml.SafeLoader.construct_mapping(loader, node, deep=True)
-
-
-_UniqueKeyLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _mapping)
+    for fill in FILLS:
+        tree = fill(tree)
+    return validate(SequenceConfig, tree)
 
 
 def load_run(path: str | Path, overrides: list[str] | tuple[str, ...] = (), *, seed: int | None = None) -> RunTemplate:
-    """Reads a YAML file, applies ``a.b=c`` overrides (c is YAML) and an optional seed, checks every range.
+    """Reads a YAML file, applies ``a.b=c`` overrides (c is YAML) and an optional seed, checks all that can be drawn.
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_YAML_BYTES:
-            raise ConfigError("file is too large for a configuration", where=str(path), accepted=f"at most {MAX_YAML_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError("no such file", where=str(path), accepted="a YAML file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error.__class__.__name__}", where=str(path), accepted="a YAML text file in UTF-8") from None
-    tree = parse_yaml(text, str(path))
-    tree = {} if tree is None else tree
-    if not isinstance(tree, dict):
-        raise ConfigError("not a table of keys", where=str(path), value=tree, accepted="key: value lines")
-    tree = apply_overrides(tree, overrides)
+    tree = apply_overrides(read_table(path), overrides)
     if seed is not None:
         tree["seed"] = seed
-    template = RunTemplate(tree, path.parent)
+    if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses
+        tree["seed"] = validate_field(SequenceConfig, "seed", tree["seed"])
+    template = RunTemplate(tree, Path(path).parent)
     template.check()
     return template
-
-
-def parse_yaml(text: str, where: str) -> Any:
-    """Plain data from YAML text, safely; ConfigError with line and column when it is not YAML."""
-    try:
-        return yaml.load(text, Loader=_UniqueKeyLoader)  # noqa: S506 (a SafeLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise ConfigError(f"not valid YAML: {problem}", where=place) from None
 
 
 def apply_overrides(tree: dict[str, Any], overrides: list[str] | tuple[str, ...]) -> dict[str, Any]:

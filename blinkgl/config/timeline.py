@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from blinkgl.config.base import Config
+from blinkgl.config.base import Config, Refused, one_of, rule
 
 
 class _Timeline(Config):
@@ -28,11 +28,10 @@ class _AdaptiveTimeline(_Timeline):
     min_step_us: float = Field(200.0, ge=0.001, description="the step is never shorter, µs")
     max_step_us: float = Field(20000.0, ge=0.001, description="the step is never longer, µs")
 
-    @model_validator(mode="after")
-    def _ordered(self):
-        if self.min_step_us > self.max_step_us:
-            raise ValueError(f"min_step_us must not exceed max_step_us = {self.max_step_us}")
-        return self
+    @rule("min_step_us", "max_step_us")
+    def _ordered(least, most):
+        if least > most:
+            raise Refused(f"min_step_us must not exceed max_step_us = {most}", value=least)
 
 
 class DisplacementTimeline(_AdaptiveTimeline):
@@ -62,11 +61,10 @@ class BudgetTimeline(_AdaptiveTimeline):
     max_time_error_px: float | None = Field(None, gt=0, le=1e4, description="the same times the image speed: how far an edge is from where it should be, px")
     percentile: float = Field(75.0, gt=0, le=99.9, description="of the events' errors, which keeps to the budget")
 
-    @model_validator(mode="after")
-    def _one_of(self):
-        if (self.max_time_error_us is None) == (self.max_time_error_px is None):
-            raise ValueError("give max_time_error_us or max_time_error_px, one of the two")
-        return self
+    @rule("max_time_error_us", "max_time_error_px")
+    def _one_of(us, px):
+        if (us is None) == (px is None):
+            raise Refused("give max_time_error_us or max_time_error_px, one of the two")
 
 
-TimelineConfig = Annotated[UniformTimeline | DisplacementTimeline | BrightnessTimeline | BudgetTimeline, Field(discriminator="kind")]
+TimelineConfig = one_of("kind", UniformTimeline, DisplacementTimeline, BrightnessTimeline, BudgetTimeline, default="displacement")

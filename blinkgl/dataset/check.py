@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-
-from blinkgl.dataset.verify import verify_dataset
+from blinkgl.dataset.verify import Verification, verify_dataset
+from blinkgl.io.records import shown
 from blinkgl.terminal import plain_console
 
 _MOST_LINES = 20
@@ -17,12 +17,24 @@ def verify_and_show(folder: str, *, deep: int = 0, seed: int = 0, base: str | No
         result = verify_dataset(folder, deep=deep, seed=seed, base=base, progress=lambda number, name: status.update(f"{number}: {name}"))
     for name, lines in sorted(result.problems.items()):
         for line in lines[:_MOST_LINES]:
-            say(f"{name}: {line}" if name != "." else line)
+            say(f"{shown(name)}: {line}" if name != "." else line)
         if len(lines) > _MOST_LINES:
-            say(f"{name}: … and {len(lines) - _MOST_LINES} more")
-    for note in result.notes:
-        say(note)
-    made = f", {len(result.deep)} made again and compared bit by bit" if deep else ""
-    bad = len(result.problems)
-    say(f"{folder}: {result.sequences} sequences{made}: " + ("no problem found" if result.clean else f"problems in {bad} place{'s' * (bad != 1)}"))
+            say(f"{shown(name)}: … and {len(lines) - _MOST_LINES} more")
+    for note in result.notes[:_MOST_LINES]:
+        say(f"note: {note}")
+    if len(result.notes) > _MOST_LINES:
+        say(f"note: … and {len(result.notes) - _MOST_LINES} more")
+    say(f"{folder}: {last_line(result, bool(deep))}")
     return result.clean
+
+
+def last_line(result: Verification, deep: bool) -> str:
+    """"20 sequences, 3 made again and compared bit by bit: no problem found"; says also what was compared in part or not at all."""
+    parts = [f"{result.sequences} sequences"]
+    if deep:
+        parts.append(f"{len(result.deep) - len(result.in_part)} made again and compared bit by bit")
+    if result.in_part:
+        parts.append(f"{len(result.in_part)} made again and compared in part")
+    bad = len(result.problems)
+    verdict = f"problems in {bad} place{'s' * (bad != 1)}" if bad else "no problem found" + (" in what could be compared" if result.notes else "")
+    return ", ".join(parts) + f": {verdict}"

@@ -6,12 +6,16 @@ is written by the node that made it. Before any work each node is asked for its 
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import socket
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
+from blinkgl.dataset.sockets import listening
 from blinkgl.dataset.work import Job, Maker, Message, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.extras import install
@@ -25,8 +29,9 @@ class RayCluster:
     """Executor of :mod:`blinkgl.dataset.run` on Ray. A worker that is lost costs an attempt, a node that is lost does not.
 
     workers : tasks at a time; default: as many as the cluster has CPUs, new nodes included.
-    address : of a running cluster ("host:6379", "auto", "ray://host:10001"); default: the one this process is connected to, else a
-        local one without dashboard, closed with the run.
+    address : of a running cluster ("host:6379", "auto", "ray://host:10001"); default: the one this process is connected to, else
+        that of the environment's RAY_ADDRESS, else one of its own on this machine, closed with the run. That one has no dashboard and
+        listens on 127.0.0.1 alone: whoever reaches a Ray port may run code (Ray 2.60 asks for a token, earlier versions for nothing).
     gpus : GPUs per task, e.g. 0.25 for four tasks on each. Ray deals them out; the task draws on that card's EGL device.
     """
 
@@ -43,6 +48,7 @@ class RayCluster:
         self._tasks: dict[Any, int] = {}    # object reference -> task
         self._reasons: dict[int, str] = {}  # task -> why it was killed
         self._board = None
+        self._folder: str | None = None     # of a cluster of ours
 
     def open(self, job: Job) -> list[Message]:
         ray = self._ray
@@ -86,6 +92,7 @@ class RayCluster:
     def close(self) -> None:
         ray = self._ray
         if not ray.is_initialized():
+            self._discard_folder()
             return
         try:
             for reference in self._tasks:
@@ -104,21 +111,45 @@ class RayCluster:
             self._tasks.clear()
             if self._ours:
                 ray.shutdown()
+            self._discard_folder()
+
+    def _discard_folder(self) -> None:
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            self._folder = None
 
     # ---- machinery -------------------------------------------------------------------------------------------------
 
     def _connect(self) -> None:
-        ray, address = self._ray, self._address
-        if address is not None and address not in ("auto", "local"):
+        ray, address = self._ray, self._address or os.environ.get("RAY_ADDRESS") or "local"
+        if address not in ("auto", "local"):
             _reachable(address)
-        options: dict[str, Any] = {"include_dashboard": False, "num_cpus": self._workers or len(os.sched_getaffinity(0))} if address is None else {}
         try:
-            ray.init(address=address, log_to_driver=False, logging_level="ERROR", configure_logging=True, **options)
+            if address == "local":
+                self._start_own()
+            else:
+                ray.init(address=address, log_to_driver=False, logging_level="ERROR", configure_logging=True)
+        except BlinkGLError:
+            raise
         except Exception as error:  # Ray raises ConnectionError, RuntimeError, ValueError, grpc's own
             text = " ".join(str(error).split())[:200]
             what = "Ray's or Python's version differs from the cluster's" if "ersion mismatch" in text else "cannot connect to Ray"
-            raise ConfigError(f"{what}: {text}", where="--address", value=address or "a local cluster", accepted="a running Ray of the same version") from None
+            raise ConfigError(f"{what}: {text}", where="--address", value=address if address != "local" else "a local cluster",
+                              accepted="a running Ray of the same version") from None
         self._ours = True
+
+    def _start_own(self) -> None:
+        """A cluster on 127.0.0.1 alone, with its files where no other user of the machine can read or write them."""
+        before = set(listening(os.getpid()))  # a notebook's kernel listens, too
+        self._folder = tempfile.mkdtemp(prefix="ray-", dir=_short_folder())  # 0700; Ray opens its own folder in it to everybody
+        with _loopback_only():
+            self._ray.init(address="local", include_dashboard=False, num_cpus=self._workers or len(os.sched_getaffinity(0)),
+                           log_to_driver=False, logging_level="ERROR", configure_logging=True, _temp_dir=f"{self._folder}/r")
+        if exposed := [s for s in listening(os.getpid()) if s not in before and not s.loopback]:
+            self._ours = True
+            self.close()
+            raise ConfigError(f"Ray {self._ray.__version__} listens to other machines: {', '.join(map(str, exposed))}", where="--executor",
+                              value="ray", accepted="Ray 2.60, which can be told not to; or a cluster of your own and its --address")
 
     def _ask(self, node: dict[str, Any]) -> Message:
         ray, name = self._ray, node.get("NodeManagerHostname") or node["NodeID"]
@@ -246,3 +277,25 @@ def _reachable(address: str) -> None:
         socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
     except OSError as error:
         raise ConfigError(f"cannot be reached: {error.strerror or error}", where="--address", value=address, accepted="a running Ray cluster") from None
+
+
+@contextlib.contextmanager
+def _loopback_only() -> Iterator[None]:
+    """Makes Ray take 127.0.0.1 for this machine's address, and so bind all its servers to it.
+
+    Ray does so by itself on macOS and Windows, where it knows no clusters of machines; the constant behind that is read when a
+    cluster starts. (``_node_ip_address="127.0.0.1"`` is turned into the outward address by Ray.)"""
+    from ray._private import ray_constants
+
+    before = getattr(ray_constants, "ENABLE_RAY_CLUSTER", True)
+    ray_constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+
+
+def _short_folder() -> str:
+    """Where temporary files go, unless its name leaves no room for those of Ray's sockets: Unix allows 107 characters."""
+    folder = tempfile.gettempdir()
+    return folder if len(folder) <= 20 else "/tmp"

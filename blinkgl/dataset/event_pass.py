@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from blinkgl.dataset.clock import StageClock
+from blinkgl.errors import EventDataError
 from blinkgl.events import Emulator, Events, make_emulator
 from blinkgl.events.response import response_of
 from blinkgl.render.renderer import Renderer
@@ -37,10 +38,22 @@ class EventPass:
             renderer.luminance(t_ns, out=luminance, rate=rate)
             self.timeline.observe(t_ns, luminance, rate)
             with self._clock("events"):
-                events = emulator.step(luminance, t_ns, renderer.changed_rows, rate)
+                try:
+                    events = emulator.step(luminance, t_ns, renderer.changed_rows, rate)
+                except EventDataError as error:
+                    raise self._explained(error, t_ns) from error
             self.frames += 1
             yield emulator.done_ns, events
         if emulator.lags:
             with self._clock("events"):
                 events = emulator.flush()
             yield emulator.done_ns, events
+
+    def _explained(self, error: EventDataError, t_ns: int) -> EventDataError:
+        """The error with the time and, where a pixel is at fault, what is seen there."""
+        if error.pixel is None:
+            return error
+        explained = EventDataError(f"{error.problem}: it shows {self.renderer.shown_at(*error.pixel, t_ns)}",
+                                   where=f"{error.where} at {t_ns * 1e-9:.9g} s", value=error.value, accepted=error.accepted)
+        explained.pixel = error.pixel
+        return explained

@@ -17,10 +17,11 @@ import cv2
 import numpy as np
 
 import blinkgl
-from blinkgl.config.frames import FramesConfig
+from blinkgl.config.base import Refused
+from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.clock import StageClock
-from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
+from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png
@@ -51,30 +52,46 @@ def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
     return found
 
 
+def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
+    """The ``index``-th folder of frames; the only one for every index. Raises ConfigError as :func:`matching_folders`, or for too few."""
+    folders = matching_folders(config, base)
+    if len(folders) > 1 and index >= len(folders):
+        raise ConfigError(f"{len(folders)} folders are too few for sequence {index}", where="frames.folders")
+    return folders[index] if len(folders) > 1 else folders[0]
+
+
+def used_images(config: FramesConfig, folder: Path) -> list[Path]:
+    """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer than an event
+    file can hold."""
+    files = _listed(folder / config.images, IMAGE)[config.first:]
+    files = files[: config.count]
+    if len(files) < 3 or (config.count and len(files) < config.count):
+        raise AssetError("too few frames", where=str(folder / config.images), value=len(files), accepted=f"at least {config.count or 3}")
+    try:
+        check_span(len(files), config.fps)
+    except Refused as error:
+        raise ConfigError(error.problem, where="frames.fps", value=error.value, accepted=error.accepted) from None
+    return files
+
+
 def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Path = Path("."), progress: Progress | None = None) -> SequenceReport:
     """Makes the sequence directory ``path`` from the ``index``-th folder of frames, whole or not at all.
 
     Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval of
     events before it, as in generated sequences. Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them."""
     frames = config.frames
-    folders = matching_folders(frames, base)
-    if len(folders) > 1 and index >= len(folders):
-        raise ConfigError(f"{len(folders)} folders are too few for sequence {index}", where="frames.folders")
-    folder = folders[index] if len(folders) > 1 else folders[0]
-    files = _listed(folder / frames.images, IMAGE)[frames.first:]
-    files = files[: frames.count]
-    if len(files) < 3 or (frames.count and len(files) < frames.count):
-        raise AssetError("too few frames", where=str(folder / frames.images), value=len(files), accepted=f"at least {frames.count or 3}")
-    flows, masks = _flow_files(folder, frames, len(files))
+    folder = folder_of(frames, index, base)
+    files = used_images(frames, folder)
+    flows, masks = flow_files(folder, frames, len(files))
     clock, report, counted = StageClock(), SequenceReport(index, path), SimulationReport()
     time_of = lambda k: round(k * 1e9 / frames.fps)  # noqa: E731 - frame k's time, ns
-    first = _image(files[0])
+    first = read_frame(files[0])
     height, width = first.shape[:2]
     decode = Decoder(frames.gamma)
 
     def given() -> Iterator[tuple[np.ndarray, int, str]]:
         for k, file in enumerate(files):
-            yield first if k == 0 else _image(file), time_of(k), str(file)
+            yield first if k == 0 else read_frame(file), time_of(k), str(file)
             if progress is not None:
                 report.frames, report.events = counted.steps, counted.events
                 progress(report, k / len(files))
@@ -95,7 +112,8 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
             video.append(PreviewWriter(writer.path("preview.mp4"), height, width, flow=False, rate_hz=rate, fps=rate / config.preview.slowdown))
         try:
             stream = simulate(given(), emulator=config.events, gamma=frames.gamma, interpolate=frames.interpolate, factor=frames.factor,
-                              max_px=frames.max_px, seed=kernel_seed(config.seed, index, Role.EVENTS), report=counted, on_frame=on_frame)
+                              max_px=frames.max_px, seed=kernel_seed(config.seed, index, Role.EVENTS),
+                              readout=config.readout, report=counted, on_frame=on_frame)
             while True:
                 with clock("events"):
                     events = next(stream, None)
@@ -114,6 +132,7 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
             writer.t_end_us = time_of(len(files) - 1) // 1000
             report.frames, report.events = counted.steps, counted.events
             writer.info.update(_manifest(config, index, folder, files, report, time_of(len(files) - 1)))
+            writer.info.update(losses(counted.saturated, counted.lost, counted.late))
     report.simulated_s = time_of(len(files) - 1) * 1e-9
     report.seconds, report.total_s, report.compile_s = clock.seconds, clock.total, clock.compile_s
     return report
@@ -122,7 +141,7 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
 def _write_labels(config: SequenceConfig, files, flows, masks, time_of, size, writer: SequenceWriter, report: SequenceReport) -> None:
     for k in range(1, len(files)):
         if config.labels.images:
-            writer.image(k - 1, time_of(k) // 1000, _image(files[k]))
+            writer.image(k - 1, time_of(k) // 1000, read_frame(files[k]))
         if k == len(files) - 1 or "forward" not in config.labels.flow:
             continue
         if flows:
@@ -152,7 +171,7 @@ def _listed(folder: Path, suffixes) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
 
 
-def _flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path], list[Path]]:
+def flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path], list[Path]]:
     """(flow, masks) of the frames used; the k-th goes from frame k to frame k + 1."""
     if frames.flow is None:
         return [], []
@@ -182,7 +201,8 @@ def _flow(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     return flow, valid
 
 
-def _image(path: Path) -> np.ndarray:
+def read_frame(path: Path) -> np.ndarray:
+    """(H, W) or (H, W, 3) RGB of an image file, alpha dropped. Raises AssetError."""
     image = read_any_image(path)
     return image if image.ndim == 2 else np.ascontiguousarray(image[..., :3])
 

@@ -20,7 +20,7 @@ from blinkgl.dataset.event_pass import EventPass
 from blinkgl.dataset.frames import convert_sequence
 from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
-from blinkgl.dataset.report import Progress, SequenceReport, config_yaml
+from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.events.readout import Readout
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
@@ -39,7 +39,7 @@ def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
     are looked at before any work starts."""
     check_output(out)
     plan = Plan.of(template, num)
-    for task in plan.tasks:
+    for _, task in plan.tasks.present(Path(out)):
         refuse_existing(Path(out) / task.name)
     plan.check_assets()
     with ExitStack() as stack:
@@ -67,6 +67,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
     with clock("scene"):
         scene = build_scene(config.scene, config.camera, t0_ns, t1_ns, split=config.output.split, seed=config.seed,
                             sequence=index, base=base)
+    report.omissions = scene.omissions
     with (
         Renderer(gl, scene, config.render) as renderer,
         SequenceWriter(report.path, scene.camera.height, scene.camera.width, config_yaml=config_yaml(config, index),
@@ -97,7 +98,7 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
         for t_ns, events in frames:
             if readout is not None:
                 with clock("events"):
-                    events = readout.step(events)
+                    events = readout.step(events, t_ns // 1000)
             with clock("write"):
                 writer.append_events(events)
             preview.add_events(events)
@@ -110,8 +111,8 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
                 progress(report, (t_ns - t0_ns) / (t1_ns - t0_ns))
     report.timeline = frames.timeline.info()
     writer.info["timeline"] = {"kind": config.timeline.kind, "reconstruction": config.timeline.reconstruction, **report.timeline}
-    writer.info["events_cut_by_max_events_per_step"] = frames.emulator.saturated
-    writer.info["events_lost_in_readout"] = readout.dropped if readout is not None else 0
+    dropped, late = (readout.dropped, readout.late) if readout is not None else (0, 0)
+    writer.info.update(losses(frames.emulator.saturated, dropped, late))
 
 
 def _write_labels(config: SequenceConfig, renderer: Renderer, writer: SequenceWriter, clock: StageClock,
@@ -178,8 +179,9 @@ def manifest_info(config: SequenceConfig, index: int, scene: Scene, gl: GLContex
         "frames": report.frames,
         "labels": report.labels,
         "triangles": triangles,
-        "duration_us": (scene.t1_ns - scene.t0_ns) // 1000,
+        "duration_us": scene.t1_ns // 1000 - scene.t0_ns // 1000,  # between whole microseconds, as every time in the files
         "objects": [{"name": o.name, "id": o.instance_id, "category": o.category,
                      "source_hashes": sorted({p.mesh.source_hash for p in o.parts})} for o in scene.objects],
         "scene_log": list(scene.log),
+        "not_drawn": list(scene.omissions),
     }

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+import os
+import re
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import yaml
-
-from blinkgl.config.draw import extremes
 from blinkgl.config.base import validate
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import matching_folders
-from blinkgl.errors import ConfigError, OutputError
+from blinkgl.dataset.frames import matching_folders, used_images
+from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
 from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.mesh_files import dependencies
@@ -39,13 +41,75 @@ def sequence_name(output: OutputConfig, index: int) -> str:
     return f"{output.split}/{output.name}_{index:06d}"
 
 
+SPLITS = ("train", "test")
+_NUMBERED = re.compile(r"(.+)_([0-9]{6,})")
+
+
+class Tasks(Sequence[Task]):
+    """The sequences of a run by number, made when they are asked for: a run of millions takes no more memory than one of ten.
+
+    parts : (group, output, first, count) of each group that has sequences, in order.
+    """
+
+    def __init__(self, parts: Sequence[tuple[str, OutputConfig, int, int]]):
+        self._parts = tuple(parts)
+        self._starts = [0]
+        for *_, count in self._parts:
+            self._starts.append(self._starts[-1] + count)
+        self._by_prefix = {f"{output.split}/{output.name}": part for part, (_, output, _, _) in enumerate(self._parts)}
+
+    @property
+    def splits(self) -> list[str]:
+        """The folders below the data set that sequences go to."""
+        return sorted({output.split for _, output, _, _ in self._parts})
+
+    def __len__(self) -> int:
+        return self._starts[-1]
+
+    def __getitem__(self, number):
+        if isinstance(number, slice):
+            return tuple(self[n] for n in range(*number.indices(len(self))))
+        if not -len(self) <= number < len(self):
+            raise IndexError(number)
+        number %= len(self)
+        part = bisect_right(self._starts, number) - 1
+        group, output, first, _ = self._parts[part]
+        index = first + number - self._starts[part]
+        return Task(group, index, sequence_name(output, index))
+
+    def number(self, name: str) -> int | None:
+        """Of the task with this name; None when the run has no such sequence."""
+        matched = _NUMBERED.fullmatch(name)
+        part = self._by_prefix.get(matched.group(1)) if matched else None
+        if part is None:
+            return None
+        _, output, first, count = self._parts[part]
+        index = int(matched.group(2))
+        inside = first <= index < first + count and name == sequence_name(output, index)
+        return self._starts[part] + index - first if inside else None
+
+    def present(self, out: Path) -> Iterator[tuple[int, Task]]:
+        """The tasks at whose names something lies below ``out``, in no order. Looks at what is there, not for all that could be."""
+        for split in self.splits:
+            try:
+                entries = os.scandir(out / split)
+            except OSError:
+                continue
+            with entries:
+                for entry in entries:
+                    if (number := self.number(f"{split}/{entry.name}")) is not None:
+                        yield number, self[number]
+
+
 @dataclass(frozen=True)
 class Plan:
     """The sequences of a run, in order. ``groups`` also holds those that are switched off: they identify the recipe."""
 
     template: RunTemplate
     groups: tuple[Group, ...]
-    tasks: tuple[Task, ...]
+    tasks: Tasks
+    counts: dict[str, int]
+    """How many sequences of each group that has any."""
 
     @classmethod
     def of(cls, template: RunTemplate, num: int | None = None) -> "Plan":
@@ -53,15 +117,15 @@ class Plan:
 
         Raises ConfigError: any bad value of the recipe, or every group switched off."""
         groups = all_groups(template)
-        tasks = []
+        parts = []
         for group in groups:
             count = group.count if num is None else num if group.name == "" else min(num, group.count)
             output = validate(OutputConfig, group.template.tree.get("output") or {}, where="output")
             if group.enabled:
-                tasks += [Task(group.name, i, sequence_name(output, i)) for i in range(group.first, group.first + count)]
-        if not tasks:
+                parts.append((group.name, output, group.first, count))
+        if not parts:
             raise ConfigError("every group is switched off", where="groups", accepted="enabled: true in at least one")
-        return cls(template, groups, tuple(tasks))
+        return cls(template, groups, Tasks(parts), {name: count for name, _, _, count in parts})
 
     @cached_property
     def by_name(self) -> dict[str, Group]:
@@ -74,8 +138,7 @@ class Plan:
     @cached_property
     def used(self) -> tuple[Group, ...]:
         """The groups that have tasks."""
-        names = {task.group for task in self.tasks}
-        return tuple(group for group in self.groups if group.name in names)
+        return tuple(group for group in self.groups if group.name in self.counts)
 
     @property
     def identity(self) -> dict[str, str]:
@@ -89,7 +152,7 @@ class Plan:
         hashes: dict[str, str] = {}
         for group in self.used:
             try:
-                _check_group(group, self.tasks, hashes)
+                _check_group(group, self.counts[group.name], hashes)
             except ConfigError as error:
                 if group.name:
                     raise ConfigError(f"in group '{group.name}': {error.problem}", where=error.where, value=error.value,
@@ -99,20 +162,23 @@ class Plan:
 
     def recipe_text(self) -> str:
         """The recipe with all overrides, as YAML that ``load_run`` takes."""
-        return yaml.safe_dump(self.template.tree, sort_keys=False, allow_unicode=True)
+        return to_yaml(self.template.tree)
 
 
-def _check_group(group: Group, tasks: Iterable[Task], hashes: dict[str, str]) -> None:
+def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
     base = group.template.base
-    for tree in extremes(group.template.tree):
-        config = validate(SequenceConfig, tree)
+    # What check_assets looks at, and which folders there are.
+    for config in group.template.corners_of("frames", "scene.kind", "scene.pool", "scene.textures", "scene.sky", "scene.objects.count",
+                                            "scene.meshes", "scene.materials", "scene.path"):
         if config.frames is not None:
             folders = matching_folders(config.frames, base)
-            needed = [task.index for task in tasks if task.group == group.name]
-            if len(folders) > 1 and max(needed) >= len(folders):
-                raise ConfigError(f"{len(folders)} folders are too few for sequence {max(needed)}", where="frames.folders",
-                                  value=list(config.frames.folders), accepted=f"at least {max(needed) + 1} folders, or fewer output.sequences")
+            last = group.first + count - 1
+            if len(folders) > 1 and last >= len(folders):
+                raise ConfigError(f"{len(folders)} folders are too few for sequence {last}", where="frames.folders",
+                                  value=list(config.frames.folders), accepted=f"at least {last + 1} folders, or fewer output.sequences")
             for folder in folders:
+                with suppress(AssetError):  # one bad folder is set aside alone; frames too far apart are the recipe's fault
+                    used_images(config.frames, folder)
                 for path in sorted(folder.rglob("*")):
                     if path.is_file():
                         hashes[f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"] = f"{path.stat().st_size} bytes"
@@ -147,7 +213,13 @@ def digest(hashes: dict[str, str]) -> str:
 
 
 def check_output(out: str | Path) -> None:
-    """OutputError when ``out`` cannot become a folder of sequences."""
+    """OutputError when ``out`` cannot become a folder of sequences.
+
+    ``out`` itself may be a symbolic link; what BlinkGL makes below it may not be one already: sequences would go, and what is not
+    whole would be moved, where nobody looks for a data set."""
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise OutputError("is a file", where=str(out), accepted="a folder")
+    for name in SPLITS:
+        if (out / name).is_symlink():
+            raise OutputError("is a symbolic link", where=str(out / name), accepted="a folder (--out itself may be a link)")

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import yaml
-
 import blinkgl
+from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import SequenceConfig
 
 Progress = Callable[["SequenceReport", float], None]
@@ -34,6 +33,42 @@ class SequenceReport:
     """compiling kernels; 0 but for a machine's first sequence of a kind"""
     timeline: dict = field(default_factory=dict)
     """what an adaptive timeline says it achieved"""
+    omissions: tuple[str, ...] = ()
+    """what files of the scene ask for and is not drawn, a line per file"""
+
+
+def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
+    """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
+    return {"events_cut_by_max_events_per_step": saturated, "events_lost_in_readout": dropped, "events_late_in_readout": late}
+
+
+@dataclass
+class Totals:
+    """What many sequences cost together: as large for a million as for one. ``first`` is the first that was added."""
+
+    count: int = 0
+    first: SequenceReport | None = None
+    simulated_s: float = 0.0
+    frames: int = 0
+    events: int = 0
+    labels: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+    total_s: float = 0.0
+
+    def __len__(self) -> int:
+        return self.count
+
+    def add(self, report: SequenceReport) -> Totals:
+        self.count += 1
+        self.first = self.first or report
+        self.simulated_s += report.simulated_s
+        self.frames += report.frames
+        self.events += report.events
+        self.labels += report.labels
+        self.total_s += report.total_s
+        for stage, seconds in report.seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        return self
 
 
 def config_yaml(config: SequenceConfig, index: int) -> str:
@@ -44,4 +79,4 @@ def config_yaml(config: SequenceConfig, index: int) -> str:
         tree.pop("frames", None)
     return (f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
             "# Relative paths start from the folder of the run's own configuration file.\n"
-            + yaml.safe_dump(tree, sort_keys=False))
+            + to_yaml(tree))

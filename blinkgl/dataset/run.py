@@ -19,17 +19,16 @@ from pathlib import Path
 from typing import Protocol
 
 from blinkgl.config.sequence import RunTemplate
-from blinkgl.dataset.executor import Executor, Inline
+from blinkgl.dataset.executor import Executor, Inline, StartError
 from blinkgl.io.index import write_index
 from blinkgl.dataset.plan import Plan, check_output, digest
-from blinkgl.dataset.report import SequenceReport
+from blinkgl.dataset.report import Totals
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, Message, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
-from blinkgl.io.sequence_dir import refuse_existing
 
 ATTEMPTS = 3
-"""A sequence that fails so often is set aside."""
+"""A sequence is set aside after so many failures that could have passed, or one that could not (:func:`blinkgl.errors.may_pass`)."""
 _POLL_S = 0.5
 
 
@@ -39,7 +38,7 @@ class Outcome:
 
     planned: int
     found: int = 0
-    made: list[SequenceReport] = field(default_factory=list)
+    made: Totals = field(default_factory=Totals)
     set_aside: dict[str, str] = field(default_factory=dict)
     elapsed_s: float = 0.0
     surprises: int = 0
@@ -76,24 +75,15 @@ def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | Non
     plan = Plan.of(template, num)
     assets = plan.check_assets()
     folder = RunFolder(out)
-    folder.check(plan, assets, mixed)
-    if not resume:
-        for task in plan.tasks:
-            _refuse(out / task.name)
-    job = Job(str(out), str(template.base), plan.recipe_text(), num)
     with _terminable(), folder.locked():
-        outcome = Outcome(len(plan.tasks))
-        todo = deque()
-        for number, task in enumerate(plan.tasks):
-            state = folder.state(task.name)
-            if state == "":
-                outcome.found += 1
-                continue
-            if state is not None:
-                outcome.damaged[task.name] = state
-            todo.append((number, 1))
+        folder.check(plan, assets, mixed)
+        outcome = _found(plan, folder, resume)
+        missing = outcome.planned - outcome.found
+        # Absolute: workers on other machines start in other folders, and a link may be turned while the run is on.
+        job = Job(str(out.resolve()), str(template.base.resolve()), plan.recipe_text(), num)
+        keep_logs = False
         try:
-            if todo:
+            if missing:
                 hellos = executor.open(job)
                 for hello in hellos:
                     _agree(hello, hellos[0]["environment"], digest(assets))
@@ -105,28 +95,56 @@ def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | Non
             if listener:
                 listener.begin(plan, outcome)
             started = time.monotonic()
-            if todo:
-                _loop(plan, executor, todo, folder, outcome, time_limit_s, listener)
+            if missing:
+                _loop(plan, executor, folder, outcome, time_limit_s, listener)
             outcome.elapsed_s = time.monotonic() - started
+        except StartError:
+            keep_logs = True
+            raise
         finally:
             executor.close()
-            if folder.begun:
+            if not folder.begun:
+                if not keep_logs:
+                    folder.take_back_logs()
+            elif folder.in_place:
                 folder.sweep(plan)
-                folder.write_failures(outcome.set_aside, plan)
                 with contextlib.suppress(OutputError):  # on a full disk the first error is the one to hear of
+                    if folder.read("run.json") is None:  # deleted under us; without it nobody could tell whose run this is
+                        folder.begin(plan, assets, folder.environment, num)
+                folder.write_failures(outcome.set_aside, plan)
+                with contextlib.suppress(OutputError):
                     write_index(out)
             if listener:
                 listener.end(outcome)
         if outcome.set_aside and not (outcome.made or outcome.found):
-            folder.forget(keep_logs=outcome.surprises > 0)
+            folder.forget(plan, keep_logs=outcome.surprises > 0)
             reason = next(iter(outcome.set_aside.values()))
             raise BlinkGLError(reason if outcome.planned == 1 else f"{reason} (all {outcome.planned} sequences failed, this is the first's reason)")
     return outcome
 
 
-def _loop(plan: Plan, executor: Executor, todo: deque, folder: RunFolder, outcome: Outcome, time_limit_s: float,
-          listener: Listener | None) -> None:
+def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
+    """What is there already. OutputError when there is something and nobody said ``resume``."""
+    outcome = Outcome(len(plan.tasks))
+    for _, task in plan.tasks.present(folder.out):
+        state = folder.state(task.name)
+        if state is None:  # an empty folder
+            continue
+        if not resume:
+            raise OutputError("output folder exists", where=str(folder.out / task.name),
+                              accepted="a new folder name, or --resume to make only what is missing")
+        if state == "":
+            outcome.found += 1
+        else:
+            outcome.damaged[task.name] = state
+    return outcome
+
+
+def _loop(plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, time_limit_s: float, listener: Listener | None) -> None:
     running: dict[int, tuple[int, float]] = {}  # task -> attempt, since when
+    # What is there was looked at before; damaged things have been put away by now.
+    fresh = ((number, 1) for number, task in enumerate(plan.tasks) if not folder.occupied(task.name))
+    again: deque[tuple[int, int]] = deque()
 
     def tell(message: Message) -> None:
         if listener:
@@ -134,9 +152,13 @@ def _loop(plan: Plan, executor: Executor, todo: deque, folder: RunFolder, outcom
 
     executor.listener = tell
     environment = folder.environment
-    while todo or running:
-        while todo and executor.free() > 0:
-            number, attempt = todo.popleft()
+    upcoming = next(fresh, None)
+    while upcoming or again or running:
+        while (upcoming or again) and executor.free() > 0:
+            if upcoming:
+                (number, attempt), upcoming = upcoming, next(fresh, None)
+            else:
+                number, attempt = again.popleft()
             running[number] = (attempt, time.monotonic())
             executor.submit(number, attempt)
         for message in executor.poll(_POLL_S):
@@ -147,8 +169,11 @@ def _loop(plan: Plan, executor: Executor, todo: deque, folder: RunFolder, outcom
             task = plan.tasks[number]
             if message["kind"] == "done":
                 attempt, _ = running.pop(number)
-                outcome.made.append(report_of(message))
+                message["report"]["path"] = str(folder.out / task.name)  # as the user wrote it
+                outcome.made.add(report_of(message))
                 folder.add_cost(task, message, attempt)
+            elif message["kind"] == "silent":
+                folder.log(task.name, message["error"])
             elif message["kind"] == "failed":
                 attempt, _ = running.pop(number)
                 outcome.surprises += not message.get("expected", False)
@@ -159,13 +184,14 @@ def _loop(plan: Plan, executor: Executor, todo: deque, folder: RunFolder, outcom
                     raise OutputError(f"{message['error']}; the run has stopped with {outcome.found + len(outcome.made)} of "
                                       f"{outcome.planned} sequences whole", accepted="run again with --resume when that is mended")
                 elif message.get("lost"):  # no fault of the sequence's: a whole machine went
-                    todo.append((number, attempt))
+                    again.append((number, attempt))
                 elif attempt >= ATTEMPTS or message["final"]:
                     outcome.set_aside[task.name] = message["error"]
                     message["given_up"] = True
                 else:
-                    todo.append((number, attempt + 1))
+                    again.append((number, attempt + 1))
             tell(message)
+        folder.check_in_place()
         if time_limit_s > 0:
             now = time.monotonic()
             for number, (_, since) in running.items():
@@ -180,13 +206,6 @@ def _agree(hello: Message, environment: dict[str, str], assets: str | None) -> N
                           accepted="the same installation on all of them")
     if assets is not None and hello["assets"] != assets:
         raise ConfigError("a worker sees other meshes or textures than the driver", where="--executor", accepted="the same files on all machines")
-
-
-def _refuse(path: Path) -> None:
-    try:
-        refuse_existing(path)
-    except OutputError as error:
-        raise OutputError(error.problem, where=error.where, accepted="a new folder name, or --resume to make only what is missing") from None
 
 
 @contextlib.contextmanager

@@ -21,17 +21,56 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from blinkgl.dataset.plan import Plan, Task
 from blinkgl.dataset.work import RUN_FOLDER, Message, SequenceLog
-from blinkgl.errors import OutputError
+from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import atomic_file, output_errors, remove_stale
+from blinkgl.io.records import parse, read_text
 from blinkgl.io.sequence_dir import verify_sequence
 
 FORMAT = "blinkgl-run"
 _FORSAKEN_S = 3600.0
 _TEMPORARY = re.compile(r"^\.(.+)\.blinkgl-tmp-")
+
+
+class _Run(BaseModel):
+    """``run.json``."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    format: Literal["blinkgl-run"]
+    format_version: Literal[1]
+    groups: dict[str, str]
+    environment: dict[str, str]
+    mixed: list[dict[str, dict[str, str]]] = []
+    base: str = Field(max_length=4096, pattern=r"^[^\x00]*$")
+    num: int | None = Field(None, ge=1, le=10_000_000)
+
+
+_Amount = Annotated[float, Field(ge=0, le=1e18, allow_inf_nan=False)]
+
+
+class _Cost(BaseModel):
+    """A line of ``costs.jsonl``."""
+
+    model_config = ConfigDict(extra="allow")
+    name: str
+    seconds: dict[str, _Amount]
+    total_s: _Amount
+    simulated_s: _Amount
+    frames: _Amount
+    bytes: _Amount
+    cpu_s: _Amount
+    peak_rss_kib: _Amount
+    attempts: _Amount
+
+
+_TABLE = TypeAdapter(dict[str, str])
+_RECORDS = {"run.json": TypeAdapter(_Run), "assets.json": _TABLE, "failed.json": _TABLE}
+_COST = TypeAdapter(_Cost)
 
 
 class RunFolder:
@@ -41,6 +80,7 @@ class RunFolder:
         self.out, self.path = out, out / RUN_FOLDER
         self.begun = False
         self.environment: dict[str, str] = {}
+        self._foreign: dict[Path, tuple[tuple[int, ...], float]] = {}  # temporary of another machine -> its state, seen since
 
     # ---- may this run go on here? ---------------------------------------------------------------------------------
 
@@ -71,26 +111,71 @@ class RunFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """One run at a time per folder; the lock goes when the process does. Makes the folder."""
-        with output_errors(self.out):
-            made = not self.out.exists()
-            self.out.mkdir(parents=True, exist_ok=True)
-            handle = os.open(self.out, os.O_RDONLY)
+        """One run at a time per folder; the lock goes when the process does. Makes the folder, and takes it away when it is
+        empty in the end: a run that was refused leaves nothing."""
+        made = self._make()
+        self._handle = self._lock()
         try:
-            if not os.access(self.out, os.W_OK | os.X_OK):
-                raise OutputError("cannot be written", where=str(self.out), accepted="a folder you may write to")
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise OutputError("another run is at work in this folder", where=str(self.out)) from None
-            except OSError:  # a file system without locks
-                pass
+            if self.path.is_symlink():
+                raise OutputError("is a symbolic link", where=str(self.path), accepted="a folder (--out itself may be a link)")
+            self._fresh = not self.path.exists()
+            self._logs = set(self._worker_logs())
             yield
         finally:
-            os.close(handle)
-            if made:
-                with contextlib.suppress(OSError):  # refused after all: an empty folder would only be in the way
-                    self.out.rmdir()
+            os.close(self._handle)
+            with contextlib.suppress(OSError):  # what is not empty stays
+                for folder in made:
+                    folder.rmdir()
+
+    def _make(self) -> list[Path]:
+        """The folders that were made, innermost first."""
+        missing = [folder for folder in (self.out, *self.out.parents) if not folder.exists()]
+        with output_errors(self.out):
+            self.out.mkdir(parents=True, exist_ok=True)
+        return missing
+
+    def _lock(self) -> int:
+        while True:
+            with output_errors(self.out):
+                handle = os.open(self.out, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                if not os.access(self.out, os.W_OK | os.X_OK):
+                    raise OutputError("cannot be written", where=str(self.out), accepted="a folder you may write to")
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                except BlockingIOError:
+                    raise OutputError("another run is at work in this folder", where=str(self.out),
+                                      accepted="another --out, or --resume when it is over") from None
+                except OSError:  # a file system without locks
+                    pass
+                if _same(self.out, handle):
+                    return handle
+            except BaseException:
+                os.close(handle)
+                raise
+            os.close(handle)  # another run was refused, and took the folder away, between our opening and our locking it
+            self._make()
+
+    def check_in_place(self) -> None:
+        """OutputError when the folder that was locked is no longer the one at ``out``: deleted, moved or replaced under the run."""
+        if not _same(self.out, self._handle):
+            raise OutputError("was deleted, moved or replaced while the run was at work in it", where=str(self.out),
+                              accepted="a folder that stays where it is")
+
+    @property
+    def in_place(self) -> bool:
+        return _same(self.out, self._handle)
+
+    def _worker_logs(self) -> Iterator[Path]:
+        return (self.path / "logs").glob("worker-*.log")
+
+    def take_back_logs(self) -> None:
+        """Removes what starting workers left of a run that did not begin."""
+        if self._fresh:
+            shutil.rmtree(self.path, ignore_errors=True)
+            return
+        for path in set(self._worker_logs()) - self._logs:
+            path.unlink(missing_ok=True)
 
     # ---- sequences ------------------------------------------------------------------------------------------------
 
@@ -115,16 +200,32 @@ class RunFolder:
                 number += 1
             os.rename(self.out / name, final)
 
+    def occupied(self, name: str) -> bool:
+        """Whether something other than an empty folder lies at a sequence's name."""
+        try:
+            with os.scandir(self.out / name) as entries:
+                return any(True for _ in entries)
+        except FileNotFoundError:
+            return False
+        except OSError:
+            return True
+
     def sweep(self, plan: Plan) -> None:
         """Removes what dead writers of this run left. Those of another machine or an earlier boot cannot be asked whether they
-        live: theirs go when nothing has touched them for an hour."""
-        names = {self.out / task.name for task in plan.tasks}
-        for folder in {name.parent for name in names} | {self.out, self.path}:
+        live: theirs go when this run has seen nothing in them change for an hour of its own, by a clock that nobody can set."""
+        now = time.monotonic()
+        for folder in [*(self.out / split for split in plan.tasks.splits), self.out, self.path]:
             with contextlib.suppress(OSError):
                 remove_stale(folder)
                 for path in folder.iterdir() if folder.is_dir() else ():
                     match = _TEMPORARY.match(path.name)
-                    if match and folder / match.group(1) in names and not path.is_symlink() and _untouched_s(path) > _FORSAKEN_S:
+                    if not match or path.is_symlink() or plan.tasks.number(f"{folder.name}/{match.group(1)}") is None:
+                        continue
+                    state = _fingerprint(path)
+                    before, since = self._foreign.get(path, (None, now))
+                    if state != before:
+                        self._foreign[path] = (state, now)
+                    elif now - since > _FORSAKEN_S:
                         shutil.rmtree(path, ignore_errors=True)
 
     # ---- records --------------------------------------------------------------------------------------------------
@@ -143,18 +244,16 @@ class RunFolder:
             path.write_text(plan.recipe_text(), encoding="utf-8")
         self.begun = True
 
-    def forget(self, keep_logs: bool) -> None:
-        """Takes back :meth:`begin` for a run of which nothing came."""
+    def forget(self, plan: Plan, keep_logs: bool) -> None:
+        """Takes back :meth:`begin` for a run of which nothing came. What was put away stays: it is not ours to delete."""
         for name in ("run.json", "recipe.yaml", "assets.json", "failed.json", "costs.jsonl"):
             (self.path / name).unlink(missing_ok=True)
         (self.out / "index.jsonl").unlink(missing_ok=True)
         if not keep_logs:
-            shutil.rmtree(self.path, ignore_errors=True)
-        for folder in sorted((p for p in self.out.rglob("*") if p.is_dir()), reverse=True):
+            shutil.rmtree(self.path / "logs", ignore_errors=True)
+        for folder in (self.path, *(self.out / split for split in plan.tasks.splits)):
             with contextlib.suppress(OSError):  # what is not empty stays
                 folder.rmdir()
-        with contextlib.suppress(OSError):
-            self.out.rmdir()
 
     def add_cost(self, task: Task, message: Message, attempt: int) -> None:
         line = {"name": task.name, "group": task.group, **{k: v for k, v in message["report"].items() if k not in ("path", "index")},
@@ -176,32 +275,39 @@ class RunFolder:
     def costs(self) -> list[dict[str, Any]]:
         """The last line of each sequence; a line cut by a crash is left out."""
         found: dict[str, dict[str, Any]] = {}
-        with contextlib.suppress(OSError, UnicodeDecodeError):
-            for line in (self.path / "costs.jsonl").read_text(encoding="utf-8").splitlines():
-                with contextlib.suppress(ValueError, KeyError, TypeError):
-                    entry = json.loads(line)
+        with contextlib.suppress(FileNotFoundError, AssetError):
+            for line in read_text(self.path / "costs.jsonl").splitlines():
+                with contextlib.suppress(ValueError):
+                    entry = parse(line, _COST)
                     found[entry["name"]] = entry
         return list(found.values())
 
     def read(self, name: str) -> dict[str, Any] | None:
-        """A JSON file of the folder; None when there is none. OutputError when it is damaged."""
+        """A JSON file of the folder, of the shape it has here; None when there is none. OutputError when it is damaged."""
         path = self.path / name
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
-            if not isinstance(data, dict):
-                raise ValueError
-            return data
+            return parse(read_text(path), _RECORDS[name])
         except FileNotFoundError:
             return None
-        except (OSError, ValueError) as error:
-            raise OutputError("the run's record is damaged", where=str(path), accepted="a readable file; without it the run cannot be told "
-                              "from another recipe's") from error
+        except (AssetError, ValueError) as error:
+            problem = error.problem if isinstance(error, AssetError) else error
+            raise OutputError(f"the run's record is damaged: {problem}", where=str(path), accepted="a readable file; without it the run "
+                              "cannot be told from another recipe's") from error
 
     def _write(self, name: str, data: dict[str, Any]) -> None:
         with atomic_file(self.path / name) as path, output_errors(path):
             path.write_text(json.dumps(data, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
-def _untouched_s(path: Path) -> float:
-    newest = max((p.lstat().st_mtime for p in (path, *path.rglob("*"))), default=0.0)
-    return time.time() - newest
+def _fingerprint(path: Path) -> tuple[int, ...]:
+    """Changes when anything is written below ``path``; the values are compared, never taken for times."""
+    stats = [p.lstat() for p in (path, *path.rglob("*"))]
+    return len(stats), sum(s.st_size for s in stats), max(s.st_mtime_ns for s in stats)
+
+
+def _same(path: Path, handle: int) -> bool:
+    try:
+        found, held = os.stat(path), os.fstat(handle)
+    except OSError:
+        return False
+    return (found.st_dev, found.st_ino) == (held.st_dev, held.st_ino)

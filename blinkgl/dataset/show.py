@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 from rich.console import Console
@@ -14,12 +15,14 @@ from blinkgl.compiling import compiling_line
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Executor
 from blinkgl.dataset.plan import Plan
-from blinkgl.dataset.report import SequenceReport
+from blinkgl.dataset.report import SequenceReport, Totals
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 from blinkgl.terminal import plain_column, plain_console
 
 STAGES = ("scene", "render", "read-back", "events", "write", "preview")
+MAX_NOTES = 20
+"""Files of which it is said what is not drawn; beyond, that there are more."""
 SET_ASIDE = 3
 """Exit status of a run that is over but lacks sequences."""
 
@@ -48,6 +51,7 @@ class Display:
         self._tasks: dict[str, TaskID] = {}
         self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames, events of what is being made
         self._done = self._frames = self._events = self._bytes = self._given_up = 0
+        self._notes: set[str] = set()
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
         self._todo, self._outcome, self._started = len(plan.tasks) - outcome.found, outcome, time.monotonic()
@@ -60,13 +64,14 @@ class Display:
 
     def message(self, name: str, message: Message) -> None:
         kind = message["kind"]
+        self._note(message.get("omissions") or message.get("report", {}).get("omissions") or ())
         if kind == "progress":
             self._at_work[name] = (message["fraction"], message["frames"], message["events"])
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, total=1.0, detail="")
             detail = f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {_shares(message['seconds'])}" if message["fraction"] < 1 else "labels, files"
             self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
-        else:
+        elif kind != "silent":
             self._at_work.pop(name, None)
             if name in self._tasks:
                 self._bars.remove_task(self._tasks.pop(name))
@@ -76,6 +81,8 @@ class Display:
             self._bytes += message["bytes"]
             if not self._console.is_terminal or self._todo > 1:
                 self._say(_line(report) + (f"; {self.summary()}" if self._todo > 1 else ""))
+        elif kind == "silent":
+            self._say(f"{name}: {message['error']}")
         elif kind == "failed":
             self._given_up += bool(message.get("given_up"))
             self._say(f"{name} failed, {'set aside' if message.get('given_up') else 'will be tried again'}: {message['error']}")
@@ -100,6 +107,17 @@ class Display:
             if expected - self._bytes > room:
                 parts.append(f"DISK: only {_size(room)} free")
         return ", ".join(parts)
+
+    def _note(self, lines: Iterable[str]) -> None:
+        """Says what is not drawn, once, however many sequences and workers use the file."""
+        for line in lines:
+            if line in self._notes:
+                continue
+            self._notes.add(line)
+            if len(self._notes) <= MAX_NOTES:
+                self._say(f"note: {line}")
+            elif len(self._notes) == MAX_NOTES + 1:
+                self._say("note: more files ask for what is not drawn; the manifests name them under not_drawn")
 
     def _say(self, text: str) -> None:
         self._console.print(text, highlight=False, soft_wrap=True, markup=False)
@@ -136,42 +154,39 @@ def _line(report: SequenceReport) -> str:
             f"{report.total_s:.1f} s ({report.total_s / report.simulated_s:.1f} s per simulated second)")
 
 
-def summary(reports: list[SequenceReport]) -> dict[str, float]:
+def summary(made: Totals) -> dict[str, float]:
     """Totals of a run: counts, wall seconds per stage, and the rates the table shows."""
-    total = sum(r.total_s for r in reports)
-    simulated = sum(r.simulated_s for r in reports)
-    stages = {name: sum(r.seconds.get(name, 0.0) for r in reports) for name in STAGES}
-    stages["other"] = max(0.0, total - sum(stages.values()))
-    events = sum(r.events for r in reports)
-    return {"sequences": len(reports), "frames": sum(r.frames for r in reports), "events": events,
-            "labels": sum(r.labels for r in reports), "simulated_s": simulated, "total_s": total,
-            "seconds_per_simulated_second": total / simulated, "events_per_second": events / total,
+    stages = {name: made.seconds.get(name, 0.0) for name in STAGES}
+    stages["other"] = max(0.0, made.total_s - sum(stages.values()))
+    return {"sequences": made.count, "frames": made.frames, "events": made.events,
+            "labels": made.labels, "simulated_s": made.simulated_s, "total_s": made.total_s,
+            "seconds_per_simulated_second": made.total_s / made.simulated_s, "events_per_second": made.events / made.total_s,
             **{f"{name}_s": seconds for name, seconds in stages.items()}}
 
 
-def show_table(console: Console, reports: list[SequenceReport], elapsed_s: float | None = None) -> None:
+def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -> None:
     """The final table: what was made, how fast, and where the time went. ``elapsed_s``: of the run, where several workers
     each spent wall time at once."""
-    s = summary(reports)
+    s = summary(made)
     table = Table(title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",
                   title_justify="left", show_header=False)
     table.add_row("event frames", f"{s['frames']:,}")
     table.add_row("events", f"{s['events'] / 1e6:.2f} M")
     table.add_row("labels", f"{s['labels']:,}")
-    if elapsed_s is not None and len(reports) > 1:
+    if elapsed_s is not None and len(made) > 1:
         table.add_row("elapsed", f"{elapsed_s:.1f} s  ({s['total_s'] / elapsed_s:.2f} sequences at a time)")
-    table.add_row("wall time of all sequences" if len(reports) > 1 else "wall time", f"{s['total_s']:.1f} s")
+    table.add_row("wall time of all sequences" if len(made) > 1 else "wall time", f"{s['total_s']:.1f} s")
     table.add_row("per simulated second", f"{s['seconds_per_simulated_second']:.2f} s")
     table.add_row("rate", f"{s['events_per_second'] / 1e6:.2f} M events/s")
-    for error in [r.timeline["time_error"] for r in reports[:1] if "time_error" in r.timeline]:
+    if (error := made.first.timeline.get("time_error")) is not None:
         name = f"p{error['percentile']:g}"
         table.add_row("time error, estimated", f"median {error['median_us']} µs, {name} {error[name + '_us']} µs"
-                      + (" (first sequence)" if len(reports) > 1 else ""))
+                      + (" (first sequence)" if len(made) > 1 else ""))
     table.add_section()
     for name in (*STAGES, "other"):
         seconds = s[f"{name}_s"]
         table.add_row(name, f"{seconds:.2f} s  {100 * seconds / s['total_s']:4.0f} %")
     console.print(table)
-    folder = reports[0].path
+    folder = made.first.path
     console.print(f"look at {folder / 'preview.mp4'}" if (folder / "preview.mp4").exists() else f"written to {folder}",
                   highlight=False, soft_wrap=True)

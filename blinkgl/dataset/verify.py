@@ -1,10 +1,14 @@
-"""Is a data set whole and right? Files against manifests, contents against the formats, and a sample against itself made anew.
+"""Is a data set whole and right? Files against manifests, names and manifests against configurations, contents against the formats,
+and a sample against itself made anew.
 
-A sequence's problems are lines of text; none means none found.
+A sequence's problems are lines of text; none means none found. What could not be looked at is counted and said: nothing is
+passed over in silence. Whatever stands in a record, looking at it ends, and ends with a line.
 """
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -13,35 +17,44 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import h5py
-import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
 import numpy as np
 
-from blinkgl.config.sequence import RunTemplate, load_run
+from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
 from blinkgl.dataset.generate import generate_sequence
-from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
-from blinkgl.dataset.plan import Plan
+from blinkgl.dataset.plan import Plan, sequence_name
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.flow_png import read_flow_png
-from blinkgl.io.images import read_image
+from blinkgl.io.hdf5 import open_hdf5
+from blinkgl.io.images import read_image, read_npy
+from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
+from blinkgl.io.records import open_regular, shown
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
 
 _BLOCK = 1 << 20
-_REQUIRED = {"format": str, "format_version": int, "height": int, "width": int, "events": int, "t_offset_us": int, "duration_us": int,
-             "seed": int, "sequence": int, "split": str, "labels": int, "files": dict}
+_REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "labels": int}
 _AT_TOP = {INDEX, "report.html"}
+_MOST_MISSING = 1000
+"""Missing sequences that get a line each; the others are counted."""
+_FLOW_PX, _FLOW_SHARE = 2 / 128, 0.95
+"""Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the pixels. Silhouettes may fall on either side."""
+_SAME_ANYWHERE = ("split", "seed", "sequence", "emulator", "labels", "duration_us", "t_offset_us", "height", "width", "objects", "source")
+"""Of a manifest: what no renderer and no library has a say in."""
 
 
 @dataclass
 class Verification:
-    """``problems``: sequence (or "." for the data set) -> lines. ``deep``: sequences that were made again, bit by bit the same or not."""
+    """``problems``: sequence (or "." for the data set) -> lines. ``notes``: what was not looked at, and why.
+
+    ``deep``: sequences that were made again, the same bit by bit or not. ``in_part``: those of them that differ from what this
+    machine makes and were made on another; there only what no machine has a say in was compared."""
 
     sequences: int = 0
     problems: dict[str, list[str]] = field(default_factory=dict)
     deep: list[str] = field(default_factory=list)
+    in_part: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -51,6 +64,15 @@ class Verification:
     def add(self, name: str, problems: list[str]) -> None:
         if problems:
             self.problems.setdefault(name, []).extend(problems)
+
+
+@dataclass
+class _Known:
+    """A sequence without problems of its own."""
+
+    folder: Path
+    manifest: dict[str, Any]
+    config: SequenceConfig
 
 
 def verify_dataset(root: str | Path, *, deep: int = 0, seed: int = 0, base: str | Path | None = None,
@@ -67,60 +89,128 @@ def verify_dataset(root: str | Path, *, deep: int = 0, seed: int = 0, base: str 
     folders = list(sequence_folders(root))
     if not folders and not (root / RUN_FOLDER).is_dir():
         raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
+    known: dict[str, _Known] = {}
     for number, folder in enumerate(folders):
         name = folder.relative_to(root).as_posix()
         if progress:
-            progress(number, name)
-        result.add(name, check_sequence(folder))
+            progress(number, shown(name))
+        problems, found = _look(folder, name)
+        result.add(name, problems)
+        if found is not None:
+            known[name] = found
     result.sequences = len(folders)
     if not (root / MANIFEST).is_file():
-        result.add(".", _between(root, folders))
-        _against_run(root, folders, result)
-    sound = [f for f in folders if f.relative_to(root).as_posix() not in result.problems]
+        result.add(".", _guarded(lambda: _between(root, folders)))
+        result.add(".", _guarded(lambda: _index(root, folders)))
+        for name, lines in _twins(known, result).items():
+            result.add(name, lines)
+        result.add(".", _guarded(lambda: _against_run(root, folders, known, result)))
+    sound = [name for name in known if name not in result.problems]
     if deep and sound:
-        chosen = np.random.default_rng(seed).permutation(len(sound))[:deep]
-        for number in sorted(chosen):
-            if progress:
-                progress(len(folders), "again: " + sound[number].name)
-        _deep(root, [sound[i] for i in sorted(chosen)], result, base)
-        if not result.deep and result.notes:
-            result.add(".", ["nothing could be compared on this machine"])
+        chosen = sorted(np.random.default_rng(seed).permutation(len(sound))[:deep])
+        _deep(root, {sound[i]: known[sound[i]] for i in chosen}, result, base, progress)
     return result
 
 
-def check_sequence(folder: Path) -> list[str]:
-    """Checksums first; contents only where those hold."""
-    problems = verify_sequence(folder)
-    if problems:
-        return problems
-    manifest = read_manifest(folder)
-    problems = [f"{MANIFEST}: '{key}' is missing or no {kind.__name__}" for key, kind in _REQUIRED.items() if not isinstance(manifest.get(key), kind)]
-    if problems:
-        return problems
-    if "events.h5" in manifest["files"]:
-        try:
-            problems += check_events(folder / "events.h5", manifest)
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            problems.append(f"events.h5: cannot be read: {' '.join(str(error).split())[:120]}")
+def _guarded(check: Callable[[], list[str]]) -> list[str]:
+    """``check()``, or as its only line what stopped it: libraries meet damaged files with exceptions of every kind."""
     try:
-        problems += _check_labels(folder, manifest)
-    except (BlinkGLError, OSError, ValueError) as error:
-        problems.append(" ".join(str(error).split()))
+        return check()
+    except BlinkGLError as error:
+        return [str(error)]
+    except Exception as error:  # noqa: BLE001
+        return [f"cannot be checked: {type(error).__name__}: {shown(' '.join(str(error).split()))}"]
+
+
+def check_sequence(folder: Path) -> list[str]:
+    """Problems of one sequence by itself. Checksums first; contents only where those hold."""
+    return _look(folder, ".")[0]
+
+
+def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
+    """``name``: path below the data set, "." where the sequence is looked at alone and may be called anything."""
+    found: list[_Known] = []
+
+    def check() -> list[str]:
+        if name != "." and folder.is_symlink():
+            return ["a symbolic link, not a folder"]
+        if problems := verify_sequence(folder):
+            return problems
+        manifest = read_manifest(folder)
+        if missing := [f"{MANIFEST}: '{key}' is missing or no {kind.__name__}" for key, kind in _REQUIRED.items() if manifest.get(key) is None]:
+            return missing
+        if "config.yaml" not in manifest["files"]:
+            return ["config.yaml: missing"]
+        config = load_run(folder / "config.yaml").sequence(manifest["sequence"])
+        if problems := _bound(name, manifest, config):
+            return problems
+        problems = _guarded(lambda: check_events(folder / "events.h5", manifest)) if "events.h5" in manifest["files"] else []
+        problems = [line if line.startswith("events.h5") else f"events.h5: {line}" for line in problems]
+        problems += _guarded(lambda: _check_labels(folder, manifest))
+        if not problems:
+            found.append(_Known(folder, manifest, config))
+        return problems
+
+    return _guarded(check), found[0] if found else None
+
+
+def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Do the folder's name, the manifest and the sequence's own configuration speak of the same sequence, and is there what it asks for?"""
+    index, output = manifest["sequence"], config.output
+    path = sequence_name(output, index)
+    said = [("split", output.split), ("seed", config.seed), ("sequence", output.first_index), ("emulator", config.events.emulator)]
+    if config.frames is None:
+        t0, t1 = config.time.t0_ns // 1000, config.time.t1_ns // 1000
+        said += [("height", config.camera.height), ("width", config.camera.width), ("t_offset_us", t0), ("duration_us", t1 - t0),
+                 ("labels", config.time.label_count)]
+    problems = [f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}" for key, value in said if manifest.get(key) != value]
+    if name != "." and name != (path if "/" in name else path.split("/")[1]):
+        problems.append(f"the folder is called {shown(name)}, but holds {path}")
+    if config.frames is None and not problems:
+        wanted, there = set(_files_of(config)), set(manifest["files"])
+        problems += [f"{file}: missing, config.yaml asks for it" for file in sorted(wanted - there)[:5]]
+        problems += [f"{shown(file)}: config.yaml does not ask for it" for file in sorted(there - wanted)[:5]]
     return problems
+
+
+def _files_of(config: SequenceConfig) -> Iterator[str]:
+    """Names of the files of a generated sequence, the manifest left out."""
+    labels, count = config.labels, config.time.label_count
+    numbered = lambda folder, ending, n=count: (f"{folder}/{k:06d}.{ending}" for k in range(n))  # noqa: E731
+    yield from ("events.h5", "poses.npz", "config.yaml")
+    if labels.images:
+        yield "images/timestamps.txt"
+        yield from numbered("images", "png", count + 1)
+    for direction in set(labels.flow):
+        yield f"flow/{direction}_timestamps.txt"
+        yield from numbered(f"flow/{direction}", "png")
+        for form in labels.float_flow:
+            yield from (f"flow/{direction}.h5",) if form == "h5" else numbered(f"flow/{direction}_{form}", form)
+        if labels.occlusion:
+            yield from numbered(f"occlusion/{direction}", "png")
+    for kind, ending in (("depth", "npy"), ("velocity", "npy"), ("normals", "npy"), ("ids", "png")):
+        if getattr(labels, kind):
+            yield from numbered(kind, ending)
+    if config.preview.enabled:
+        yield "preview.mp4"
 
 
 def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
     """Sorted, inside the sensor and the sequence's time, counted as the manifest says, and ``ms_to_idx`` right at every millisecond."""
     problems = []
-    with h5py.File(path) as file:
+    with open_hdf5(path) as file:
         columns = {k: file[f"events/{k}"] for k in "xytp"}
-        ms_to_idx, offset = file["ms_to_idx"][()].astype(np.int64), int(file["t_offset"][()])
+        offset = int(file["t_offset"][()])
         counts = {k: len(c) for k, c in columns.items()}
         if set(counts.values()) != {manifest["events"]}:
             return [f"events.h5: columns of {sorted(set(counts.values()))} events, manifest says {manifest['events']}"]
         if offset != manifest["t_offset_us"]:
             problems.append(f"events.h5: t_offset is {offset}, manifest says {manifest['t_offset_us']}")
         last, end = 0, manifest["duration_us"]
+        needed = -(-end // 1000) + 1
+        if not needed <= len(file["ms_to_idx"]) <= needed + 1:  # before it is read: it may claim to be of any length
+            return [*problems, f"events.h5: ms_to_idx has {len(file['ms_to_idx'])} entries, {needed} are needed"]
+        ms_to_idx = file["ms_to_idx"][()].astype(np.int64)
         expected = np.zeros(len(ms_to_idx), np.int64)
         marks = np.arange(len(ms_to_idx), dtype=np.int64) * 1000
         for begin in range(0, manifest["events"], _BLOCK):
@@ -129,19 +219,17 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
                 problems.append(f"events.h5: times decrease after event {begin + int(np.argmax(np.diff(t, prepend=last) < 0))}")
                 break
             last = int(t[-1])
-            if x.max() >= manifest["width"] or y.max() >= manifest["height"]:
+            if x.max() >= manifest["width"] or y.max() >= manifest["height"] or min(x.min(), y.min()) < 0:
                 problems.append(f"events.h5: an event outside {manifest['width']}x{manifest['height']} px")
                 break
-            if p.max() > 1:
+            if p.max() > 1 or p.min() < 0:
                 problems.append("events.h5: a polarity other than 0 and 1")
                 break
             expected += np.searchsorted(t, marks)
         else:
             if manifest["events"] and last > end:
                 problems.append(f"events.h5: last event at {last} µs, the sequence ends at {end} µs")
-            if not len(ms_to_idx) or len(ms_to_idx) < -(-end // 1000) + 1:
-                problems.append(f"events.h5: ms_to_idx has {len(ms_to_idx)} entries, {-(-end // 1000) + 1} are needed")
-            elif (wrong := np.flatnonzero(ms_to_idx != expected)).size:
+            if (wrong := np.flatnonzero(ms_to_idx != expected)).size:
                 problems.append(f"events.h5: ms_to_idx[{wrong[0]}] is {ms_to_idx[wrong[0]]}, expected {expected[wrong[0]]}")
     return problems
 
@@ -184,6 +272,9 @@ def _check_labels(folder: Path, manifest: dict[str, Any]) -> list[str]:
     return problems
 
 
+# ---- between sequences ------------------------------------------------------------------------------------------------
+
+
 def _between(root: Path, folders: list[Path]) -> list[str]:
     """What lies in the data set and belongs to no sequence."""
     problems = []
@@ -204,80 +295,222 @@ def _between(root: Path, folders: list[Path]) -> list[str]:
         if path.is_dir() and not path.is_symlink() and not any(path.iterdir()):
             continue
         left = ".blinkgl-tmp-" in path.name
-        problems.append(f"{name}: {'left by a run that was cut off' if left else 'belongs to no sequence'}")
+        problems.append(f"{shown(name)}: {'left by a run that was cut off' if left else 'belongs to no sequence'}")
     return problems
 
 
-def _against_run(root: Path, folders: list[Path], result: Verification) -> None:
-    """Sequences that the recipe asks for and are not there; the index."""
-    here = {folder.relative_to(root).as_posix() for folder in folders}
+def _index(root: Path, folders: list[Path]) -> list[str]:
+    """The index says what the manifests say."""
     try:
-        plan = plan_of(root)
-    except BlinkGLError as error:
-        result.add(".", [str(error)])
-        plan = None
-    if plan is not None:
-        failed = {}
+        (root / INDEX).lstat()
+    except FileNotFoundError:
+        return []
+    listed = {line["path"]: line for line in read_index(root)}
+    actual = {}
+    for folder in folders:
         with suppress(BlinkGLError):
-            failed = RunFolder(root).read("failed.json") or {}
-        for task in plan.tasks:
-            if task.name not in here:
-                result.add(task.name, [f"set aside: {failed[task.name]}" if task.name in failed else "missing: the recipe asks for it"])
-    if (root / INDEX).is_file():
-        try:
-            listed = {line["path"]: line for line in read_index(root)}
-            actual = {}
-            for folder in folders:
-                with suppress(BlinkGLError):
-                    line = entry(root, folder)
-                    actual[line["path"]] = line
-            wrong = sorted(p for p in listed.keys() | actual.keys() if listed.get(p) != actual.get(p))
-            result.add(".", [f"{INDEX}: out of date for {p}" for p in wrong[:5]])
-        except BlinkGLError as error:
-            result.add(".", [str(error)])
+            line = entry(root, folder)
+            actual[line["path"]] = line
+    wrong = sorted(p for p in listed.keys() | actual.keys() if listed.get(p) != actual.get(p))
+    return [f"{INDEX}: out of date for {shown(p)}" for p in wrong[:5]]
+
+
+def _twins(known: dict[str, _Known], result: Verification) -> dict[str, list[str]]:
+    """Sequences with the events or the poses of another one, although they are different draws. Where nothing is drawn at all (a scene
+    of one's own or recorded frames, thresholds that are all alike) twins are what was asked for, and a note."""
+    seen: dict[tuple[str, str], str] = {}
+    problems: dict[str, list[str]] = {}
+    for name, one in known.items():
+        files, config = one.manifest["files"], one.config
+        random_scene = config.frames is None and config.scene.kind == "random"
+        looked = [f for f, tells in (("events.h5", one.manifest["events"] > 0), ("poses.npz", random_scene)) if tells and f in files]
+        for file in looked:
+            other = seen.setdefault((file, files[file]["sha256"]), name)
+            if other == name:
+                continue
+            numbers = [(known[n].config.seed, known[n].manifest["sequence"]) for n in (name, other)]
+            if numbers[0] != numbers[1] and (random_scene or _noisy(config)):
+                problems.setdefault(name, []).append(f"{file}: the same as in {shown(other)}, a sequence of another draw")
+            elif file == "events.h5":
+                result.notes.append(f"{shown(name)}: the same events as {shown(other)}, as their configurations have it")
+    return problems
+
+
+def _noisy(config: SequenceConfig) -> bool:
+    """Whether two seeds give two pixel arrays."""
+    drawn = ("threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6")
+    return any(getattr(config.events, key, 0) > 0 for key in drawn)
+
+
+def _against_run(root: Path, folders: list[Path], known: dict[str, _Known], result: Verification) -> list[str]:
+    """Sequences that the recipe asks for and are not there, or are and it draws others; what the run says of its OpenGL."""
+    plan, record = plan_of(root), RunFolder(root).read("run.json") or {}
+    if plan is None:
+        result.notes.append("no record of the run here: sequences were not compared with a recipe")
+        return []
+    failed: dict[str, str] = {}
+    problems = _guarded(lambda: failed.update(RunFolder(root).read("failed.json") or {}) or [])
+    here = {folder.relative_to(root).as_posix() for folder in folders}
+    missing = 0
+    for task in plan.tasks:
+        if task.name not in here:
+            missing += 1
+            if missing <= _MOST_MISSING:
+                result.add(task.name, [f"set aside: {shown(failed[task.name])}" if task.name in failed else "missing: the recipe asks for it"])
+    if missing > _MOST_MISSING:
+        problems.append(f"and {missing - _MOST_MISSING} more sequences that the recipe asks for are missing")
+    if record.get("mixed"):
+        result.notes.append("the run went on with --mixed: configurations and OpenGL were not compared with its record")
+        return problems
+    groups = {f"{g.template.tree.get('output', {}).get('split', 'train')}/{_called(g.template)}": g for g in plan.groups}
+    environment = record.get("environment", {})
+    for name, one in known.items():
+        group = groups.get(re.sub(r"_\d{6,}$", "", name))
+        if group is None:
+            result.add(name, ["no group of the recipe makes it"])
+            continue
+        drawn = group.template.sequence(one.manifest["sequence"])
+        if where := _first_difference(_comparable(one.config), _comparable(drawn)):
+            result.add(name, [f"config.yaml: the recipe draws another value for {where}"])
+        result.add(name, [f"{MANIFEST}: made with {key} {shown(value)}, the run's record says {shown(environment[key])}"
+                          for key, value in _made_with(one.manifest).items() if environment.get(key, value) != value])
+    return problems
+
+
+def _made_with(manifest: dict[str, Any]) -> dict[str, str]:
+    """Versions and OpenGL, under the names that the run's record has for them."""
+    gl = manifest.get("opengl") or {}
+    return {**(manifest.get("versions") or {}), **({"opengl": f"{gl.get('renderer')}, {gl.get('version')}"} if gl else {})}
+
+
+def _called(template: RunTemplate) -> str:
+    return template.check().output.name
+
+
+def _comparable(config: SequenceConfig) -> dict[str, Any]:
+    """Plain data without what a sequence's own configuration says otherwise than the recipe: its number, and which of the folders."""
+    tree = json.loads(config.model_dump_json())
+    for key in ("sequences", "first_index"):
+        tree["output"].pop(key)
+    if tree["frames"] is not None:
+        tree["frames"].pop("folders")
+    return tree
+
+
+def _first_difference(a: Any, b: Any, path: str = "") -> str:
+    """Dotted path, "" when they agree. Numbers that a text form rounds are equal."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in sorted(a.keys() | b.keys()):
+            if where := _first_difference(a.get(key), b.get(key), f"{path}.{key}" if path else key):
+                return where
+        return ""
+    return "" if a == b else path
 
 
 def plan_of(root: Path) -> Plan | None:
-    """The plan of the run that made ``root``; None without a record of one."""
+    """The plan of the run that made ``root``; None without a record of one. Raises BlinkGLError: a damaged record."""
     known = RunFolder(root).read("run.json")
-    if known is None or not (root / RUN_FOLDER / "recipe.yaml").is_file():
+    if known is None:
         return None
-    template = load_run(root / RUN_FOLDER / "recipe.yaml")
-    return Plan.of(RunTemplate(template.tree, Path(known.get("base", "."))), known.get("num"))
+    recipe = root / RUN_FOLDER / "recipe.yaml"
+    with suppress(FileNotFoundError):
+        open(open_regular(recipe), "rb").close()
+        template = load_run(recipe)
+        return Plan.of(RunTemplate(template.tree, Path(known.get("base", "."))), known.get("num"))
+    return None
 
 
-def _deep(root: Path, folders: list[Path], result: Verification, base: str | Path | None) -> None:
-    if base is None:
-        base = (RunFolder(root).read("run.json") or {}).get("base", ".")
+# ---- made again --------------------------------------------------------------------------------------------------------
+
+
+def _deep(root: Path, chosen: dict[str, _Known], result: Verification, base: str | Path | None, progress) -> None:
     gl: GLContext | None = None
+    if base is None:
+        base = "."
+        with suppress(BlinkGLError):  # a damaged record has been reported
+            base = (RunFolder(root).read("run.json") or {}).get("base", ".")
     with tempfile.TemporaryDirectory(prefix="blinkgl-verify-") as scratch:
         try:
-            for folder in folders:
-                name = folder.relative_to(root).as_posix()
-                try:
-                    manifest = read_manifest(folder)
-                    template = load_run(folder / "config.yaml")
-                    config = template.sequence(manifest["sequence"])
-                    if config.frames is None and gl is None:
-                        gl = create_context(config.gl.backend, config.gl.device)
-                    made_with = (manifest.get("opengl") or {}).get("renderer")
-                    if gl is not None and made_with not in (None, gl.renderer):
-                        result.notes.append(f"{name}: made with {made_with}, this machine has {gl.renderer}; not compared")
-                        continue
-                    again = generate_sequence(config, manifest["sequence"], scratch, gl, base=Path(base)).path
-                except BlinkGLError as error:
-                    result.add(name, [f"cannot be made again: {error}"])
-                    continue
-                result.deep.append(name)
-                result.add(name, [f"made again, {line}" for line in differences(folder, again)])
-                shutil.rmtree(again)
+            for name, one in chosen.items():
+                if progress:
+                    progress(result.sequences, "again: " + shown(name))
+
+                def again() -> list[str]:
+                    nonlocal gl
+                    if one.config.frames is None and gl is None:
+                        gl = create_context(one.config.gl.backend, one.config.gl.device)
+                    made = generate_sequence(one.config, one.manifest["sequence"], scratch, gl, base=Path(base)).path
+                    try:
+                        result.deep.append(name)
+                        return _compared(name, one, made, result)
+                    finally:
+                        shutil.rmtree(made)
+
+                lines = _guarded(again)
+                result.add(name, lines if name in result.deep else [f"cannot be made again: {line}" for line in lines])
         finally:
             if gl is not None:
                 gl.release()
 
 
+def _compared(name: str, one: _Known, made: Path, result: Verification) -> list[str]:
+    """The sequence against itself made again: bit by bit, or as far as two machines can agree."""
+    lines = differences(one.folder, made)
+    if not lines:
+        return []
+    manifest = read_manifest(made)
+    if not (apart := _apart(one.manifest, manifest)):
+        return [f"made again, {line}" for line in lines]
+    result.in_part.append(name)
+    problems = [f"made again, {MANIFEST}: {key} differs" for key in _SAME_ANYWHERE if one.manifest.get(key) != manifest.get(key)]
+    problems += [f"made again, {line}" for line in lines if line.endswith("only in one of them")]
+    depend = []
+    for file in sorted(set(one.manifest["files"]) & set(manifest["files"])):
+        if one.manifest["files"][file]["sha256"] != manifest["files"][file]["sha256"]:
+            if _agrees(file, one.folder, made):
+                depend.append(file)
+            else:
+                problems.append(f"made again, {file}: differs by more than a renderer can")
+    result.notes.append(f"{shown(name)}: {apart}; of {len(depend)} files that may depend on it the bytes were not compared: "
+                        + ", ".join(depend[:4]) + (" …" if len(depend) > 4 else ""))
+    return problems
+
+
+def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
+    """What may make the bytes of two machines differ; "" where nothing does."""
+    mine, here = ({"BlinkGL": manifest.get("blinkgl"), **_made_with(manifest)} for manifest in (one, other))
+    different = [k for k in mine.keys() | here.keys() if mine.get(k) != here.get(k)]
+    return "; ".join(f"made with {k} {shown(mine.get(k))}, this machine has {shown(here.get(k))}" for k in sorted(different))
+
+
+def _agrees(file: str, one: Path, other: Path) -> bool:
+    """Whether two machines' files of one name say the same, as far as machines can agree. True for what a renderer, a codec or a
+    library may change in every byte."""
+    a, b = one / file, other / file
+    if file == "config.yaml":
+        configs = [load_run(path) for path in (a, b)]
+        return not _first_difference(*(_comparable(c.sequence(c.check().output.first_index)) for c in configs))
+    if file.endswith(".txt"):
+        return False
+    if file == "poses.npz":
+        with np.load(a, allow_pickle=False) as p, np.load(b, allow_pickle=False) as q:
+            return set(p.files) == set(q.files) and all(
+                p[k].shape == q[k].shape and (np.allclose(p[k], q[k], rtol=1e-9, atol=1e-9) if p[k].dtype.kind == "f" else np.array_equal(p[k], q[k]))
+                for k in p.files)
+    if re.fullmatch(r"flow/(forward|backward)/\d+\.png", file):
+        (u, valid), (v, also) = read_flow_png(a), read_flow_png(b)
+        if u.shape != v.shape:
+            return False
+        near = (np.abs(u - v).max(-1) <= _FLOW_PX) & (valid == also)
+        return bool(near.mean() >= _FLOW_SHARE)
+    if re.fullmatch(r"depth/\d+\.npy", file):
+        u, v = read_npy(a), read_npy(b)
+        return u.shape == v.shape and bool(np.isclose(u, v, rtol=1e-4).mean() >= _FLOW_SHARE)
+    return True
+
+
 def differences(a: Path, b: Path) -> list[str]:
     """Files in which two folders differ, one line each."""
     names = [{p.relative_to(f).as_posix() for p in f.rglob("*") if p.is_file()} for f in (a, b)]
-    lines = [f"{name}: only in one of them" for name in sorted(names[0] ^ names[1])]
-    return lines + [f"{name}: differs" for name in sorted(names[0] & names[1]) if (a / name).read_bytes() != (b / name).read_bytes()]
+    lines = [f"{shown(name)}: only in one of them" for name in sorted(names[0] ^ names[1])]
+    return lines + [f"{shown(name)}: differs" for name in sorted(names[0] & names[1]) if (a / name).read_bytes() != (b / name).read_bytes()]

@@ -4,7 +4,8 @@ A :class:`Job` says what the run is; a :class:`Maker` turns task numbers into se
 (dicts that JSON can carry):
 
     {"kind": "hello", "pid", "environment", "assets"}          ready
-    {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far}
+    {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far,
+     "omissions": what is not drawn}
     {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
     {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use trying again, "stop": nor anything else}
 """
@@ -26,11 +27,12 @@ from pathlib import Path
 from typing import Any
 
 from blinkgl import __version__
-from blinkgl.config.sequence import RunTemplate, parse_yaml
+from blinkgl.config.reader import parse_yaml
+from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, digest
 from blinkgl.dataset.report import SequenceReport
-from blinkgl.errors import BlinkGLError, ConfigError, OutputError
+from blinkgl.errors import BlinkGLError, ConfigError, OutputError, may_pass
 from blinkgl.gl import GLContext, create_context
 
 Message = dict[str, Any]
@@ -97,7 +99,7 @@ class Maker:
             if (now := time.monotonic()) - last > _NEWS_EVERY_S:
                 last = now
                 tell({"kind": "progress", "task": number, "frames": report.frames, "events": report.events, "fraction": fraction,
-                      "seconds": dict(report.seconds)})
+                      "seconds": dict(report.seconds), "omissions": list(report.omissions)})
 
         try:
             config = self.plan.config(task)
@@ -109,7 +111,8 @@ class Maker:
             line = str(error) if isinstance(error, BlinkGLError) else f"{type(error).__name__}: {' '.join(str(error).split())}"
             log.write("failed: " + line)
             log.write(traceback.format_exc())
-            return {"kind": "failed", "task": number, "error": line, "expected": isinstance(error, BlinkGLError), "final": isinstance(error, ConfigError), "stop": _disk_is_full(error)}
+            return {"kind": "failed", "task": number, "error": line, "expected": isinstance(error, BlinkGLError),
+                    "final": not may_pass(error), "stop": _disk_is_full(error)}
         size = sum(p.stat().st_size for p in report.path.rglob("*") if p.is_file())
         log.write(f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} labels, {size} bytes; "
                   + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items()))

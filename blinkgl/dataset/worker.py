@@ -6,6 +6,7 @@ same way. When standard input ends, the driver is dead: whatever is being made i
 
 from __future__ import annotations
 
+import contextlib
 import faulthandler
 import json
 import os
@@ -13,23 +14,32 @@ import queue
 import signal
 import sys
 import threading
+import time
+from collections.abc import Callable
 
 _GRACE_S = 20.0
+_ALIVE_EVERY_S = 1.0
 
 
 def main() -> int:
     faulthandler.enable()
     signal.signal(signal.SIGTERM, _interrupt)
-    channel = os.fdopen(int(sys.argv[1]), "w", encoding="utf-8")
+    channel = int(sys.argv[1])
     tasks: queue.Queue = queue.Queue()
     threading.Thread(target=_listen, args=(tasks,), daemon=True).start()
 
+    one_at_a_time = threading.Lock()
+
     def tell(message: dict) -> None:
+        data = json.dumps(message).encode() + b"\n"
         try:
-            channel.write(json.dumps(message) + "\n")
-            channel.flush()
+            with one_at_a_time:
+                while data:  # not a buffered file: a thread in the middle of one at exit is a fatal error of Python's
+                    data = data[os.write(channel, data):]
         except OSError:  # nobody listens any more
             raise KeyboardInterrupt from None
+
+    threading.Thread(target=_pulse, args=(tell,), daemon=True).start()
 
     try:
         from blinkgl.dataset.work import Job, Maker
@@ -59,6 +69,14 @@ def _listen(tasks: queue.Queue) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     threading.Event().wait(_GRACE_S)
     os._exit(1)
+
+
+def _pulse(tell: Callable[[dict], None]) -> None:
+    """Says that this process runs, which one that was stopped or that hangs in a driver does not."""
+    with contextlib.suppress(KeyboardInterrupt):  # nobody listens any more: the main thread sees to that
+        while True:
+            time.sleep(_ALIVE_EVERY_S)
+            tell({"kind": "alive"})
 
 
 def _interrupt(*_) -> None:

@@ -169,8 +169,10 @@ class Emulator(ABC):
         bad = np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))  # -0.0 is not bad
         if bad.size:
             y, x = divmod(int(bad[0]), self.width)
-            raise EventDataError(f"intensity at pixel x={x}, y={y} cannot be used", where=f"frame {self.frames}",
-                                 value=float(frame[bad[0]]), accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}")
+            error = EventDataError(f"intensity at pixel x={x}, y={y} cannot be used", where=f"frame {self.frames}",
+                                   value=float(frame[bad[0]]), accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}")
+            error.pixel = (x, y)
+            raise error
 
     @abstractmethod
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events: ...

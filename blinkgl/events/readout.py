@@ -5,6 +5,9 @@ when they leave the bus, ``1 / events_per_second`` (and ``row_ns`` more where th
 the one before. Below the limit events are late by less than a microsecond; above it time stamps lag by up to
 ``queue_events / events_per_second`` and the output rate is the bus's. Events of one microsecond are served in raster
 order, as a row arbiter would, so in overload the upper rows of that microsecond come first.
+
+An event exists for the outside when it has left the bus. A recording that ends at time T therefore ends with the last event that
+left by T; those still on the bus then are no part of it, and are counted (``late``).
 """
 
 from __future__ import annotations
@@ -46,8 +49,7 @@ def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
 class Readout:
     """Events of an emulator, in order, chunk by chunk -> the events the sensor sends.
 
-    Time stamps may lie beyond the end of the chunk they came in with; they never decrease from chunk to chunk.
-    ``dropped`` counts the lost events.
+    ``dropped`` counts the events that found the queue full; ``late`` those that had not left the bus by the end of the last step.
     """
 
     def __init__(self, config: ReadoutConfig):
@@ -57,11 +59,28 @@ class Readout:
         self._row_ps = round(config.row_ns * 1000)
         self._waiting = np.zeros(config.queue_events, np.int64)
         self._state = np.array([0, -(2**62), -1], np.int64)
+        self._on_bus = Events.empty()
 
-    def step(self, events: Events) -> Events:
-        """Raises EventDataError for times beyond 100 days, which picoseconds in int64 cannot hold."""
-        if not len(events):
-            return events
+    @property
+    def late(self) -> int:
+        """Accepted events that no step has given out yet."""
+        return len(self._on_bus)
+
+    def step(self, events: Events, until_us: int | None = None) -> Events:
+        """The events that leave the bus until ``until_us`` (that microsecond included), stamped when they do and in order from step
+        to step; later ones wait for the next step. None: all of them, however late.
+
+        ``until_us`` : the time up to which the emulator has given its events, int µs.
+        Raises EventDataError for times beyond 100 days, which picoseconds in int64 cannot hold."""
+        sent = self._serve(events) if len(events) else events
+        if self.late:
+            sent = Events.concatenate([self._on_bus, sent])
+        count = len(sent) if until_us is None else int(np.searchsorted(sent.t, until_us, side="right"))
+        self._on_bus = Events(*(getattr(sent, k)[count:].copy() for k in "xytp"))
+        return Events(*(getattr(sent, k)[:count] for k in "xytp"))
+
+    def _serve(self, events: Events) -> Events:
+        """Those that find a place, with the times at which they leave."""
         if max(abs(int(events.t[0])), abs(int(events.t[-1]))) > 2**43:
             raise EventDataError("event time too large for the read-out model", value=int(events.t[-1]), accepted="at most 100 days")
         keep, out_us = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
@@ -71,9 +90,12 @@ class Readout:
         return Events(events.x[keep], events.y[keep], out_us[:kept].copy(), events.p[keep])
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        return {"waiting": self._waiting.copy(), "state": self._state.copy(), "dropped": np.array([self.dropped], np.int64)}
+        return {"waiting": self._waiting.copy(), "state": self._state.copy(), "dropped": np.array([self.dropped], np.int64),
+                **{f"on_bus_{k}": getattr(self._on_bus, k).copy() for k in "xytp"}}
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        if set(state) != {"waiting", "state", "dropped"} or state["waiting"].shape != self._waiting.shape:
+        columns = [f"on_bus_{k}" for k in "xytp"]
+        if set(state) != {"waiting", "state", "dropped", *columns} or state["waiting"].shape != self._waiting.shape:
             raise EventDataError("saved state is of another read-out", value=sorted(state))
         self._waiting[...], self._state[...], self.dropped = state["waiting"], state["state"], int(state["dropped"][0])
+        self._on_bus = Events(*(state[k].copy() for k in columns))

@@ -25,6 +25,9 @@ from blinkgl.gl.shader import ShaderLoader
 
 _thread = threading.local()
 """``current``: weak reference to the context last made current in the thread."""
+_opened_by: int | None = None
+"""The process that opened OpenGL first. One that is forked off it afterwards has the drivers' locks, and not their threads: it would
+wait for them for ever with its first triangle, also in a context of its own."""
 REQUIRED_VERSION = 430
 APT_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6"
 REMEDY = f"run 'sudo apt-get install -y --no-install-recommends {APT_PACKAGES}', or install the GPU's driver with its EGL part"
@@ -53,11 +56,13 @@ class GLContext:
     notes      : what was tried before and failed, one line each (empty when the first choice worked).
     shaders    : the :class:`~blinkgl.gl.shader.ShaderLoader` behind :meth:`program`.
 
-    Not thread-safe, and not to be carried over ``fork()``: worker processes make their own.
+    Not thread-safe, and not to be carried over ``fork()``: GLError in a process that was forked after the first context was made.
     """
 
     def __init__(self, raw: Any, backend: str, device: int, notes: tuple[str, ...] = ()):
+        global _opened_by
         self._raw = raw
+        _opened_by = _opened_by or os.getpid()
         try:
             self.ctx = moderngl.create_context(require=REQUIRED_VERSION, standalone=True, context=raw)
         except Exception as error:  # moderngl raises bare Exception, ValueError and its own Error here
@@ -92,6 +97,7 @@ class GLContext:
 
     def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
         """The program of ``shaders/<name>``; compiled once per (name, defines). See :class:`ShaderLoader`."""
+        _refuse_after_fork()
         return self.shaders.program(name, defines)
 
     def framebuffer(self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True,
@@ -103,7 +109,8 @@ class GLContext:
         """Make this context the current one again, after another context was used in the same thread.
 
         Raises GLError where it is current in another thread: going on would draw into, and free, what belongs to the context
-        that is current here."""
+        that is current here, and in a forked process."""
+        _refuse_after_fork()
         egl = None
         if self.backend == "egl":
             # EGL does not see what OSMesa does behind its back: it takes a context it bound for still bound, and does nothing.
@@ -132,6 +139,8 @@ class GLContext:
 
     def release(self) -> None:
         """Free the context and everything in it. Harmless when repeated."""
+        if self._raw is not None and _forked():  # the parent's, who goes on with it
+            self._raw = None
         if self._raw is not None:
             with self.borrowed():
                 self.shaders.clear()
@@ -156,8 +165,9 @@ def create_context(backend: str = "auto", device: int = 0) -> GLContext:
     device  : index in the order of ``eglQueryDevicesEXT``; CUDA_VISIBLE_DEVICES has no say in it. The environment variable
               GLCONTEXT_DEVICE_INDEX overrides it (glcontext's own rule, kept because job schedulers set it).
 
-    Raises GLError naming every attempt and the remedy.
+    Raises GLError naming every attempt and the remedy, and in a process that was forked after another context was made.
     """
+    _refuse_after_fork()
     if backend not in ("auto", "egl", "osmesa"):
         raise GLError("unknown backend", where="gl.backend", value=backend, accepted="'auto', 'egl' or 'osmesa'")
     device = _overridden(device)
@@ -178,6 +188,16 @@ def create_context(backend: str = "auto", device: int = 0) -> GLContext:
         except (OSMesaUnavailable, _EGLUnavailable) as error:
             attempts.append(f"OSMesa: {error}")
     raise GLError(f"no usable OpenGL ({'; '.join(attempts)})", where=f"gl.backend {backend}", accepted=REMEDY)
+
+
+def _forked() -> bool:
+    return _opened_by not in (None, os.getpid())
+
+
+def _refuse_after_fork() -> None:
+    if _forked():
+        raise GLError("this process was forked from one that had opened OpenGL, and would hang", where=f"process {os.getpid()}",
+                      accepted="use multiprocessing.get_context('spawn'), or fork before anything is drawn")
 
 
 def _overridden(device: int) -> int:

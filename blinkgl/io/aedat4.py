@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib.util
+import json
 import os
+import signal
+import subprocess
+import sys
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.extras import install
+from blinkgl.io import aedat4_decode
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import check_events, check_size, events_of
 
 MAGIC = b"#!AER-DAT4"
 
 
-def _dv(error: type[BlinkGLError], path):
-    try:
-        import dv_processing
-    except ImportError as problem:
-        raise error("AEDAT4 needs dv-processing, which is not installed", where=str(path),
-                    accepted=f"run {install('dv-processing')}") from problem
-    return dv_processing
+def _missing(error: type[BlinkGLError], path) -> BlinkGLError:
+    return error("AEDAT4 needs dv-processing, which is not installed", where=str(path), accepted=f"run {install('dv-processing')}")
 
 
 class Aedat4Reader:
@@ -37,39 +42,80 @@ class Aedat4Reader:
             raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
         if magic != MAGIC:
             raise AssetError("not an AEDAT4 file: wrong magic", where=str(path))
-        recording = self._open()
-        if not recording.isEventStreamAvailable():
-            raise AssetError("recording without an event stream", where=str(path))
-        self.width, self.height = (int(v) for v in recording.getEventResolution())
-
-    def _open(self):
-        try:
-            return _dv(AssetError, self.path).io.MonoCameraRecording(os.fspath(self.path))
-        except RuntimeError as error:
-            raise self._broken(error) from error
-
-    def _broken(self, error: Exception) -> AssetError:
-        return AssetError(f"damaged AEDAT4 file: {' '.join(str(error).split())[:160]}", where=str(self.path))
+        self._decoder: _Decoder | None = _Decoder(self.path)
+        self.height, self.width = self._decoder.size
+        check_size(self.height, self.width, str(path))
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """All events, packet by packet, joined to about ``size``."""
-        recording = self._open()
-        pending, count = [], 0
-        while True:
-            try:
-                batch = recording.getNextEventBatch()
-            except RuntimeError as error:
-                raise self._broken(error) from error
-            if batch is not None and batch.size():
-                a = batch.numpy()
-                pending.append(Events(a["x"].astype(np.uint16), a["y"].astype(np.uint16), a["timestamp"].astype(np.int64),
-                                      a["polarity"].astype(np.uint8)))
+        decoder, self._decoder = self._decoder or _Decoder(self.path), None
+        first, pending, count = 0, [], 0
+        with contextlib.closing(decoder):
+            for a in decoder:
+                pending.append(events_of(a["x"], a["y"], a["t"], a["p"], str(self.path), first + count))
                 count += len(a)
-            if pending and (batch is None or count >= size):
-                yield Events.concatenate(pending)
-                pending, count = [], 0
-            if batch is None:
-                return
+                if count >= size:
+                    yield Events.concatenate(pending)
+                    first, pending, count = first + count, [], 0
+        if pending:
+            yield Events.concatenate(pending)
+
+    def close(self) -> None:
+        if self._decoder is not None:
+            self._decoder.close()
+            self._decoder = None
+
+
+class _Decoder:
+    """dv-processing in a process of its own, :mod:`blinkgl.io.aedat4_decode`: damaged bytes crash it or keep it busy for ever.
+    Iterating yields its arrays. Raises AssetError."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        if importlib.util.find_spec("dv_processing") is None:
+            raise _missing(AssetError, path)
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        self._process = subprocess.Popen([sys.executable, aedat4_decode.__file__, os.fspath(path)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                                         stdin=subprocess.DEVNULL, env=environment)
+        self._finalizer = weakref.finalize(self, _end, self._process)
+        self.size: tuple[int, int] = tuple(self._line()["size"])
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        while (count := int(np.frombuffer(self._read(8), np.int64)[0])) >= 0:
+            if count:
+                yield np.frombuffer(self._read(count * aedat4_decode.ROW.itemsize), aedat4_decode.ROW)
+        self._line()
+
+    def close(self) -> None:
+        self._finalizer()
+
+    def _line(self) -> dict:
+        line = self._process.stdout.readline()
+        if not line.endswith(b"\n"):
+            self._died()
+        said = json.loads(line)
+        if "problem" in said:
+            self.close()
+            raise AssetError(f"damaged AEDAT4 file: {said['problem']}", where=str(self.path))
+        return said
+
+    def _read(self, size: int) -> bytes:
+        data = self._process.stdout.read(size)
+        if len(data) < size:
+            self._died()
+        return data
+
+    def _died(self) -> NoReturn:
+        status = self._process.wait()
+        self.close()
+        raise AssetError("damaged AEDAT4 file: dv-processing " + ("does not come to an end with it" if status == -signal.SIGPROF else "crashed on it"),
+                         where=str(self.path))
+
+
+def _end(process: subprocess.Popen) -> None:
+    process.kill()
+    process.stdout.close()
+    process.wait()
 
 
 class Aedat4Writer:
@@ -78,8 +124,12 @@ class Aedat4Writer:
     def __init__(self, path: str | os.PathLike, height: int, width: int):
         if height > 32767 or width > 32767:
             raise EventDataError("AEDAT4 has 15-bit coordinates", where=str(path), value=(height, width))
-        dv = _dv(OutputError, path)
-        self.path, self._store = Path(path), dv.EventStore
+        try:
+            import dv_processing as dv
+        except ImportError as error:
+            raise _missing(OutputError, path) from error
+        self.path, self._store, self._size = Path(path), dv.EventStore, (height, width)
+        self._count, self._last = 0, None
         with output_errors(path):
             open(path, "wb").close()  # dv's own message for an unwritable path does not say why
             try:
@@ -90,6 +140,8 @@ class Aedat4Writer:
     def append(self, events: Events) -> None:
         if not len(events):
             return
+        self._last = check_events(events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last)
+        self._count += len(events)
         store = self._store()
         push = store.push_back
         for t, x, y, p in zip(events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.astype(bool).tolist()):

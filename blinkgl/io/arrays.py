@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,8 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.images import numpy_errors
+from blinkgl.io.columns import check_events, check_size, events_of, microseconds
+from blinkgl.io.images import NpzReader, numpy_errors, read_npy
 
 DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 _NAMES = {"t": ("t", "ts", "timestamp", "timestamps"), "x": ("x",), "y": ("y",), "p": ("p", "polarity", "polarities", "pol", "on")}
@@ -26,18 +27,19 @@ class ArrayReader:
         self.path = Path(path)
         self.height = self.width = None
         with numpy_errors(path):
-            data = np.load(path, allow_pickle=False)
-            names = (data.dtype.names or ()) if isinstance(data, np.ndarray) else tuple(data.files)
-            found = {k: next((n for n in options if n in names), None) for k, options in _NAMES.items()}
-            if missing := [k for k, name in found.items() if name is None]:
-                raise AssetError(f"no column '{missing[0]}'", where=str(path), value=list(names) or "a plain array",
-                                 accepted="x, y, t, p in an .npz or a structured .npy")
-            columns = {k: np.asarray(data[name]) for k, name in found.items()}
-            if not isinstance(data, np.ndarray):
-                if "height" in names and "width" in names:
-                    self.height, self.width = int(data["height"]), int(data["width"])
-                data.close()
-        self._events = _events(columns, path)
+            if self.path.suffix.lower() == ".npy":
+                table = read_npy(path)
+                columns = {k: table[name] for k, name in _named(table.dtype.names or (), path).items()}
+            else:
+                with NpzReader(path) as arrays:
+                    columns = {k: arrays[name] for k, name in _named(arrays.names, path).items()}
+                    if "height" in arrays and "width" in arrays:
+                        self.height, self.width = (_declared(arrays[k], k, path) for k in ("height", "width"))
+        check_size(self.height, self.width, str(path))
+        t = columns["t"]
+        if t.dtype.kind == "f" and t.ndim == 1:
+            columns["t"] = microseconds(t, str(path))
+        self._events = events_of(*(columns[k] for k in "xytp"), str(path), signed=True)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         for i in range(0, len(self._events), size):
@@ -49,8 +51,11 @@ class ArrayWriter:
 
     def __init__(self, path: str | os.PathLike, height: int, width: int):
         self.path, self._size, self._chunks = Path(path), (height, width), []
+        self._count, self._last = 0, None
 
     def append(self, events: Events) -> None:
+        self._last = check_events(events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last)
+        self._count += len(events)
         self._chunks.append(Events(*(getattr(events, k).copy() for k in "xytp")))
 
     def close(self, t_end_us: int | None = None) -> None:
@@ -68,19 +73,16 @@ class ArrayWriter:
         self._chunks = []
 
 
-def _events(columns: dict[str, np.ndarray], path) -> Events:
-    """The four columns as Events; AssetError for shapes and values that cannot be events."""
-    if len({c.shape for c in columns.values()}) != 1 or columns["t"].ndim != 1:
-        raise AssetError("columns differ in length", where=str(path), value={k: c.shape for k, c in columns.items()})
-    for k, low, high in (("x", 0, 65535), ("y", 0, 65535), ("p", -1, 1)):
-        c = columns[k]
-        if c.dtype.kind not in "iufb" or (len(c) and not (c.min() >= low and c.max() <= high)):
-            raise AssetError(f"column '{k}' outside {low}…{high}", where=str(path), value=c.dtype if c.dtype.kind not in "iuf" else (c.min(), c.max()))
-    t = columns["t"]
-    if t.dtype.kind == "f":
-        if not np.isfinite(t).all():
-            raise AssetError("column 't' holds NaN or infinity", where=str(path))
-        t = np.rint(t.astype(np.float64) * 1e6)
-    elif t.dtype.kind not in "iu":
-        raise AssetError("column 't'", where=str(path), value=t.dtype, accepted="integer µs or float seconds")
-    return Events(columns["x"].astype(np.uint16), columns["y"].astype(np.uint16), t.astype(np.int64), (columns["p"] > 0).astype(np.uint8))
+def _named(names: Iterable[str], path) -> dict[str, str]:
+    """Column -> its name in the file; AssetError when one is missing."""
+    found = {k: next((n for n in options if n in names), None) for k, options in _NAMES.items()}
+    if missing := [k for k, name in found.items() if name is None]:
+        raise AssetError(f"no column '{missing[0]}'", where=str(path), value=list(names) or "a plain array",
+                         accepted="x, y, t, p in an .npz or a structured .npy")
+    return found
+
+
+def _declared(value: np.ndarray, name: str, path) -> int:
+    if value.size != 1 or value.dtype.kind not in "iu":
+        raise AssetError(f"'{name}' is no integer", where=str(path), value=f"{value.dtype} {value.shape}")
+    return int(value.item())

@@ -13,6 +13,7 @@ import queue
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NoReturn
 
 import h5py
 import hdf5plugin
@@ -21,6 +22,8 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import MAX_SIDE, check_events, check_size, events_of
+from blinkgl.io.hdf5 import blosc_dataset, dataset, hdf5_errors, open_hdf5, write_rows
 
 BLOCK = 1 << 17
 """Events per HDF5 chunk and per write."""
@@ -49,9 +52,9 @@ class DsecEventWriter:
     """
 
     def __init__(self, path: str | os.PathLike, height: int, width: int, t_offset_us: int = 0, *, background: bool = True):
-        if not (0 < height <= 65536 and 0 < width <= 65536):
+        if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
             raise EventDataError("sensor size does not fit uint16 coordinates", where=str(path), value=(height, width),
-                                 accepted="1 to 65536 px a side")
+                                 accepted=f"1 to {MAX_SIDE} px a side")
         self.path, self.height, self.width, self.t_offset_us = Path(path), int(height), int(width), int(t_offset_us)
         self.count = 0
         self.t_end_us: int | None = None  # may be set any time before close
@@ -62,15 +65,10 @@ class DsecEventWriter:
         self._block = _new_block()
         self._error: BaseException | None = None
         self._closed = False
-        # Blosc's threads store blocks in the order they finish: with more than one the bytes differ from run to run.
-        os.environ["BLOSC_NTHREADS"] = "1"
         with output_errors(path):
             self._file = h5py.File(self.path, "w", rdcc_nbytes=0)  # whole chunks only: no cache, a full disk shows at once
-            codec = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
-            make = lambda name, dtype, chunk: self._file.create_dataset(  # noqa: E731
-                name, (0,), dtype, maxshape=(None,), chunks=(chunk,), track_times=False, compression=codec)
-            self._columns = {k: make(f"events/{k}", dtype, BLOCK) for k, dtype in _COLUMNS.items()}
-            self._ms_to_idx = make("ms_to_idx", np.uint64, 1 << 13)
+            self._columns = {k: blosc_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,)) for k, dtype in _COLUMNS.items()}
+            self._ms_to_idx = blosc_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,))
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
             self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
         self._queue: queue.Queue | None = None
@@ -152,23 +150,12 @@ class DsecEventWriter:
         if not len(events):
             return
         where, t = str(self.path), events.t
-        if t[0] < self._last_t:
-            raise EventDataError("event time runs backwards or precedes the recording's start", where=where,
-                                 value=int(t[0]), accepted=f">= {self._last_t} µs")
-        if np.any(t[1:] < t[:-1]):
-            i = int(np.argmax(t[1:] < t[:-1]))
-            raise EventDataError(f"event times not in order at event {self.count + i + 1}", where=where,
-                                 value=(int(t[i]), int(t[i + 1])))
+        if t[0] < self.t_offset_us:
+            raise EventDataError("event before the recording's start", where=where, value=int(t[0]), accepted=f">= {self.t_offset_us} µs")
         if t[-1] - self.t_offset_us > _MAX_RELATIVE_US:
             raise EventDataError("event time beyond what DSEC's 32-bit µs can hold", where=where, value=int(t[-1]),
                                  accepted=f"at most {self.t_offset_us + _MAX_RELATIVE_US} µs (71.6 minutes per file)")
-        if events.x.max() >= self.width or events.y.max() >= self.height:
-            i = int(np.argmax((events.x >= self.width) | (events.y >= self.height)))
-            raise EventDataError("event outside the sensor", where=where, value=(int(events.x[i]), int(events.y[i])),
-                                 accepted=f"x < {self.width}, y < {self.height}")
-        if events.p.max() > 1:
-            raise EventDataError("polarity", where=where, value=int(events.p.max()), accepted="0 or 1")
-        self._last_t = int(t[-1])
+        self._last_t = check_events(events, where, self.count, height=self.height, width=self.width, after=self._last_t)
 
     def _submit(self, block: dict[str, np.ndarray] | None) -> None:
         if self._queue is not None:
@@ -195,9 +182,8 @@ class DsecEventWriter:
 
     def _store(self, block: dict[str, np.ndarray]) -> None:
         start, stop = self._written, self._written + len(block["t"])
-        for name, dataset in self._columns.items():
-            dataset.resize((stop,))
-            dataset[start:stop] = block[name]
+        for name, column in self._columns.items():
+            write_rows(column, start, block[name])
         if stop > start:
             # Entries up to the last event's own millisecond are settled now; later ones wait for their event.
             last_ms = int(block["t"][-1]) // 1000
@@ -207,8 +193,7 @@ class DsecEventWriter:
 
     def _store_ms(self, entries: np.ndarray) -> None:
         if len(entries):
-            self._ms_to_idx.resize((self._next_ms + len(entries),))
-            self._ms_to_idx[self._next_ms :] = entries
+            write_rows(self._ms_to_idx, self._next_ms, entries)
             self._next_ms += len(entries)
 
 
@@ -234,39 +219,58 @@ class DsecEventReader:
             missing = [k for k in ("events/x", "events/y", "events/t", "events/p") if not isinstance(self._file.get(k), h5py.Dataset)]
             if missing:
                 raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
-            self._columns = {k: self._file["events"][k] for k in "xytp"}
-            if any(c.ndim != 1 or c.dtype.kind not in "iub" for c in self._columns.values()):
-                raise AssetError("event columns must be 1-D integers", where=str(path),
-                                 value={k: f"{c.dtype} {c.shape}" for k, c in self._columns.items()})
+            self._columns = {k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"}
             lengths = {len(c) for c in self._columns.values()}
             if len(lengths) != 1:
                 raise AssetError("event columns differ in length", where=str(path), value=sorted(lengths))
             self.count = lengths.pop()
-            self.t_offset_us = int(self._file["t_offset"][()]) if "t_offset" in self._file else 0
-            self._ms_to_idx = self._file["ms_to_idx"][()].astype(np.int64) if "ms_to_idx" in self._file else None
-            attrs = self._file.attrs
-            self.height = int(attrs["height"]) if "height" in attrs else None
-            self.width = int(attrs["width"]) if "width" in attrs else None
+            self.t_offset_us, self._ms_to_idx = 0, None
+            if "t_offset" in self._file:
+                self.t_offset_us = int(dataset(self._file, "t_offset", self.path, shape=())[()])
+            if "ms_to_idx" in self._file:
+                self._ms_to_idx = dataset(self._file, "ms_to_idx", self.path, shape=(None,))
+            self.height, self.width = (self._declared(name) for name in ("height", "width"))
+            check_size(self.height, self.width, str(path))
+
+    def _declared(self, name: str) -> int | None:
+        """A root attribute that says the sensor's size; None without."""
+        value = self._file.attrs.get(name)
+        if value is not None and (np.ndim(value) or np.asarray(value).dtype.kind not in "iu"):
+            raise AssetError(f"attribute '{name}' is no integer", where=str(self.path), value=value)
+        return None if value is None else int(value)
 
     def slice(self, t0_us: int, t1_us: int) -> Events:
         """Events of [t0_us, t1_us), image clock, by DSEC's rule: ``ms_to_idx`` gives the conservative range
-        floor(t0)…ceil(t1) in ms, the exact bounds are searched inside it."""
+        floor(t0)…ceil(t1) in ms, the exact bounds are searched inside it.
+
+        Raises EventDataError as :func:`~blinkgl.io.columns.check_events`; AssetError: damaged, or a table that leaves events out."""
         r0, r1 = int(t0_us) - self.t_offset_us, int(t1_us) - self.t_offset_us
         start, stop = self._index(r0 // 1000, 0), self._index(-(-r1 // 1000), self.count)
-        with hdf5_errors(self.path):
-            t = self._columns["t"][start:stop].astype(np.int64)
-        i, j = np.searchsorted(t, (r0, r1), side="left")
-        return self._read(start + int(i), start + int(j))
+        if not 0 <= start <= stop <= self.count:
+            self._wrong_table(t0_us, t1_us, (start, stop))
+        # One more on either side shows whether the table was right.
+        low, high = max(start - 1, 0), min(stop + 1, self.count)
+        events = self._read(low, high)
+        check_events(events, str(self.path), low, height=self.height, width=self.width)
+        if (low < start and events.t[0] >= t0_us) or (high > stop and events.t[-1] < t1_us):
+            self._wrong_table(t0_us, t1_us, (start, stop))
+        return events.window(t0_us, t1_us)
+
+    def _wrong_table(self, t0_us: int, t1_us: int, found: tuple[int, int]) -> NoReturn:
+        raise AssetError(f"'ms_to_idx' does not lead to the events of [{t0_us}, {t1_us}) µs", where=str(self.path), value=found,
+                         accepted=f"the smallest index whose t >= 1000·ms, at most {self.count}")
 
     def _index(self, ms: int, otherwise: int) -> int:
-        if self._ms_to_idx is None:
+        table = self._ms_to_idx
+        if table is None:
             return otherwise
         if ms < 0:
             return 0
-        if ms < len(self._ms_to_idx):
-            return int(self._ms_to_idx[ms])
-        # Past the table: the end for an upper bound; for a lower one the last entry is still a safe start.
-        return self.count if otherwise else (int(self._ms_to_idx[-1]) if len(self._ms_to_idx) else 0)
+        with hdf5_errors(self.path):
+            if ms < len(table):
+                return int(table[ms])
+            # Past the table: the end for an upper bound; for a lower one the last entry is still a safe start.
+            return self.count if otherwise else (int(table[-1]) if len(table) else 0)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         """All events in pieces of ``size``."""
@@ -276,8 +280,7 @@ class DsecEventReader:
     def _read(self, start: int, stop: int) -> Events:
         with hdf5_errors(self.path):
             x, y, t, p = (self._columns[k][start:stop] for k in "xytp")
-        return Events(x.astype(np.uint16, copy=False), y.astype(np.uint16, copy=False),
-                      t.astype(np.int64) + self.t_offset_us, p.astype(np.uint8, copy=False))
+        return events_of(x, y, t, p, str(self.path), start, offset=self.t_offset_us)
 
     def close(self) -> None:
         self._file.close()
@@ -287,31 +290,6 @@ class DsecEventReader:
 
     def __exit__(self, *_) -> None:
         self.close()
-
-
-def open_hdf5(path: Path) -> h5py.File:
-    """Opens for reading; AssetError with the likely cause when that fails."""
-    if not path.is_file():
-        raise AssetError("no such file", where=str(path))
-    try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        text = " ".join(str(error).split())
-        problem = "truncated HDF5 file" if "truncated" in text else "not an HDF5 file" if "signature" in text else f"cannot be opened: {text}"
-        raise AssetError(problem, where=str(path)) from error
-
-
-@contextlib.contextmanager
-def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
-    """h5py's ways of saying that bytes make no sense, as AssetError; ``file`` is closed on any exception."""
-    try:
-        yield
-    except BaseException as error:
-        if file is not None:
-            file.close()
-        if isinstance(error, (OSError, KeyError, RuntimeError, ValueError)):
-            raise AssetError(f"damaged HDF5 file: {' '.join(str(error).split())[:160]}", where=str(path)) from error
-        raise
 
 
 def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:

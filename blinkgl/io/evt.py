@@ -20,9 +20,11 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import check_events, check_size
 
 _WORD = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
 _MAX_SIDE = 2048
+_LONGEST_LINE = 4096
 _MAX_TIME = 1 << 34
 """µs, 4.8 hours: EVT2's field; also the limit of what we fill with TIME_HIGH words in EVT3."""
 
@@ -40,7 +42,7 @@ class EvtWriter:
         self.path, self.height, self.width, self.version = Path(path), height, width, version
         # time written so far, EVT3's row; -1: none yet
         self._state = np.array([0, -1], np.int64)
-        self._started = False
+        self._count = 0
         header = (f"% evt {version[-1]}.0\n% format {version.upper()};height={height};width={width}\n"
                   f"% geometry {width}x{height}\n% integrator_name BlinkGL\n% end\n")
         with output_errors(path):
@@ -51,20 +53,17 @@ class EvtWriter:
         if not len(events):
             return
         t = events.t
-        if t[0] < self._state[0] or np.any(t[1:] < t[:-1]):
-            raise EventDataError("event times not in order (or negative)", where=str(self.path))
-        if t[-1] >= _MAX_TIME:
+        if t[0] < 0 or t[-1] >= _MAX_TIME:
             raise EventDataError(f"{self.version.upper()} times count from the recording's start", where=str(self.path),
-                                 value=int(t[-1]), accepted="less than 2^34 µs; use --zero-time to shift")
-        if events.x.max() >= self.width or events.y.max() >= self.height:
-            raise EventDataError("event outside the sensor", where=str(self.path), accepted=f"x < {self.width}, y < {self.height}")
+                                 value=int(t[0] if t[0] < 0 else t[-1]), accepted="0 to less than 2^34 µs; use --zero-time to shift")
+        check_events(events, str(self.path), self._count, height=self.height, width=self.width, after=int(self._state[0]))
         if self.version == "evt2":
             words = np.empty(2 * len(t) + 1, np.uint32)
-            n = _encode_evt2(events.x, events.y, t, events.p, self._state, not self._started, words)
+            n = _encode_evt2(events.x, events.y, t, events.p, self._state, not self._count, words)
         else:
             words = np.empty(4 * len(t) + 2 + int((t[-1] >> 12) - (self._state[0] >> 12)), np.uint16)
-            n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._started, words)
-        self._started = True
+            n = _encode_evt3(events.x, events.y, t, events.p, self._state, not self._count, words)
+        self._count += len(t)
         with output_errors(self.path):
             self._file.write(words[:n].astype(_WORD[self.version], copy=False).data)
 
@@ -82,7 +81,9 @@ class EvtWriter:
 class EvtReader:
     """Header and events of an EVT2/EVT3 file. ``height`` and ``width`` are None when the header does not say.
 
-    Raises AssetError: no ``% evt`` header, another version, stray bytes at the end (truncated)."""
+    As the format asks for, events before the first TIME_HIGH have no time and are left out, and triggers and vendors' words are passed over.
+    Raises AssetError: no ``% evt`` header, another version, an impossible size, stray bytes at the end (truncated), a word that
+    the format does not have (with its byte), events but no TIME_HIGH at all."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -93,16 +94,18 @@ class EvtReader:
         self.version = "evt" + version.group(1).removesuffix(".0")  # 2.1 has 64-bit words: another format
         if self.version not in _WORD:
             raise AssetError("unsupported EVT version", where=str(path), value=version.group(1), accepted="2 or 3")
-        geometry = re.search(r"^% geometry (\d+)x(\d+)", header, re.M)
-        sizes = {k: re.search(rf"{k}=(\d+)", header) for k in ("height", "width")}
+        geometry = re.search(r"^% geometry (\d{1,9})x(\d{1,9})\b", header, re.M)
+        sizes = {k: re.search(rf"{k}=(\d{{1,9}})\b", header) for k in ("height", "width")}
         self.height = int(geometry.group(2)) if geometry else int(sizes["height"].group(1)) if sizes["height"] else None
         self.width = int(geometry.group(1)) if geometry else int(sizes["width"].group(1)) if sizes["width"] else None
+        check_size(self.height, self.width, str(path))
 
     def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
         """All events, as decoded from ``words`` words at a time."""
         dtype = _WORD[self.version]
-        # EVT2: time high, wraps.  EVT3: y, high, low, vector base x, polarity, wraps.  -1: no time yet.
-        state = np.array([-1, 0], np.int64) if self.version == "evt2" else np.array([0, -1, 0, 0, 0, 0], np.int64)
+        # EVT2: time high, wraps.  EVT3: time high, y, low, vector base x, polarity, wraps.  -1: no time yet.  Last: events without a time.
+        state = np.array([-1, 0, 0] if self.version == "evt2" else [-1, 0, 0, 0, 0, 0, 0], np.int64)
+        position = self._start
         decode, most = (_decode_evt2, 1) if self.version == "evt2" else (_decode_evt3, 12)
         with open(self.path, "rb") as file:
             file.seek(self._start)
@@ -111,12 +114,18 @@ class EvtReader:
                 raw = np.frombuffer(data[:whole], dtype)
                 x, y, p = np.empty(most * len(raw), np.uint16), np.empty(most * len(raw), np.uint16), np.empty(most * len(raw), np.uint8)
                 t = np.empty(most * len(raw), np.int64)
-                n = decode(raw, state, x, y, t, p)
+                n, bad = decode(raw, state, x, y, t, p)
+                if bad >= 0:
+                    raise AssetError(f"damaged at byte {position + bad * dtype.itemsize}: no {self.version.upper()} word can stand here",
+                                     where=str(self.path), value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}")
+                position += whole
                 if n:
                     yield Events(x[:n].copy(), y[:n].copy(), t[:n].copy(), p[:n].copy())
                 if whole < len(data):
                     raise AssetError(f"truncated: {len(data) - whole} stray bytes after the last {self.version.upper()} word",
                                      where=str(self.path))
+        if state[0] < 0 and state[-1]:
+            raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
 
 def _read_header(path: Path) -> tuple[str, int]:
@@ -127,7 +136,9 @@ def _read_header(path: Path) -> tuple[str, int]:
                 start = file.tell()
                 if file.read(1) != b"%":
                     break
-                line = file.readline(4096)
+                line = file.readline(_LONGEST_LINE)
+                if line.startswith(b" ") and len(line) == _LONGEST_LINE:
+                    raise AssetError(f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path))
                 if not line.startswith(b" ") or not line.endswith(b"\n"):
                     break  # a word that happens to begin with '%'
                 lines.append("%" + line.decode("latin-1").rstrip())
@@ -156,8 +167,9 @@ def _encode_evt2(x, y, t, p, state, first, words):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_evt2(words, state, x, y, t, p):
-    n = 0
-    high, wraps = state
+    """Returns (events, index of the first word of an unknown type or -1)."""
+    n, bad = 0, -1
+    high, wraps, untimed = state
     for i in range(len(words)):
         word = np.int64(words[i])
         kind = word >> 28
@@ -166,12 +178,18 @@ def _decode_evt2(words, state, x, y, t, p):
             if high - new > 1 << 27:
                 wraps += 1
             high = new
-        elif kind <= 1 and high >= 0:  # before the first TIME_HIGH the time is unknown
+        elif kind <= 1:
+            if high < 0:  # before the first TIME_HIGH the time is unknown
+                untimed += 1
+                continue
             x[n], y[n], p[n] = (word >> 11) & 0x7FF, word & 0x7FF, kind
             t[n] = (((wraps << 28) | high) << 6) | ((word >> 22) & 63)
             n += 1
-    state[0], state[1] = high, wraps
-    return n
+        elif kind != 10 and kind < 14:  # 10 external trigger, 14 others, 15 continued
+            bad = i
+            break
+    state[0], state[1], state[2] = high, wraps, untimed
+    return n, bad
 
 
 @numba.njit(cache=True, nogil=True)
@@ -204,29 +222,39 @@ def _encode_evt3(x, y, t, p, state, first, words):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_evt3(words, state, x, y, t, p):
-    n = 0
-    row, high, low, base, polarity, wraps = state
+    """Returns (events, index of the first word of an unknown type, or whose vector leaves the 11 bits of x; -1: none)."""
+    n, bad = 0, -1
+    high, row, low, base, polarity, wraps, untimed = state
     for i in range(len(words)):
         word = np.int64(words[i])
         kind = word >> 12
         if kind == 0:
             row = word & 0x7FF
         elif kind == 2:
-            if high >= 0:
-                x[n], y[n], p[n] = word & 0x7FF, row, (word >> 11) & 1
-                t[n] = (((wraps << 12) | high) << 12) | low
-                n += 1
+            if high < 0:  # before the first TIME_HIGH the time is unknown
+                untimed += 1
+                continue
+            x[n], y[n], p[n] = word & 0x7FF, row, (word >> 11) & 1
+            t[n] = (((wraps << 12) | high) << 12) | low
+            n += 1
         elif kind == 3:
             base, polarity = word & 0x7FF, (word >> 11) & 1
         elif kind == 4 or kind == 5:
             width = 12 if kind == 4 else 8
-            if high >= 0:
-                for k in range(width):
-                    if (word >> k) & 1:
-                        x[n], y[n], p[n] = base + k, row, polarity
-                        t[n] = (((wraps << 12) | high) << 12) | low
-                        n += 1
+            for k in range(width):
+                if (word >> k) & 1:
+                    if base + k > 0x7FF:
+                        bad = i
+                        break
+                    if high < 0:
+                        untimed += 1
+                        continue
+                    x[n], y[n], p[n] = base + k, row, polarity
+                    t[n] = (((wraps << 12) | high) << 12) | low
+                    n += 1
             base += width
+            if bad >= 0:
+                break
         elif kind == 6:
             low = word & 0xFFF
         elif kind == 8:
@@ -234,5 +262,8 @@ def _decode_evt3(words, state, x, y, t, p):
             if high - new > 1 << 11:
                 wraps += 1
             high = new
-    state[0], state[1], state[2], state[3], state[4], state[5] = row, high, low, base, polarity, wraps
-    return n
+        elif kind != 7 and kind != 10 and kind < 14:  # 7, 15 continued, 10 external trigger, 14 others
+            bad = i
+            break
+    state[0], state[1], state[2], state[3], state[4], state[5], state[6] = high, row, low, base, polarity, wraps, untimed
+    return n, bad

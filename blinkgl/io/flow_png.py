@@ -6,17 +6,25 @@ for 16-bit RGB; it speaks BGR, so the order is turned here and nowhere else.
 
 from __future__ import annotations
 
+import io
 import os
+import re
+import struct
+import warnings
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.io.atomic import output_errors
 
 DSEC_SCALE, KITTI_SCALE = 128.0, 64.0
 _ZERO = 1 << 15
+_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_MAX_PIXELS = 1 << 28
 
 
 def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_SCALE) -> tuple[bytes, int]:
@@ -68,12 +76,58 @@ def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) 
 
 
 def read_png(path: str | os.PathLike) -> np.ndarray:
-    """Pixels as stored, channels in OpenCV's BGR order; AssetError when missing or undecodable."""
+    """Pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes; AssetError when missing,
+    truncated, undecodable, or of more than 2^28 px (what it would unpack to is known before that happens)."""
     try:
-        data = np.fromfile(path, np.uint8)
+        data = Path(path).read_bytes()
     except OSError as error:
         raise AssetError(f"cannot read image: {error.strerror}", where=str(path)) from error
-    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if (problem := _image_problem(data)) is not None:
+        raise AssetError(problem, where=str(path))
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
     if image is None:
         raise AssetError("cannot decode image (corrupt or truncated)", where=str(path))
     return image
+
+
+def _image_problem(data: bytes) -> str | None:
+    """What is wrong with an image file that OpenCV would pass over: it fills up what is missing with grey."""
+    if data[:8] == _PNG_MAGIC:
+        return _png_problem(data)
+    if data[:2] == b"\xff\xd8" and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+        return "cannot decode image (truncated)"
+    if data[:2] == b"#?":
+        found = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
+        size = found and (int(found[2]), int(found[1]))
+    else:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                with Image.open(io.BytesIO(data)) as opened:  # reads the header only
+                    size = opened.size
+        except Exception:  # noqa: BLE001 - unknown to Pillow, or damaged, for which its plug-ins raise anything: OpenCV has the last word
+            return "cannot decode image (corrupt or truncated)" if not len(data) else None
+    return _size_problem(*size) if size else "cannot decode image (no size in its header)"
+
+
+def _png_problem(data: bytes) -> str | None:
+    """Chunks (length, type, content, CRC) up to IEND, all there and undamaged? (PNG specification, section 5)"""
+    if data[12:16] != b"IHDR" or len(data) < 33:
+        return "cannot decode image (corrupt or truncated)"
+    at = 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length
+        if end > len(data) or zlib.crc32(data[at + 4:end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            break
+        if kind == b"IEND":
+            return _size_problem(*struct.unpack_from(">II", data, 16))
+        at = end
+    return f"cannot decode image (corrupt or truncated at byte {at})"
+
+
+def _size_problem(width: int, height: int) -> str | None:
+    return None if 0 < width * height <= _MAX_PIXELS else f"image of {width}x{height} px is too large (at most {_MAX_PIXELS >> 20} Mpx)"

@@ -21,9 +21,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.errors import AssetError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file
+from blinkgl.io.columns import check_events, check_size
 
 ENDINGS = {".h5": "dsec", ".hdf5": "dsec", ".raw": "evt3", ".aedat4": "aedat4", ".txt": "text", ".csv": "csv", ".npz": "npz", ".npy": "npy"}
 WRITABLE = ("dsec", "evt3", "evt2", "aedat4", "text", "csv", "npz", "npy")
@@ -58,18 +59,13 @@ class EventFile:
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning, in pieces, memory flat (npz, npy: held whole).
 
-        Raises EventDataError when times run backwards; AssetError when the file is damaged."""
+        Raises, naming event and value, EventDataError: times that run backwards, an event outside height and width where those are known,
+        or that :class:`~blinkgl.events.types.Events` cannot hold; AssetError when the file is damaged."""
         last, count = None, 0
         for events in self._reader.chunks():
-            t = events.t
-            if last is not None and len(t) and t[0] < last:
-                raise EventDataError(f"event times run backwards at event {count}", where=str(self.path), value=(last, int(t[0])))
-            if (back := np.flatnonzero(t[1:] < t[:-1])).size:
-                i = int(back[0])
-                raise EventDataError(f"event times run backwards at event {count + i + 1}", where=str(self.path),
-                                     value=(int(t[i]), int(t[i + 1])))
-            if len(t):
-                last, count = int(t[-1]), count + len(t)
+            last = check_events(events, str(self.path), count, height=self.height, width=self.width, after=last)
+            count += len(events)
+            if len(events):
                 yield events
 
     def close(self) -> None:
@@ -110,7 +106,8 @@ def open_events(path: str | os.PathLike) -> EventFile:
     if not path.is_file():
         raise AssetError("no such file", where=str(path))
     if kind == "dsec":
-        from blinkgl.io.dsec import DsecEventReader, hdf5_errors, open_hdf5
+        from blinkgl.io.dsec import DsecEventReader
+        from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
         from blinkgl.io.mvsec import DATASET, MvsecReader
         with open_hdf5(path) as file, hdf5_errors(path):
             kind = "mvsec" if DATASET in file else "dsec"
@@ -140,7 +137,10 @@ def output_format(path: str | os.PathLike, format: str | None = None) -> str:
     return kind
 
 
-def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int) -> EventWriter:
+def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int, time_unit: str) -> EventWriter:
+    check_size(height, width, str(path))
+    if time_unit != "s" and kind not in ("text", "csv"):
+        raise OutputError(f"{kind} has a unit of time of its own", where=str(path), value=time_unit, accepted="a unit with .txt and .csv only")
     if kind == "dsec":
         from blinkgl.io.dsec import DsecEventWriter
         return DsecEventWriter(path, height, width, t_offset_us)
@@ -152,22 +152,23 @@ def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int) ->
         return Aedat4Writer(path, height, width)
     if kind in ("text", "csv"):
         from blinkgl.io.text import TextWriter
-        return TextWriter(path, "," if kind == "csv" else " ")
+        return TextWriter(path, height, width, "," if kind == "csv" else " ", unit=time_unit)
     from blinkgl.io.arrays import ArrayWriter
     return ArrayWriter(path, height, width)
 
 
 @contextlib.contextmanager
 def event_writer(path: str | os.PathLike, height: int, width: int, *, format: str | None = None, t_offset_us: int = 0,
-                 overwrite: bool = True) -> Iterator[EventWriter]:
+                 time_unit: str = "s", overwrite: bool = True) -> Iterator[EventWriter]:
     """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the block ends
     without an exception, and not at all otherwise.
 
-    t_offset_us : DSEC only, the time of the recording's start. Raises OutputError, EventDataError.
+    t_offset_us : DSEC only, the time of the recording's start. time_unit : text and CSV only, "s" or "us".
+    Raises OutputError, EventDataError.
     """
     kind = output_format(path, format)
     with atomic_file(path, overwrite=overwrite) as temporary:
-        writer = _writer(temporary, kind, height, width, t_offset_us)
+        writer = _writer(temporary, kind, height, width, t_offset_us, time_unit)
         try:
             yield writer
             writer.close()
@@ -187,11 +188,11 @@ def write_events(path: str | os.PathLike, chunks: Events | Iterable[Events], hei
 
 
 def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str | None = None, size: tuple[int, int] | None = None,
-            zero_time: bool = False, overwrite: bool = True) -> tuple[EventFile, int]:
+            zero_time: bool = False, time_unit: str = "s", overwrite: bool = True) -> tuple[EventFile, int]:
     """Copies events from one format to another, streaming.
 
     size : (height, width) for sources that do not say (default: guessed, see :meth:`EventFile.sized`).
-    zero_time : shift times so that the first event is at 0, for formats that count from the start (EVT2, EVT3).
+    time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for formats that count from the start (EVT2, EVT3).
     Returns the source with its size, and the number of events written.
     """
     output_format(target, format)
@@ -204,5 +205,6 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str
         # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
         offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
         shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
-        count = write_events(target, shifted, file.height, file.width, format=format, t_offset_us=offset, overwrite=overwrite)
+        count = write_events(target, shifted, file.height, file.width, format=format, t_offset_us=offset,
+                             time_unit=time_unit, overwrite=overwrite)
     return file, count

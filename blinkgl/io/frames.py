@@ -12,7 +12,7 @@ from typing import Callable
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.images import numpy_errors, read_image
+from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_image
 
 VIDEO = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".gif", ".mpg", ".mpeg", ".ts", ".wmv"}
 IMAGE = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".exr", ".hdr", ".pfm"}
@@ -147,14 +147,15 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
     times = None
     with numpy_errors(path):
         if path.suffix.lower() == ".npy":
+            check_npy(path)
             frames = np.load(path, mmap_mode="r", allow_pickle=False)
         else:
-            with np.load(path, allow_pickle=False) as data:
-                name = next((k for k in ("frames", "images", "video", "luminance") if k in data.files), None)
+            with NpzReader(path) as data:
+                name = next((k for k in ("frames", "images", "video", "luminance") if k in data), None)
                 if name is None:
-                    raise AssetError("no array 'frames'", where=str(path), value=data.files)
+                    raise AssetError("no array 'frames'", where=str(path), value=data.names)
                 frames = data[name]
-                stamp = next((k for k in ("timestamps", "t", "times", "timestamps_us", "timestamps_ns") if k in data.files), None)
+                stamp = next((k for k in ("timestamps", "t", "times", "timestamps_us", "timestamps_ns") if k in data), None)
                 times = _stamps(stamp, data[stamp]) if stamp else None
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3))) or not frames.shape[0]:
         raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W) or (N, H, W, 3)")
@@ -208,6 +209,8 @@ def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
         stamps.append((t_ns, fields[1] if len(fields) > 1 else None))
     if not stamps:
         raise EventDataError("no time stamps", where=str(path))
+    if len({name is None for _, name in stamps}) > 1:
+        raise EventDataError("times with a name and times without one", where=str(path), accepted="'time', or 'time name', in every line")
     return stamps
 
 

@@ -8,16 +8,26 @@ Made from the manifests alone and sorted by path: the same sequences give the sa
 
 from __future__ import annotations
 
+import contextlib
+import heapq
+import itertools
 import json
+import os
+import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.records import InsidePath, parse, read_text, shown
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest
 
 INDEX = "index.jsonl"
+_PART = 20_000
 _KEYS = ("split", "sequence", "seed", "emulator", "events", "labels", "frames", "height", "width", "t_offset_us", "duration_us", "blinkgl")
 
 
@@ -41,29 +51,79 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
 
 
 def write_index(root: str | Path) -> int:
-    """Writes ``index.jsonl`` of the sequences below ``root`` (damaged ones are left out); returns how many. Raises OutputError."""
+    """Writes ``index.jsonl`` of the sequences below ``root`` (damaged ones are left out); returns how many. Raises OutputError.
+
+    Lines are sorted in parts of some thousands, which wait in files without names and are merged: memory does not grow with the data set."""
     root = Path(root)
-    entries = []
-    for folder in sequence_folders(root):
-        try:
-            entries.append(entry(root, folder))
-        except BlinkGLError:
-            continue
-    with atomic_file(root / INDEX) as path, output_errors(path):
-        path.write_text("".join(json.dumps(line, sort_keys=True) + "\n" for line in sorted(entries, key=lambda e: e["path"])), encoding="utf-8")
-    return len(entries)
+    count = 0
+    with atomic_file(root / INDEX) as path, output_errors(path), contextlib.ExitStack() as stack:
+        parts = [stack.enter_context(part) for part in _sorted_parts(root)]
+        with open(path, "w", encoding="utf-8") as file:
+            for line in heapq.merge(*parts, key=_path_of):
+                file.write(line)
+                count += 1
+    return count
+
+
+def _sorted_parts(root: Path) -> Iterator[IO[str]]:
+    """Open files of sorted lines."""
+    found = _lines(root)
+    while part := sorted(itertools.islice(found, _PART), key=_path_of):
+        file = tempfile.TemporaryFile("w+", encoding="utf-8", dir=root)
+        file.writelines(part)
+        file.seek(0)
+        yield file
+
+
+def _lines(root: Path) -> Iterator[str]:
+    for folder in _unsorted(root):
+        with contextlib.suppress(BlinkGLError):
+            yield json.dumps(entry(root, folder), sort_keys=True) + "\n"
+
+
+def _path_of(line: str) -> str:
+    return json.loads(line)["path"]
+
+
+def _unsorted(root: Path) -> Iterator[Path]:
+    """The same as :func:`sequence_folders`, in no order, and without a list of them all."""
+    if (root / MANIFEST).is_file():
+        yield root
+        return
+    for top in _visible(root):
+        if (top / MANIFEST).is_file():
+            yield top
+        for folder in _visible(top):
+            if (folder / MANIFEST).is_file():
+                yield folder
+
+
+def _visible(folder: Path) -> Iterator[Path]:
+    with os.scandir(folder) as entries:
+        for found in entries:
+            if found.is_dir() and not found.name.startswith("."):
+                yield Path(found.path)
+
+
+class _Line(BaseModel):
+    """What a reader relies on; "." is the path of a folder that is a sequence itself."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    path: Literal["."] | InsidePath
+
+
+_MODEL = TypeAdapter(_Line)
 
 
 def read_index(root: str | Path) -> list[dict[str, Any]]:
-    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, or a path that leaves the data set."""
+    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves the data set or is listed twice."""
     path = Path(root) / INDEX
     try:
-        entries = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
-        for one in entries:
-            if Path(one["path"]).is_absolute() or ".." in Path(one["path"]).parts:
-                raise ValueError
-        return entries
-    except OSError as error:
-        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise AssetError("damaged index", where=str(path), accepted="run 'blinkgl report' to make it anew") from error
+        entries = [parse(line, _MODEL) for line in read_text(path).splitlines() if line]
+    except FileNotFoundError:
+        raise AssetError("no such file", where=str(path)) from None
+    except ValueError as error:
+        raise AssetError(f"damaged index: {error}", where=str(path), accepted="run 'blinkgl report' to make it anew") from None
+    if twice := [name for name, count in Counter(line["path"] for line in entries).items() if count > 1]:
+        raise AssetError(f"damaged index: {shown(twice[0])} is listed twice", where=str(path), accepted="run 'blinkgl report' to make it anew")
+    return entries

@@ -6,11 +6,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import h5py
 import numpy as np
 
-from blinkgl.errors import AssetError
 from blinkgl.events.types import Events
-from blinkgl.io.dsec import hdf5_errors, open_hdf5
+from blinkgl.io.columns import events_of, microseconds
+from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 
 DATASET = "davis/left/events"
 
@@ -20,17 +21,27 @@ class MvsecReader:
 
     height, width = 260, 346
 
-    def __init__(self, path: str | os.PathLike, dataset: str = DATASET):
-        self.path, self._dataset = Path(path), dataset
+    def __init__(self, path: str | os.PathLike, name: str = DATASET):
+        self.path, self._name = Path(path), name
         with open_hdf5(self.path) as file, hdf5_errors(self.path):
-            if dataset not in file or file[dataset].ndim != 2 or file[dataset].shape[1] != 4:
-                raise AssetError(f"no (N, 4) dataset '{dataset}'", where=str(path))
+            event_table(file, self.path, name)
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         with open_hdf5(self.path) as file:
-            table = file[self._dataset]
+            table = event_table(file, self.path, self._name)
             for i in range(0, len(table), size):
                 with hdf5_errors(self.path):
                     rows = table[i:i + size]
-                yield Events(rows[:, 0].astype(np.uint16), rows[:, 1].astype(np.uint16), np.rint(rows[:, 2] * 1e6).astype(np.int64),
-                             (rows[:, 3] > 0).astype(np.uint8))
+                yield events_of_rows(rows, str(self.path), i)
+
+
+def event_table(file: h5py.File, path: Path, name: str = DATASET) -> h5py.Dataset:
+    """The (N, 4) float64 data set of events. Raises AssetError."""
+    return dataset(file, name, path, shape=(None, 4), kinds="f")
+
+
+def events_of_rows(rows: np.ndarray, where: str, first: int, t0_s: float = 0.0) -> Events:
+    """Rows x, y, t[s], ±1 as events; ``t0_s`` is subtracted from the times. first : index of the first row in the file.
+    Raises EventDataError, naming event and value."""
+    x, y, t, p = np.ascontiguousarray(rows.T)  # several passes over each column: not through all four
+    return events_of(x, y, microseconds(t - t0_s, where, first), p, where, first, signed=True)

@@ -24,11 +24,11 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
-import hdf5plugin
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
@@ -37,8 +37,11 @@ from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_besi
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.flo import encode_flo
 from blinkgl.io.flow_png import encode_flow_png
+from blinkgl.io.hdf5 import blosc_dataset, write_rows
+from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 
 MANIFEST = "manifest.json"
+_LARGEST = 2**62
 _IN_FLIGHT = 8
 """Labels waiting for the encoder thread: bounds memory at a few tens of MB."""
 
@@ -82,6 +85,7 @@ class SequenceWriter:
         self.flow_lost: dict[str, int] = {}
         self._with_events = events
         self._files: dict[str, dict[str, Any]] = {}
+        self._promised = {"events.h5"} if events else set()
         self._timestamps: dict[str, list[str]] = {}
         self._flow_h5: dict[str, h5py.File] = {}
         self._failure: list[BaseException] = []
@@ -204,6 +208,7 @@ class SequenceWriter:
             path = self.path(name)
             with output_errors(path):
                 save(path)
+        self._promised.add(name)
         self._submit(task)
 
     # ---- machinery -------------------------------------------------------------------------------------------
@@ -250,16 +255,13 @@ class SequenceWriter:
         path = self.path(f"flow/{direction}.h5")
         with output_errors(path):
             if direction not in self._flow_h5:
+                self._promised.add(f"flow/{direction}.h5")
                 file = self._flow_h5[direction] = h5py.File(path, "w", rdcc_nbytes=0)
-                codec = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE)
                 for name, array in (("flow", flow), ("valid", valid)):
-                    file.create_dataset(name, (0, *array.shape), np.float32 if name == "flow" else np.uint8,
-                                        maxshape=(None, *array.shape), chunks=(1, *array.shape), track_times=False, compression=codec)
+                    blosc_dataset(file, name, (0, *array.shape), np.float32 if name == "flow" else np.uint8, (1, *array.shape))
             file = self._flow_h5[direction]
             for name, array in (("flow", np.where(valid[..., None], flow, np.float32(0))), ("valid", valid)):
-                n = len(file[name])
-                file[name].resize(n + 1, axis=0)
-                file[name][n] = array
+                write_rows(file[name], len(file[name]), array[None])
 
     def _finish(self) -> None:
         self._check()
@@ -273,6 +275,7 @@ class SequenceWriter:
         with output_errors(self.final):
             for file in self._flow_h5.values():
                 file.close()
+            self._check_untouched()
             for path in sorted(self._tmp.rglob("*")):
                 name = path.relative_to(self._tmp).as_posix()
                 if path.is_file() and name not in self._files:
@@ -289,6 +292,14 @@ class SequenceWriter:
             refuse_existing(self.final)
             os.rename(self._tmp, self.final)
             fsync(self.final.parent)
+
+    def _check_untouched(self) -> None:
+        """OutputError when a file that was written is gone or cut: somebody tidied up under us. Half of it must not pass for the whole."""
+        sizes = {name: path.stat().st_size if (path := self._tmp / name).is_file() else None for name in self._promised | self._files.keys()}
+        for name, size in sorted(sizes.items()):
+            if size is None or size != self._files.get(name, {"bytes": size})["bytes"]:
+                raise OutputError(f"{name} was deleted or altered while the sequence was being written", where=str(self.final),
+                                  accepted="a folder that nobody else writes to")
 
     def _discard(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
@@ -312,53 +323,92 @@ def refuse_existing(final: str | os.PathLike) -> None:
                           accepted="a new folder name")
 
 
+class _File(BaseModel):
+    """A line of the manifest's ``files``."""
+
+    model_config = ConfigDict(strict=True)
+    bytes: int = Field(ge=0, le=_LARGEST)
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class Manifest(BaseModel):
+    """What a manifest must look like, wherever it comes from. Further keys are welcome; a key that its maker left out is None."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    format: Literal["blinkgl-sequence"]
+    format_version: Literal[1]
+    height: int = Field(ge=1, le=65536)
+    width: int = Field(ge=1, le=65536)
+    events: int = Field(ge=0, le=_LARGEST)
+    t_offset_us: int = Field(ge=-_LARGEST, le=_LARGEST)
+    duration_us: int | None = Field(None, ge=0, le=_LARGEST)
+    seed: int | None = Field(None, ge=0, lt=2**63)
+    sequence: int | None = Field(None, ge=0, le=_LARGEST)
+    split: str | None = Field(None, max_length=255)
+    emulator: str | None = Field(None, max_length=255)
+    blinkgl: str | None = Field(None, max_length=255)
+    labels: int | None = Field(None, ge=0, le=_LARGEST)
+    frames: int | None = Field(None, ge=0, le=_LARGEST)
+    opengl: dict[str, str] | None = None
+    versions: dict[str, str] | None = None
+    files: dict[InsidePath, _File]
+
+
+_MODEL = TypeAdapter(Manifest)
+
+
 def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> list[str]:
     """Problems of a sequence directory against its manifest, one line each; empty when whole.
 
-    Finds missing, foreign, truncated and altered files; an unreadable manifest is one problem. ``checksums=False`` reads no
-    contents, and so misses what was altered without changing its length."""
+    Finds missing, foreign, truncated and altered files, and what is no file: links, pipes, devices, empty folders. An unreadable
+    manifest is one problem. ``checksums=False`` reads no contents, and so misses what was altered without changing its length."""
     folder = Path(folder)
     try:
         files = read_manifest(folder)["files"]
+        present = {name: (kind, size) for name, kind, size in entries_below(folder)}
     except BlinkGLError as error:
         return [str(error)]
+    except OSError as error:
+        return [f"{shown(error.filename)}: cannot be read: {error.strerror}"]
     problems = []
     for name, expected in sorted(files.items()):
-        path = folder / name
-        if not path.resolve().is_relative_to(folder.resolve()):
-            problems.append(f"{name}: path leaves the sequence")
-        elif not path.is_file():
-            problems.append(f"{name}: missing")
-        elif path.stat().st_size != expected["bytes"]:
-            problems.append(f"{name}: {path.stat().st_size} bytes, manifest says {expected['bytes']}")
-        elif checksums and _digest(path)["sha256"] != expected["sha256"]:
-            problems.append(f"{name}: checksum differs")
-    present = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
-    problems += [f"{name}: not in the manifest" for name in sorted(present - set(files) - {MANIFEST})]
+        kind, size = present.get(name, ("", 0))
+        if kind != "file":
+            problems += [f"{shown(name)}: missing"] if not kind else []
+        elif size != expected["bytes"]:
+            problems.append(f"{shown(name)}: {size} bytes, manifest says {expected['bytes']}")
+        elif checksums:
+            try:
+                if _digest(folder / name)["sha256"] != expected["sha256"]:
+                    problems.append(f"{shown(name)}: checksum differs")
+            except (OSError, BlinkGLError) as error:
+                problems.append(f"{shown(name)}: cannot be read: {getattr(error, 'strerror', error)}")
+    for name, (kind, _) in sorted(present.items()):
+        if kind != "file":
+            problems.append(f"{shown(name)}: a {kind}" if kind[0] != "e" else f"{shown(name)}: an {kind}")
+        elif name not in files and name != MANIFEST:
+            problems.append(f"{shown(name)}: not in the manifest")
     return problems
 
 
 def read_manifest(folder: str | os.PathLike) -> dict[str, Any]:
-    """The manifest; AssetError when there is none or it is damaged."""
+    """The manifest, of the shape :class:`Manifest` describes; AssetError when there is none or it is damaged."""
     path = Path(folder) / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        files = manifest["files"]
-        if not all(isinstance(f["bytes"], int) and isinstance(f["sha256"], str) for f in files.values()):
-            raise ValueError
-    except OSError as error:
-        raise AssetError(f"no manifest: {error.strerror}", where=str(path)) from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise AssetError("damaged manifest", where=str(path)) from error
-    return manifest
+        return parse(read_text(path), _MODEL)
+    except FileNotFoundError:
+        raise AssetError("no manifest", where=str(path)) from None
+    except ValueError as error:
+        raise AssetError(f"damaged manifest: {error}", where=str(path)) from None
 
 
 def _digest(path: Path) -> dict[str, Any]:
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
+    digest, size = hashlib.sha256(), 0
+    with open(open_regular(path), "rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)
-    return {"bytes": path.stat().st_size, "sha256": digest.hexdigest()}
+            size += len(block)
+    return {"bytes": size, "sha256": digest.hexdigest()}
 
 
 def _plain(value: Any) -> Any:

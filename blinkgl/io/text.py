@@ -1,13 +1,15 @@
 """Events as text, the Event Camera Dataset's ``t[s] x y p`` and its relatives, parsed and printed by numba at disk speed.
 
-Read: separators space, tab, comma; comment and header lines; p as 0/1 or -1/1; t in seconds when it is written with a point or an
-exponent, in µs when it is an integer; an optional first line ``width height`` (as E2VID's files have). Written: seconds with six
-decimals (exact µs).
+Read: separators space, tab, comma; comment lines (``#``, ``%``) anywhere; before the first event a line ``width height`` (as E2VID's files
+have) and a line that names the columns, also as faery writes it (``t,x@640,y@480,on``); p as 0/1 or -1/1; t in seconds when it is written
+with a point or an exponent, in µs when it is an integer, the same way in the whole file. Written: seconds with six decimals, or integer
+µs (exact both).
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,52 +19,81 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
+from blinkgl.io.columns import check_events, check_size
+
+_LONGEST_LINE = 1 << 16
+_ACCEPTED = "t x y p"
+_MICROSECONDS, _SECONDS = 0, 1
+_COLUMN = re.compile(r"(?P<name>[a-z]+)[ _]?[\[(]?(?P<unit>s|us|µs|px)?[\])]?(@(?P<size>\d{1,9}))?")
+_COLUMN_NAMES = ({"t", "ts", "time", "times", "timestamp", "timestamps"}, {"x"}, {"y"}, {"p", "pol", "polarity", "on"})
 
 
 class TextReader:
-    """Raises AssetError with the line number for anything that is not an event."""
+    """``height`` and ``width`` are None when the file does not say. Raises AssetError with the line's number for anything that is no event."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
         self.height = self.width = None
-        self._skip = 0
+        self._start = self._lines = 0  # bytes and lines before the first event
+        self._unit = -1  # of integer and of decimal times: not known yet
+        named = False
         try:
             with open(path, "rb") as file:
-                for _ in range(1000):
-                    line = file.readline(4096)
-                    fields = line.replace(b",", b" ").split()
-                    if not line:
-                        break
-                    if len(fields) == 2 and all(f.isdigit() for f in fields):
-                        self.width, self.height = int(fields[0]), int(fields[1])
-                    elif fields and _is_number(fields[0]):
-                        break
-                    self._skip += 1
+                while line := file.readline(_LONGEST_LINE + 1):
+                    if len(line) > _LONGEST_LINE:
+                        raise AssetError(f"line {self._lines + 1} is longer than {_LONGEST_LINE} bytes", where=str(path), value=line[:40])
+                    text = line.decode("utf-8-sig", "replace").strip()
+                    if text and text[0] not in "#%":
+                        size = re.fullmatch(r"(\d{1,9})[ \t,]+(\d{1,9})", text)
+                        if size and self.width is None:
+                            self.width, self.height = int(size[1]), int(size[2])
+                        elif not named and text[0].isalpha() and not re.match(r"(nan|inf)\b", text, re.I):
+                            self._name_columns(text)
+                            named = True
+                        else:
+                            break
+                    self._start, self._lines = file.tell(), self._lines + 1
         except OSError as error:
             raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+        check_size(self.height, self.width, str(path))
+
+    def _name_columns(self, text: str) -> None:
+        """Takes sizes and the unit of time from a line that names the columns; AssetError when it names others, or in another order."""
+        names = re.split(r"[,\t]|\s+(?![\[(])", text.lower().replace('"', ""))
+        found = [_COLUMN.fullmatch(name.strip()) for name in names if name.strip()]
+        if len(found) != 4 or not all(m and m["name"] in known for m, known in zip(found, _COLUMN_NAMES)):
+            raise AssetError(f"line {self._lines + 1} is not an event, and does not name the columns of one", where=str(self.path), value=text,
+                             accepted=f"{_ACCEPTED}, in this order")
+        if found[0]["unit"]:
+            self._unit = _SECONDS if found[0]["unit"] == "s" else _MICROSECONDS
+        if found[1]["size"] and found[2]["size"]:
+            self.width, self.height = int(found[1]["size"]), int(found[2]["size"])
 
     def chunks(self, size: int = 1 << 22) -> Iterator[Events]:
         """All events, from about ``size`` bytes of text at a time."""
+        unit = np.array([self._unit])
         with open(self.path, "rb") as file:
-            for _ in range(self._skip):
-                file.readline()
-            line, rest = self._skip, b""
+            file.seek(self._start)
+            line, rest = self._lines, b""
             while True:
                 data = file.read(size)
                 text = rest + data if data else rest + b"\n"
                 cut = text.rfind(b"\n") + 1
                 text, rest = text[:cut], text[cut:]
-                if len(rest) > 1 << 16:
-                    raise AssetError(f"line {line + 1} is not an event", where=str(self.path), value=rest[:40])
+                if len(rest) > _LONGEST_LINE:
+                    line += text.count(b"\n") + 1
+                    raise AssetError(f"line {line} is longer than {_LONGEST_LINE} bytes", where=str(self.path), value=rest[:40])
                 buffer = np.frombuffer(text, np.uint8)
                 capacity = text.count(b"\n")
                 x, y, p = np.empty(capacity, np.uint16), np.empty(capacity, np.uint16), np.empty(capacity, np.uint8)
                 t = np.empty(capacity, np.int64)
-                n, bad = _parse(buffer, x, y, t, p)
+                n, bad, mixed = _parse(buffer, x, y, t, p, unit)
                 if bad >= 0:
                     content = text.split(b"\n", bad + 1)[bad].decode("latin-1")
-                    raise AssetError(f"line {line + bad + 1} is not an event", where=str(self.path), value=content,
-                                     accepted="t x y p")
+                    if mixed:
+                        raise AssetError(f"line {line + bad + 1} has its time in another unit", where=str(self.path), value=content,
+                                         accepted="either integers (µs) or numbers with a point (s) in the whole file")
+                    raise AssetError(f"line {line + bad + 1} is not an event", where=str(self.path), value=content, accepted=_ACCEPTED)
                 line += capacity
                 if n:
                     yield Events(x[:n], y[:n], t[:n], p[:n])
@@ -71,21 +102,27 @@ class TextReader:
 
 
 class TextWriter:
-    """``t x y p`` with t in seconds, six decimals. ``separator`` "," also writes a header line (CSV)."""
+    """``t x y p``. ``separator`` "," makes a CSV: it begins with a line that names the columns. unit : "s" writes seconds with six decimals,
+    "us" integer µs; the CSV is then what faery writes and reads, with the sensor's size in its first line."""
 
-    def __init__(self, path: str | os.PathLike, separator: str = " "):
-        self.path, self._separator = Path(path), ord(separator)
+    def __init__(self, path: str | os.PathLike, height: int, width: int, separator: str = " ", *, unit: str = "s"):
+        if unit not in ("s", "us"):
+            raise EventDataError("unit of time", where=str(path), value=unit, accepted="s or us")
+        self.path, self._separator, self._micro = Path(path), ord(separator), unit == "us"
+        self._size, self._count, self._last = (height, width), 0, None
         with output_errors(path):
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
             if separator == ",":
-                self._file.write(b"t,x,y,p\n")
+                self._file.write(f"t,x@{width},y@{height},on\n".encode() if self._micro else b"t,x,y,p\n")
 
     def append(self, events: Events) -> None:
         if len(events) and events.t[0] < 0:
             raise EventDataError("negative time", where=str(self.path), value=int(events.t[0]), accepted=">= 0 µs")
+        self._last = check_events(events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last)
+        self._count += len(events)
         # 13 digits of seconds, point, 6, two coordinates of 5, polarity, separators, newline
         buffer = np.empty(len(events) * 40, np.uint8)
-        n = _print(events.x, events.y, events.t, events.p, self._separator, buffer)
+        n = _print(events.x, events.y, events.t, events.p, self._separator, self._micro, buffer)
         with output_errors(self.path):
             self._file.write(buffer[:n].data)
 
@@ -98,13 +135,6 @@ class TextWriter:
             self._file.close()
         except OSError:
             pass
-
-
-def _is_number(field: bytes) -> bool:
-    try:
-        return np.isfinite(float(field))
-    except ValueError:
-        return False
 
 
 @numba.njit(cache=True, nogil=True)
@@ -163,8 +193,10 @@ def _scaled(mantissa, exponent):
 
 
 @numba.njit(cache=True, nogil=True)
-def _parse(buffer, x, y, t, p):
-    """Events in whole lines of text. Returns (count, index of the first bad line or -1)."""
+def _parse(buffer, x, y, t, p, unit):
+    """Events in whole lines of text. Returns (count, index of the first bad line or -1, bad for its unit of time?).
+
+    unit[0] : of the times so far, -1 not known, 0 integers (µs), 1 decimals (s); kept up to date."""
     n, line, i = 0, 0, 0
     values = np.empty(4, np.int64)
     while i < len(buffer):
@@ -174,32 +206,37 @@ def _parse(buffer, x, y, t, p):
             if c == 32 or c == 9 or c == 44 or c == 13:
                 i += 1
                 continue
-            if c == 35 and field == 0:  # comment
+            if (c == 35 or c == 37) and field == 0:  # comment
                 while buffer[i] != 10:
                     i += 1
                 break
             if field == 4:
-                return n, line
+                return n, line, False
             mantissa, exponent, integer, i = _number(buffer, i)
             if i < 0:
-                return n, line
+                return n, line, False
             c = buffer[i]
             if not (c == 32 or c == 9 or c == 44 or c == 13 or c == 10):
-                return n, line
+                return n, line, False
             values[field], ok = _scaled(mantissa, exponent + (6 if field == 0 and not integer else 0))
             if not ok or (field > 0 and exponent < 0 and values[field] * 10.0 ** -exponent != mantissa):
-                return n, line  # also coordinates between pixels: rectified events are not raw events
+                return n, line, False  # also coordinates between pixels: rectified events are not raw events
+            if field == 0 and (values[0] != 0 or not integer):  # a plain 0 is the same in both
+                kind = 0 if integer else 1
+                if unit[0] >= 0 and unit[0] != kind:
+                    return n, line, True
+                unit[0] = kind
             field += 1
         i += 1
         if field == 4:
             if not (0 <= values[1] <= 65535 and 0 <= values[2] <= 65535 and -1 <= values[3] <= 1):
-                return n, line
+                return n, line, False
             t[n], x[n], y[n], p[n] = values[0], values[1], values[2], max(values[3], 0)
             n += 1
         elif field != 0:
-            return n, line
+            return n, line, False
         line += 1
-    return n, -1
+    return n, -1, False
 
 
 @numba.njit(cache=True, nogil=True)
@@ -216,12 +253,15 @@ def _put(value, digits, buffer, n):
 
 
 @numba.njit(cache=True, nogil=True)
-def _print(x, y, t, p, separator, buffer):
+def _print(x, y, t, p, separator, micro, buffer):
     n = 0
     for i in range(len(t)):
-        n = _put(t[i] // 1000000, 1, buffer, n)
-        buffer[n] = 46
-        n = _put(t[i] % 1000000, 6, buffer, n + 1)
+        if micro:
+            n = _put(t[i], 1, buffer, n)
+        else:
+            n = _put(t[i] // 1000000, 1, buffer, n)
+            buffer[n] = 46
+            n = _put(t[i] % 1000000, 6, buffer, n + 1)
         buffer[n] = separator
         n = _put(np.int64(x[i]), 1, buffer, n + 1)
         buffer[n] = separator

@@ -76,3 +76,16 @@ def frustum_planes(camera) -> np.ndarray:
     top, bottom = (-0.5 - camera.cy) / camera.fy, (camera.height - 0.5 - camera.cy) / camera.fy
     planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
     return planes / np.linalg.norm(planes, axis=1, keepdims=True)
+
+
+DEPTH_ROOM = 2.0
+"""A fragment may lie a fraction of a pixel outside of its triangle, and outside of the part's depths by the slope there."""
+
+
+def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) -> np.ndarray:
+    """(n, 2) uint32 of bounding spheres, ``inverse_depths`` of guard.glsl: the smallest 1/Z that a fragment can have, as the bits of a float32,
+    and the largest's less those. centre_z, radius : (n,) float64."""
+    farthest, nearest = np.maximum(centre_z + radius, near), np.maximum(centre_z - radius, near)
+    bits = np.stack([1 / (DEPTH_ROOM * farthest), DEPTH_ROOM / nearest], axis=1).astype(np.float32).view(np.uint32)
+    bits[:, 1] -= bits[:, 0]
+    return bits

@@ -18,35 +18,42 @@ import numpy as np
 
 from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.frames import Flow, LabelFrame, LabelRequest, RenderStats
-from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, frustum_planes, mat4_bytes, projection, rows_xyw_bytes
+from blinkgl.render.matrices import (
+    cam_from_obj, cam_from_obj_rate, frustum_planes, inverse_depth_bits, mat4_bytes, projection, rows_xyw_bytes,
+)
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
 from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import Backdrop, Rectangle, screen_rectangle
 from blinkgl.scene.lod import at_level_of_detail
+from blinkgl.scene.meshes import without_collapsed_faces
 from blinkgl.scene.types import PosePath, Scene
 
 
 @dataclass(eq=False)
 class _Moment:
-    """All objects at one time: T_cam_obj and clip matrices, (n, 4, 4) float64."""
+    """All objects at one time: T_cam_obj and clip matrices, (n, 4, 4) float64; and of every item the centre of its bounding sphere,
+    (m, 3) float64 in camera axes, and ``inverse_depths`` of guard.glsl, (m, 2) uint32."""
 
     T_world_cam: np.ndarray
     T_world_obj: np.ndarray
     T_cam_obj: np.ndarray
     mvp: np.ndarray
+    centres: np.ndarray
+    inverse_depths: np.ndarray
 
 
 class Renderer:
     """Draws one scene. Holds GL resources: use it as a context manager or call :meth:`release`.
 
     gl : blinkgl.gl.GLContext.   config : blinkgl.config.sequence.RenderConfig.
-    scene : as it is drawn, frames and ground truth alike: at the level of detail that the configuration asks for.
-    changed : rectangles in which the last :meth:`luminance` may differ from the one before it; None: anywhere.
+    scene : as it is drawn, frames and ground truth alike: at the level of detail that the configuration asks for, without triangles
+    that are lines in float32.
+    changed : rectangles in which the last :meth:`luminance` may differ from the one before it, of whatever kind; None: anywhere.
     """
 
     def __init__(self, gl, scene: Scene, config):
-        scene = at_level_of_detail(scene, config.lod)
+        scene = without_collapsed_faces(at_level_of_detail(scene, config.lod))
         self.gl, self.scene, self.config = gl, scene, config
         self.width, self.height = scene.camera.width, scene.camera.height
         self.stats = RenderStats()
@@ -61,6 +68,7 @@ class Renderer:
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         self._still = scene.camera.path.is_static and not self._moves.all()
         self._backdrops: dict[str, Backdrop] = {}
+        self._held: tuple[Backdrop, np.ndarray, np.ndarray | None] | None = None  # whose last frame is in which arrays
         self.changed: list[Rectangle] | None = None
         self._surfaces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._samples, self._image_samples = samples_of(config.antialiasing), samples_of(config.image_antialiasing, "render.image_antialiasing")
@@ -89,12 +97,14 @@ class Renderer:
             self._resources.release()
 
     def look_through(self, camera) -> None:
-        """From now on draws with another camera of the same size and path: another part of the picture at the same cost."""
+        """From now on draws with another camera of the same size and path: another part of the picture at the same cost.
+        Nothing of what was drawn before is used again."""
         self._projection, self._frustum = projection(camera), frustum_planes(camera)
         if self._last_moment is not None:
             t_ns, moment = self._last_moment
             self._last_moment = (t_ns, replace(moment, mvp=self._projection @ moment.T_cam_obj))
         self._still = False  # what stands still in one picture is no backdrop of the other
+        self._backdrops, self._held, self._surfaces, self.changed = {}, None, {}, None
 
     @property
     def changed_rows(self) -> tuple[int, int] | None:
@@ -115,8 +125,8 @@ class Renderer:
 
         rate : (H, W) float32, filled with d(luminance)/dt per second of each pixel when given, as the surface it shows moves
         (edges that pass are not in it); a shader variant of its own, not compiled otherwise.
-        With a still camera only what moves is drawn, and when ``out`` (and ``rate``) is the array of the call before, only what
-        has changed is written: leave it as it was returned. ``changed`` then says where."""
+        With a still camera only what moves is drawn, and when ``out`` and ``rate`` are those of the call before, only what
+        has changed is written: leave them as they were returned. ``changed`` then says where."""
         started = time.perf_counter()
         samples, (name, fmt) = self._samples, ("luminance", "R32F") if rate is None else ("luminance+rate", "RG32F")
         target = self._target(name, samples.grid, (fmt,), samples.multi)
@@ -134,10 +144,11 @@ class Renderer:
         return image
 
     def brightness(self, t_ns: int, every: int = 1) -> np.ndarray:
-        """(H // every, W // every, 2) float32: luminance and d(luminance)/dt per second on every n-th pixel in x and y, textures
-        filtered as for the whole image."""
+        """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures filtered as for the
+        whole image. h = max(1, H // every), w likewise: the small picture covers the whole image, so that its pixels are H / h and W / w
+        pixels apart, a little more than ``every`` where that is no divisor."""
         started = time.perf_counter()
-        target = self._target("brightness", 1 / every, ("RG32F",))
+        target = self._target("brightness", 1, ("RG32F",), every=every)
         moment = self._moment(t_ns)
         self._begin(target, moment, (self.scene.background, 0.0))
         self._draw_luminance(moment, self._visible(moment), target, self._rates(t_ns, moment), every)
@@ -149,15 +160,15 @@ class Renderer:
         return largest_speed(self.motion(t_ns, sample_every), percentile)
 
     def motion(self, t_ns: int, every: int = 1) -> np.ndarray:
-        """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone."""
+        """:meth:`velocity` of what moves, (h, w, 2) float32 px/s, for the time sampling: with a still camera of the moving objects alone."""
         return self.velocity(t_ns, every, moving_only=self._still)
 
     def velocity(self, t_ns: int, reduce: int = 1, moving_only: bool = False) -> np.ndarray:
-        """Image velocity at t_ns in px/s (of the full-size image), (H // reduce, W // reduce, 2) float32, 0 where
-        nothing is hit. ``reduce`` samples every n-th pixel: enough to find the largest motion, at 1/n² the cost.
+        """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit.
+        ``reduce`` samples every n-th pixel, h and w as for :meth:`brightness`: enough to find the largest motion, at 1/n² the cost.
         ``moving_only`` leaves out objects that stand still, also where they hide something."""
         started = time.perf_counter()
-        target = self._target("velocity", 1 / reduce, ("RG32F",))
+        target = self._target("velocity", 1, ("RG32F",), every=reduce)
         moment = self._moment(t_ns)
         rate, _ = self._rates(t_ns, moment)
         self._begin(target, moment)
@@ -203,6 +214,12 @@ class Renderer:
                 if name in buffers:
                     result[key] = self._flow(buffers[name], buffers.get("ID"), t_other, needs_occlusion)
         return LabelFrame(t_ns, **result)
+
+    def shown_at(self, x: int, y: int, t_ns: int) -> str:
+        """What is seen at the centre of pixel (x, y) at t_ns, in words, for messages."""
+        number = int(self._surface(t_ns)[1][y, x])
+        names = [f"object '{o.name}' (id {number})" for o in self.scene.objects if number and o.instance_id == number]
+        return names[0] if names else "the background"
 
     def colour(self, t_ns: int, antialiasing: str | None = None) -> np.ndarray:
         """Linear radiance at t_ns, (H, W, 3) float32; ``antialiasing`` overrides the configuration's."""
@@ -271,9 +288,12 @@ class Renderer:
         ctx.scissor = None
         self.stats.frames += 1
         result = self._filtered(target, name, fmt, samples, stale=bool(stale))
-        self.changed = stale
-        if backdrop.images is None or backdrop.images[0] is not image or backdrop.images[1] is not rate:
-            stale, backdrop.images = [self._whole], (image, rate)
+        held, self._held = self._held, (backdrop, image, rate)
+        same_kind = held is not None and held[0] is backdrop
+        # Rectangles tell of two frames of one kind; a frame with rates in between may have been of any other time.
+        self.changed = stale if same_kind else [self._whole]
+        if not (same_kind and held[1] is image and held[2] is rate):
+            stale = [self._whole]
         ctx.finish()
         drawn = time.perf_counter()
         for r in stale:
@@ -322,7 +342,7 @@ class Renderer:
         started = time.perf_counter()
         w_next = buffer[..., 2]
         hit = buffer[..., 3] > 0
-        valid = hit & (w_next > 0) & np.isfinite(buffer[..., :2]).all(axis=-1)
+        valid = hit & (w_next > 0)
         flow = np.where(valid[..., None], buffer[..., :2], np.float32(0))
         occluded = None
         if surface is not None:
@@ -349,7 +369,10 @@ class Renderer:
             T_world_obj[i] = self._paths[i].pose(t_ns)
         T_world_cam = self.scene.camera.path.pose(t_ns)
         T_cam_obj = cam_from_obj(T_world_cam, T_world_obj)
-        moment = _Moment(T_world_cam, T_world_obj, T_cam_obj, self._projection @ T_cam_obj)
+        T = T_cam_obj[self._item_object]
+        centres = (T[:, :3, :3] @ self._item_centre[..., None])[..., 0] + T[:, :3, 3]
+        moment = _Moment(T_world_cam, T_world_obj, T_cam_obj, self._projection @ T_cam_obj, centres,
+                         inverse_depth_bits(centres[:, 2], self._item_radius, self.scene.camera.near))
         self._last_moment = (t_ns, moment)
         return moment
 
@@ -365,20 +388,19 @@ class Renderer:
         """Items whose bounding sphere meets the view frustum: objects front to back, then ground, then sky."""
         if not len(self._item_object):
             return []
-        T = moment.T_cam_obj[self._item_object]
-        centre = (T[:, :3, :3] @ self._item_centre[..., None])[..., 0] + T[:, :3, 3]
-        inside = (centre @ self._frustum.T >= -self._item_radius[:, None]).all(axis=1)
-        nearest = centre[:, 2] - self._item_radius
+        inside = (moment.centres @ self._frustum.T >= -self._item_radius[:, None]).all(axis=1)
+        nearest = moment.centres[:, 2] - self._item_radius
         order = np.lexsort((nearest, self._item_layer))
         items = self._resources.items
         return [items[i] for i in order if inside[i]]
 
     # ---- GL state ----------------------------------------------------------------------------------------------
 
-    def _target(self, name: str, scale: float, formats: tuple[str, ...], samples: int = 0):
-        key = (name, scale, samples)
+    def _target(self, name: str, scale: int, formats: tuple[str, ...], samples: int = 0, every: int = 1):
+        """Of ``scale`` times the image's size, or of the small pictures' (:meth:`brightness`)."""
+        key = (name, scale, samples, every)
         if key not in self._targets:
-            width, height = max(1, int(self.width * scale)), max(1, int(self.height * scale))
+            width, height = (max(1, size * scale // every) for size in (self.width, self.height))
             self._targets[key] = self.gl.framebuffer(width, height, colour=formats, depth=True, samples=samples)
         return self._targets[key]
 
@@ -412,6 +434,7 @@ class Renderer:
         uniforms = self._uniforms[key]
         index = item.object_index
         uniforms["mvp"].write(mat4_bytes(moment.mvp[index]))
+        uniforms["inverse_depths"].write(moment.inverse_depths[item.number].tobytes())
         if "sun_direction" in uniforms:
             # Every time: the context's programs are shared with other renderers, their uniforms included.
             uniforms["light_strength"].value = (self.scene.light.sun, self.scene.light.sky)

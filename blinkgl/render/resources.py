@@ -21,7 +21,7 @@ _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f
 class DrawItem:
     """One part of one object, ready to draw.
 
-    object_index : row of the frame's matrices.   centre, radius; low, high : bounding sphere and box, object frame.
+    object_index : row of the frame's matrices.   number : of this item among all.   centre, radius; low, high : bounding sphere and box, object frame.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.
     """
@@ -36,6 +36,7 @@ class DrawItem:
     layer: int
     two_sided: bool
     lit: bool
+    number: int = -1
 
     @property
     def textured(self) -> bool:
@@ -44,6 +45,8 @@ class DrawItem:
 
 MAX_RADIUS = 1e18
 """Times the largest focal length, 1e9 px, still far below float32's 3e38."""
+MAX_RADIANCE = 1e18
+"""Of a texel: times the largest colour and the largest light of a configuration, 1e9 each, it is still finite in float32."""
 _LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
 
 
@@ -61,6 +64,8 @@ class SceneResources:
             for index, obj in enumerate(scene.objects) for part in obj.parts
         ]
         self.items.sort(key=lambda item: item.layer)
+        for number, item in enumerate(self.items):
+            item.number = number
 
     @property
     def triangles(self) -> int:
@@ -123,6 +128,10 @@ class SceneResources:
             data = np.empty((len(mesh.vertices), 8), np.float32)
             data[:, :3], data[:, 3:6] = mesh.vertices, mesh.normals
             data[:, 6:] = _near_zero(mesh.uvs * np.asarray(uv_scale, np.float64))
+            if not np.isfinite(data).all():
+                first = int(np.flatnonzero(~np.isfinite(data).all(axis=1))[0])
+                raise AssetError(f"vertex {first} has a position, normal or texture coordinate (x, y, z; n; u, v) beyond float32",
+                                 where=mesh.name or "mesh", value=data[first].tolist(), accepted="finite numbers")
             self._buffers[key] = (self.ctx.buffer(data.tobytes()),
                                   self.ctx.buffer(np.ascontiguousarray(mesh.faces, np.int32).tobytes()))
         return self._buffers[key]
@@ -133,6 +142,10 @@ class SceneResources:
         if max(height, width) > limit:
             raise AssetError("texture is larger than this OpenGL takes", where=name, value=(width, height),
                              accepted=f"at most {limit} px on a side")
+        if image.dtype != np.uint8 and not (image.min() >= 0 and image.max() <= MAX_RADIANCE):  # NaN too
+            y, x, _ = np.argwhere(~((image >= 0) & (image <= MAX_RADIANCE)))[0].tolist()
+            raise AssetError(f"texel x={x}, y={y} cannot be drawn", where=name or "texture", value=image[y, x].tolist(),
+                             accepted=f"linear light from 0 to {MAX_RADIANCE:g}")
         dtype = "f1" if image.dtype == np.uint8 else "f4"
         texture = self.ctx.texture((width, height), components, np.ascontiguousarray(image).tobytes(), alignment=1,
                                    dtype=dtype, internal_format=internal_format)

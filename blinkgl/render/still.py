@@ -77,8 +77,6 @@ class Backdrop:
         self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
         self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
         self._covered: list[Rectangle] = []
-        self.images: tuple[np.ndarray, np.ndarray | None] | None = None
-        """The arrays the last frame and its rates were read into; the next one need only be mended when they are the same."""
 
     def stale(self, covered: list[Rectangle]) -> list[Rectangle]:
         """Where the frame has to be drawn anew, given what moving objects cover now."""

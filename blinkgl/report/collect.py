@@ -8,21 +8,22 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from blinkgl.config.draw import is_distribution
+from blinkgl.config.reader import read_table
 from blinkgl.io.index import entry, sequence_folders
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import plan_of
-from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.images import read_image, read_npy
+from blinkgl.io.records import shown
+from blinkgl.io.sequence_dir import verify_sequence
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass
@@ -59,6 +60,8 @@ class Collected:
     examples: list[Example] = field(default_factory=list)
     parameters: list[Parameter] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
+    damaged: set[str] = field(default_factory=set)
+    """paths of sequences that are not what their manifests say: counted, but no file of theirs is opened"""
 
 
 def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
@@ -66,12 +69,16 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
     root = Path(root)
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
-    sequences, unreadable = [], []
+    sequences, unreadable, damaged = [], [], set()
     for folder in sequence_folders(root):
         try:
             sequences.append(entry(root, folder))
         except BlinkGLError as error:
             unreadable.append(str(error))
+            continue
+        if problems := verify_sequence(folder, checksums=False):
+            damaged.add(sequences[-1]["path"])
+            unreadable.append(f"{shown(sequences[-1]['path'])}: {problems[0]}")
     run = RunFolder(root)
     try:
         plan, record, failed = plan_of(root), run.read("run.json") or {}, run.read("failed.json") or {}
@@ -80,7 +87,7 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         unreadable.append(str(error))
     if not sequences and plan is None:
         raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
-    found = Collected(root, sequences, plan, record.get("environment", {}), failed, run.costs(), unreadable=unreadable)
+    found = Collected(root, sequences, plan, record.get("environment", {}), failed, run.costs(), unreadable=unreadable, damaged=damaged)
     rng = np.random.default_rng(seed)
     _sample(found, rng, examples)
     _parameters(found, rng)
@@ -94,6 +101,7 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
                                          if s["duration_us"] and s["events"] is not None])
     found.quantities["events"] = np.array([s["events"] for s in found.sequences if s["events"] is not None], float)
     order = rng.permutation(len(found.sequences))[:SAMPLED_SEQUENCES]
+    order = [number for number in order if found.sequences[number]["path"] not in found.damaged]
     shown = set(_spread(found.sequences, order, examples))
     for number in order:
         line = found.sequences[number]
@@ -125,7 +133,7 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
     found.quantities.update({k: np.concatenate(v).astype(float) for k, v in values.items() if v})
 
 
-def _spread(sequences: list[dict[str, Any]], order: np.ndarray, count: int) -> list[int]:
+def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> list[int]:
     """Of each (split, kind of name, emulator) in turn, so that rare kinds are shown, too."""
     kinds: dict[tuple, list[int]] = {}
     for number in order:
@@ -178,15 +186,15 @@ def _parameters(found: Collected, rng: np.random.Generator) -> None:
     """Every distribution of the recipe with the values drawn, as the sequences' own config.yaml say."""
     if found.plan is None:
         return
-    here = {s["path"] for s in found.sequences}
+    here = {s["path"] for s in found.sequences} - found.damaged
     tasks = [task for task in found.plan.tasks if task.name in here]
     tasks = [tasks[i] for i in sorted(rng.permutation(len(tasks))[:MAX_CONFIGS])]
     configs: dict[str, list[dict]] = {}
     for task in tasks:
         try:
-            configs.setdefault(task.group, []).append(yaml.load((found.root / task.name / "config.yaml").read_text(encoding="utf-8"), Loader=_LOADER))  # noqa: S506
-        except (OSError, yaml.YAMLError) as error:
-            found.unreadable.append(f"{task.name}/config.yaml: {error.__class__.__name__}")
+            configs.setdefault(task.group, []).append(read_table(found.root / task.name / "config.yaml"))
+        except ConfigError as error:
+            found.unreadable.append(f"{task.name}/config.yaml: {error.problem}")
     for group in found.plan.used:
         _walk(group.name, group.template.tree, (), configs.get(group.name, []), found.parameters)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.errors import ConfigError
-from blinkgl.scene.explicit import explicit_scene
+from blinkgl.scene.explicit import explicit_scene, primitive_mesh
 from blinkgl.scene.importers import scene_from_file
 from blinkgl.scene.pool import SPLITS, resolve
 from blinkgl.scene.types import Scene
@@ -46,6 +46,8 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
     elif isinstance(config, ExplicitSceneConfig):
         for name, mesh in config.meshes.items():
             _exists(mesh.file, base, f"scene.meshes.{name}.file", "a mesh file")
+            if mesh.primitive is not None:
+                primitive_mesh(mesh, name)
         for name, material in config.materials.items():
             _exists(material.texture, base, f"scene.materials.{name}.texture", "an image file")
     else:

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from blinkgl.config.scene import ExplicitSceneConfig, KeyedMotionConfig, MaterialConfig, MeshConfig, PoseConfig
+from blinkgl.config.scene import ExplicitSceneConfig, KeyedMotionConfig, MaterialConfig, MeshConfig, PoseConfig, object_names
+from blinkgl.config.sequence import near_corner
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.collision import resolve_collisions
 from blinkgl.scene.images import content_hash, decode_image, photographs
@@ -17,10 +18,11 @@ from blinkgl.scene.meshes import transform_mesh
 from blinkgl.scene.paths import KeyframePath, StaticPath
 from blinkgl.scene.pool import resolve
 from blinkgl.scene.primitives import BUILDERS
+from blinkgl.scene.reading import contents
 from blinkgl.scene.textures import procedural_texture
 from blinkgl.scene.trajectories import look_rotation
-from blinkgl.scene.types import Material, Part, PosePath, Scene, SceneObject, Texture
-from blinkgl.scene.world import make_camera, make_light, near_corner
+from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.world import make_camera, make_light
 
 _PROCEDURAL_SIZE = 1024
 # A camera (OpenCV axes) that looks along the world's +x with z up.
@@ -30,32 +32,27 @@ _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 
 def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path) -> Scene:
     """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
 
-    Raises ConfigError (unknown mesh or material name, missing file, bad parameter, name given twice; with ``collisions``,
+    Raises ConfigError (missing file, bad parameter; with ``collisions``,
     bodies that touch at the start) and AssetError."""
     log: list[str] = []
+    omissions: dict[str, None] = {}
     materials = {name: _material(m, base, f"scene.materials.{name}") for name, m in config.materials.items()}
     assets: dict[tuple[str, bool], Asset] = {}
-    objects, names = [], set()
+    objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
     for k, item in enumerate(config.objects):
         where = f"scene.objects.{k}"
-        _known(item.mesh, config.meshes, f"{where}.mesh", "scene.meshes")
-        if item.material is not None:
-            _known(item.material, materials, f"{where}.material", "scene.materials")
         own = item.material is None
         if (item.mesh, own) not in assets:
             assets[item.mesh, own] = _asset(config.meshes[item.mesh], item.mesh, own, base, config.max_faces)
             log += [line for line in assets[item.mesh, own].log if line not in log]
-        name = item.name or (item.mesh if item.mesh not in names else f"{item.mesh}#{k}")
-        if name in names:
-            raise ConfigError("the name is given to two objects", where=f"{where}.name", value=name)
-        names.add(name)
+            omissions.update(dict.fromkeys(assets[item.mesh, own].omissions))
         matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
         parts = []
         for part in assets[item.mesh, own].parts:
             material = part.material if own else materials[item.material]
             material = replace(material, unlit=material.unlit or config.light.unlit)
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
-        objects.append(SceneObject(name, k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category))
+        objects.append(SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
     if config.collisions:
         result = resolve_collisions(tuple(objects), path, 1.01 * near_corner(camera), t0_ns, t1_ns)
@@ -63,7 +60,8 @@ def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, 
             raise ConfigError(f"{result.at_start[0]}, at the start", where="scene.collisions",
                               accepted="bodies apart at the start, or collisions: false")
         objects, path, log = result.objects, result.camera_path, log + list(result.log)
-    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background, tuple(log))
+    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background,
+                 tuple(log), tuple(omissions))
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
@@ -96,26 +94,26 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
     return T
 
 
-def _known(name: str, table: dict, where: str, what: str) -> None:
-    if name not in table:
-        raise ConfigError(f"no such name under {what}", where=where, value=name,
-                          accepted="one of: " + ", ".join(table) if table else f"a name under {what}")
+def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
+    """The primitive that ``scene.meshes.name`` asks for. Raises ConfigError for a bad parameter."""
+    try:
+        return BUILDERS[config.primitive](**config.parameters)
+    except AssetError as error:
+        key = (error.where or "").partition(".")[2]
+        raise ConfigError(error.problem, where=f"scene.meshes.{name}.parameters" + (f".{key}" if key else ""), value=error.value,
+                          accepted=error.accepted) from None
 
 
 def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int) -> Asset:
-    where = f"scene.meshes.{name}"
     if config.primitive is not None:
-        try:
-            mesh = BUILDERS[config.primitive](**config.parameters)
-        except AssetError as error:
-            key = (error.where or "").partition(".")[2]
-            raise ConfigError(error.problem, where=f"{where}.parameters" + (f".{key}" if key else ""), value=error.value,
-                              accepted=error.accepted) from None
+        mesh = primitive_mesh(config, name)
         return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
+    where = f"scene.meshes.{name}"
     path = resolve(config.file, base)
     if not path.is_file():
         raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a mesh file")
-    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs, uv_size=config.uv_size)
+    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs,
+                      uv_size=config.uv_size, up=config.up)
 
 
 def _material(config: MaterialConfig, base: Path, where: str) -> Material:
@@ -136,5 +134,5 @@ def _material(config: MaterialConfig, base: Path, where: str) -> Material:
 def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:
     if not path.is_file():
         raise ConfigError("no such file", where=where, value=given, accepted="an image file")
-    data = path.read_bytes()
+    data = contents(path, "image")
     return Texture(decode_image(data, max_size, str(path)), path.name, content_hash(data))

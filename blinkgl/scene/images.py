@@ -1,11 +1,17 @@
-"""Image files as :class:`~blinkgl.scene.types.Texture` images: limits checked before decoding, corrupt files refused."""
+"""Image files as :class:`~blinkgl.scene.types.Texture` images: limits checked before decoding, corrupt files refused.
+
+Pillow's guard against decompression bombs is a module-wide number far below what ``max_size`` allows, and changing it
+would change it for the whole process. So files are opened by Pillow's readers themselves, and the guard is
+:data:`MAX_PIXELS`.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import io
+import math
 import re
-import warnings
+import struct
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,10 +20,17 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.reading import contents, reading
 from blinkgl.srgb import DECODE_8BIT, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr")
-MAX_PIXELS = 120_000_000
+MAX_SIDE = 16_384    # what the configuration's max_size allows, and what OpenGL implementations take
+MAX_PIXELS = MAX_SIDE**2
+MAX_HDR_PIXELS = MAX_PIXELS // 2    # 12 bytes each: a panorama of 16384x8192
+_MAX_LINE = 1 << 20
+# Pillow knows many more; some of them run other programs (EPS), and none of them is a texture's.
+_FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "TIFF", "PPM", "GIF", "TGA")
+_BLOCK_PIXELS = 1 << 22     # pixels converted or averaged at a time: bounds what a large image takes beside itself
 HDR_WHITE = 1.5     # brightest radiance kept of an HDR image: light sources would drown everything else
 # Not those that are mostly black (retina, hubble_deep_field): no light, no events.
 _PHOTOGRAPHS = ("astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png", "grass.png", "gravel.png",
@@ -45,61 +58,83 @@ def load_image(path: Path, max_size: int | None = None, where: str | None = None
     """(h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr``; the longer side at most ``max_size`` px.
 
     HDR images are exposed so that their 90th percentile is 0.8 and clipped at :data:`HDR_WHITE`.
+    While it is reduced, an image takes at most 7 bytes per pixel of the file (HDR: 25), and some 100 MB beside it.
     Raises :class:`AssetError` naming the file when it is missing, corrupt, truncated or beyond :data:`MAX_PIXELS`.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise AssetError(f"cannot read the image: {error.strerror or error}", where=where or str(path)) from None
-    return decode_image(data, max_size, where or str(path))
+    return decode_image(contents(Path(path), "image", where), max_size, where or str(path))
 
 
 def decode_image(data: bytes, max_size: int | None, where: str) -> np.ndarray:
     """:func:`load_image` from bytes already read."""
-    image = _decode_hdr(data, where) if data[:2] == b"#?" else _decode_ldr(data, where)
-    return shrink(image, max_size)
+    with reading("image", where):
+        image = _decode_hdr(data, where) if data[:2] == b"#?" else _decode_ldr(data, where)
+        return shrink(image, max_size)
+
+
+def _open(data: bytes, where: str) -> Image.Image:
+    """``Image.open`` for the formats of textures and without its guard, which the caller replaces."""
+    Image.init()
+    stream = io.BytesIO(data)
+    for name in _FORMATS:
+        factory, accepts = Image.OPEN.get(name, (None, None))
+        if factory is None or (accepts and accepts(data[:16]) is not True):
+            continue
+        stream.seek(0)
+        try:
+            return factory(stream, "")
+        except Image.DecompressionBombError:        # some readers ask the guard themselves
+            raise AssetError(f"the image is too large for a {name} file", where=where,
+                             accepted="a PNG, or fewer pixels") from None
+        except (SyntaxError, IndexError, TypeError, struct.error):     # not this format after all: as Image.open does
+            continue
+    raise AssetError("the image is corrupt or of an unknown format", where=where,
+                     accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR")
 
 
 def _decode_ldr(data: bytes, where: str) -> np.ndarray:
     # Pillow, because it says so when a file is truncated; OpenCV returns a half grey picture.
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(io.BytesIO(data)) as opened:
-                width, height = opened.size
-                _check_size(width, height, where)
-                opened.load()
-                image = ImageOps.exif_transpose(opened)
-                if image.mode.startswith("I") or image.mode == "F":     # 16-bit grey
-                    grey = np.asarray(image, np.float64)
-                    image = Image.fromarray((grey / (65535 if grey.max() > 255 else 255) * 255).clip(0, 255).astype(np.uint8))
-                return np.ascontiguousarray(np.asarray(image.convert("RGB")))
-    except AssetError:
-        raise
-    except Exception as error:     # Pillow's decoders raise anything: OSError, SyntaxError, ValueError, struct.error, …
-        detail = f"{type(error).__name__}: {' '.join(str(error).split())[:80]}"
-        raise AssetError(f"the image is corrupt or of an unknown format ({detail})", where=where) from None
+    with _open(data, where) as image:
+        _check_size(*image.size, where)
+        image.load()
+        ImageOps.exif_transpose(image, in_place=True)
+        if image.mode.startswith("I") or image.mode == "F":     # 16-bit grey
+            grey = np.asarray(image, np.float32)
+            scale = 255 / (65535 if grey.max() > 255 else 255)
+            return np.repeat((grey * scale).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        width, height = image.size
+        pixels = np.empty((height, width, 3), np.uint8)
+        for rows in _blocks(height, width):
+            block = image.crop((0, rows.start, width, rows.stop))
+            pixels[rows] = block if block.mode == "RGB" else block.convert("RGB")
+        return pixels
+
+
+def _blocks(height: int, width: int) -> list[slice]:
+    rows = max(1, _BLOCK_PIXELS // width)
+    return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
 
 def _decode_hdr(data: bytes, where: str) -> np.ndarray:
     size = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
     if size is None:
         raise AssetError("the image is corrupt (no size in the Radiance header)", where=where)
-    _check_size(int(size[2]), int(size[1]), where)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
+    _check_size(int(size[2]), int(size[1]), where, MAX_HDR_PIXELS)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or not np.isfinite(image).all():
         raise AssetError("the image is corrupt or of an unknown format", where=where)
-    image = image[..., 2::-1].astype(np.float32)
-    level = float(np.percentile(image.max(axis=2), 90))
-    return np.clip(image * (0.8 / level if level > 0 else 1.0), 0, HDR_WHITE)
+    image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+    level = float(np.percentile(image.max(axis=2), 90, overwrite_input=True))
+    image *= np.float32(0.8 / level if level > 0 else 1.0)
+    return np.clip(image, 0, HDR_WHITE, out=image)
 
 
-def _check_size(width: int, height: int, where: str) -> None:
-    if width * height > MAX_PIXELS:
-        raise AssetError("the image is too large", where=where, value=f"{width}x{height}", accepted=f"at most {MAX_PIXELS // 10**6} Mpx")
+def _check_size(width: int, height: int, where: str, pixels: int = MAX_PIXELS) -> None:
+    if width * height > pixels or max(width, height) > _MAX_LINE:
+        raise AssetError("the image is too large", where=where, value=f"{width}x{height}", accepted=_most(pixels))
+
+
+def _most(pixels: int) -> str:
+    return f"at most {pixels / 1e6:.0f} Mpx, as {MAX_SIDE}x{pixels // MAX_SIDE} has"
 
 
 def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
@@ -108,10 +143,21 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
     if max_size is None or max(height, width) <= max_size:
         return image
     factor = max_size / max(height, width)
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    if image.dtype == np.float32:
-        return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return to_srgb8(cv2.resize(DECODE_8BIT[image], size, interpolation=cv2.INTER_AREA))
+    new_width, new_height = max(1, round(width * factor)), max(1, round(height * factor))
+    made = np.empty((new_height, new_width, 3), image.dtype)
+    # A block of the result at a time, across and then down: in one piece, linear light takes four times the image.
+    for rows in _blocks(new_height, math.ceil(width * height / new_height)):
+        top, bottom = rows.start * height / new_height, rows.stop * height / new_height
+        source = slice(math.floor(top), min(math.ceil(bottom - 1e-9), height))
+        linear = image[source] if image.dtype == np.float32 else DECODE_8BIT[image[source]]
+        linear = cv2.resize(linear, (new_width, len(linear)), interpolation=cv2.INTER_AREA)
+        edges = np.arange(rows.start, rows.stop + 1)[:, None] * (height / new_height)
+        pixel = np.arange(source.start, source.stop)[None]
+        overlap = np.minimum(edges[1:], pixel + 1) - np.maximum(edges[:-1], pixel)
+        share = np.clip(overlap, 0, None) * (new_height / height)
+        average = np.tensordot(share.astype(np.float32), linear, axes=1)
+        made[rows] = average if image.dtype == np.float32 else to_srgb8(average)
+    return made
 
 
 def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.ndarray]:

@@ -25,8 +25,10 @@ from blinkgl.scene.explicit import motion_path
 from blinkgl.scene.images import content_hash, shrink
 from blinkgl.scene.mesh_files import piece_of_trimesh
 from blinkgl.scene.meshes import closed_together, make_mesh
+from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.paths import KeyframePath, StaticPath
 from blinkgl.scene.pool import resolve
+from blinkgl.scene.reading import reading
 from blinkgl.scene.types import Camera, Light, Material, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.world import make_camera, make_light
 
@@ -57,10 +59,18 @@ def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: 
     camera_name : name or index of the file's camera (None: the first), unless ``camera_path`` is given.
     intrinsics : "config": those of ``camera``; "file": fx = fy = height / 2 / tan(yfov / 2), centred, near = znear.
     animation : name or index; translations, rotations of nodes are sampled at 60 Hz and joined by a C2 spline. Changing
-        scales, morphing and skinning are not supported and named in the scene's log.
+        scales keep their first value, which the scene's log says.
+    What the file asks for and is not drawn is in the scene's ``omissions``.
     Raises AssetError (file), ConfigError (camera or animation that is not there).
     """
-    document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture)
+    with reading("scene", str(path)):
+        document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture)
+        return _from_document(document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light,
+                              background)
+
+
+def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation,
+                   light, background) -> Scene:
     channels = _channels(document, animation)
     objects = []
     for index, node in document.nodes.items():
@@ -76,11 +86,14 @@ def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: 
     changes = {}
     if camera_path is None or intrinsics == "file":
         index = _camera_node(document, camera_name)
+        if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
+            document.omissions.add("an orthographic camera (drawn in perspective)")
         if camera_path is None:
             camera_path, _ = _motion(document, index, channels, t0_ns, t1_ns, CV_FROM_GL)
         if intrinsics == "file":
             changes = _gltf_intrinsics(document, index, camera)
-    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, document.log)
+    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, document.log,
+                  document.omissions)
 
 
 def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
@@ -93,19 +106,19 @@ def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000,
     up : "y" turns the world z up. Normals are made anew (crease angle), because trimesh's round off every edge.
     """
     turn = _turn(up)
-    log: list[str] = []
+    log, omissions = [], Omissions("the trimesh scene")
     objects = []
     for name in sorted(scene.graph.nodes_geometry):
         matrix, geometry = scene.graph[name]
         mesh = scene.geometry[geometry]
         if not hasattr(mesh, "faces") or not len(mesh.faces):
-            log.append(f"{name}: no triangles, left out")
+            omissions.add("points and lines")
             continue
         where = f"trimesh geometry '{geometry}'"
         if len(mesh.faces) > max_faces:
             raise AssetError("the mesh has too many faces", where=where, value=len(mesh.faces), accepted=f"at most {max_faces}")
         rigid, baked = split_rigid(turn @ matrix)
-        piece = piece_of_trimesh(mesh, max_texture=max_texture, where=where, file_normals=False)
+        piece = piece_of_trimesh(mesh, max_texture=max_texture, where=where, file_normals=False, omissions=omissions)
         objects.append((str(name), _parts([piece], baked, str(name), where, log), StaticPath(rigid, t0_ns, t1_ns)))
     if (camera is None or camera_path is None) and not scene.has_camera:
         raise ConfigError("the trimesh scene has no camera", where="from_trimesh", accepted="camera and camera_path, or scene.set_camera()")
@@ -118,7 +131,7 @@ def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000,
         scene_camera = make_camera(camera, camera_path)
     if not objects:
         raise AssetError("the scene has no faces", where="from_trimesh", accepted="a scene with a mesh")
-    return _scene(objects, scene_camera, t0_ns, t1_ns, light, background, log)
+    return _scene(objects, scene_camera, t0_ns, t1_ns, light, background, log, omissions)
 
 
 def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
@@ -130,7 +143,7 @@ def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, 
     background : None takes the mean of ``scene.bg_color``.
     """
     turn = _turn(up)
-    log: list[str] = []
+    log, omissions = [], Omissions("the pyrender scene")
     objects = []
     # pyrender keeps nodes in a set: order them by what they are.
     order = sorted(scene.mesh_nodes, key=lambda n: (str(n.name or n.mesh.name or ""), np.asarray(scene.get_pose(n)).tobytes(),
@@ -138,9 +151,11 @@ def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, 
     for number, node in enumerate(order):
         name = str(node.name or node.mesh.name or f"mesh-{number}")
         pieces = [_pyrender_piece(p, max_texture, name) for p in node.mesh.primitives if getattr(p, "mode", 4) == 4]
+        if len(pieces) < len(node.mesh.primitives):
+            omissions.add("points and lines")
         if not pieces:
-            log.append(f"{name}: no triangles, left out")
             continue
+        _pyrender_omissions(node.mesh.primitives, omissions)
         rigid, baked = split_rigid(turn @ scene.get_pose(node))
         objects.append((name, _parts(pieces, baked, name, f"pyrender mesh '{name}'", log), StaticPath(rigid, t0_ns, t1_ns)))
     if not objects:
@@ -160,7 +175,7 @@ def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, 
             light = replace(light, sun_direction=tuple(float(v) for v in T[:3, 2]))
     if background is None:
         background = float(np.mean(np.asarray(scene.bg_color, float)[:3]))
-    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, log)
+    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, log, omissions)
 
 
 def unlit(scene: Scene) -> Scene:
@@ -186,13 +201,13 @@ def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return T, A
 
 
-def _scene(objects: Iterable, camera: Camera, t0_ns, t1_ns, light, background, log) -> Scene:
+def _scene(objects: Iterable, camera: Camera, t0_ns, t1_ns, light, background, log, omissions: Omissions) -> Scene:
     made, names = [], set()
     for k, (name, parts, path) in enumerate(objects):
         name = name if name not in names else f"{name}#{k}"
         names.add(name)
         made.append(SceneObject(name, k + 1, parts, path))
-    return Scene(tuple(made), camera, t0_ns, t1_ns, light, background, tuple(dict.fromkeys(log)))
+    return Scene(tuple(made), camera, t0_ns, t1_ns, light, background, tuple(dict.fromkeys(log)), omissions.lines())
 
 
 def _parts(pieces: list[gltf.Piece], baked: np.ndarray, name: str, where: str, log: list[str]) -> tuple[Part, ...]:
@@ -220,6 +235,8 @@ def _channels(document: gltf.Document, animation: str | int | None) -> list[gltf
     if animation is None or (animation == 0 and not listed):
         return []
     names = [str(a.get("name", i)) for i, a in enumerate(listed)]
+    if len(listed) > 1 and animation == 0:
+        document.omissions.add(f"animations beside '{names[0]}' (scene.animation chooses one of: {', '.join(names)})")
     index = names.index(animation) if animation in names else animation
     if not isinstance(index, int) or not 0 <= index < len(listed):
         accepted = f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
@@ -252,7 +269,7 @@ def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0
         first = A if first is None else first
         if np.abs(A - first).max() > 1e-3 * np.abs(first).max():
             line = f"{document.path.name}: the changing scale of node '{document.nodes[node].name}' is not supported, its first one is kept"
-            document.log.append(line) if line not in document.log else None
+            document.log.append(line)
         poses.append(T @ local)
     if any(c.interpolation == "STEP" for c in mine):
         document.log.append(f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed")
@@ -266,10 +283,16 @@ def _camera_node(document: gltf.Document, name: str | int | None) -> int:
         raise ConfigError("the file has no camera", where="scene.pose", accepted="a camera pose here, or a file with a camera")
     names = {}
     for i, n in found.items():
-        names.setdefault(str(document.tree["cameras"][n.camera].get("name", n.name)), i)
+        cameras = document.tree.get("cameras", [])
+        if n.camera >= len(cameras):
+            raise AssetError("the file is no valid glTF (a reference to cameras that does not exist)",
+                             where=document.where, value=n.camera)
+        names.setdefault(str(cameras[n.camera].get("name", n.name)), i)
         names.setdefault(n.name, i)
     order = list(found)
     if name is None:
+        if len(order) > 1:
+            document.omissions.add(f"cameras beside '{next(iter(names))}' (scene.camera chooses one of: {', '.join(names)})")
         return order[0]
     if isinstance(name, int) and 0 <= name < len(order):
         return order[name]
@@ -283,15 +306,29 @@ def _gltf_intrinsics(document: gltf.Document, node: int, camera) -> dict:
     description = document.tree["cameras"][document.nodes[node].camera]
     perspective = description.get("perspective", {})
     yfov = perspective.get("yfov")
-    if description.get("type") != "perspective" or not isinstance(yfov, (int, float)) or not 0 < yfov < np.pi:
+    if description["type"] != "perspective" or yfov is None:
         raise AssetError("the camera is not a perspective one with a valid yfov", where=document.where, value=yfov,
                          accepted="intrinsics: config")
     focal = camera.height / 2 / np.tan(yfov / 2)
     znear = perspective.get("znear", camera.near)
-    return dict(fx=focal, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2, near=float(znear) if znear > 0 else camera.near)
+    return dict(fx=focal, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2,
+                near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near)
 
 
 # ---- pyrender
+def _pyrender_omissions(primitives, omissions: Omissions) -> None:
+    for primitive in primitives:
+        if getattr(primitive, "color_0", None) is not None:
+            omissions.add("vertex colours (left out)")
+        material = primitive.material
+        if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
+            omissions.add(f"alpha {material.alphaMode} (drawn opaque)")
+        if np.any(getattr(material, "emissiveFactor", None)):
+            omissions.add("emissive light")
+        if getattr(material, "normalTexture", None) is not None:
+            omissions.add("normal maps")
+
+
 def _pyrender_piece(primitive, max_texture: int, name: str) -> gltf.Piece:
     positions = np.asarray(primitive.positions, np.float64)
     faces = np.arange(len(positions)).reshape(-1, 3) if primitive.indices is None else np.asarray(primitive.indices).reshape(-1, 3)

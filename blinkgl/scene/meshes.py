@@ -11,11 +11,12 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.types import Mesh
+from blinkgl.scene.types import Mesh, Scene
 
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6        # vertices nearer than this times the extent are one point
 COARSE_WELD_RELATIVE = 1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part by itself
+_MAX_REPEATS = 1e9          # of a texture: float32 has no fraction left, and overflows later
 _MAX_COORDINATE = 1e15      # squares of larger coordinates lose all meaning in float32 and overflow soon after
 
 
@@ -81,7 +82,7 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
         log.append(f"{label}: the normals are unusable, made new ones")
         normals = None
     if uvs_given:
-        broken = uvs is None or not np.isfinite(uvs[faces]).all()
+        broken = uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all()     # NaN compares false
         if broken or (project_degenerate and uvs_degenerate(vertices, faces, uvs)):
             log.append(f"{label}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones")
             uvs = None
@@ -100,13 +101,50 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
 def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(F,) bool. A sliver is judged against its own longest edge, so that small meshes are not dropped."""
     corners = vertices[faces]
+    height, longest = _height_and_edge(corners)
+    floor = 1e-14 * max(float(np.abs(corners).max()), 1e-300)
+    return (height > 1e-10 * longest) & (longest > floor)
+
+
+def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """((F,) smallest height, (F,) longest edge) of (F, 3, 3) triangles."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    scale = np.where(longest > 0, longest, 1.0)[:, None, None]
-    edges = edges / scale
-    twice_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
-    floor = 1e-14 * max(float(np.abs(corners).max()), 1e-300)
-    return (twice_area > 1e-10) & (longest > floor)
+    edges = edges / np.where(longest > 0, longest, 1.0)[:, None, None]  # products of the smallest coordinates would underflow
+    return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * longest, longest
+
+
+def faces_in_float32(mesh: Mesh) -> np.ndarray:
+    """(F,) bool, faces that still have a direction when a GPU has rounded the vertices to float32.
+
+    Rounding moves a corner by up to half of 2^-23 times its largest coordinate in each axis, so that corners on one line come
+    out as a triangle up to sqrt(3) times 2^-23 high: what is not higher than twice that unit is a line, and its normal and the
+    slopes of all that is interpolated over it are noise. NaN and what overflows is no line: the renderer refuses such meshes."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        corners = mesh.vertices.astype(np.float32)[mesh.faces].astype(np.float64)
+        return ~(_height_and_edge(corners)[0] <= 2.0**-22 * np.abs(corners).max(axis=(1, 2)))
+
+
+def without_collapsed_faces(scene: Scene) -> Scene:
+    """The scene without the faces that are lines in float32 (:func:`faces_in_float32`), and a line in its log that counts them;
+    the scene itself when there are none."""
+    made: dict[int, Mesh | None] = {}  # id of a mesh -> without them; None: nothing is left
+    objects, dropped = [], 0
+    for obj in scene.objects:
+        parts = []
+        for part in obj.parts:
+            if id(part.mesh) not in made:
+                kept = faces_in_float32(part.mesh)
+                faces = part.mesh.faces[kept]
+                made[id(part.mesh)] = part.mesh if kept.all() else replace(part.mesh, faces=faces) if len(faces) else None
+            mesh = made[id(part.mesh)]
+            dropped += len(part.mesh.faces) - (0 if mesh is None else len(mesh.faces))
+            if mesh is not None:
+                parts.append(part if mesh is part.mesh else replace(part, mesh=mesh))
+        objects.append(obj if len(parts) == len(obj.parts) and all(a is b for a, b in zip(parts, obj.parts)) else replace(obj, parts=tuple(parts)))
+    if not dropped:
+        return scene
+    return replace(scene, objects=tuple(objects), log=(*scene.log, f"{dropped} triangles without width in float32 are not drawn"))
 
 
 def _face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

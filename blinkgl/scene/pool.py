@@ -20,6 +20,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
 from blinkgl.scene.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
 from blinkgl.scene.primitives import random_primitive, random_primitive_hash
+from blinkgl.scene.reading import MAX_BYTES, contents
 from blinkgl.scene.textures import procedural_hash, procedural_texture
 from blinkgl.scene.types import Material, Part, Texture
 
@@ -136,14 +137,14 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
         folders.append((urdfs, f"{where}.urdfs", "pybullet random_urdfs"))
     limit = int(config.max_file_mb * 1e6)
     for folder, at, name in folders:
-        entries += _folder_entries(folder, at, name, MESH_SUFFIXES, limit, "meshes", config.bad_assets)
+        entries += _folder_entries(folder, at, name, MESH_SUFFIXES, limit, "mesh", config.bad_assets)
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
             return Asset(entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)).normalised()
         asset = load_asset(entry.file, max_faces=config.max_faces, max_bytes=limit, keep_materials=config.keep_materials,
-                           max_texture=max_texture, source_hash=entry.source_hash)
-        _same_content(entry, content_hash(entry.file.read_bytes(), *dependencies(entry.file)))
+                           max_texture=max_texture, source_hash=entry.source_hash, up=config.up)
+        _same_content(entry, content_hash(contents(entry.file, "mesh", max_bytes=limit), *dependencies(entry.file)))
         return asset.normalised()
 
     return Pool(_listed(entries), load, config.test_fraction, where, "meshes", config.bad_assets)
@@ -161,15 +162,13 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
                               accepted="run 'pip install scikit-image', or set it to false")
         entries += [Entry(content_hash(file.read_bytes()), name, "photographs", file) for name, file in bundled.items()]
     for i, folder in enumerate(config.folders):
-        entries += _folder_entries(resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, None, "images", config.bad_assets)
+        entries += _folder_entries(resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, MAX_BYTES,
+                                   "image", config.bad_assets)
 
     def load(entry: Entry) -> Texture:
         if entry.file is None:
             return procedural_texture(entry.kind, entry.index, config.max_size)
-        try:
-            data = entry.file.read_bytes()
-        except OSError as error:
-            raise AssetError(f"cannot read the image: {error.strerror or error}", where=str(entry.file)) from None
+        data = contents(entry.file, "image")
         _same_content(entry, content_hash(data))
         return Texture(decode_image(data, config.max_size, str(entry.file)), entry.name, entry.source_hash)
 
@@ -203,17 +202,13 @@ def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...],
     return files
 
 
-def _folder_entries(folder: Path, where: str, given: str, suffixes, limit: int | None, what: str, bad_assets: str) -> Iterable[Entry]:
+def _folder_entries(folder: Path, where: str, given: str, suffixes, limit: int, what: str,
+                    bad_assets: str) -> Iterable[Entry]:
     entries = []
-    for file in files_below(folder, where, given, suffixes, what):
+    for file in files_below(folder, where, given, suffixes, "meshes" if what == "mesh" else "images"):
         try:
-            size = file.stat().st_size
-            if limit is not None and size > limit:
-                raise AssetError("the mesh file is too large", where=str(file), value=f"{size / 1e6:.0f} MB",
-                                 accepted=f"at most {limit / 1e6:.0f} MB")
-            digest = content_hash(file.read_bytes(), *dependencies(file))
-        except OSError as error:
-            raise AssetError(f"cannot read the file: {error.strerror or error}", where=str(file)) from None
+            data = contents(file, what, max_bytes=limit)
+            digest = content_hash(data, *dependencies(file, data))
         except AssetError:
             if bad_assets == "error":
                 raise

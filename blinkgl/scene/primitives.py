@@ -20,6 +20,21 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.meshes import closedness, make_mesh, transform_mesh, weld
 from blinkgl.scene.types import Mesh
 
+PARAMETERS = {
+    "extents": "edge lengths in x, y, z, m",
+    "width": "edge in x, m",
+    "depth": "edge in y, m",
+    "radius": "m; prism, pyramid: of the circle through the polygon's corners; torus: from the axis to the middle of the tube",
+    "tube": "radius of the tube, m, less than radius",
+    "height": "along z, m; capsule: of the cylinder between the two half spheres",
+    "segments": "faces round the z axis",
+    "tube_segments": "faces round the tube",
+    "rings": "rows of faces along z; cylinder, cone: rows of vertices",
+    "sides": "corners of the polygon",
+    "subdivisions": "cells per edge; icosphere: how often each of 20 triangles is cut into four, 0 to 7",
+}
+"""What the builders' parameters mean, for the documentation. Metres are world units, before the object's scale."""
+
 _LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1}
 _MAX_SEGMENTS = 4096
 
@@ -241,6 +256,11 @@ def pyramid(sides=4, radius=0.5, height=1.0):
 
 
 BUILDERS = {f.__name__: f for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid)}
+
+
+def parameters(kind: str) -> dict[str, float | int | tuple[float, ...]]:
+    """Names and defaults of a builder's parameters."""
+    return {name: parameter.default for name, parameter in inspect.signature(BUILDERS[kind]).parameters.items()}
 
 
 def random_primitive(kind: str, index: int) -> Mesh:

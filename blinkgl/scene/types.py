@@ -16,6 +16,8 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from blinkgl.config.scene import LightConfig
+
 
 @runtime_checkable
 class PosePath(Protocol):
@@ -139,11 +141,13 @@ class Light:
     """White sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E.
 
     sun_direction : unit vector in the world, from the surface towards the sun (s).
+
+    The defaults are those of ``light:`` in the configuration, where nothing is random.
     """
 
-    sun_direction: tuple[float, float, float] = (0.37139068, 0.27854301, 0.88569817)
-    sun: float = 0.8
-    sky: float = 0.4
+    sun_direction: tuple[float, float, float] = LightConfig().sun_direction()
+    sun: float = LightConfig().sun
+    sky: float = LightConfig().sky
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +156,8 @@ class Scene:
 
     background : linear radiance where nothing is hit.
     log        : one line per decision worth keeping (collisions cut, objects dropped), for the manifest.
+    omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and
+    the manifest.
     """
 
     objects: tuple[SceneObject, ...]
@@ -161,3 +167,4 @@ class Scene:
     light: Light = Light()
     background: float = 0.0
     log: tuple[str, ...] = field(default=())
+    omissions: tuple[str, ...] = field(default=())

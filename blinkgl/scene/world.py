@@ -15,14 +15,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
+from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.collision import resolve_collisions
-from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, cube_faces, decode_image, shrink, SKY_SIDES
+from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash, cube_faces, load_image, shrink, SKY_SIDES
 from blinkgl.scene.meshes import scale_mesh
 from blinkgl.scene.paths import StaticPath
 from blinkgl.scene.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
 from blinkgl.scene.primitives import cuboid, grid, parameter_hash, square
+from blinkgl.scene.reading import contents
 from blinkgl.scene.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
 
@@ -38,11 +40,12 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     rng, rng_motion, rng_texture = (generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE))
     objects, textures = pools(config, base)
     log: list[str] = []
+    omissions: dict[str, None] = {}
     floor = config.ground.height if config.ground else 0.0
     unlit = config.light.unlit
 
     T_cam, target = _viewpoint(config, rng, floor)
-    clearance = max(config.camera_clearance, 1.01 * near_corner(camera))
+    clearance = camera_radius(camera, config.camera_clearance)
     if clearance > config.region.height:
         raise ConfigError("the region is too low for a camera that keeps this far from everything", where="scene.region.height",
                           value=config.region.height, accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
@@ -60,7 +63,7 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
     backdrop += [(f"wall-{k}", "wall", parts, StaticPath(T, t0_ns, t1_ns))
                  for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))]
 
-    placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log)
+    placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log, omissions)
     centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
     radii = np.array([radius for *_, radius, _ in placed])
     half = config.region.width / 2
@@ -88,7 +91,8 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
     return Scene(objects=result.objects, camera=make_camera(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
-                 light=make_light(config.light, rng), background=config.background, log=tuple(log))
+                 light=make_light(config.light, rng), background=config.background, log=tuple(log),
+                 omissions=tuple(omissions))
 
 
 def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
@@ -107,21 +111,10 @@ def make_camera(camera, path, **changes) -> Camera:
     return replace(made, **changes)
 
 
-def near_corner(camera) -> float:
-    """Distance from the camera centre to the farthest corner of the near rectangle."""
-    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
-    x = max(cx + 0.5, camera.width - 0.5 - cx) / camera.fx
-    y = max(cy + 0.5, camera.height - 0.5 - cy) / camera.fy
-    return camera.near * math.sqrt(1 + x * x + y * y)
-
-
 def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:
     """Sun direction drawn where the configuration leaves it open and ``rng`` is given."""
-    drawn = (60.0, 40.0) if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
-    elevation = math.radians(drawn[0] if config.sun_elevation is None else config.sun_elevation)
-    azimuth = math.radians(drawn[1] if config.sun_azimuth is None else config.sun_azimuth)
-    direction = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation))
-    return Light(direction, config.sun, config.sky)
+    drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
+    return Light(config.sun_direction(*drawn), config.sun, config.sky)
 
 
 def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +130,8 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
     return T, target
 
 
-def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log):
+def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log,
+           omissions):
     """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
     placed: list[tuple] = []
@@ -170,6 +164,7 @@ def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, spli
         radii.append(radius)
         placed.append((f"{asset.name}#{k}", parts, T, radius, resting))
         log.extend(line for line in asset.log if line not in log)
+        omissions.update(dict.fromkeys(asset.omissions))
     return placed
 
 
@@ -242,13 +237,13 @@ def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[
         if not path.exists():
             raise ConfigError("no such file or folder", where=where, value=given, accepted="an equirectangular image or a folder of them")
         files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
-    hashed = sorted({content_hash(f.read_bytes()): f for f in files}.items())
+    hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
     mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
     if not mine:
         raise ConfigError(f"none of the {len(hashed)} panoramas falls to split '{split}'", where="scene.sky.panoramas",
                           accepted="more panoramas, or another scene.textures.test_fraction")
     digest, file = mine[int(rng.integers(len(mine)))]
-    image = shrink(decode_image(file.read_bytes(), None, str(file)), 4096)
+    image = shrink(load_image(file), 4096)
     image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
     sides = cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN)
     return [Texture(side, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)]

@@ -13,10 +13,12 @@ import cv2
 import numba
 import numpy as np
 
+from blinkgl.errors import EventDataError
 from blinkgl.srgb import to_srgb8
 
 Timed = tuple[np.ndarray, int]
 _EPS = np.float32(1e-3)
+_LEAST = 16  # px, of a side: below, OpenCV's dense flow raises, returns NaN or ends the process, depending on the other side
 
 
 def cubic(frames: Iterable[Timed], factor: int = 4) -> Iterator[Timed]:
@@ -108,6 +110,9 @@ def motion(frames: Iterable[Timed], max_px: float = 1.0, *, most: int = 64, disp
     statistics = displacement if displacement is not None else Displacement()
     last: tuple[np.ndarray, np.ndarray, int] | None = None
     for frame, t in frames:
+        if min(frame.shape[:2]) < _LEAST:
+            raise EventDataError("too small for dense flow", where="interpolate: motion", value=f"{frame.shape[1]}x{frame.shape[0]}",
+                                 accepted=f"at least {_LEAST}x{_LEAST}, or interpolate: linear")
         grey = _to8(frame)
         if last is not None:
             a, grey_a, t_a = last

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import os
 import zipfile
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.dsec import open_hdf5
-from blinkgl.io.mvsec import DATASET
+from blinkgl.io.columns import check_events, microseconds
+from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
+from blinkgl.io.images import npy_header, numpy_errors
+from blinkgl.io.mvsec import event_table, events_of_rows
 from eflow.data.window import RawSample, Window
 
 HEIGHT, WIDTH = 260, 346
@@ -27,20 +29,15 @@ class NpzRows:
 
     def __init__(self, path: Path, names: tuple[str, ...]):
         self.path, self._layout = path, {}
-        try:
-            with zipfile.ZipFile(path) as archive:
-                for name in names:
-                    with archive.open(f"{name}.npy") as member:
-                        version = np.lib.format.read_magic(member)
-                        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-                        shape, fortran, dtype = header(member)
-                        if fortran or dtype.hasobject:
-                            raise AssetError(f"array '{name}' is not a plain C-ordered array", where=str(path))
-                        self._layout[name] = (shape, dtype, member.tell())
-        except KeyError:
-            raise AssetError("missing array", where=str(path), accepted=", ".join(names)) from None
-        except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise AssetError(f"not a readable .npz: {' '.join(str(error).split())}", where=str(path)) from error
+        with numpy_errors(path), zipfile.ZipFile(path) as archive:
+            if missing := [n for n in names if f"{n}.npy" not in archive.namelist()]:
+                raise AssetError(f"no array '{missing[0]}'", where=str(path), accepted=", ".join(names))
+            for name in names:
+                with archive.open(f"{name}.npy") as member:
+                    shape, fortran, dtype = npy_header(member, archive.getinfo(f"{name}.npy").file_size, f"{path}: '{name}'")
+                    if fortran or not shape or dtype.kind not in "fiu":
+                        raise AssetError(f"array '{name}' is not a C-ordered array of numbers", where=str(path), value=f"{dtype} {shape}")
+                    self._layout[name] = (shape, dtype, member.tell())
 
     def shape(self, name: str) -> tuple[int, ...]:
         return self._layout[name][0]
@@ -48,14 +45,11 @@ class NpzRows:
     def read(self, name: str, row: int | None = None) -> np.ndarray:
         """One row, or the whole array."""
         shape, dtype, start = self._layout[name]
-        count = int(np.prod(shape if row is None else shape[1:]))
-        try:
-            with zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
-                member.seek(start + (row or 0) * count * dtype.itemsize)
-                data = member.read(count * dtype.itemsize)
-            return np.frombuffer(data, dtype).reshape(shape if row is None else shape[1:])
-        except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-            raise AssetError(f"array '{name}' cannot be read: {' '.join(str(error).split())}", where=str(self.path)) from error
+        shape = shape if row is None else shape[1:]
+        count = math.prod(shape)
+        with numpy_errors(self.path), zipfile.ZipFile(self.path) as archive, archive.open(f"{name}.npy") as member:
+            member.seek(start + (row or 0) * count * dtype.itemsize)
+            return np.frombuffer(member.read(count * dtype.itemsize), dtype).reshape(shape)
 
 
 class MvsecSource:
@@ -100,19 +94,22 @@ class MvsecSource:
 class _MvsecSequence:
     def __init__(self, path: Path):
         self.path, self.name = path, path.name.removesuffix("_data.hdf5")
-        with open_hdf5(path) as file:
-            for name in (DATASET, "davis/left/image_raw_ts", "davis/left/image_raw_event_inds"):
-                if name not in file:
-                    raise AssetError(f"no dataset '{name}'", where=str(path))
-            stamps = file["davis/left/image_raw_ts"][()]
-            self._inds = file["davis/left/image_raw_event_inds"][()].astype(np.int64)
+        with open_hdf5(path) as file, hdf5_errors(path):
+            self._count = len(event_table(file, path))
+            stamps = dataset(file, "davis/left/image_raw_ts", path, shape=(None,), kinds="f")[()]
+            self._inds = dataset(file, "davis/left/image_raw_event_inds", path, shape=(len(stamps),), kinds="iuf")[()].astype(np.int64)
+        if not len(stamps):
+            raise AssetError("no images, so no times to take samples between", where=str(path))
         flow = path.with_name(f"{self.name}_gt_flow_dist.npz")
         if not flow.is_file():
             raise AssetError("no such file", where=str(flow), accepted="ground truth beside the events")
         self._flow = NpzRows(flow, ("timestamps", "x_flow_dist", "y_flow_dist"))
         self.t0_s = float(stamps[0])
-        self.image_us = np.rint((stamps - self.t0_s) * 1e6).astype(np.int64)
-        self.flow_us = np.rint((self._flow.read("timestamps") - self.t0_s) * 1e6).astype(np.int64)
+        self.image_us = _stamps(stamps - self.t0_s, f"{path}: 'davis/left/image_raw_ts'")
+        self.flow_us = _stamps(self._flow.read("timestamps") - self.t0_s, f"{flow}: 'timestamps'")
+        for name in ("x_flow_dist", "y_flow_dist"):
+            if self._flow.shape(name) != (expected := (len(self.flow_us), HEIGHT, WIDTH)):
+                raise AssetError(f"array '{name}' has the wrong shape", where=str(flow), value=self._flow.shape(name), accepted=str(expected))
         self._file, self._pid = None, None
         self._rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -122,24 +119,24 @@ class _MvsecSequence:
     def window(self, t0: int, t1: int, image0: int, image1: int) -> Window:
         """Events of [t0, t1) µs; the images' event indices say where to look, the times decide."""
         if self._pid != os.getpid():  # HDF5 handles do not survive a fork
-            self._file, self._pid = h5py.File(self.path, "r"), os.getpid()
-        table = self._file[DATASET]
-        low, high = int(self._inds[image0]), int(self._inds[image1])
+            self._file, self._pid = open_hdf5(self.path), os.getpid()
+        with hdf5_errors(self.path):
+            table = event_table(self._file, self.path)
+        low, high = (int(np.clip(self._inds[k], 0, self._count)) for k in (image0, image1))
         margin = 4096
         while True:
-            i, j = max(low - margin, 0), min(high + margin, len(table))
-            try:
-                rows = table[i:j]
-            except OSError as error:
-                raise AssetError(f"events from {i} cannot be read: {' '.join(str(error).split())}", where=str(self.path)) from error
-            t = np.rint((rows[:, 2] - self.t0_s) * 1e6).astype(np.int64)
-            enough = len(t) and (i == 0 or t[0] < t0) and (j == len(table) or t[-1] >= t1)
-            if enough or (i == 0 and j == len(table)):
+            i, j = max(low - margin, 0), min(high + margin, self._count)
+            with hdf5_errors(self.path):
+                rows = table[i:max(i, j)]
+            t = microseconds(rows[:, 2] - self.t0_s, str(self.path), i)
+            enough = len(t) and (i == 0 or t[0] < t0) and (j == self._count or t[-1] >= t1)
+            if enough or (i == 0 and j == self._count):
                 break
             margin *= 4
-        a, b = np.searchsorted(t, (t0, t1), side="left")
-        rows = rows[a:b]
-        return Window(rows[:, 0].astype(np.uint16), rows[:, 1].astype(np.uint16), t[a:b], (rows[:, 3] > 0).astype(np.uint8), t0, t1)
+        events = events_of_rows(rows, str(self.path), i, self.t0_s)
+        check_events(events, str(self.path), i, height=HEIGHT, width=WIDTH)
+        e = events.window(t0, t1)
+        return Window(e.x, e.y, e.t, e.p, t0, t1)
 
     def flow_between(self, t0: int, t1: int) -> tuple[np.ndarray, np.ndarray]:
         """flow (H, W, 2) float32 and valid over [t0, t1] µs; see :func:`propagate`."""
@@ -157,6 +154,16 @@ class _MvsecSequence:
                 self._rows.pop(next(iter(self._rows)))
             self._rows[k] = np.stack([self._flow.read(n, k).astype(np.float32) for n in ("x_flow_dist", "y_flow_dist")], axis=-1)
         return self._rows[k]
+
+
+def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
+    """int64 µs; AssetError when they are no list of increasing times."""
+    if seconds.ndim != 1 or len(seconds) < 2:
+        raise AssetError("not a list of times", where=where, value=seconds.shape, accepted="(N,) with N >= 2")
+    t = microseconds(seconds, where)
+    if (back := np.flatnonzero(t[1:] <= t[:-1])).size:
+        raise AssetError(f"time {int(back[0]) + 1} does not come after the one before", where=where, value=tuple(seconds[back[0]:back[0] + 2].tolist()))
+    return t
 
 
 def propagate(pieces: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:

@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-import h5py
 import numpy as np
-import yaml
 
-from blinkgl.errors import AssetError, EventDataError
-from blinkgl.io.dsec import DsecEventReader, open_hdf5
+from blinkgl.config.reader import read_table
+from blinkgl.errors import AssetError, ConfigError, EventDataError
+from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.images import read_npy
 from blinkgl.io.index import INDEX, read_index
 from eflow.data.window import RawSample, Window
@@ -114,10 +114,11 @@ class FolderSource:
 
     def _map(self, path: Path) -> np.ndarray:
         if path not in self._maps:
-            with open_hdf5(path) as file:
-                if "rectify_map" not in file or not isinstance(file["rectify_map"], h5py.Dataset) or file["rectify_map"].ndim != 3:
-                    raise AssetError("no (H, W, 2) dataset 'rectify_map'", where=str(path))
-                self._maps[path] = file["rectify_map"][()].astype(np.float32)
+            with open_hdf5(path) as file, hdf5_errors(path):
+                rectify_map = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(np.float32)
+            if not np.isfinite(rectify_map).all():
+                raise AssetError("rectification map with NaN or infinity", where=str(path))
+            self._maps[path] = rectify_map
         return self._maps[path]
 
     @staticmethod
@@ -162,16 +163,19 @@ def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_blinkgl(root: Path) -> list[Sequence]:
-    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds. Flow is taken from
-    the 16-bit PNG (quantum 1/128 px)."""
+    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds; those without forward flow
+    are passed over. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
     found = []
     indexed = (root / INDEX).is_file()
     folders = [root / line["path"] for line in read_index(root)] if indexed else [m.parent for m in sorted(root.rglob("manifest.json"))]
     for folder in folders:
         if any(part.startswith(".") for part in folder.relative_to(root).parts) or not (folder / "events.h5").is_file():
             continue
-        times = read_times(folder / "flow/forward_timestamps.txt")
+        stamps = folder / "flow/forward_timestamps.txt"
         forward, backward = sorted((folder / "flow/forward").glob("*.png")), sorted((folder / "flow/backward").glob("*.png"))
+        if not forward and not stamps.exists():  # made without flow: there is nothing to learn from it, and nothing wrong with it
+            continue
+        times = read_times(stamps)
         _same_count(folder / "flow/forward", forward, times)
         if backward:
             _same_count(folder / "flow/backward", backward, times)
@@ -230,9 +234,8 @@ def _fps(path: Path) -> float:
     if not path.is_file():
         return 10.0
     try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-        fps = float(tree.get("fps", 10.0))
-    except (OSError, yaml.YAMLError, AttributeError, TypeError, ValueError):
+        fps = float(read_table(path).get("fps", 10.0))
+    except (ConfigError, TypeError, ValueError):
         raise AssetError("no readable 'fps'", where=str(path), accepted="duration and fps as YAML") from None
     if not 0 < fps < 1e6:
         raise AssetError("impossible fps", where=str(path), value=fps)

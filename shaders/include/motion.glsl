@@ -5,23 +5,28 @@
 // Subtracting two projected positions instead (c1/w1 - c0/w0) leaves float32 rounding of the positions, 1e-4 px,
 // in the result however small the motion is. ndc comes from gl_FragCoord, which is exact.
 
+const float BEYOND = 1e37; // px, px/s: further than anything that is told apart from infinity
+
 vec2 ndc_of_fragment(vec2 image_size)
 {
     return gl_FragCoord.xy / image_size * 2.0 - 1.0;
 }
 
-// difference: rows x, y, w of D.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera.
+// difference: rows x, y, w of D.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera, or so near to its plane
+// that the flow is beyond float32; u = v = 0 then.
 vec3 displacement(mat4x3 difference, vec3 local, vec2 image_size)
 {
     vec3 d = difference * vec4(local, 1.0);
     float w_next = 1.0 / gl_FragCoord.w + d.z;
-    vec2 flow_ndc = (d.xy - ndc_of_fragment(image_size) * d.z) / w_next;
-    return vec3(flow_ndc * 0.5 * image_size, w_next);
+    vec2 flow = (d.xy - ndc_of_fragment(image_size) * d.z) / w_next * 0.5 * image_size;
+    bool usable = w_next > 0.0 && max(abs(flow.x), abs(flow.y)) < BEYOND;
+    return usable ? vec3(flow, w_next) : vec3(0.0, 0.0, min(w_next, 0.0));
 }
 
-// rate: rows x, y, w of d(MVP)/dt.  Returns px/s.
+// rate: rows x, y, w of d(MVP)/dt.  Returns px/s, at most BEYOND, whose square is infinite.
 vec2 velocity(mat4x3 rate, vec3 local, vec2 image_size)
 {
     vec3 d = rate * vec4(local, 1.0);
-    return (d.xy - ndc_of_fragment(image_size) * d.z) * gl_FragCoord.w * 0.5 * image_size;
+    vec2 v = (d.xy - ndc_of_fragment(image_size) * d.z) * gl_FragCoord.w * 0.5 * image_size;
+    return clamp(v, -BEYOND, BEYOND);
 }

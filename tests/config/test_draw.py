@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from blinkgl.config.draw import draw, extremes, is_distribution
+from blinkgl.config.corners import sites
+from blinkgl.config.draw import draw, is_distribution, options
 from blinkgl.errors import ConfigError
 
 TREE = {"a": {"uniform": [0.18, 0.25]}, "b": {"c": [{"integer": [1, 6]}, 5]}, "d": {"choice": ["x", "y"]}, "e": 3}
@@ -53,15 +54,25 @@ def test_a_choice_may_hold_distributions():
     assert 1 <= draw(tree, 0, 0)["events"]["contrast_threshold"] < 2
 
 
-def test_extremes_visit_both_ends_and_every_choice():
-    trees = extremes({"a": {"uniform": [1, 2]}, "b": {"choice": [7, 8, 9]}})
-    assert {t["a"] for t in trees} == {1, 2} and {t["b"] for t in trees} == {7, 8, 9}
+def test_options_are_both_ends_and_every_choice():
+    assert options((), {"uniform": [1, 2]}) == [1, 2] and options((), {"choice": [7, 8, 9]}) == [7, 8, 9]
+    low, high, inside = options((), {"uniform": [1, 3]}, between=True)
+    assert (low, high) == (1, 3) and 1 < inside < 3 and inside != round(inside)
+    assert options((), {"integer": [1, 3]}, between=True) == [1, 3]
+
+
+def test_a_logarithmic_draw_never_leaves_its_range():
+    spec = {"log_uniform": [0.1, 0.1]}
+    assert {draw({"a": spec}, 0, i)["a"] for i in range(5)} == {0.1}, "exp(log(0.1)) is another number"
 
 
 @pytest.mark.parametrize("node, message", [
     ({"uniform": [2, 1]}, "p.q.uniform: the range is empty"),
     ({"uniform": [1]}, "p.q.uniform: not a range"),
     ({"uniform": "ab"}, "p.q.uniform: not a range"),
+    ({"uniform": [-1e308, 1e308]}, "p.q.uniform: the range is too wide"),
+    ({"integer": [0, 10**19]}, "p.q.integer: the range is too wide"),
+    ({"uniform": [0, 10**400]}, "p.q.uniform: not a range"),
     ({"uniform": [0, "nan"]}, "p.q.uniform: not a range"),
     ({"log_uniform": [0, 1]}, "p.q.log_uniform: a logarithmic range needs positive ends"),
     ({"integer": [1, 2.5]}, "p.q.integer: not whole numbers"),
@@ -70,7 +81,7 @@ def test_extremes_visit_both_ends_and_every_choice():
     ({"weighted": {"a": -1, "b": 3}}, "p.q.weighted: not a table of weights"),
 ])
 def test_malformed_distributions_name_the_path(node, message):
-    for function in (lambda t: draw(t, 0, 0), extremes):
+    for function in (lambda t: draw(t, 0, 0), sites):
         with pytest.raises(ConfigError, match="^" + message):
             function({"p": {"q": node}})
 

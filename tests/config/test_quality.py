@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from blinkgl.config.quality import QUALITIES, load_quality, with_quality
+from blinkgl.config.quality import QUALITIES, fill_quality, load_quality
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.report import config_yaml
 from blinkgl.errors import ConfigError
@@ -42,7 +42,8 @@ def test_emulators_that_follow_straight_lines(tmp_path):
 
 def test_no_quality_changes_nothing(tmp_path):
     tree = {"timeline": {"kind": "uniform", "fps": 50}}
-    assert with_quality(tree) is tree and with_quality({**tree, "quality": None})["timeline"] == tree["timeline"]
+    assert fill_quality(None, "uniform", None, None) == {} == fill_quality("best", None, None, None)
+    assert sequence(tmp_path, tree).timeline.fps == 50
     assert sequence(tmp_path, {"quality": None}) == sequence(tmp_path, {})
 
 

@@ -65,7 +65,7 @@ def test_tables_of_another_kind_replace():
     ({"groups": {"a": {"enabled": "maybe"}}}, "groups.a.enabled: not a switch"),
     ({"groups": {"a": {"output": {"name": "x"}}, "b": {"output": {"name": "x"}}}}, "groups.b.output: writes the same folders as group 'a'"),
     ({"groups": {"a": {"camera": {"widht": 3}}}}, "camera.widht: in group 'a': unknown key; expected 'width' (nearest)"),
-    ({"groups": {"a": {"output": {"split": {"choice": ["train", "test"]}}}}}, "where a sequence goes cannot be drawn"),
+    ({"groups": {"a": {"output": {"split": {"choice": ["train", "test"]}}}}}, "output: in group 'a': belongs to the whole run and cannot be drawn"),
     ({"groups": {"a": {"enabled": False}}}, "groups: every group is switched off"),
     ({"events": {"shares": [{"share": 0.8, "value": {"emulator": "v2e"}}, {"share": 0.3, "value": {"emulator": "voltmeter"}}]}},
      "events.shares: in group 'a': the shares do not sum to 1"),

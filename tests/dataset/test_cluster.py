@@ -1,7 +1,13 @@
 """The Ray executor: the same bytes as without Ray, also when a worker or a whole node is lost. Needs the extra [cluster]."""
 
+import contextlib
+import ipaddress
 import os
 import signal
+import socket
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -11,6 +17,7 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset.cluster import RayCluster, _egl_device, _first_line
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.sockets import listening
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import ConfigError
 from runs import RECIPE, recipe_file, temporaries, tree
@@ -63,6 +70,68 @@ def two_nodes():
     finally:
         ray.shutdown()
         cluster.shutdown()
+
+
+class Scan:
+    """A display that looks, at the first word of a worker, at what this process and its descendants listen on."""
+
+    def __init__(self):
+        self.found, self.modes = [], []
+
+    def begin(self, plan, outcome) -> None: ...
+    def end(self, outcome) -> None: ...
+
+    def message(self, name, message) -> None:
+        if not self.found:
+            self.found = listening(os.getpid())
+            self.modes = [oct(p.stat().st_mode & 0o777) for p in Path(tempfile.gettempdir()).glob("ray-*")]
+
+
+def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypatch):
+    short = tempfile.mkdtemp(prefix="b-", dir="/tmp")
+    monkeypatch.setattr(tempfile, "tempdir", short)
+    scan = Scan()
+    try:
+        outcome = run_dataset(load_run(recipe_file(tmp_path, groups={"one": {}})), tmp_path / "out", RayCluster(1), listener=scan)
+    finally:
+        ray.shutdown()
+    processes = {socket.process for socket in scan.found}
+    assert {"gcs_server", "raylet"} <= processes and len(scan.found) >= 5, "or the scan saw nothing"
+    assert [str(s) for s in scan.found if not s.loopback] == []
+    assert scan.modes == ["0o700"], "no other user gets at its Unix sockets and logs"
+    assert len(outcome.made) == 1 and os.listdir(short) == [], "nothing is left"
+    os.rmdir(short)
+
+
+@pytest.mark.slow
+def test_a_ray_that_listens_to_everybody_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("blinkgl.dataset.cluster._loopback_only", contextlib.nullcontext)  # as Ray would, left to itself
+    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray"]) == 2
+    error = capsys.readouterr().err
+    assert "listens to other machines: " in error and "raylet on " in error and error.count("\n") == 1
+    assert not ray.is_initialized() and not (tmp_path / "out").exists()
+
+
+def test_listening_sockets_are_found_and_told_apart():
+    addresses = [(socket.AF_INET, "127.0.0.1", True), (socket.AF_INET, "0.0.0.0", False), (socket.AF_INET6, "::1", True),
+                 (socket.AF_INET6, "::", False), (socket.AF_INET6, "::ffff:127.0.0.1", True)]
+    with contextlib.ExitStack() as stack:
+        made = {}
+        for family, address, loopback in addresses:
+            try:
+                server = stack.enter_context(socket.socket(family, socket.SOCK_STREAM))
+                server.bind((address, 0))
+            except OSError:  # a machine without IPv6
+                continue
+            server.listen()
+            made[server.getsockname()[1]] = (ipaddress.ip_address(address), loopback)
+        # a child's are found as well
+        code = "import socket, sys; s = socket.socket(); s.bind(('0.0.0.0', 0)); s.listen(); print(s.getsockname()[1], flush=True); sys.stdin.read()"
+        child = stack.enter_context(subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+        made[int(child.stdout.readline())] = (ipaddress.ip_address("0.0.0.0"), False)
+        found = {s.port: (ipaddress.ip_address(s.address), s.loopback) for s in listening(os.getpid())}
+        child.stdin.close()
+    assert len(made) >= 3 and {port: found.get(port) for port in made} == made
 
 
 @pytest.mark.slow
@@ -128,8 +197,6 @@ def test_gpu_numbers_become_egl_devices(monkeypatch):
 
 
 def test_without_ray_the_remedy_is_named(monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(ConfigError, match=r"Ray is not installed .*pip install ray"):
         RayCluster(2)

@@ -55,7 +55,8 @@ def recipe(tmp_path, tartan, **frames):
 
 def test_conversion(tmp_path, tartan):
     outcome = run_dataset(recipe(tmp_path, tartan), tmp_path / "out")
-    assert [r.path.name for r in outcome.made] == ["tartan_000000", "tartan_000001"] and not outcome.set_aside
+    assert len(outcome.made) == 2 and not outcome.set_aside
+    assert sorted(p.parent.name for p in (tmp_path / "out").glob("*/*/manifest.json")) == ["tartan_000000", "tartan_000001"]
     folder = tmp_path / "out/test/tartan_000000"
     # Label k is the flow from frame k + 1, which has an interval of events before it; the last frame has no flow.
     assert (folder / "images/timestamps.txt").read_text().split() == ["100000", "200000", "300000", "400000", "500000"]
@@ -76,6 +77,21 @@ def test_conversion(tmp_path, tartan):
     assert verify_dataset(tmp_path / "out", deep=2).clean
     config = yaml.safe_load((folder / "config.yaml").read_text())
     assert config["frames"]["folders"][0].endswith("P000"), "the sequence's own configuration names its folder"
+
+
+def test_a_read_out_holds_for_frames(tmp_path, tartan):
+    """Every emulated event is in the file, or counted as lost or late; and the sequence passes verify."""
+    made = {}
+    for name, readout in (("free", None), ("slow", {"events_per_second": 3000, "queue_events": 50})):
+        template = recipe(tmp_path, tartan, folders=[f"{tartan}/P000"], first=2, interpolate="linear")
+        template.tree["groups"]["tartan"].update(readout=readout, labels={"images": False})
+        run_dataset(template, tmp_path / name, num=1)
+        assert verify_dataset(tmp_path / name, deep=1).clean
+        made[name] = json.loads((tmp_path / name / "test/tartan_000000/manifest.json").read_text())
+    free, slow = made["free"], made["slow"]
+    assert free["events"] > 3 * slow["events"] > 0 and free["events_lost_in_readout"] == free["events_late_in_readout"] == 0
+    assert slow["events_lost_in_readout"] > 100 and slow["events_late_in_readout"] > 0
+    assert slow["events"] + slow["events_lost_in_readout"] + slow["events_late_in_readout"] == free["events"]
 
 
 def test_a_part_of_the_frames_and_other_flow_files(tmp_path, tartan):

@@ -19,6 +19,8 @@ from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset import generate as generate_module
 from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.verify import check_sequence
+from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.sequence_dir import verify_sequence
 from shared_data import shared
 
@@ -132,6 +134,40 @@ def test_flow_follows_from_depth_ids_and_poses(sequence):
             errors.append(np.hypot(pixel[0] - x[at] - flow[at, 0], pixel[1] - y[at] - flow[at, 1]))
         errors = np.concatenate(errors)
         assert np.median(errors) < 1e-4 and errors.max() < 1e-2
+
+
+def test_the_poses_begin_with_the_first_frame(tmp_path):
+    """A camera that moves 1 m/s along x on straight lines: its position is the clock, to the nanosecond."""
+    scene = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box", "position": [3, 0, 0]}],
+             "camera": {"interpolation": "linear", "keyframes": [{"time": t, "position": [t, 0, 0]} for t in (0, 10)]}}
+    folder = generate(tmp_path, scene=scene, time={"duration": 0.2, "label_rate": 30, "start": 3.0000005})[0]
+    poses = np.load(folder / "poses.npz", allow_pickle=False)
+    start, interval = 3_000_000_500, 33_333_333
+    assert poses["t_ns"].tolist() == [start + k * interval for k in range(8)]
+    np.testing.assert_allclose(poses["T_world_cam"][:, 0, 3], poses["t_ns"] * 1e-9, rtol=0, atol=1e-12)
+
+
+def test_a_clock_between_microseconds(tmp_path):
+    """Start and labels that no µs count holds: labels, duration and events still agree."""
+    for start in (7e-7, 3.0000009):
+        folder = generate(tmp_path, out=f"{start}", time={"duration": 0.1, "label_rate": 30, "start": start})[0]
+        manifest = json.loads((folder / "manifest.json").read_text())
+        last = int((folder / "images/timestamps.txt").read_text().split()[-1])
+        assert manifest["t_offset_us"] + manifest["duration_us"] == last
+        assert check_sequence(folder) == []
+
+
+def test_events_that_leave_the_bus_late_are_no_part_of_the_recording(tmp_path):
+    """With a sensor's read-out, too, windows are a partition of the recording, and nothing made is unaccounted for."""
+    free = json.loads((generate(tmp_path, out="free")[0] / "manifest.json").read_text())
+    folder = generate(tmp_path, out="slow", readout={"events_per_second": 4000, "queue_events": 40})[0]
+    slow = json.loads((folder / "manifest.json").read_text())
+    assert check_sequence(folder) == []
+    assert slow["events_late_in_readout"] > 0 and slow["events_lost_in_readout"] > 0
+    assert slow["events"] + slow["events_late_in_readout"] + slow["events_lost_in_readout"] == free["events"]
+    with DsecEventReader(folder / "events.h5") as reader:
+        windows = [reader.slice(a, a + 50_000) for a in range(3_000_000, 3_250_000, 50_000)]
+        assert sum(map(len, windows)) + int((next(reader.chunks()).t == 3_250_000).sum()) == slow["events"]
 
 
 def test_manifest_is_complete(sequence):

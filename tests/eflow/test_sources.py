@@ -150,9 +150,9 @@ def test_pickles_are_not_loaded(tmp_path):
             return (open, (str(tmp_path / "sprung"), "w"))
 
     np.save(tmp_path / "a.npy", np.array([Trap()], object), allow_pickle=True)
-    refused("a.npy: cannot read.*allow_pickle=False", lambda: read_flow(tmp_path / "a.npy"))
+    refused("a.npy: array of Python objects, which could run any code", lambda: read_flow(tmp_path / "a.npy"))
     np.savez(tmp_path / "b.npz", timestamps=np.array([Trap()], object))
-    with pytest.raises(AssetError, match="not a plain"):
+    with pytest.raises(AssetError, match="array of Python objects"):
         NpzRows(tmp_path / "b.npz", ("timestamps",))
     assert not (tmp_path / "sprung").exists()
 
@@ -161,7 +161,7 @@ def test_mvsec_without_ground_truth(tmp_path):
     mvsec_set(tmp_path)
     path = tmp_path / "indoor_flying1_gt_flow_dist.npz"
     path.write_bytes(path.read_bytes()[:1000])
-    refused("not a readable .npz", lambda: open_source(tmp_path))
+    refused("npz: cannot read", lambda: open_source(tmp_path))
     path.unlink()
     refused("gt_flow_dist.npz: no such file", lambda: open_source(tmp_path))
 

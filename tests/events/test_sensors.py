@@ -81,12 +81,29 @@ def test_above_the_limit_the_rate_is_the_bus_rate_and_the_lag_is_bounded():
     assert out.t[-1] - events.t[-1] <= 200 / 4 + 1 and (np.diff(out.t) >= 0).all()
 
 
+def test_what_has_not_left_the_bus_waits_for_the_next_step():
+    """A step gives what left until its time; at the end of the recording the rest is counted and no part of it."""
+    events = random_events(np.random.default_rng(4), 6000, 1000)
+    config = ReadoutConfig(events_per_second=4e6, queue_events=300)
+    readout, parts = Readout(config), []
+    for start in range(0, 1000, 100):
+        parts.append(readout.step(events.window(start, start + 100), start + 99))
+        assert len(parts[-1]) and parts[-1].t[-1] <= start + 99
+    assert readout.late > 100, "the bus is behind"
+    sent, everything = Events.concatenate(parts), slow_bus(events, config)
+    assert_same(sent, everything.window(0, 1000))
+    assert len(sent) + readout.late + readout.dropped == 6000
+    assert_same(Events.concatenate([sent, readout.step(Events.empty())]), everything)
+    assert readout.late == 0
+
+
 def test_state_resumes():
     events = random_events(np.random.default_rng(3), 4000, 500)
     config = ReadoutConfig(events_per_second=3e6, row_ns=50, queue_events=64)
     whole = Readout(config).step(events)
     a, b = Readout(config), Readout(config)
-    head = a.step(Events(*(getattr(events, c)[:1500] for c in "xytp")))
+    head = a.step(Events(*(getattr(events, c)[:1500] for c in "xytp")), int(events.t[1499]))
+    assert a.late > 0
     b.load_state_dict(a.state_dict())
     assert_same(whole, Events.concatenate([head, b.step(Events(*(getattr(events, c)[1500:] for c in "xytp")))]))
 

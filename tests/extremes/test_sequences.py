@@ -123,7 +123,7 @@ def test_beyond_the_ranges_there_is_a_message(gl, tmp_path, change, message):
 
 def test_light_beyond_the_emulators_is_refused_where_it_is_seen(gl, tmp_path):
     bright = {**BOX, "materials": {"paint": {"color": [1e6, 1e6, 1e6]}}, "light": {"sky": 1e6}}
-    with pytest.raises(BlinkGLError, match="frame 0: intensity at pixel .* a finite value from 0 to 1.07e\\+09"):
+    with pytest.raises(BlinkGLError, match="frame 0 at 0 s: intensity at pixel .* it shows object .* a finite value from 0 to 1.07e\\+09"):
         generate(gl, tmp_path, scene=bright)
     assert not any(tmp_path.rglob("*.h5"))
 

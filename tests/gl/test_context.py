@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -263,3 +264,59 @@ def test_the_environment_of_the_process_is_left_alone():
         assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
     """
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+FORK = """
+import multiprocessing, sys
+import numpy as np
+from blinkgl.errors import GLError
+from blinkgl.gl import create_context
+sys.path.insert(0, {tests!r})
+from test_context import draw
+
+def child(how):
+    try:
+        if how == "new":
+            with create_context() as other:
+                draw(other)
+        else:
+            gl.make_current()
+            draw(gl)
+        print(how, "drawn", flush=True)
+    except GLError as error:
+        print(how, error, flush=True)
+    gl.release()  # the parent's is left alone
+
+if {opened}:
+    gl = create_context()
+    draw(gl)  # the driver's threads are started by the first triangles
+else:
+    class gl: release = staticmethod(lambda: None)
+for how in {how}:
+    process = multiprocessing.get_context("fork").Process(target=child, args=(how,))
+    process.start()
+    process.join(20)
+    if process.is_alive():
+        print(how, "hangs", flush=True)
+        process.kill()
+if {opened}:
+    print("parent", len(draw(gl)), flush=True)
+"""
+
+
+def forked(opened: bool, *how: str) -> list[str]:
+    code = FORK.format(tests=str(Path(__file__).parent), opened=opened, how=how)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+def test_a_process_forked_after_a_context_is_told_so_and_does_not_hang():
+    new, old, parent = forked(True, "new", "inherited")
+    for line in (new, old):
+        assert "this process was forked from one that had opened OpenGL, and would hang; use multiprocessing.get_context('spawn')" in line
+    assert parent == "parent 2", "the parent goes on"
+
+
+def test_a_process_forked_before_any_context_draws():
+    assert forked(False, "new") == ["new drawn"]

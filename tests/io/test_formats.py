@@ -274,12 +274,12 @@ def test_truncated_recordings(tmp_path):
 
 @pytest.mark.parametrize("array, message", [
     (np.zeros((5, 4)), "no column 't'.*plain array"), (np.zeros(3, [("t", "f8"), ("x", "i4"), ("y", "i4")]), "no column 'p'"),
-    (np.array([(np.nan, 1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), "NaN"),
-    (np.array([(1, -1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), "column 'x' outside"),
+    (np.array([(np.nan, 1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), r"time of event 0 .got nan"),
+    (np.array([(1, -1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), r"x of event 0 .got -1"),
 ])
 def test_arrays_that_are_not_events(tmp_path, array, message):
     np.save(tmp_path / "e.npy", array)
-    with pytest.raises(AssetError, match=message):
+    with pytest.raises(BlinkGLError, match=message):
         open_events(tmp_path / "e.npy")
 
 

@@ -167,3 +167,19 @@ def test_bad_samples_are_refused(gl):
         gl.framebuffer(8, 8, ("R32F",), depth="texture", samples=4)
 
 
+
+
+@pytest.mark.parametrize("antialiasing, blurred", [("none", 0.01), ("taps4", 0.25)])
+def test_anisotropy_keeps_stripes_that_run_into_the_distance(gl, antialiasing, blurred):
+    """Stripes along the view on grazing ground: a pixel is as wide as ever and very long, an isotropic mip level averages as wide as long."""
+    image = np.zeros((64, 64, 3), np.float32)
+    image[:, (np.arange(64) // 8) % 2 == 0] = 1.0
+    ground = thing("ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True))
+    world = scene([ground], Camera(96, 64, 90.0, 90.0, 47.5, 8.0, still(rotation=LEVEL)))
+    contrast = {}
+    for anisotropy in (1.0, 4.0):
+        config = RenderConfig(anisotropy=anisotropy, antialiasing=antialiasing, image_antialiasing="none")
+        with Renderer(gl, world, config) as renderer:
+            contrast[anisotropy] = renderer.luminance(0)[14].std(), renderer.colour(0)[14, :, 1].std()
+    assert contrast[1.0][0] < blurred and contrast[1.0][1] < 0.01
+    assert contrast[4.0][0] > 0.3 and contrast[4.0][1] > 0.3

@@ -136,3 +136,26 @@ def test_rates_are_those_of_finer_and_finer_differences(gl, antialiasing):
     # The small picture sees the same rates, though its own pixels are four times as large.
     for q in (50, 90):
         assert np.percentile(np.abs(small[..., 1]), q) == pytest.approx(np.percentile(np.abs(rate), q), rel=0.1)
+
+
+@pytest.mark.parametrize("antialiasing, gain, error", [("none", np.sinc(1 / 6) ** 2 * np.sinc(0.5 / 6), 0.21), ("taps4", 0.885, 0.17)])
+def test_the_rate_is_taken_over_half_a_pixel(gl, antialiasing, gain, error):
+    """Stripes of six texels, a pixel each, that slide by. Straight lines between texels keep sinc²(1/6) of the true rate, a difference
+    over half a pixel sinc(0.5/6) of that, one over two pixels sinc(2/6): 0.75 in all. Much less than half a pixel is no better:
+    the rate of a straight line between two texels is off by more than the mean over half of it."""
+    texels, period, speed, focal = 64, 6.0, 3.0, 64.0
+    stripes = 0.5 + 0.3 * np.sin(2 * np.pi * (np.arange(texels) + 0.5) / period)
+    paint = Material(texture=Texture(np.tile(stripes.astype(np.float32)[None, :, None], (texels, 1, 3))), unlit=True)
+    facing = LEVEL * LEVEL.from_euler("x", 180, degrees=True)
+    slides = drift((0, 1, 0), (speed / focal, 1, 0), facing)
+    world = scene([thing("wall", 1, quad(0.5, 0.5), slides, paint)], Camera(48, 16, focal, focal, 23.5, 7.5, still(rotation=LEVEL)))
+    rate, found, true = np.empty((16, 48), np.float32), [], []
+    with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
+        for t in np.linspace(0.05, 0.9, 23):
+            renderer.luminance(int(t * SECOND), rate=rate)
+            at = np.arange(48) - 23.5 - speed * t + texels / 2
+            found.append(rate[8, 4:-4].copy())
+            true.append(-speed * 0.3 * 2 * np.pi / period * np.cos(2 * np.pi * at / period)[4:-4])
+    found, true = np.array(found), np.array(true)
+    assert (found * true).sum() / (true * true).sum() == pytest.approx(gain, rel=0.02)
+    assert np.sqrt(((found - true) ** 2).mean() / (true**2).mean()) < error

@@ -13,7 +13,7 @@ from blinkgl.render.statistics import largest_speed
 from blinkgl.scene import primitives
 from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObject, Texture
 
-from render_scenes import LEVEL, SECOND, curve, still
+from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")
 
@@ -155,6 +155,20 @@ def test_reduced_velocity_samples_the_full_one(gl):
     assert 0.7 * full < reduced <= 1.05 * full
 
 
+@pytest.mark.parametrize("width, height, every", [(98, 147, 49), (23, 15, 4), (3, 5, 7), (12, 8, 4)])
+def test_small_pictures_cover_the_whole_image(gl, width, height, every):
+    """(98 * (1 / 49) is 1.9999999999999998.) Pixels are W / w apart: a wall that drifts shows its velocity at exactly those places."""
+    small = (max(1, height // every), max(1, width // every))
+    wall = SceneObject("wall", 1, (Part(primitives.cuboid(), Material(unlit=True)),), drift((-1.0, 4, 0), (1.0, 4.5, 0)))
+    camera = Camera(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2, still(rotation=LEVEL))
+    with Renderer(gl, Scene((wall,), camera, 0, SECOND), PLAIN) as renderer:
+        made = renderer.velocity(0, every), renderer.motion(0, every), renderer.brightness(0, every)
+        assert all(a.shape == (*small, 2) and a.dtype == np.float32 for a in made)
+    fewer = Camera(small[1], small[0], camera.fx * small[1] / width, camera.fy * small[0] / height, (small[1] - 1) / 2, (small[0] - 1) / 2, camera.path)
+    with Renderer(gl, Scene((wall,), fewer, 0, SECOND), PLAIN) as renderer:
+        np.testing.assert_allclose(made[0], renderer.velocity(0) * (width / small[1], height / small[0]), rtol=1e-4, atol=1e-4)
+
+
 # ---- matrices ----------------------------------------------------------------------------------------------------
 
 
@@ -221,3 +235,32 @@ def test_occlusion_by_hand():
     gone = occlusion_mask(flow, depth, valid, ids, np.full_like(depth, 4), np.ones_like(ids))
     np.testing.assert_array_equal(gone[0], [False, False, False, True, True, True]), "outside the image is not visible"
     assert not occlusion_mask(flow, depth, ~valid, ids, depth_next, ids_next).any()
+
+
+def flat_patch(depths, size=6):
+    """(ids, depth) of an image that shows object 1 alone, at one depth or one per column."""
+    return np.ones((size, size), np.uint32), np.broadcast_to(np.asarray(depths, np.float32), (size, size)).copy()
+
+
+@pytest.mark.parametrize("nearer_id", [1, 2])
+@pytest.mark.parametrize("by, hidden", [(0.002, True), (0.01, True), (0.0005, False)])
+def test_a_surface_nearer_by_more_than_a_thousandth_hides(nearer_id, by, hidden):
+    """Whether it is another object or another side of the same one: leaves of a book, a cup's wall behind its front."""
+    ids, depth = flat_patch(2.0)
+    shown, at = np.full_like(ids, nearer_id), depth * np.float32(1 - by)
+    mask = occlusion_mask(np.full((6, 6, 2), 0.3, np.float32), depth, np.ones((6, 6), bool), ids, at, shown)
+    assert (mask[1:-1, 1:-1] == hidden).all()
+
+
+@pytest.mark.parametrize("spreads, hidden", [(0.45, False), (0.55, True), (1.5, True), (-3.0, False)])
+def test_half_of_the_spread_around_is_allowed_to_a_curved_surface(spreads, hidden):
+    """1/Z at t' goes up by a tenth per column; the point lies that many times a column's difference behind the mean of its neighbours
+    (besides a thousandth of tolerance)."""
+    inverse = 0.5 * (1 + 0.1 * np.arange(6))
+    ids, depth_next = flat_patch(1 / inverse)
+    flow = np.full((6, 6, 2), 0.5, np.float32)  # between two columns: the mean of both
+    mean = (inverse[:-1] + inverse[1:]) / 2
+    w_next = np.full((6, 6), 1.0, np.float32)
+    w_next[:, :-1] = 1 / ((mean - spreads * 0.05) / 1.001)
+    mask = occlusion_mask(flow, w_next, np.ones((6, 6), bool), ids, depth_next, ids)
+    assert (mask[:-1, :-1] == hidden).all()

@@ -9,7 +9,7 @@ import pytest
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Esim
-from blinkgl.render.renderer import Renderer
+from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.still import Rectangle, merged, screen_rectangle
 from blinkgl.scene.paths import KeyframePath
 from blinkgl.scene.types import Camera, Part, SceneObject
@@ -83,6 +83,47 @@ def test_other_passes_in_between_do_not_disturb(gl):
             quick.velocity(t, 4)
             quick.colour(t)
             quick.luminance(t, out=np.empty_like(out))  # another array, then the first again
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_order_of_kinds_and_arrays(gl, seed):
+    """Which array holds what is known: frames with and without rates, into old, new and swapped arrays, at times that go back and forth."""
+    rng, world = np.random.default_rng(seed), mixed_scene(48, 36, camera_moves=False)
+    arrays = [np.empty((36, 48), np.float32) for _ in range(3)]
+    true_rate, before = np.empty((36, 48), np.float32), None
+    with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
+        for t in rng.integers(0, SECOND, 60).tolist():
+            out, rate = arrays[rng.integers(2)], [None, arrays[2], np.empty_like(true_rate)][rng.integers(3)]
+            image = quick.luminance(t, out=out, rate=rate)
+            np.testing.assert_array_equal(image, slow.luminance(t, rate=true_rate))
+            if rate is not None:
+                np.testing.assert_array_equal(rate, true_rate)
+            if before is not None:
+                outside = np.ones_like(image, bool)
+                for r in quick.changed:
+                    outside[r.y0:r.y1, r.x0:r.x1] = False
+                np.testing.assert_array_equal(image[outside], before[outside])
+            before = image.copy()
+
+
+def test_another_camera_takes_nothing_from_the_first(gl):
+    """look_through: luminance, what has changed in it, and the surfaces that hide points at t' are the other camera's."""
+    world = mixed_scene(48, 36, camera_moves=False)
+    other = replace(world.camera, cx=world.camera.cx - 20, fx=world.camera.fx * 1.3)
+    request = LabelRequest(flow_forward=True, occlusion=True)
+    with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, replace(world, camera=other), PLAIN) as fresh:
+        out = np.empty((36, 48), np.float32)
+        for t in (0, SECOND // 9):
+            renderer.luminance(t, out=out)
+        assert renderer.changed and renderer.changed_rows is not None
+        renderer.labels(0, request, SECOND // 9)
+        renderer.look_through(other)
+        assert renderer.changed is None and renderer.changed_rows is None
+        np.testing.assert_array_equal(renderer.luminance(SECOND // 9, out=out), fresh.luminance(SECOND // 9))
+        assert renderer.changed is None
+        a, b = (r.labels(0, request, SECOND // 9).forward for r in (renderer, fresh))
+        np.testing.assert_array_equal(a.flow, b.flow)
+        np.testing.assert_array_equal(a.occluded, b.occluded)
 
 
 def test_changes_are_where_they_are_said_to_be(gl):

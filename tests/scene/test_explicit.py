@@ -12,6 +12,7 @@ from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.explicit import pose_matrix
+from blinkgl.scene.paths import body_rate
 from tests.scene.gltf_files import GltfBuilder
 
 CAMERA = CameraConfig(width=64, height=48)
@@ -114,6 +115,50 @@ def test_materials_meshes_and_scale(tmp_path):
     assert scene.light.sun == 2 and scene.light.sun_direction == pytest.approx((0, 0, 1), abs=1e-12)
 
 
+@pytest.mark.parametrize("suffix, up, expected", [
+    ("glb", "auto", "y"), ("glb", "y", "y"), ("glb", "z", "z"), ("obj", "auto", "z"), ("obj", "z", "z"),
+    ("obj", "y", "y"),
+])
+def test_which_axis_of_a_file_points_up(tmp_path, suffix, up, expected):
+    """The file's (x, y, z) = (1, 2, 3) is drawn there, or at (x, -z, y) when y points up."""
+    corners = [[1, 2, 3], [2, 2, 3], [1, 5, 3]]
+    if suffix == "glb":
+        builder = GltfBuilder()
+        builder.node(mesh=builder.mesh(corners, [[0, 1, 2]]))
+        (tmp_path / "a.glb").write_bytes(builder.glb())
+    else:
+        (tmp_path / "a.obj").write_text("".join("v {} {} {}\n".format(*c) for c in corners) + "f 1 2 3\n")
+    scene = build(tmp_path, meshes={"a": {"file": f"a.{suffix}", "up": up}}, objects=[{"mesh": "a"}])
+    want = [(x, -z, y) if expected == "y" else (x, y, z) for x, y, z in corners]
+    np.testing.assert_allclose(sorted(scene.objects[0].parts[0].mesh.vertices.tolist()), sorted(want), atol=1e-12)
+    with pytest.raises(ConfigError, match="up belongs to a file, not to a primitive"):
+        build(tmp_path, meshes={"a": {"primitive": "cuboid", "up": "y"}}, objects=[{"mesh": "a"}])
+
+
+@pytest.mark.parametrize("before, after, step", [
+    ([0, 0, 0], [0, 0, 40000], "40000 degrees about z"), (None, [0, 200, 0], "200 degrees about y"),
+    ([-90, 0, 0], [90, 0, 0], "180 degrees about x"),
+    ([0, 0, 179], [0, 0, -179], "358 degrees about z"),
+])
+def test_a_turn_that_has_no_shortest_way_is_refused(tmp_path, before, after, step):
+    keys = [{"time": 0}, {"time": 0.5}, {"time": 1}]
+    keys[1] |= {"euler": before} if before else {}
+    keys[2] |= {"euler": after}
+    with pytest.raises(ConfigError) as error:
+        build(tmp_path, camera={"keyframes": keys})
+    assert f"scene.camera: euler changes by {step} from key frame 1 to 2; it must be less than 180" in str(error.value)
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "spline"])
+def test_a_turn_goes_as_far_as_is_said(tmp_path, interpolation):
+    """Two and a half turns in steps of 150 degrees: the integrated rate is 900 degrees."""
+    keys = [{"time": k / 6, "euler": [0, 0, 150 * k]} for k in range(7)]
+    path = build(tmp_path, objects=[{"mesh": "box", "keyframes": keys, "interpolation": interpolation}]).objects[0].path
+    rates = [body_rate(path.pose(t), path.derivative(t))[2] for t in np.linspace(0, 1e9, 1000,
+                                                                                 endpoint=False).astype(int)]
+    assert np.degrees(np.mean(rates)) == pytest.approx(900, rel=1e-3)
+
+
 def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
     builder = GltfBuilder()
     builder.tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 0.25, 1]}, "doubleSided": True}]
@@ -143,9 +188,9 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
     ({"materials": {"m": {"texture": "a.png", "procedural": "dots"}}}, "scene.materials.m: only one of texture, procedural, photograph may be given, not texture and procedural"),
     ({"materials": {"m": {"photograph": "lena"}}}, "scene.materials.m.photograph: no such photograph (got 'lena')"),
     ({"camera": {"euler": [0, 0, 0], "look_at": [1, 0, 0]}}, "scene.camera: only one of quaternion, euler, look_at may be given, not euler and look_at"),
-    ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera: a quaternion must not be zero"),
-    ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera: one key frame is no motion"),
-    ({"camera": {"keyframes": [{"time": 1}, {"time": 1}]}}, "scene.camera: the key frames' times must increase"),
+    ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera.quaternion: a quaternion must not be zero"),
+    ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera.keyframes: one key frame is no motion"),
+    ({"camera": {"keyframes": [{"time": 1}, {"time": 1}]}}, "scene.camera.keyframes.1.time: the key frames' times must increase"),
     ({"camera": {"position": [1, 0, 0], "keyframes": [{"time": 0}, {"time": 1}]}}, "scene.camera: give a fixed pose or keyframes, not both"),
 ])
 def test_bad_input(tmp_path, tree, expected):

@@ -291,7 +291,8 @@ def test_obj_materials(tmp_path):
     assert len(load_asset(tmp_path / "a.obj", keep_materials=False).parts) == 1
     (tmp_path / "b.obj").write_text("mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     plain = load_asset(tmp_path / "b.obj")
-    assert plain.log == ("b.obj: 'gone.mtl' is missing, done without it",) and not plain.has_materials
+    assert plain.omissions == ("b.obj asks for what is not drawn: 'gone.mtl', which is missing",
+                               ) and not plain.has_materials
 
 
 def test_corrupt_image_in_a_folder_is_named_or_skipped(tmp_path):

@@ -117,3 +117,7 @@ def test_hash_is_of_the_parameters():
     assert P.sphere().source_hash == P.sphere(radius=0.5).source_hash != P.sphere(radius=0.6).source_hash
     # pinned: a published data set's splits depend on it
     assert P.cuboid().source_hash == "55684c5d222dadfe09b8cc81c42433ea"
+
+
+def test_every_parameter_is_documented():
+    assert {name for kind in P.BUILDERS for name in P.parameters(kind)} == set(P.PARAMETERS)

@@ -136,6 +136,66 @@ def test_a_huge_claim_is_refused_before_decoding(tmp_path):
         I.load_image(tmp_path / "a.png")
 
 
+def large_png(width: int, height: int) -> bytes:
+    """A black 1-bit PNG of any size in a few kB, made without an image in memory."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    packer, row = zlib.compressobj(9), b"\0" * (1 + (width + 7) // 8)
+    data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR",
+                                        struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)) + chunk(b"IDAT",
+                                                                                                       data) + chunk(b"IEND", b"")
+
+
+def test_pillows_guard_is_not_ours_and_stays_as_it_is(monkeypatch):
+    """Images within our own limit load however low the process has set Pillow's, and nobody's setting is changed."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    image = I.decode_image(large_png(301, 200), 100, "a.png")
+    assert image.shape == (66, 100, 3) and Image.MAX_IMAGE_PIXELS == 1000
+    with pytest.raises(Image.DecompressionBombError):
+        Image.open(io.BytesIO(large_png(301, 200)))
+
+
+@pytest.mark.slow
+def test_the_largest_image_that_is_documented_loads():
+    assert I.decode_image(large_png(16384, 16384), 64, "a.png").shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize("width, height", [(60_000, 60_000), (16_384, 16_385), (2_000_000, 1)])
+def test_a_claim_beyond_the_limit_names_size_and_limit(width, height):
+    data = large_png(8, 8)
+    data = data[:16] + width.to_bytes(4, "big") + height.to_bytes(4, "big") + data[24:]
+    import zlib
+    data = data[:29] + zlib.crc32(data[12:29]).to_bytes(4, "big") + data[33:]
+    with pytest.raises(AssetError) as error:
+        I.decode_image(data, 64, "a.png")
+    assert str(error.value) == f"a.png: the image is too large (got '{width}x{height}'); expected at most 268 Mpx, as 16384x16384 has"
+
+
+def test_shrinking_in_blocks_is_shrinking_at_once(monkeypatch):
+    image = np.random.default_rng(0).integers(0, 256, (301, 217, 3), dtype=np.uint8)
+    for max_size in (300, 128, 7):
+        whole = I.shrink(image, max_size)
+        monkeypatch.setattr(I, "_BLOCK_PIXELS", 2000)
+        assert len(I._blocks(301, 217)) > 10
+        assert np.abs(I.shrink(image,
+                               max_size).astype(int) - whole).max() <= 1      # the float32 sums differ in their last bit
+        monkeypatch.undo()
+        linear = linear_from_srgb(image / 255.0).astype(np.float32)
+        reference = cv2.resize(linear, whole.shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(linear_from_srgb(whole / 255.0) - reference).max() < 6e-3       # half a code, at its widest
+
+
+def test_no_other_program_is_run_for_a_texture():
+    """Pillow hands EPS to Ghostscript: it is none of a texture's formats, whatever its name."""
+    with pytest.raises(AssetError, match="corrupt or of an unknown format; expected one of PNG, JPEG"):
+        I.decode_image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n", 64, "a.png")
+
+
 def test_missing_image(tmp_path):
     with pytest.raises(AssetError, match="cannot read the image: No such file"):
         I.load_image(tmp_path / "none.png")

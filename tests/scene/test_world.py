@@ -8,10 +8,11 @@ import pytest
 
 from blinkgl.config.base import validate
 from blinkgl.config.scene import ExplicitSceneConfig, LightConfig, ObjectsConfig, PoolConfig, RandomSceneConfig, RegionConfig, SkyConfig, TexturesConfig, WallsConfig
-from blinkgl.config.sequence import CameraConfig
+from blinkgl.config.sequence import CameraConfig, near_corner
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
-from blinkgl.scene.world import make_light, near_corner, pools
+from blinkgl.scene.types import Light
+from blinkgl.scene.world import make_light, pools
 from tests.shared_data import shared
 
 CAMERA = CameraConfig(width=96, height=72)
@@ -199,15 +200,15 @@ def message(make):
 
 @pytest.mark.parametrize("tree, expected", [
     ({"objects": {"cuont": 3}}, "scene.objects.cuont: unknown key; expected 'count' (nearest)"),
-    ({"objects": {"count": -1}}, "scene.objects.count: input should be greater than or equal to 0 (got -1)"),
+    ({"objects": {"count": -1}}, "scene.objects.count: too small (got -1)"),
     ({"objects": {"size": [2, 1]}}, "scene.objects.size: the range must be [smallest, largest] (got [2, 1])"),
-    ({"objects": {"size": [0, 1]}}, "scene.objects.size.0: input should be greater than 0 (got 0)"),
+    ({"objects": {"size": [0, 1]}}, "scene.objects.size.0: too small (got 0)"),
     ({"pool": {"primitives": ["cube"]}}, "scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid (got ['cube'])"),
     ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),
-    ({"pool": {"test_fraction": 1.5}}, "scene.pool.test_fraction: input should be less than or equal to 1 (got 1.5)"),
+    ({"pool": {"test_fraction": 1.5}}, "scene.pool.test_fraction: too large (got 1.5); expected a number from 0 to 1"),
     ({"textures": {"procedural": ["noise"]}}, "scene.textures.procedural: must be true, false or a list of value, perlin,"),
-    ({"sky": {"size": 20}}, "scene: sky.size 20 must be at least 36 to hold the region and its objects"),
-    ({"region": {"height": 0.5}}, "scene: region.camera_height must begin below region.height 0.5"),
+    ({"sky": {"size": 20}}, "scene.sky.size: must be at least 36 to hold the region and its objects (got 20.0)"),
+    ({"region": {"height": 0.5}}, "scene.region.camera_height: must begin below region.height 0.5 (got [1.0, 3.5])"),
 ])
 def test_configuration_errors(tree, expected):
     assert message(lambda: validate(RandomSceneConfig, tree, where="scene")).startswith(expected)
@@ -242,3 +243,7 @@ def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_pa
     scene = module.random_world(config(), CAMERA, 0, 10**9, "train", 3, 0, tmp_path)
     assert len(drawn) >= 2 and not np.allclose(drawn[0].pose(5 * 10**8), drawn[1].pose(5 * 10**8))
     assert scene.camera.path is drawn[-1]
+
+
+def test_there_is_one_set_of_light_defaults():
+    assert Light() == make_light(LightConfig()) and Light().sun == LightConfig().sun and Light().sky == LightConfig().sky

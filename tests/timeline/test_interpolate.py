@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from scipy.interpolate import PchipInterpolator
 from skimage import data
 
+from blinkgl.errors import EventDataError
 from blinkgl.timeline import interpolate
 
 
@@ -75,3 +77,11 @@ def test_motion_inserts_nothing_where_nothing_moves():
 def test_motion_is_bounded():
     out = list(interpolate.motion([(scene(0), 0), (scene(16), 10**6)], max_px=0.01, most=8))
     assert len(out) == 9
+
+
+def test_motion_of_frames_too_small_for_dense_flow():
+    for size in ((16, 16), (16, 300), (300, 16), (17, 130)):
+        assert len(list(interpolate.motion([(np.zeros(size, np.float32), t) for t in (0, 10)]))) == 2
+    for size in ((15, 300), (300, 15), (12, 64), (1, 1)):
+        with pytest.raises(EventDataError, match=f"too small for dense flow .got '{size[1]}x{size[0]}'.; expected at least 16x16"):
+            list(interpolate.motion([(np.zeros(size, np.float32), t) for t in (0, 10)]))

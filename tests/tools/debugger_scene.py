@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 from blinkgl.gl.shader import shader_folder
@@ -71,3 +72,50 @@ MISTAKES = {
     "no perspective division": ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
     "depth off by near": ("label.glsl", "depth = 1.0 / gl_FragCoord.w", "depth = 1.0 / gl_FragCoord.w - 0.05"),
 }
+
+_UV = "float luminance = texture(albedo, uv).r;"
+
+LOOKUP_MISTAKES = {
+    # name: ([(file, right, wrong), …], the first buffer that is wrong, words of the suspicion, the objects)
+    "noperspective varying": (
+        [("luminance.glsl", "out vec2 uv;", "noperspective out vec2 uv;"), ("luminance.glsl", "in vec2 uv;", "noperspective in vec2 uv;")],
+        "luminance_uv", "without perspective", {"floor"}),
+    "sRGB decoded twice": (
+        [("label.glsl", "radiance *= texture(albedo, uv).rgb;", "radiance *= pow(texture(albedo, uv).rgb, vec3(2.2));")],
+        "colour_albedo", "sRGB is decoded twice", {"floor", "ball"}),
+    "mip bias +1": ([("luminance.glsl", _UV, _UV.replace("uv)", "uv, 1.0)"))], "luminance_level", "a mip bias of +1", {"floor", "ball"}),
+    "uv off by half a texel": (
+        [("luminance.glsl", _UV, _UV.replace("uv)", "uv + 0.5 / vec2(textureSize(albedo, 0)))"))],
+        "luminance_uv", "shifted by half a texel (+0.5, +0.5)", {"floor", "ball"}),
+    # thought of when the debugger was done
+    "normal not normalised": (
+        [("include/light.glsl", "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    return", "vec3 n = normal;\n    return")],
+        "luminance_light", "the interpolated normal is not normalised", {"ball"}),
+    "width and height exchanged": (
+        [("include/motion.glsl", "* gl_FragCoord.w * 0.5 * image_size;", "* gl_FragCoord.w * 0.5 * image_size.yx;")],
+        "velocity", "x is 0.75 times, y 1.333 times", {"floor", "ball", "box", "passing"}),
+    "two-sided normal reversed": (
+        [("luminance.glsl", "gl_FrontFacing ? normal : -normal", "gl_FrontFacing ? -normal : normal")],
+        "luminance_light", "the normal points the other way", {"floor"}),
+}  # fmt: skip
+
+
+class LatePath:
+    """A pose path that is behind by ``late_ns``: a stale pose."""
+
+    def __init__(self, path, late_ns: int):
+        self.path, self.late_ns, self.is_static = path, late_ns, path.is_static
+
+    def pose(self, t_ns: int):
+        return self.path.pose(t_ns - self.late_ns)
+
+    def derivative(self, t_ns: int):
+        return self.path.derivative(t_ns - self.late_ns)
+
+
+def with_stale_pose(scene, name: str, late_ns: int):
+    """The scene with one object (or "camera") where it was ``late_ns`` ago."""
+    if name == "camera":
+        return replace(scene, camera=replace(scene.camera, path=LatePath(scene.camera.path, late_ns)))
+    late = [replace(o, path=LatePath(o.path, late_ns)) if o.name == name else o for o in scene.objects]
+    return replace(scene, objects=tuple(late))

@@ -1,16 +1,23 @@
-"""docs/configuration.md says what the models say."""
+"""The pages of keys say what the models say."""
 
 from pathlib import Path
 
-from blinkgl.tools.config_docs import page
+import pytest
+
+from blinkgl.tools.config_docs import eflow_page, page
+
+PAGES = {"docs/configuration.md": (page, "python -m blinkgl.tools.config_docs"), "docs/eflow_configuration.md": (eflow_page, "python -m blinkgl.tools.config_docs eflow")}
 
 
-def test_the_page_is_up_to_date():
-    written = (Path(__file__).parents[2] / "docs/configuration.md").read_text()
-    assert written == page(), "run: python -m blinkgl.tools.config_docs > docs/configuration.md"
+@pytest.mark.parametrize("name", PAGES)
+def test_the_page_is_up_to_date(name):
+    made, command = PAGES[name]
+    written = (Path(__file__).parents[2] / name).read_text()
+    assert written == made(), f"run: {command} > {name}"
 
 
-def test_every_key_is_explained():
-    rows = [line for line in page().splitlines() if line.startswith("| `")]
+@pytest.mark.parametrize("made", [page, eflow_page])
+def test_every_key_is_explained(made):
+    rows = [line for line in made().splitlines() if line.startswith("| `")]
     silent = [row for row in rows if row.rstrip(" |").endswith("|") or row.split("|")[-2].strip() == ""]
-    assert [r for r in silent if not r.startswith(("| `kind`", "| `emulator`", "| `category`"))] == []
+    assert [r for r in silent if not r.startswith(("| `kind`", "| `emulator`", "| `name`", "| `category`"))] == []

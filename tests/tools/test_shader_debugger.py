@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
-from debugger_scene import HEIGHT, MISTAKES, WIDTH, edit
+from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -14,13 +17,15 @@ from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl import create_context
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.resources import SceneResources
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.paths import KeyframePath, StaticPath
 from blinkgl.scene.primitives import grid
 from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject, Texture
-from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, suspicions
+from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session
 from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
 
+DEMO = str(Path(__file__).parents[2] / "configs/demo.yaml")
 T, T_NEXT, T_LAST = 100_000_000, 200_000_000, 0
 
 
@@ -57,7 +62,7 @@ def test_passes_writes_every_buffer_that_generation_renders(written, world):
         assert arrays[name].dtype == expected.dtype, name
         np.testing.assert_array_equal(arrays[name], expected, err_msg=name)
     np.testing.assert_allclose(arrays["log_luminance"], np.log(luminance + np.float32(config.events.log_eps)), rtol=1e-6)
-    assert arrays["uv"].shape == (HEIGHT, WIDTH, 2) and arrays["mip_level"].shape == (HEIGHT, WIDTH)
+    assert arrays["luminance_uv"].shape == (HEIGHT, WIDTH, 2) and arrays["colour_level"].shape == (HEIGHT, WIDTH)
     assert not arrays["valid_forward"][labels.ids == 4].any() and (labels.ids == 4).any()  # the pane passes the camera
 
 
@@ -71,8 +76,9 @@ def test_pictures_are_labelled_and_large_enough(written):
 
 
 def test_only_the_passes_asked_for(shader, config, tmp_path):
-    status, out, _ = shader("passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "uv", "--time", 0.25)
-    assert status == 0 and sorted(p.name for p in (tmp_path / "o").iterdir()) == ["contact_sheet.png", "depth.npy", "depth.png", "uv.npy", "uv.png"]
+    status, out, _ = shader("passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "colour_uv", "--time", 0.25)
+    assert status == 0 and sorted(p.name for p in (tmp_path / "o").iterdir()) == ["colour_uv.npy", "colour_uv.png", "contact_sheet.png",
+                                                                                      "depth.npy", "depth.png"]
 
 
 # ------------------------------------------------------------------------------------------------- against the reference
@@ -84,7 +90,7 @@ def both(config):
     when = moment(subject)
     with open_renderer(subject) as renderer:
         gpu, ref = moments.GpuMoment(renderer, when, subject.log_eps), moments.ReferenceMoment(subject.scene, when, subject.log_eps)
-        for name in (*moments.PASSES, "part", "local", "shade", "window", "next_depth_forward", "next_depth_backward"):
+        for name in (*moments.PASSES, "part", "window", "next_depth_forward", "next_depth_backward"):
             gpu[name]
         comparison = compare.Comparison(gpu, ref)
         reports = {name: comparison.report(name) for name in comparison.names()}
@@ -96,8 +102,8 @@ def test_every_buffer_agrees(both):
     assert set(reports) == set(compare.QUANTITIES)
     for name, report in reports.items():
         assert report.passed, (name, report.value)
-        assert report.graded.mean() > 0.8, name
-    assert np.ptp(gpu["mip_level"]) > 3 and np.abs(gpu["dL_dt"]).max() > 1
+        assert report.graded.mean() > (0.4 if name == "local" else 0.8), name  # where something is drawn
+    assert np.ptp(gpu["luminance_level"]) > 3 and np.abs(gpu["dL_dt"]).max() > 1
 
 
 def test_debug_pass_draws_the_same_fragments(both):
@@ -107,8 +113,25 @@ def test_debug_pass_draws_the_same_fragments(both):
     np.testing.assert_array_equal(ids[gpu["part"]], gpu["id"])
     hit = gpu["id"] != 0
     np.testing.assert_allclose(1 / gpu["window"][..., 3][hit], gpu["depth"][hit], rtol=1e-6)
-    np.testing.assert_allclose(gpu["luminance"][hit], (gpu["shade"][..., 0] * gpu["shade"][..., 1])[hit], rtol=2e-6)
-    np.testing.assert_allclose(gpu["colour"][hit], (gpu["albedo"] * gpu["irradiance"][..., None])[hit], rtol=1e-5, atol=1e-7)
+
+
+def test_look_ups_are_those_of_the_pass_itself(both):
+    """The variant that shows them writes the very picture of the pass, and what it shows makes that picture."""
+    gpu, ref, _, _ = both
+    gpu.renderer.gl.make_current()
+    hit, textured = gpu["id"] != 0, ref["texture_size"][..., 0] > 1
+    for name in ("luminance", "colour"):
+        shown = gpu.renderer.lookups(name, T)
+        np.testing.assert_array_equal(shown["result"], gpu[name])
+        product = gpu[f"{name}_albedo"] * gpu[f"{name}_light"][..., None]
+        np.testing.assert_allclose((product if name == "colour" else product[..., 0])[hit], gpu[name][hit], rtol=1e-6)
+        np.testing.assert_array_equal(gpu[f"{name}_count"][hit], textured[hit].astype(np.float32))
+    np.testing.assert_array_equal(gpu["luminance_uv"], gpu["colour_uv"])
+
+
+def test_the_mip_bias_of_a_configuration_is_no_error(shader, config):
+    status, out, _ = shader("diff", config, "--set", "render.mip_bias=-1", "--pass", "luminance_level", "--pass", "luminance_albedo")
+    assert status == 0, out
 
 
 def test_derivative_of_luminance_of_a_sliding_cosine(gl):
@@ -246,9 +269,20 @@ def test_ulps():
 def test_diff_of_the_shipped_shaders_is_clean(shader, config, tmp_path):
     some = ("--pass", "depth", "--pass", "flow_forward", "--pass", "luminance")
     status, out, _ = shader("diff", config, "--time", 0.1, *some, "--out", tmp_path / "d")
-    assert status == 0 and "all 3 buffers agree" in out and "silhouette band" in out and "no mip maps" in out
+    assert status == 0 and "all 3 buffers agree" in out and "silhouette band" in out and "own albedo times its own light" in out
     assert (tmp_path / "d" / "diff.png").stat().st_size > 10_000
     assert np.load(tmp_path / "d" / "depth_error.npy").shape == (HEIGHT, WIDTH)
+
+
+def test_a_full_disk_names_the_user_s_file(shader, config, tmp_path, monkeypatch):
+    def full(file, array, **more):
+        raise OSError(errno.ENOSPC, "No space left on device", file.name)
+
+    monkeypatch.setattr(np, "save", full)
+    for command, more in (("passes", ()), ("diff", ("--tolerance", "1"))):
+        status, _, err = shader(command, config, "--pass", "depth", *more, "--out", tmp_path / command)
+        assert status == 2 and err.startswith(f"error: {tmp_path / command}/depth") and "no space left" in err and "blinkgl-tmp" not in err
+        assert [p.name for p in (tmp_path / command).iterdir()] == []
 
 
 def test_tolerances(shader, config):
@@ -256,8 +290,11 @@ def test_tolerances(shader, config):
     report = json.loads(out)
     assert status == 1 and not report["passed"]
     assert [(b["buffer"], b["passed"]) for b in report["buffers"]] == [("depth", False), ("id", True)]
-    worst = report["buffers"][0]["worst"]
-    assert len(worst) == 10 and [w["error"] for w in worst] == sorted((w["error"] for w in worst), reverse=True)
+    objects = report["buffers"][0]["objects"]
+    assert {o["object"] for o in objects} == {"floor", "ball", "box", "passing", "nothing hit"}
+    assert [o["max"] for o in objects] == sorted((o["max"] for o in objects), reverse=True)
+    assert sum(o["pixels"] for o in objects) == report["buffers"][0]["off_silhouettes"]["pixels"]
+    assert report["first"]["buffer"] == "depth" and {o["object"] for o in report["objects"]} == {"floor", "ball", "box", "passing"}
     assert sum(report["buffers"][0]["histogram"].values()) == report["buffers"][0]["off_silhouettes"]["pixels"]
 
 
@@ -275,27 +312,108 @@ def test_a_broken_shader_is_found(shader, config, shaders, mistake):
     reports = {b["buffer"]: b for b in json.loads(out)["buffers"]}
     assert status == 1 and not reports[buffer]["passed"]
     assert reports[buffer]["suspicions"][0].startswith(suspicion)
-    unharmed = {"id", "velocity", "normals", "luminance", "colour", "albedo", "uv"} | ({"depth"} if buffer != "depth" else {"flow_forward"})
+    unharmed = {"local", "id", "velocity", "normals", "luminance", "colour", "luminance_albedo", "colour_uv"} | ({"depth"} if buffer != "depth" else {"flow_forward"})
     assert all(reports[name]["passed"] for name in unharmed)
 
-    worst = reports[buffer]["worst"][0]
+    worst = reports[buffer]["objects"][0]
     status, out, _ = shader("probe", config, "--shaders", shaders, "--pixel", f"{worst['x']},{worst['y']}")
     marked = [line for line in out.splitlines() if line.startswith("!!")]
     assert status == 0 and any(line[3:].startswith(title) for line in marked)
 
 
+@pytest.mark.parametrize("mistake", LOOKUP_MISTAKES)
+def test_a_mistaken_look_up_is_named_as_such(shader, config, shaders, mistake):
+    edits, buffer, suspicion, objects = LOOKUP_MISTAKES[mistake]
+    for file, right, wrong in edits:
+        edit(shaders / file, right, wrong)
+    status, out, _ = shader("diff", config, "--shaders", shaders)
+    lines = out.splitlines()
+    assert status == 1
+    assert lines[0].startswith(f"The first that is wrong: {moments.PASSES[buffer].title} (")
+    assert "it looks as if: " in lines[1] and suspicion in lines[1]
+    named = lines[0].partition(", on ")[2].split(", ")
+    assert set(named) == objects
+    for name in objects:  # one line each, with a pixel to look at
+        row = [line for line in lines if line.startswith(f"  {name} ") and moments.PASSES[buffer].title in line]
+        assert len(row) == 1 and re.search(r"\(\d+, \d+\)", row[0])
+
+
+@pytest.mark.parametrize("who, objects", [("ball", {"ball"}), ("passing", {"passing"}), ("camera", {"floor", "ball", "box", "passing"})])
+def test_a_stale_pose_is_named_with_its_time(shader, config, monkeypatch, who, objects):
+    class Stale(DebugRenderer):
+        def __init__(self, gl, scene, render):
+            super().__init__(gl, with_stale_pose(scene, who, 20_000_000), render)
+
+    monkeypatch.setattr(session, "DebugRenderer", Stale)
+    status, out, _ = shader("diff", config, "--json")
+    found = json.loads(out)
+    assert status == 1 and found["first"]["buffer"] == "local" and set(found["first"]["objects"]) == objects
+    who = "the camera is" if who == "camera" else f"{who} is drawn"
+    assert found["first"]["suspicions"] == [f"{who} where it is at t = 0.08 s, 0.02 s earlier: a stale pose"]
+
+
+def test_a_backward_flow_that_runs_forward_is_named(shader, config, monkeypatch):
+    class Forward(DebugRenderer):
+        def labels(self, t_ns, request, t_forward_ns=None, t_backward_ns=None):
+            return super().labels(t_ns, request, t_forward_ns, t_forward_ns)
+
+    monkeypatch.setattr(session, "DebugRenderer", Forward)
+    status, out, _ = shader("diff", config, "--json")
+    first = json.loads(out)["first"]
+    assert status == 1 and first["buffer"] == "flow_backward" and first["suspicions"][0].startswith("the forward flow (")
+
+
+def test_another_object_s_texture_is_named(shader, config, monkeypatch):
+    own = SceneResources.luminance_texture
+    monkeypatch.setattr(SceneResources, "luminance_texture", lambda self, material: own(self, next(i.material for i in self.items if i.textured)))
+    status, out, _ = shader("diff", config, "--json")
+    first = json.loads(out)["first"]
+    assert status == 1 and (first["buffer"], first["objects"]) == ("luminance_albedo", ["floor"])
+    assert first["suspicions"][0].startswith("the texture of ball (")
+
+
+@pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0")])
+def test_right_shaders_raise_no_suspicion(shader, config, more):
+    status, out, _ = shader("diff", config, *more)
+    assert status == 0 and "looks as if" not in out and "FAIL" not in out
+
+
+def test_right_shaders_raise_no_suspicion_in_a_random_scene(shader):
+    status, out, _ = shader("diff", DEMO, "--set", "camera.width=120", "--set", "camera.height=90", "--time", "0.1")
+    assert status == 0 and "looks as if" not in out, out
+
+
+def pretend(comparison, name: str, wrong: np.ndarray) -> list[str]:
+    """Suspicions if the GPU had written ``wrong``."""
+    gpu = comparison.gpu
+    original = gpu[name]
+    try:
+        gpu._made[name] = wrong
+        return comparison.report(name).suspicions
+    finally:
+        gpu._made[name] = original
+
+
 def test_suspicions_want_evidence(both):
-    gpu, ref, _, _ = both
+    _, ref, comparison, _ = both
     right = ref["flow_forward"]
-    everywhere = ref.frame.hit
     noise = np.random.default_rng(0).normal(0, 1, right.shape)
-    assert suspicions.suspicions("flow_forward", right + noise, right, everywhere, 1e-2, gpu, ref) == []
-    found = suspicions.suspicions("flow_forward", right[..., ::-1], right, everywhere, 1e-2, gpu, ref)
-    assert found[0].startswith("x and y are exchanged")
+    assert pretend(comparison, "flow_forward", right + noise) == []
+    assert pretend(comparison, "flow_forward", right[..., ::-1])[0].startswith("x and y are exchanged")
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     camera = ref.scene.camera
     along = ref["depth"] * np.sqrt(1 + ((x - camera.cx) / camera.fx) ** 2 + ((y - camera.cy) / camera.fy) ** 2)
-    assert suspicions.suspicions("depth", along, ref["depth"], everywhere, 1e-5, gpu, ref)[0].startswith("distance along the ray")
+    assert pretend(comparison, "depth", along)[0].startswith("distance along the ray")
+
+
+def test_a_suspicion_about_one_object_names_it(both):
+    _, ref, comparison, _ = both
+    ball = comparison.owner("colour") == comparison.objects.index("ball")
+    box = comparison.owner("colour") == comparison.objects.index("box")
+    wrong = comparison.gpu["colour"].copy()
+    wrong[ball] = 2 * wrong[ball]
+    wrong[box] = np.random.default_rng(0).uniform(0, 1, wrong[box].shape)
+    assert [text.partition(" (")[0] for text in pretend(comparison, "colour", wrong)] == ["ball: twice the right value"]
 
 
 def test_nothing_written_where_the_gpu_says_nan(both):
@@ -310,4 +428,4 @@ def test_nothing_written_where_the_gpu_says_nan(both):
         report = comparison.report("depth")
     finally:
         comparison.gpu._made["depth"] = original
-    assert report.value == np.inf and report.tolerance == quantity.tolerance and (report.worst[0]["x"], report.worst[0]["y"]) == (x, y)
+    assert report.value == np.inf and report.tolerance == quantity.tolerance and (report.objects[0]["x"], report.objects[0]["y"]) == (x, y)

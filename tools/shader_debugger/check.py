@@ -16,7 +16,7 @@ from blinkgl.gl.shader import STAGES, ShaderError, ShaderSource, expand
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.tools.shader_debugger.preprocess import active_lines
 from blinkgl.tools.shader_debugger.session import EditedFolder, files_of, open_folder
-from blinkgl.tools.shader_debugger.variants import variants
+from blinkgl.tools.shader_debugger.variants import lookups, variants
 
 _DECLARATION = re.compile(
     r"^\s*(?:layout\s*\([^)]*\)\s*)?(?:(?:flat|smooth|noperspective|centroid|invariant|highp|mediump|lowp)\s+)*"
@@ -70,8 +70,7 @@ def check(files: list[str], shaders: str | None = None, backend: str = "auto", d
 def check_program(ctx: moderngl.Context, folder, name: str, result: Result) -> None:
     """Adds every variant of one program to ``result``."""
     wanted = variants(name)
-    if wanted is None:
-        wanted = [{}]  # somebody's own program: as it stands
+    wanted = [{}] if wanted is None else wanted + lookups(name)  # [{}]: somebody's own program, as it stands
     result.programs[name] = len(wanted)
     loader = ShaderLoader(ctx, folder)
     for defines in wanted:

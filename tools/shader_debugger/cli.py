@@ -75,9 +75,9 @@ def diff(
     from blinkgl.tools.shader_debugger import commands
 
     subject = _subject(config, seed, sequence, overrides)
-    reports = commands.run_diff(subject, _when(subject, time, step), names, tolerance or [], shaders, out)
-    typer.echo(commands.diff_json(reports) if json else commands.diff_text(reports))
-    if not all(report.passed for report in reports):
+    found, reports = commands.run_diff(subject, _when(subject, time, step), names, tolerance or [], shaders, out)
+    typer.echo(commands.diff_json(found, reports) if json else commands.diff_text(found, reports))
+    if not found["passed"]:
         raise typer.Exit(DIFFERENT)
 
 

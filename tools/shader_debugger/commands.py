@@ -10,9 +10,11 @@ import numpy as np
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.tools.shader_debugger.compare import Comparison, Report, parse_tolerances
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass
+from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass, lookup_of, open_reference
 from blinkgl.tools.shader_debugger.probe import as_text, probe
 from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, open_renderer
+from blinkgl.tools.shader_debugger.verdict import as_text as verdict_text
+from blinkgl.tools.shader_debugger.verdict import verdict
 
 
 def write_passes(subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None) -> list[Path]:
@@ -44,6 +46,8 @@ def _meaningful(moment, info) -> np.ndarray | None:
     if info.name.startswith("flow_"):
         return moment[info.name.replace("flow", "valid")]
     everywhere = info.name in ("luminance", "log_luminance", "dL_dt")  # the background has them, too
+    if lookup_of(info.name)[1] in ("uv", "level"):
+        return moment["texture_size"][..., 0] > 1 if isinstance(moment, ReferenceMoment) else moment[f"{info.name.rpartition('_')[0]}_count"] > 0
     return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and not everywhere else None
 
 
@@ -60,36 +64,39 @@ def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = No
     """What ``blinkgl shader probe`` prints."""
     x, y = check_pixel(subject.scene, pixel)
     with open_renderer(subject, shaders) as renderer:
-        found = probe(GpuMoment(renderer, when, subject.log_eps), ReferenceMoment(subject.scene, when, subject.log_eps), x, y)
+        found = probe(GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when), x, y)
     return json.dumps(_finite(found)) if as_json else as_text(found)
 
 
 def run_diff(subject: Subject, when: When, names: list[str] | None, tolerances: list[str], shaders: str | None = None,
-             out: str | None = None) -> list[Report]:
-    """Compares the named buffers (default: all that can be); with ``out`` also writes diff.png and NAME_error.npy there."""
+             out: str | None = None) -> tuple[dict, list[Report]]:
+    """Compares the named buffers (default: all that can be); with ``out`` also writes diff.png and NAME_error.npy there.
+    Returns what :func:`verdict.verdict` says, and the reports."""
     from blinkgl.tools.shader_debugger.compare import QUANTITIES
 
     if names:
         names = [check_pass(name, QUANTITIES) for name in names]
     with open_renderer(subject, shaders) as renderer:
-        comparison = Comparison(GpuMoment(renderer, when, subject.log_eps), ReferenceMoment(subject.scene, when, subject.log_eps))
+        comparison = Comparison(GpuMoment(renderer, when, subject.log_eps), open_reference(subject, when))
         names = names or comparison.names()
         limits = parse_tolerances(tolerances, names)
         reports = [comparison.report(name, limits.get(name)) for name in names]
+        found = verdict(comparison, reports)
     if out is not None:
         from blinkgl.tools.shader_debugger import picture
 
         folder = _folder(out)
         for report in reports:
-            with atomic_file(folder / f"{report.quantity.name}_error.npy") as temporary, temporary.open("wb") as file:
+            path = folder / f"{report.quantity.name}_error.npy"
+            with atomic_file(path) as temporary, output_errors(path), temporary.open("wb") as file:
                 np.save(file, report.errors, allow_pickle=False)
         title = f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = {when.t_ns * 1e-9:.6g} s"
         picture.save_errors(folder / "diff.png", reports, title + "   (log scale; silhouettes and shared edges greyed)")
-    return reports
+    return found, reports
 
 
-def diff_json(reports: list[Report]) -> str:
-    return json.dumps(_finite({"passed": all(r.passed for r in reports), "buffers": [r.summary() for r in reports]}))
+def diff_json(found: dict, reports: list[Report]) -> str:
+    return json.dumps(_finite(found | {"buffers": [r.summary() for r in reports]}))
 
 
 def _finite(value):
@@ -103,19 +110,21 @@ def _finite(value):
     return value
 
 
-def diff_text(reports: list[Report]) -> str:
-    """The table, then histogram, worst pixels and suspicions of each buffer that failed, or of a single one."""
-    lines = [f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} {'max':>8}   "
-             "silhouette band: over / pixels"]
+def diff_text(found: dict, reports: list[Report]) -> str:
+    """The verdict, the table, then histogram, suspicions and the worst pixel of each object of each buffer that failed, or of a
+    single one."""
+    lines = [*verdict_text(found), ""] if not found["passed"] else []
+    lines.append(f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} {'max':>8}   "
+                 "silhouette band: over / pixels")
     summaries = [report.summary() for report in reports]
     for s in summaries:
         e, b = s["off_silhouettes"], s["silhouette_band"]
         lines.append(f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  {s['unit']:<24} "
                      f"{e['pixels']:>8} {e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   {b['over_tolerance']} / {b['pixels']}")
-    notes = {s["note"]: [] for s in summaries if s["note"]}
+    notes: dict[str, list[str]] = {}
     for s in summaries:
         if s["note"]:
-            notes[s["note"]].append(s["buffer"])
+            notes.setdefault(s["note"], []).append(s["buffer"])
     lines += ["" for _ in notes][:1] + [f"{', '.join(names)}: {note}" for note, names in notes.items()]
     for s in summaries:
         if s["passed"] and len(summaries) > 1:
@@ -126,11 +135,12 @@ def diff_text(reports: list[Report]) -> str:
         top = max([1, *s["histogram"].values()])
         bars = {name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count}
         lines += [f"  {name:>6} {s['histogram'][name]:>8} {'#' * bar}" for name, bar in bars.items()]
-        lines += [f"  worst: ({w['x']}, {w['y']}) error {w['error']:.3g}, GPU {_short(w['gpu'])}, reference {_short(w['reference'])}, "
-                  f"{w['object'] or 'nothing hit'}" + (f" triangle {w['triangle']}" if w["object"] else "") for w in s["worst"]]
+        lines += [f"  {o['object']}: {o['over_tolerance']} of {o['pixels']} px, median {o['median']:.2g}; worst ({o['x']}, {o['y']}): "
+                  f"error {o['error']:.3g}, GPU {_short(o['gpu'])}, reference {_short(o['reference'])}"
+                  + (f", triangle {o['triangle']}" if o["triangle"] >= 0 else "") for o in s["objects"] if o["over_tolerance"]]
     failed = [s for s in summaries if not s["passed"]]
     if failed:
-        w = failed[0]["worst"][0] if failed[0]["worst"] else None
+        w = next(iter(found["objects"]), None)
         closer = f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else ""
         lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"]
     else:

@@ -6,10 +6,14 @@ Pixels in the silhouette band (``reference.silhouette_band``: within one pixel o
 apart: there a pixel centre may fall on either side of an edge. Off the band a buffer is graded where both sides see the same
 triangle; where they see neighbouring ones (a pixel centre on a shared edge) only ids and masks are graded.
 
-Light: the reference has no mip maps, so textured light is compared in two steps. ``albedo`` (and with it ``mip_level`` and
-``dL_dt``) is compared with a CPU twin of mip-mapped sampling, loosely. ``luminance`` and ``colour`` are compared with the albedo
-*that the GPU itself sampled* times the reference's irradiance, tightly. A wrong texture shows in the first, a wrong light or
-normal in the second. With anisotropic filtering (``render.anisotropy`` > 1) the first step is left out.
+Order: the buffers are graded in the order in which a pass makes them: where the surface is (local position, depth, id), what the
+pass looks up there (coordinates, level, albedo), the light, and their product. Each look-up is the pass's own, shown by a variant of
+its own source (``include/lookup.glsl``), and what follows from an earlier step is graded with that step as the GPU made it: the
+albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and level, the result against the GPU's own albedo
+times its own light. So the first buffer that fails is where the fault is; ``verdict.py`` says so, object by object.
+
+The reference has no mip maps, hence the twin, and a loose tolerance: drivers may make mip maps as they like. With anisotropic
+filtering (``render.anisotropy`` > 1) level and albedo are left out.
 """
 
 from __future__ import annotations
@@ -21,10 +25,14 @@ import numpy as np
 
 from blinkgl.errors import ConfigError
 from blinkgl.render import reference
-from blinkgl.tools.shader_debugger.moments import GpuMoment, ReferenceMoment, check_pass
+from blinkgl.scene.types import Material
+from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
+from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass, lookup_of, luma_of
+from blinkgl.tools.shader_debugger.poses import displaced, pose_suspicions
 from blinkgl.tools.shader_debugger.suspicions import suspicions
 
-WORST = 10
+WORST = 10  # objects told apart in a report
+NOTHING = "nothing hit"
 
 
 @dataclass(frozen=True)
@@ -32,6 +40,7 @@ class Quantity:
     """How one buffer is graded. error : (what the GPU wrote, the reference, both moments) -> (H, W) >= 0 in ``unit``.
 
     statistic : "max" of the graded pixels' errors, or "mean" (the fraction of pixels, for masks), must not exceed ``tolerance``.
+    fit : error, in tolerances, that is left to a suspicion that explains the buffer.
     """
 
     name: str
@@ -41,6 +50,15 @@ class Quantity:
     statistic: str = "max"
     same_triangle: bool = True
     note: str = ""
+    fit: float = 10.0
+
+    @property
+    def title(self) -> str:
+        return PASSES[self.name].title
+
+    @property
+    def source(self) -> str:
+        return PASSES[self.name].source
 
 
 def length(difference: np.ndarray) -> np.ndarray:
@@ -75,35 +93,53 @@ def _per_step(g, r, gpu, ref):
 
 
 def _pixels_of_texture(g, r, gpu, ref):
-    """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's rounding."""
-    return length((g.astype(np.float64) - r) * ref["texture_size"]) / np.exp2(ref["mip_level"])
+    """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's rounding.
+    Whole repeats are no shift."""
+    shift = g.astype(np.float64) - r
+    return length((shift - np.rint(shift)) * ref["texture_size"]) / np.exp2(ref["level"])
 
 
-_SHADING = "against the GPU's own albedo times the reference's irradiance (the reference has no mip maps)"
+def _misplaced(g, r, gpu, ref):
+    return length(displaced(gpu, ref))
+
+
+_TWIN = "against a CPU twin of mip-mapped sampling at the GPU's own uv and level; drivers may make mip maps differently"
+_SHADING = "against the GPU's own albedo times its own light"
+_LEVEL = "drivers may approximate the level (OpenGL 4.6, 8.14.1)"
 _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps differently, hence the loose tolerance"
 
+
+def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
+    """The steps of one pass that shades."""
+    return (Quantity(f"{name}_uv", "px of shifted texture", 0.01, _pixels_of_texture, fit=2.0),
+            Quantity(f"{name}_level", "levels", 0.6, _absolute, note=_LEVEL, fit=1.0),
+            # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
+            Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
+            Quantity(f"{name}_light", "1", 1e-4, _absolute),
+            Quantity(name, unit, 1e-4, _absolute, note=_SHADING))
+
+
 QUANTITIES = {q.name: q for q in (
-    Quantity("id", "mismatch", 0.0, _different, same_triangle=False),
+    Quantity("local", "px of misplaced surface", 0.01, _misplaced, same_triangle=False,
+             note="how far from its pixel the point that was drawn lies by the true poses"),
     Quantity("depth", "relative", 1e-5, _relative),
+    Quantity("id", "mismatch", 0.0, _different, same_triangle=False),
+    Quantity("normals", "of a unit vector", 1e-3, _absolute),
+    *_shading("luminance", "linear"),
+    *_shading("colour", "linear radiance"),
+    Quantity("dL_dt", "luminance over the step", 0.05, _per_step, note=_MIPS),
+    Quantity("velocity", "px per label interval", 1e-2, _per_interval),
     Quantity("flow_forward", "px", 1e-2, _motion),
     Quantity("flow_backward", "px", 1e-2, _motion),
-    Quantity("velocity", "px per label interval", 1e-2, _per_interval),
     Quantity("valid_forward", "mismatch", 0.0, _different),
     Quantity("valid_backward", "mismatch", 0.0, _different),
     Quantity("occluded_forward", "fraction of pixels", 1e-2, _different, "mean", False,
              "off the band at t' as well: the mask rests on one depth sample per pixel there"),
     Quantity("occluded_backward", "fraction of pixels", 1e-2, _different, "mean", False,
              "off the band at t' as well: the mask rests on one depth sample per pixel there"),
-    Quantity("normals", "of a unit vector", 1e-3, _absolute),
-    Quantity("uv", "px of shifted texture", 0.05, _pixels_of_texture),
-    Quantity("mip_level", "levels", 0.6, _absolute, note="drivers may approximate the level (OpenGL 4.6, 8.14.1)"),
-    Quantity("albedo", "linear", 0.1, _absolute, note=_MIPS),
-    Quantity("irradiance", "1", 1e-4, _absolute),
-    Quantity("luminance", "linear", 1e-4, _absolute, note=_SHADING),
-    Quantity("colour", "linear radiance", 1e-4, _absolute, note=_SHADING),
-    Quantity("dL_dt", "luminance over the step", 0.05, _per_step, note=_MIPS),
 )}
-NEEDS_ISOTROPIC = ("mip_level", "albedo", "dL_dt")
+"""In the order in which a pass makes them: the first that is wrong is where to look."""
+NEEDS_ISOTROPIC = ("luminance_level", "luminance_albedo", "colour_level", "colour_albedo", "dL_dt")
 
 
 def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
@@ -124,7 +160,8 @@ def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
 @dataclass(eq=False)
 class Report:
     """Of one buffer. errors : (H, W) float64, nan where not comparable.   graded, band : (H, W) bool.
-    value : the graded statistic.   worst : up to ten graded pixels, largest error first."""
+    value : the graded statistic.   objects : of each object (the worst ten, worst first) its graded pixels, those over the tolerance,
+    their median and largest error, and where the largest is: x, y, error, gpu, reference, triangle."""
 
     quantity: Quantity
     tolerance: float
@@ -132,24 +169,29 @@ class Report:
     graded: np.ndarray
     band: np.ndarray
     value: float
-    worst: list[dict] = field(default_factory=list)
+    objects: list[dict] = field(default_factory=list)
     suspicions: list[str] = field(default_factory=list)
 
     @property
     def passed(self) -> bool:
         return self.value <= self.tolerance
 
+    @property
+    def limit(self) -> float:
+        """Of one pixel: a fraction of all says nothing about one."""
+        return self.tolerance if self.quantity.statistic == "max" else 0.0
+
     def summary(self) -> dict:
         """Plain numbers, for JSON and for the table."""
         inside, band = self.errors[self.graded], self.errors[self.band & ~np.isnan(self.errors)]
 
         def stats(e):
-            limit = self.tolerance if self.quantity.statistic == "max" else 0.0  # a fraction says nothing about one pixel
-            return {"pixels": int(e.size), "median": _at(e, 0.5), "p99": _at(e, 0.99), "max": _at(e, 1.0), "over_tolerance": int((e > limit).sum())}
+            return {"pixels": int(e.size), "median": _at(e, 0.5), "p99": _at(e, 0.99), "max": _at(e, 1.0),
+                    "over_tolerance": int((e > self.limit).sum())}
 
         return {"buffer": self.quantity.name, "unit": self.quantity.unit, "statistic": self.quantity.statistic, "value": self.value,
                 "tolerance": self.tolerance, "passed": self.passed, "off_silhouettes": stats(inside), "silhouette_band": stats(band),
-                "histogram": histogram(inside), "worst": self.worst, "suspicions": self.suspicions, "note": self.quantity.note}
+                "histogram": histogram(inside), "objects": self.objects, "suspicions": self.suspicions, "note": self.quantity.note}
 
 
 def _at(errors: np.ndarray, q: float) -> float:
@@ -173,13 +215,24 @@ def histogram(errors: np.ndarray) -> dict[str, int]:
 
 
 class Comparison:
-    """Masks that all buffers share, and :meth:`report` for one of them."""
+    """Masks that all buffers share, and :meth:`report` for one of them. objects : names of the scene's objects, told apart."""
 
     def __init__(self, gpu: GpuMoment, ref: ReferenceMoment):
         self.gpu, self.ref = gpu, ref
         frame = ref.frame
         self.band = reference.silhouette_band(frame.instance, frame.depth)
         self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~frame.hit)
+        things = [thing for thing, _ in reference.scene_parts(ref.scene)]
+        names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
+        self.objects = [name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
+                        for name, thing in zip(names, ref.scene.objects)] + [NOTHING]
+        index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
+        self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
+
+    def owner(self, name: str) -> np.ndarray:
+        """(H, W) number of the object that a pixel's error in buffer ``name`` is put down to: the one that should be there, or, for
+        the local position, the one that was drawn."""
+        return self._object_of_part[(self.gpu if name == "local" else self.ref)["part"]]
 
     def names(self) -> list[str]:
         """Every buffer that can be graded here."""
@@ -189,12 +242,34 @@ class Comparison:
     def pair(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """(GPU, what it is graded against); equal shapes."""
         gpu, ref = self.gpu, self.ref
-        if name == "luminance":
-            return gpu[name], np.where(ref.frame.hit, gpu["shade"][..., 0].astype(np.float64) * ref["irradiance"], ref["luminance"])
-        if name == "colour":
-            shaded = gpu["albedo"].astype(np.float64) * ref["irradiance"][..., None]
-            return gpu[name], np.where(ref.frame.hit[..., None], shaded, ref["colour"])
+        of, what = lookup_of(name)
+        if what == "albedo":
+            return gpu[name], self.twin(of)
+        if name in ("luminance", "colour"):
+            shaded = gpu[f"{name}_albedo"].astype(np.float64) * gpu[f"{name}_light"][..., None]
+            shaded = shaded if name == "colour" else shaded[..., 0]
+            hit = ref.frame.hit if name == "luminance" else ref.frame.hit[..., None]
+            return gpu[name], np.where(hit, shaded, ref[name])
         return gpu[name], ref[name]
+
+    def twin(self, of: str, **more) -> np.ndarray:
+        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates; 0 where it drew nothing.
+        more : as for :meth:`twin_colour`."""
+        out = self.twin_colour(of, **more)
+        return out if of == "colour" else luma_of(out)
+
+    def twin_colour(self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0), material: Material | None = None) -> np.ndarray:
+        """:meth:`twin` in colour, for the luminance, too. Mistakes: a number of levels too coarse; coordinates moved by texels of the
+        full resolution; another material everywhere."""
+        gpu = self.gpu
+        out = np.zeros((*gpu["part"].shape, 3))
+        for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):
+            on = gpu["part"] == p
+            used = material or part.material
+            move = 0.0 if used.texture is None else np.asarray(texels) / used.texture.image.shape[1::-1]
+            out[on] = mipmapped_albedo(used, np.nan_to_num(gpu[f"{of}_uv"][on].astype(np.float64)) + move,
+                                       gpu[f"{of}_level"][on].astype(np.float64) + level)
+        return out
 
     def errors(self, name: str) -> np.ndarray:
         """(H, W) float64 in the quantity's unit; inf where the GPU wrote nan."""
@@ -215,13 +290,14 @@ class Comparison:
                 other, drawn = self.ref.at(t_ns), self.gpu.renderer.inspect(t_ns)
                 graded &= ~reference.silhouette_band(other.instance, other.depth) & (other.part == self.ref["part"])
                 graded &= (drawn["TRIANGLE"] == other.triangle + 1) & (drawn["LOCAL"][..., 3] == other.part + 1)
+        if name == "local":
+            graded &= self.gpu["part"] >= 0
         inside = errors[graded]
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
         report = Report(quantity, quantity.tolerance if tolerance is None else tolerance, errors, graded, self.band, value)
-        report.worst = self._worst(name, errors, graded)
+        report.objects = self._per_object(report)
         if not report.passed:
-            g, r = self.pair(name)
-            report.suspicions = suspicions(name, g, r, graded, report.tolerance, self.gpu, self.ref)
+            report.suspicions = pose_suspicions(self, report) if name == "local" else suspicions(self, report)
         return report
 
     def _band_there(self, way: str) -> np.ndarray:
@@ -234,16 +310,16 @@ class Comparison:
         x, y = (np.clip(np.rint(xy[..., k]), 0, n - 1).astype(int) for k, n in ((0, width), (1, height)))
         return band[y, x] & flow.valid & ~flow.outside
 
-    def _worst(self, name: str, errors: np.ndarray, graded: np.ndarray) -> list[dict]:
+    def _per_object(self, report: Report) -> list[dict]:
+        name = report.quantity.name
         g, r = self.pair(name)
-        masked = np.where(graded, errors, 0.0).ravel()
-        order = np.argsort(-masked, kind="stable")[:WORST]
-        parts, out = reference.scene_parts(self.ref.scene), []
-        for k in order:
-            if masked[k] <= 0:
-                break
-            y, x = np.unravel_index(k, errors.shape)
-            p = int(self.ref["part"][y, x])
-            out.append({"x": int(x), "y": int(y), "error": float(masked[k]), "gpu": g[y, x].tolist(), "reference": r[y, x].tolist(),
-                        "object": parts[p][0].name if p >= 0 else "", "triangle": int(self.ref["triangle"][y, x]) - 1})
-        return out
+        owner, out = self.owner(name), []
+        for k in np.unique(owner[report.graded]):
+            rows = np.flatnonzero((report.graded & (owner == k)).ravel())
+            errors = report.errors.ravel()[rows]
+            y, x = np.unravel_index(rows[errors.argmax()], owner.shape)
+            out.append({"object": self.objects[k], "pixels": len(rows), "over_tolerance": int((errors > report.limit).sum()),
+                        "median": _at(errors, 0.5), "max": float(errors.max()), "x": int(x), "y": int(y),
+                        "error": float(errors.max()), "gpu": g[y, x].tolist(), "reference": r[y, x].tolist(),
+                        "triangle": int(self.ref["triangle"][y, x]) - 1})
+        return sorted(out, key=lambda one: -one["max"])[:WORST]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections import OrderedDict
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import Any
 
 import numpy as np
@@ -17,14 +17,15 @@ from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass
+from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, open_reference
 from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
+from blinkgl.tools.shader_debugger.questions import MAPS, SOURCES
 from blinkgl.tools.shader_debugger.session import Snapshot, Subject, When, check_pixel, files_of, moment, open_folder, open_renderer
+from blinkgl.tools.shader_debugger.verdict import verdict
 
 POLL_S = 0.15  # between two looks at the shader files
 KEPT = 6  # moments in memory
 MOST_ERRORS = 5  # shown at once
-SOURCES = ("gpu", "reference")
 
 
 class _Loader(ShaderLoader):
@@ -72,11 +73,7 @@ class Inspector:
             made[name]
         return made
 
-    def _when(self, text: str) -> When:
-        try:
-            seconds = float(text) if text else None
-        except ValueError:
-            raise ConfigError("not a time", where="t", value=text, accepted="seconds") from None
+    def _when(self, seconds: float | None) -> When:
         self._shown = moment(self.subject, seconds, self.step_us) if seconds is not None else self.first
         return self._shown
 
@@ -85,12 +82,13 @@ class Inspector:
         return _kept(self._gpu, key, lambda: GpuMoment(self.renderer, when, self.subject.log_eps))
 
     def reference(self, when: When) -> ReferenceMoment:
-        return _kept(self._reference, when.t_ns, lambda: ReferenceMoment(self.subject.scene, when, self.subject.log_eps))
+        return _kept(self._reference, when.t_ns, lambda: open_reference(self.subject, when))
 
-    def _moment(self, source: str, when: When):
-        if source not in SOURCES:
-            raise ConfigError("unknown source", where="source", value=source, accepted="gpu or reference")
-        return self.gpu(when) if source == "gpu" else self.reference(when)
+    def _comparison(self, when: When) -> Comparison:
+        gpu, ref = self.gpu(when), self.reference(when)
+        if not hasattr(ref, "comparison") or ref.comparison.gpu is not gpu:
+            ref.comparison = Comparison(gpu, ref)
+        return ref.comparison
 
     # ---- answers -----------------------------------------------------------------------------------------------
 
@@ -100,51 +98,54 @@ class Inspector:
         return {"config": self.subject.path, "sequence": self.subject.index, "seed": config.seed, "renderer": gl.renderer,
                 "width": scene.camera.width, "height": scene.camera.height, "t0": scene.t0_ns * 1e-9, "t1": scene.t1_ns * 1e-9,
                 "t": self.first.t_ns * 1e-9, "labels": [t * 1e-9 for t in config.time.label_times_ns],
-                "interval": config.time.interval_ns * 1e-9, "maps": picture.MAPS, "folder": str(getattr(self.folder, "path", self.folder)),
+                "interval": config.time.interval_ns * 1e-9, "maps": MAPS, "folder": str(getattr(self.folder, "path", self.folder)),
                 "passes": [{"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source} for p in PASSES.values()]}
 
     def shaders(self) -> dict:
         return {"generation": self.generation, "errors": [d.as_dict() | {"where": d.where} for d in self.errors]}
 
-    def image(self, q: dict[str, str]) -> tuple[bytes, dict]:
-        """PNG and legend of one buffer. q : pass, source, t, component, map, low, high."""
-        when, name = self._when(q.get("t", "")), check_pass(q.get("pass", ""), where="pass")
-        source = self._moment(q.get("source", "gpu"), when)
-        info, array = PASSES[name], source[name]
-        rgb, legend = picture.picture(info.kind, array, which=q.get("component") or "auto", colours=q.get("map") or None,
-                                      low=_number(q, "low"), high=_number(q, "high"), hit=_meaningful(source, info))
+    def image(self, q: dict[str, Any]) -> tuple[bytes, dict]:
+        """PNG and legend of one buffer. q : as :func:`questions.read_query` gives it, here and below."""
+        when, name = self._when(q["t"]), q["pass"]
+        source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
+        info = PASSES[name]
+        rgb, legend = picture.picture(info.kind, source[name], which=q["component"], colours=q["map"], low=q["low"], high=q["high"],
+                                      hit=_meaningful(source, info))
         return picture.png_bytes(rgb), legend | {"unit": info.unit}
 
-    def difference(self, q: dict[str, str]) -> tuple[bytes, dict]:
-        """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0. q : a, b (each "pass:source"), t, component, map, low, high."""
-        when = self._when(q.get("t", ""))
-        arrays = []
-        for key in ("a", "b"):
-            name, _, source = q.get(key, "").partition(":")
-            arrays.append(np.asarray(self._moment(source, when)[check_pass(name, where=key)], np.float64))
-        a, b = arrays
+    def difference(self, q: dict[str, Any]) -> tuple[bytes, dict]:
+        """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
+        when = self._when(q["t"])
+        a, b = (np.asarray((self.gpu(when) if source == "gpu" else self.reference(when))[name], np.float64) for name, source in (q["a"], q["b"]))
         if a.shape != b.shape:
-            raise ConfigError("have different numbers of components", where="a, b", value=f"{q.get('a')}, {q.get('b')}", accepted="two of the same kind")
-        which = q.get("component") or "length"
+            raise ConfigError("have different numbers of components", where="a, b", value=", ".join(":".join(q[k]) for k in "ab"),
+                              accepted="two of the same kind")
+        which = "length" if q["component"] == "auto" else q["component"]
         with np.errstate(invalid="ignore"):
             change = np.where(a == b, 0.0, a - b)
-        values = np.abs(picture.component(change, "length" if which == "auto" else which))
+        values = np.abs(picture.component(change, which))
         some = values[np.isfinite(values) & (values > 0)]
         low, high = (float(v) for v in (np.quantile(some, 0.01), some.max())) if some.size else (1e-12, 1.0)
-        low, high = _number(q, "low", min(low, 0.999 * high)), _number(q, "high", high)
+        low, high = min(low, 0.999 * high) if q["low"] is None else q["low"], high if q["high"] is None else q["high"]
         if low > 0:  # logarithmic: one flipped pixel on a silhouette would hide everything else
             values = np.where(np.isnan(values), values, np.clip(values, low, None))
-        rgb, legend = picture.picture("depth", values, which="length", colours=q.get("map") or picture.ERROR_MAP, low=low, high=high)
-        return picture.png_bytes(rgb), legend | {"unit": PASSES[name].unit}
+        rgb, legend = picture.picture("depth", values, which="length", colours=q["map"] or picture.ERROR_MAP, low=low, high=high)
+        return picture.png_bytes(rgb), legend | {"unit": PASSES[q["b"][0]].unit}
 
-    def probe(self, q: dict[str, str]) -> dict:
+    def verdict(self, q: dict[str, Any]) -> dict:
+        """All buffers against the reference: what ``diff`` says first, and its text."""
+        comparison = self._comparison(self._when(q["t"]))
+        reports = [comparison.report(name) for name in comparison.names()]
+        found = verdict(comparison, reports)
+        titles = {name: info.title for name, info in PASSES.items()}
+        return _finite(found | {"titles": titles, "buffers": [r.quantity.name for r in reports if not r.passed], "compared": len(reports)})
+
+    def probe(self, q: dict[str, Any]) -> dict:
         """The CLI's probe, with the CLI's text of every number."""
-        when = self._when(q.get("t", ""))
-        x, y = check_pixel(self.subject.scene, f"{q.get('x', '')},{q.get('y', '')}")
-        gpu, ref = self.gpu(when), self.reference(when)
-        if not hasattr(ref, "comparison") or ref.comparison.gpu is not gpu:
-            ref.comparison = Comparison(gpu, ref)
-        found = probe(gpu, ref, x, y, ref.comparison)
+        when = self._when(q["t"])
+        x, y = check_pixel(self.subject.scene, f"{q['x']},{q['y']}")
+        comparison = self._comparison(when)
+        found = probe(comparison.gpu, comparison.ref, x, y, comparison)
         for row in found["buffers"]:
             row |= {f"{side}_text": _numbers(row[side]) for side in SOURCES}
         for row in found["positions"]:
@@ -202,18 +203,6 @@ def _kept(cache: OrderedDict, key, make):
     return cache[key]
 
 
-def _number(q: dict[str, str], key: str, default: float | None = None) -> float | None:
-    if not q.get(key):
-        return default
-    try:
-        value = float(q[key])
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise ConfigError("not a number", where=key, value=q[key], accepted="a finite number, or nothing")
-    return value
-
-
 class Worker:
     """Runs an Inspector in its own thread, and watches its files. ``call`` may come from any thread."""
 
@@ -251,13 +240,16 @@ class Worker:
             raise BlinkGLError("the server is stopping")
         answer: Future = Future()
         self._jobs.put((function, arguments, answer))
-        return answer.result(timeout=120)
+        while not wait((answer,), 1.0).done:
+            if not self._thread.is_alive():
+                raise BlinkGLError("the server is stopping")
+        return answer.result()
 
     def _watch(self) -> None:
-        seen = self.inspector.stamps()
+        seen = last = self.inspector.stamps()
         while not self._stop.wait(POLL_S):
-            stamps = self.inspector.stamps()
-            if stamps != seen:
+            last, stamps = self.inspector.stamps(), last
+            if stamps == last != seen:  # not while an editor is still writing: a file is empty for a moment
                 seen = stamps
                 self.call(self.inspector.reload)
                 with self.changed:

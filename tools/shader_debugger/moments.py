@@ -13,7 +13,7 @@ from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import LabelRequest
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.session import DebugRenderer, When
+from blinkgl.tools.shader_debugger.session import LOOKUP_PROGRAMS, DebugRenderer, Subject, When
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,28 @@ class Pass:
     source: str
 
 
+LOOKUPS = ("uv", "level", "albedo", "light")
+"""What a textured pass shows of its way to the result, in the order in which it happens."""
+
+
+def _lookups(name: str, program: str) -> tuple[Pass, ...]:
+    source = f"{program} SHOW_LOOKUP"
+    return (Pass(f"{name}_uv", f"uv of {name}", "texture repeats", "uv", source),
+            Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
+            Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
+            Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source))
+
+
 PASSES = {p.name: p for p in (
-    Pass("colour", "colour", "linear radiance", "light", "label.glsl OUT_COLOUR"),
-    Pass("albedo", "albedo", "linear", "light", "debug.glsl OUT_ALBEDO"),
-    Pass("irradiance", "irradiance factor", "1", "scalar", "debug.glsl OUT_SHADE"),
-    Pass("normals", "normals", "camera axes", "unit", "label.glsl OUT_NORMAL"),
+    Pass("triangle", "triangle of its part", "0: nothing hit", "ids", "debug.glsl OUT_TRIANGLE"),
+    Pass("local", "local position", "object axes", "scalar", "debug.glsl OUT_LOCAL"),
     Pass("depth", "depth", "world units", "depth", "label.glsl OUT_DEPTH"),
     Pass("id", "instance id", "0: nothing hit", "ids", "label.glsl OUT_ID"),
-    Pass("triangle", "triangle of its part", "0: nothing hit", "ids", "debug.glsl OUT_TRIANGLE"),
-    Pass("uv", "uv", "texture repeats", "uv", "debug.glsl OUT_UV"),
-    Pass("mip_level", "mip level", "log2(texels per px)", "scalar", "debug.glsl OUT_LOD"),
+    Pass("normals", "normals", "camera axes", "unit", "label.glsl OUT_NORMAL"),
+    *_lookups("luminance", LOOKUP_PROGRAMS["luminance"]),
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
+    *_lookups("colour", LOOKUP_PROGRAMS["colour"]),
+    Pass("colour", "colour", "linear radiance", "light", "label.glsl OUT_COLOUR"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
     Pass("velocity", "velocity", "px/s", "motion", "label.glsl OUT_VELOCITY"),
@@ -49,6 +60,12 @@ PASSES = {p.name: p for p in (
     Pass("occluded_forward", "occluded, forward", "", "mask", "render/occlusion.py"),
     Pass("occluded_backward", "occluded, backward", "", "mask", "render/occlusion.py"),
 )}
+
+
+def lookup_of(name: str) -> tuple[str, str]:
+    """("luminance", "uv") of "luminance_uv"; ("", "") of what is no look-up."""
+    pass_name, _, what = name.rpartition("_")
+    return (pass_name, what) if pass_name in LOOKUP_PROGRAMS and what in LOOKUPS else ("", "")
 
 
 def check_pass(name: str, known=PASSES, where: str = "--pass") -> str:
@@ -74,9 +91,9 @@ class _Lazy:
 
 
 class GpuMoment(_Lazy):
-    """What the GPU wrote. Besides :data:`PASSES`: shade (H, W, 2) float32 albedo luminance and irradiance factor;
-    part (H, W) int32, -1: nothing hit; local (H, W, 3); window (H, W, 4) gl_FragCoord; next_depth_forward|backward (H, W), the
-    depth at t' that the flow program returns.
+    """What the GPU wrote. Besides :data:`PASSES`: part (H, W) int32, -1: nothing hit; window (H, W, 4) gl_FragCoord;
+    next_depth_forward|backward (H, W), the depth at t' that the flow program returns; luminance_count, colour_count (H, W), the
+    number of texture look-ups at the pixel.
 
     Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
     """
@@ -96,8 +113,12 @@ class GpuMoment(_Lazy):
         if name == "dL_dt":
             change = draw.luminance(when.after_ns) - draw.luminance(when.before_ns)
             return {name: change / np.float32(when.step_s)}
-        if name in ("albedo", "irradiance", "triangle", "uv", "mip_level", "shade", "part", "local", "window"):
+        if name in ("triangle", "part", "local", "window"):
             return self._inspect()
+        if name.endswith("_count") or lookup_of(name)[0]:
+            of = name.rpartition("_")[0]
+            shown = draw.lookups(of, when.t_ns)
+            return {f"{of}_{key}": shown[key] for key in (*LOOKUPS, "count")}
         if name.startswith("next_depth_"):
             way = name.removeprefix("next_depth_")
             raw = draw.raw(when.t_ns, f"FLOW_{way.upper()}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
@@ -106,9 +127,8 @@ class GpuMoment(_Lazy):
 
     def _inspect(self):
         out = self.renderer.inspect(self.when.t_ns)
-        return {"albedo": out["ALBEDO"][..., :3], "irradiance": out["SHADE"][..., 1], "triangle": out["TRIANGLE"], "uv": out["UV"],
-                "mip_level": out["LOD"][..., 1], "shade": out["SHADE"], "part": out["LOCAL"][..., 3].astype(np.int32) - 1,
-                "local": out["LOCAL"][..., :3], "window": out["WINDOW"]}
+        return {"triangle": out["TRIANGLE"], "part": out["LOCAL"][..., 3].astype(np.int32) - 1, "local": out["LOCAL"][..., :3],
+                "window": out["WINDOW"]}
 
     def _labels(self):
         when = self.when
@@ -124,16 +144,17 @@ class GpuMoment(_Lazy):
 class ReferenceMoment(_Lazy):
     """What the GPU should have written, float64, by :mod:`blinkgl.render.reference`. ``frame``: the reference's own frame.
 
-    mip_level is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6, section 8.14, eq. 8.7),
-    from the exact derivatives of uv on the triangle's plane; a GPU takes it from 2 x 2 pixels. albedo, and what follows from it
-    (colour, luminance, log_luminance, dL_dt), is sampled at that level by the CPU twin in :mod:`mipmaps`, because the reference
-    itself has no mip maps; its own values, at full resolution, are albedo_level0, colour_level0 and luminance_level0.
-    texture_size : (H, W, 2) texels, 1 where there is no texture.
+    The level of a look-up is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6, section 8.14,
+    eq. 8.7), from the exact derivatives of uv on the triangle's plane, plus ``mip_bias``; a GPU takes it from 2 x 2 pixels. The
+    albedo, and what follows from it (colour, luminance, log_luminance, dL_dt), is sampled at that level by the CPU twin in
+    :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full resolution, are albedo_level0,
+    colour_level0 and luminance_level0.   texture_size : (H, W, 2) texels, 1 where there is no texture.
+    uv, level, albedo, light : what both passes should look up; luminance_albedo is the luminance of albedo.
     """
 
-    def __init__(self, scene: Scene, when: When, log_eps: float):
+    def __init__(self, scene: Scene, when: When, log_eps: float, mip_bias: float = 0.0):
         super().__init__()
-        self.scene, self.when, self.log_eps = scene, when, log_eps
+        self.scene, self.when, self.log_eps, self.mip_bias = scene, when, log_eps, mip_bias
         self._frame: reference.ReferenceFrame | None = None
         self._others: dict[int, reference.ReferenceFrame] = {}
 
@@ -175,7 +196,10 @@ class ReferenceMoment(_Lazy):
         if name == "dL_dt":
             before, after = (self._surface(t)["luminance"] for t in (self.when.before_ns, self.when.after_ns))
             return {name: (after - before) / self.when.step_s}
-        if name in ("uv", "irradiance", "mip_level", "albedo", "colour", "luminance", "texture_size"):
+        of, what = lookup_of(name)
+        if of:
+            return {name: luma_of(self["albedo"]) if name == "luminance_albedo" else self[what]}
+        if name in (*LOOKUPS, "colour", "luminance", "texture_size"):
             return self._surface(self.when.t_ns)
         flows = {}
         for way in ("forward", "backward"):
@@ -202,11 +226,21 @@ class ReferenceMoment(_Lazy):
                 pose = reference.relative_pose_at(scene, thing, t_ns)
                 points = part.mesh.vertices[corners] @ pose[:3, :3].T + pose[:3, 3]
                 texels = part.mesh.uvs[corners].astype(np.float64) * part.material.uv_scale * part.material.texture.image.shape[1::-1]
-                level[on] = footprint(points, texels, rays[on], (scene.camera.fx, scene.camera.fy))
+                level[on] = footprint(points, texels, rays[on], (scene.camera.fx, scene.camera.fy)) + self.mip_bias
             albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
         colour = np.where(frame.hit[..., None], albedo * light[..., None], frame.colour)
-        return {"uv": uv, "irradiance": light, "mip_level": level, "albedo": albedo, "colour": colour, "luminance": colour @ LUMA,
+        return {"uv": uv, "light": light, "level": level, "albedo": albedo, "colour": colour, "luminance": colour @ LUMA,
                 "texture_size": size}
+
+
+def open_reference(subject: Subject, when: When) -> ReferenceMoment:
+    """What the GPU should write for this subject."""
+    return ReferenceMoment(subject.scene, when, subject.log_eps, subject.config.render.mip_bias)
+
+
+def luma_of(albedo: np.ndarray) -> np.ndarray:
+    """(..., 3) grey of the luminance of (..., 3) albedo: what the event pass, whose textures have one channel, shows as its albedo."""
+    return np.repeat((albedo @ LUMA)[..., None], 3, axis=-1)
 
 
 def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, focal: tuple[float, float]) -> np.ndarray:

@@ -16,10 +16,9 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.colour import flow_colour, flow_wheel
 from blinkgl.srgb import srgb_from_linear
 from blinkgl.tools.shader_debugger.moments import PASSES, Pass
+from blinkgl.tools.shader_debugger.questions import MAPS
 
 SCALAR_MAP, SIGNED_MAP, ERROR_MAP = "viridis", "RdBu_r", "inferno"
-MAPS = ("viridis", "turbo", "inferno", "gray", "RdBu_r", "coolwarm")
-COMPONENTS = ("auto", "length", "x", "y", "z", "w")
 EMPTY = np.array([40, 40, 40], np.uint8)  # nothing hit, or not a number
 INK, PAPER, MUTED = "#1f2933", "#ffffff", "#64748b"
 

@@ -44,7 +44,7 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
         "t_s": when.t_ns * 1e-9,
         "times_s": {"forward": when.forward_ns * 1e-9, "backward": when.backward_ns * 1e-9},
         "band": bool(comparison.band[y, x]),
-        "buffers": [_row(name, gpu, ref, comparison, x, y) for name in PASSES if name != "triangle"],  # triangles are told below
+        "buffers": [_row(name, gpu, ref, comparison, x, y) for name in PASSES if name not in ("triangle", "local")],  # told below
         "surface": {
             "gpu": _surface(parts, drawn, int(gpu["triangle"][y, x]) - 1, _barycentric(parts, drawn, gpu, x, y)),
             "reference": _surface(parts, true, hit.triangle, hit.bary) | ({"front": hit.front, "corners": _plain(hit.corners)} if hit.hit else {}),
@@ -73,8 +73,8 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
         error = float(comparison.errors(name)[y, x])
         row["ok"] = None if comparison.band[y, x] else error <= (quantity.tolerance if quantity.statistic == "max" else 0.5)
         if name in ("luminance", "colour"):
-            row["note"] = f"with the GPU's albedo: {np.array2string(np.asarray(comparison.pair(name)[1][y, x]), precision=7)}, {error:.2g} off"
-    if name == "albedo" and ref["mip_level"][y, x] > 0:
+            row["note"] = f"of the GPU's own albedo and light: {np.array2string(np.asarray(comparison.pair(name)[1][y, x]), precision=7)}, {error:.2g} off"
+    if name == "colour_albedo" and ref["level"][y, x] > 0:
         row["note"] = f"full resolution (level 0): {np.array2string(ref['albedo_level0'][y, x], precision=5)}"
     return row
 

@@ -16,13 +16,14 @@ from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
-from blinkgl.gl.shader import shader_folder
+from blinkgl.gl.shader import ShaderError, expand, shader_folder
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene, check_assets
 from blinkgl.scene.lod import at_level_of_detail
 from blinkgl.scene.types import Scene
 
 DEBUG_PROGRAM = "debug.glsl"
+LOOKUP_PROGRAMS = {"luminance": "luminance.glsl", "colour": "label.glsl"}  # passes that show what they look up
 STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
 
 
@@ -86,13 +87,13 @@ def moment(subject: Subject, seconds: float | None = None, step_us: float | None
     if seconds is None:
         t_ns = timing.label_times_ns[0]
     else:
-        t_ns = round(seconds * NS_PER_S) if math.isfinite(seconds) else None
+        t_ns = round(seconds * NS_PER_S) if math.isfinite(seconds * NS_PER_S) else None
         if t_ns is None or not scene.t0_ns <= t_ns <= scene.t1_ns:
             raise ConfigError("outside the sequence", where="--time", value=seconds,
                               accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s")
     if step_us is None:
         step = max(1000, timing.interval_ns // STEP_FRACTION)
-    elif math.isfinite(step_us) and step_us * 1000 >= 1:
+    elif math.isfinite(step_us * 1000) and step_us * 1000 >= 1:
         step = round(step_us * 1000)
     else:
         raise ConfigError("not a time step", where="--step", value=step_us, accepted="at least 0.001 µs")
@@ -205,15 +206,16 @@ class _Variants(dict):
 
 
 class DebugRenderer(Renderer):
-    """The production renderer, plus the debug pass, plus reloading. Draws what :class:`Renderer` draws, by its code."""
+    """The production renderer, plus the debug pass, plus look-ups, plus reloading. Draws what :class:`Renderer` draws, by its code."""
 
-    OUTPUTS = (("UV", "RG32F"), ("LOD", "RG32F"), ("ALBEDO", "RGBA32F"), ("SHADE", "RG32F"), ("TRIANGLE", "R32UI"),
-               ("LOCAL", "RGBA32F"), ("WINDOW", "RGBA32F"))
+    OUTPUTS = (("TRIANGLE", "R32UI"), ("LOCAL", "RGBA32F"), ("WINDOW", "RGBA32F"))
 
     def __init__(self, gl: GLContext, scene: Scene, config):
         super().__init__(gl, scene, config)
         self._uniforms = _Variants()
         self._still = False  # always whole frames: what is kept from an earlier frame may be other shaders' work
+        self._showing: list | None = None  # while look-ups are drawn: the target they go to
+        self._plain: DebugRenderer | None = None
         parts = [(index, part) for index, thing in enumerate(scene.objects) for part in thing.parts]
         numbers = list(range(len(parts)))
         self.part_of: dict[int, int] = {}  # id of a draw item -> index into reference.scene_parts
@@ -223,12 +225,19 @@ class DebugRenderer(Renderer):
             numbers.remove(match)
             self.part_of[id(item)] = match
 
+    def release(self) -> None:
+        if self._plain is not None:
+            self._plain.release()
+        super().release()
+
     def use_shaders(self, loader: ShaderLoader) -> None:
         """Draw with another loader's programs from now on."""
         self.gl.shaders = loader
         self._uniforms.clear()
         self._surfaces.clear()
         self._resources.forget_vertex_arrays()
+        if self._plain is not None:
+            self._plain.use_shaders(loader)
 
     def inspect(self, t_ns: int) -> dict[str, np.ndarray]:
         """The outputs of debug.glsl, keyed as in :attr:`OUTPUTS`; 0 where nothing is hit."""
@@ -239,15 +248,42 @@ class DebugRenderer(Renderer):
         for item in self._visible(moment):
             uniforms = self._bind(DEBUG_PROGRAM, item, moment, defines)
             uniforms["part_number"].value = self.part_of[id(item)] + 1
-            uniforms["base_color"].value = tuple(item.material.base_color)
-            if item.textured:
-                uniforms["albedo"].value, uniforms["albedo_luminance"].value = 0, 1
-                self._resources.colour_texture(item.material).use(0)
-                self._resources.luminance_texture(item.material).use(1)
-            else:
-                uniforms["albedo_luminance"].value = self._resources.albedo_luminance(item.material)
             self._draw(uniforms, item)
         return {name: self._read(target, i, time.perf_counter(), None) for i, (name, _) in enumerate(self.OUTPUTS)}
+
+    def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
+        """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant SHOW_LOOKUP):
+        result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, light, count (H, W), the number of look-ups; albedo (H, W, 3).
+        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
+
+        Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
+        if self.config.antialiasing != "none":
+            if self._plain is None:
+                self._plain = DebugRenderer(self.gl, self.scene, self.config.model_copy(update={"antialiasing": "none"}))
+            return self._plain.lookups(name, t_ns)
+        program = LOOKUP_PROGRAMS[name]
+        if "show_lookup(" not in "".join(line for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
+                                         if not line.startswith("void")):
+            raise ShaderError("does not show what it looks up", where=program,
+                              accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the shipped file')
+        self._showing = []
+        try:
+            result = self.luminance(t_ns) if name == "luminance" else self.colour(t_ns, "none")
+            target = self._showing[-1]
+        finally:
+            self._showing = None
+        lookup, albedo = (self._read(target, i, time.perf_counter(), None) for i in (1, 2))
+        return {"result": result, "uv": lookup[..., :2], "level": lookup[..., 2], "light": lookup[..., 3], "albedo": albedo[..., :3],
+                "count": albedo[..., 3]}
+
+    def _target(self, name, scale, formats, samples=0):
+        if self._showing is None:
+            return super()._target(name, scale, formats, samples)
+        self._showing.append(super()._target("lookups:" + name, scale, (*formats, "RGBA32F", "RGBA32F"), samples))
+        return self._showing[-1]
+
+    def _bind(self, name, item, moment, defines):
+        return super()._bind(name, item, moment, defines if self._showing is None else defines | {"SHOW_LOOKUP": 1})
 
     def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
         """Buffers of label.glsl as the shader wrote them, without the renderer's masks: DEPTH, ID, FLOW_FORWARD …"""

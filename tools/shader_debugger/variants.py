@@ -9,6 +9,7 @@ from itertools import combinations, product
 LABEL_OUTPUTS = ("DEPTH", "ID", "NORMAL", "VELOCITY", "FLOW_FORWARD", "FLOW_BACKWARD")
 MATERIALS = ("TEXTURED", "LIT", "TWO_SIDED")
 FACTORS = (2, 4)
+EVERY = 4  # stands for every number of the brightness timeline's `sample_every` above 1
 
 
 def materials() -> list[dict[str, int]]:
@@ -31,11 +32,18 @@ def debug_outputs() -> dict[str, int]:
     return {f"OUT_{name}": i for i, (name, _) in enumerate(DebugRenderer.OUTPUTS)}
 
 
+def lookups(program: str) -> list[dict[str, int]]:
+    """Defines of the variants in which the debugger has a production program show what it looks up."""
+    show = {"luminance.glsl": {"SHOW_LOOKUP": 1}, "label.glsl": {"OUT_COLOUR": 0, "SHOW_LOOKUP": 1}}.get(program)
+    return [] if show is None else [show | material for material in materials()]
+
+
 def variants(program: str) -> list[dict[str, int]] | None:
-    """Defines of every variant of a program file; None for a file the renderer does not know."""
+    """Defines of every variant of a program file, without :func:`lookups`; None for a file the renderer does not know."""
     if program == "luminance.glsl":
         taps = [material | {"TAPS4": 1} for material in materials() if "TEXTURED" in material]
-        return [material | rate for rate in ({}, {"RATE": 1}) for material in materials() + taps]
+        every = [material | {"RATE": 1, "EVERY": EVERY} for material in materials()]
+        return [material | rate for rate in ({}, {"RATE": 1}) for material in materials() + taps] + every
     if program == "label.glsl":
         return [outputs | material for outputs in label_outputs() for material in materials()]
     if program == "downsample.glsl":

@@ -100,6 +100,7 @@ async function refresh() {
     wanted = false;
     const s = settings();
     const common = { t: s.t, component: s.component, map: s.map, low: s.low, high: s.high };
+    if (s.t !== compared) forget();
     $("pane-b").hidden = s.view === "single";
     document.querySelector(".second").hidden = s.view === "single";
     remember();
@@ -181,6 +182,52 @@ async function showProbe() {
   box.dataset.pixel = `${x},${y}`;
 }
 
+// ---- where the fault is -----------------------------------------------------------------------------------------
+
+let compared = null; // the moment and shaders that the verdict is about
+
+async function compare() {
+  const t = settings().t, box = $("verdict"), table = $("objects"), button = $("compare");
+  button.disabled = true;
+  box.textContent = "comparing …";
+  box.className = "hint";
+  table.hidden = true;
+  try {
+    const found = await (await get("verdict", { t })).json();
+    compared = t;
+    box.className = found.passed ? "good" : "bad";
+    box.textContent = found.passed ? `t = ${t} s: all ${found.compared} buffers agree with the reference`
+      : `t = ${t} s: the first that is wrong is ${found.first.title} (${found.first.source})` +
+        found.first.suspicions.slice(0, 1).map((s) => `; it looks as if: ${s}`).join("");
+    table.replaceChildren(row(["object", "first wrong", "px over", "of", "worst at", "then also", "looks as if"], "th"));
+    for (const o of found.objects) {
+      const place = element("a", `${o.x}, ${o.y}`);
+      place.onclick = () => {
+        pixel = [o.x, o.y];
+        remember();
+        showProbe().catch((e) => complain(e.message));
+      };
+      const cell = element("td");
+      cell.append(place);
+      table.append(row([o.object, found.titles[o.first], element("td", o.over_tolerance, "number"), element("td", o.pixels, "number"), cell,
+                        o.then.map((name) => found.titles[name]).join(", "), o.suspicion]));
+    }
+    table.hidden = found.passed;
+  } catch (error) {
+    box.className = "bad";
+    box.textContent = error.message;
+  }
+  button.disabled = false;
+}
+
+function forget() { // another moment, or other shaders
+  if (compared === null) return;
+  compared = null;
+  $("verdict").className = "hint";
+  $("verdict").textContent = "Something has changed since: compare again.";
+  $("objects").hidden = true;
+}
+
 // ---- shaders that change ----------------------------------------------------------------------------------------
 
 function showShaders(now) {
@@ -196,10 +243,13 @@ async function follow(version, generation) {
     try {
       const now = await (await get("wait", { version })).json();
       if (now.version !== version) showShaders(now);
-      if (now.generation !== generation) refresh();
+      if (now.generation !== generation) {
+        forget();
+        refresh();
+      }
       ({ version, generation } = now);
-    } catch {
-      $("reload").textContent = "the server is gone";
+    } catch (error) {
+      $("reload").textContent = error instanceof TypeError ? "the server is gone" : error.message; // TypeError: nobody answered
       $("reload").classList.add("bad");
       await new Promise((done) => setTimeout(done, 1000));
     }
@@ -246,6 +296,7 @@ async function start() {
   for (const id of SETTINGS) $(id).addEventListener("change", refresh);
   $("time").addEventListener("input", () => { setTime(Number($("time").value)); refresh(); });
   $("seconds").addEventListener("change", refresh);
+  $("compare").onclick = compare;
   $("back").onclick = () => label(-1);
   $("next").onclick = () => label(1);
   for (const image of document.querySelectorAll(".picture img"))
@@ -266,7 +317,9 @@ async function start() {
     event.preventDefault();
   });
   const still = new URLSearchParams(location.hash.slice(1)).has("still"); // for screenshots, which wait until nothing is loading
+  const fault = new URLSearchParams(location.hash.slice(1)).has("fault"); // and with the verdict
   refresh();
+  if (fault) compare();
   if (!still) follow(state.version, state.generation);
 }
 

@@ -1,0 +1,257 @@
+"""Which plain configurations stand for all that a template can draw, so that a template is accepted or refused when it is read.
+
+A sequence draws every distribution of its template. That no draw is refused for its range follows from checking, for
+everything that looks at values, all combinations of the *ends* of the distributions that it looks at together:
+
+- a field looks at its own value (for a list, at all its entries); besides both ends a value between them is tried, since
+  2.5 is no number of objects though 2 and 3 are;
+- a rule looks at the keys it names (:func:`blinkgl.config.base.rule`; it is given nothing else);
+- what a key means hangs on the ``kind`` of its table, on a ``preset`` beside it, and on what fills it in when it is not said
+  (:class:`Fill`: ``quality``, ``sensor``); and on every choice that it stands in.
+
+Everything else stays at its first option. So forty distributions of forty independent keys cost a hundred configurations,
+not 2^40. That the ends are enough holds for conditions that are monotone or convex in each value alone, as all of ours are.
+"""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from blinkgl.config.base import Config, Path, Rule, below, is_model, members
+from blinkgl.config.draw import is_distribution, options
+from blinkgl.errors import ConfigError
+
+MOST = 4096
+
+
+@dataclass(frozen=True)
+class Fill:
+    """Values laid under what a configuration says: ``values(*reads)`` returns a tree of them.
+
+    reads, writes : dotted keys from the top. ``values`` is given what the tree says at ``reads`` (None: nothing) and nothing
+    else, and may return keys at or below ``writes`` only."""
+
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    values: Callable[..., dict[str, Any]]
+
+    def __call__(self, tree: dict[str, Any]) -> dict[str, Any]:
+        """``tree`` over the fill's values. Raises TypeError where those are not the declared ones."""
+        given = self.values(*(_said(tree, key.split(".")) for key in self.reads))
+        for path in _leaves(given, ()):
+            if not any(_related(path, tuple(key.split(".")), True) and len(path) >= len(key.split(".")) for key in self.writes):
+                raise TypeError(f"a fill of {self.writes} wrote {'.'.join(path)}")
+        return _lay(given, tree)
+
+
+def _said(tree: Any, path: list[str]) -> Any:
+    for step in path:
+        tree = tree.get(step) if isinstance(tree, dict) else None
+    return tree
+
+
+def _leaves(node: Any, path: Path) -> Iterator[Path]:
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            yield from _leaves(value, (*path, key))
+    elif path:
+        yield path
+
+
+def _lay(under: Any, over: Any) -> Any:
+    """Tables key by key; anything else that is said wins."""
+    if not (isinstance(under, dict) and isinstance(over, dict)):
+        return over
+    return {**under, **{key: _lay(under[key], value) if key in under else value for key, value in over.items()}}
+
+
+def sites(tree: Any) -> list[Path]:
+    """Paths of all distributions, those inside the choices of others included, outermost first. Raises ConfigError for a
+    malformed one."""
+    found: dict[Path, None] = {}
+
+    def walk(node: Any, path: Path) -> None:
+        if is_distribution(node):
+            found[path] = None
+            for option in options(path, node):
+                walk(option, path)
+        else:
+            for step, child in _children(node):
+                walk(child, (*path, step))
+
+    walk(tree, ())
+    return list(found)
+
+
+def corners(model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Iterator[Any]:
+    """Plain trees that stand for all that ``tree`` can draw, as this module says; the first has every first option.
+
+    Raises ConfigError: a malformed distribution, or more than ``MOST`` combinations that have to be looked at together."""
+    every = sites(tree)
+    if not every:
+        yield tree
+        return
+    for site in every:
+        group = _together([(site, is_leaf(model, site))], model, every, fills)
+        yield from combinations(tree, group, between=site)
+    done: list[frozenset[Path]] = []
+    for group in sorted({_together(keys, model, every, fills) for keys in _looked_at(model, every)}, key=len, reverse=True):
+        if not any(group <= other for other in done):
+            done.append(group)
+            yield from combinations(tree, group)
+
+
+def corners_of(keys: tuple[str, ...], model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Iterator[Any]:
+    """Plain trees with every combination of the ends of the distributions at or below ``keys``, and of what those hang on."""
+    every = sites(tree)
+    yield from combinations(tree, _together([(tuple(key.split(".")), True) for key in keys], model, every, fills))
+
+
+def combinations(tree: Any, group: frozenset[Path], between: Path | None = None) -> Iterator[Any]:
+    """``tree`` with every combination of options of the distributions at the paths in ``group``, the first option of all
+    others. ``between``: the one of which a value inside the range is an option, too."""
+    number = _count(tree, (), group)
+    if number > MOST:
+        raise ConfigError("too many distributions are looked at together", where=", ".join(sorted(".".join(p) for p in group))[:200],
+                          value=f"{number} combinations", accepted=f"at most {MOST}; draw fewer of them")
+    yield from _expand(tree, (), group, between)
+
+
+def _expand(node: Any, path: Path, group: frozenset[Path], between: Path | None) -> Iterator[Any]:
+    if is_distribution(node):
+        given = options(path, node, between=path == between)
+        for option in given if path in group else given[:1]:
+            yield from _expand(option, path, group, between)
+        return
+    children = _children(node)
+    if not any(_holds(child) for _, child in children):
+        yield node
+        return
+
+    def product(at: int) -> Iterator[list[Any]]:
+        if at == len(children):
+            yield []
+            return
+        step, child = children[at]
+        for value in _expand(child, (*path, step), group, between):
+            for rest in product(at + 1):
+                yield [value, *rest]
+
+    for values in product(0):
+        yield dict(zip(node, values, strict=True)) if isinstance(node, dict) else values
+
+
+def _count(node: Any, path: Path, group: frozenset[Path]) -> int:
+    if is_distribution(node):
+        given = options(path, node)
+        return sum(_count(option, path, group) for option in (given if path in group else given[:1]))
+    number = 1
+    for step, child in _children(node):
+        number *= _count(child, (*path, step), group)
+    return number
+
+
+def _holds(node: Any) -> bool:
+    return is_distribution(node) or any(_holds(child) for _, child in _children(node))
+
+
+def _children(node: Any) -> list[tuple[str, Any]]:
+    if isinstance(node, dict):
+        return [(str(key), value) for key, value in node.items()]
+    return [(str(i), value) for i, value in enumerate(node)] if isinstance(node, list) else []
+
+
+# --- what is looked at together ---------------------------------------------------------------------------------------
+
+
+def _related(site: Path, key: Path, deep: bool) -> bool:
+    """Whether the distribution at ``site`` decides the value at ``key``: it holds it, or, ``deep``, is a part of it."""
+    return (deep or len(site) <= len(key)) and all(s == k or k == "*" for s, k in zip(site, key))
+
+
+def _together(keys: list[tuple[Path, bool]], model: type[Config], every: list[Path], fills: tuple[Fill, ...]) -> frozenset[Path]:
+    """The distributions that decide the values of ``keys`` (path, whether with all below it), directly or by what those hang on."""
+    wanted = dict.fromkeys(keys)
+    queue = list(wanted)
+    while queue:
+        key, deep = queue.pop()
+        more = [(hung, False) for hung in _hangs_on(model, key)]
+        for fill in fills:
+            writes = [tuple(w.split(".")) for w in fill.writes]
+            if any(_related(key, w, True) and (deep or len(key) >= len(w)) for w in writes):
+                more += [(tuple(r.split(".")), False) for r in fill.reads]
+        for one in more:
+            if one not in wanted:
+                wanted[one] = None
+                queue.append(one)
+    return frozenset(site for site in every if any(_related(site, key, deep) for key, deep in wanted))
+
+
+def _hangs_on(model: type[Config], key: Path) -> Iterator[Path]:
+    """Tags of the unions and presets of the models that the key stands in."""
+    here: list[Any] = [model]
+    for depth, step in enumerate((*key, None)):
+        models = [a for a in here if is_model(a)]
+        tags = {name for name in ("kind", "emulator") for m in models if name in m.model_fields} if len(models) > 1 else set()
+        for name in sorted(tags | ({"preset"} if any(m.presets for m in models) else set())):
+            yield (*key[:depth], name)
+        if step is not None:
+            here = [x for a in here for x in below(a, step)]
+
+
+def is_leaf(model: type[Config], path: Path) -> bool:
+    """Whether ``path`` stands at or inside a field that holds no tables: then all of the field is one value."""
+    here: list[Any] = [model]
+    for step in path:
+        here = [x for a in here for x in below(a, step)]
+        if not any(_has_models(a) for a in here):
+            return True
+    return False
+
+
+def _has_models(annotation: Any) -> bool:
+    if is_model(annotation):
+        return True
+    return any(_has_models(x) for a in typing.get_args(annotation) if a is not type(None) for x in members(a))
+
+
+@lru_cache
+def placed_rules(model: type[Config]) -> tuple[tuple[Path, Rule], ...]:
+    """Every rule of ``model`` and of the models below it, with the path of the model that it belongs to ("*": any entry)."""
+    found: list[tuple[Path, Rule]] = []
+
+    def walk(annotation: Any, path: Path) -> None:
+        if is_model(annotation):
+            found.extend((path, one) for one in annotation.rules)
+            for name, info in annotation.model_fields.items():
+                for member in members(info.annotation):
+                    walk(member, (*path, name))
+            return
+        for argument in typing.get_args(annotation):
+            if argument not in (Ellipsis, type(None)) and not isinstance(argument, (str, int)):
+                for member in members(argument):
+                    if _has_models(member):
+                        walk(member, (*path, "*"))
+
+    walk(model, ())
+    return tuple(dict.fromkeys(found))
+
+
+def _looked_at(model: type[Config], every: list[Path]) -> Iterator[list[tuple[Path, bool]]]:
+    """The keys of every rule that a distribution has to do with, its place bound to the entries where those are."""
+    for place, one in placed_rules(model):
+        for prefix in sorted({_bound(place, site) for site in every}):
+            keys = [((*prefix, *path), deep) for path, deep in one.paths()]
+            if any(_related(site, key, deep) for site in every for key, deep in keys):
+                yield keys
+
+
+def _bound(place: Path, site: Path) -> Path:
+    """``place`` with its "*" replaced by where ``site`` is, if it is there."""
+    if len(site) >= len(place) and _related(site[:len(place)], place, False):
+        return site[:len(place)]
+    return place

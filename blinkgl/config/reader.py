@@ -1,0 +1,185 @@
+"""The one place that knows YAML: text in, plain data out (tables with text keys, lists, text, numbers, true/false, null), and back.
+
+Whoever wrote the file may be a stranger, so what a file may cost is bounded before it is built: its size, its depth, the
+length of its numbers, and the number of values *after* aliases and merge keys are expanded (a few hundred bytes of aliases
+to aliases make billions). Plain tags only; a key given twice in one table is an error; a table may override what its merge
+key (``<<: *base``) brings. Dates are text, since nothing here is a date. ``1e-4`` is text in YAML 1.1: the models convert it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+from yaml.composer import Composer, ComposerError
+from yaml.constructor import ConstructorError, SafeConstructor
+from yaml.nodes import MappingNode, Node, ScalarNode
+from yaml.resolver import Resolver
+
+from blinkgl.errors import ConfigError
+
+MAX_BYTES = 4 << 20
+MAX_VALUES = 100_000
+MAX_DEPTH = 50
+MAX_DIGITS = 100
+
+# libyaml's parser hands out events one by one, without recursion; the composing that counts is Python's either way.
+_Events: Any = getattr(yaml, "cyaml", None) and yaml.cyaml.CParser
+if not _Events:
+    class _Events(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):  # type: ignore[no-redef]
+        def __init__(self, stream: str):
+            yaml.reader.Reader.__init__(self, stream)
+            yaml.scanner.Scanner.__init__(self)
+            yaml.parser.Parser.__init__(self)
+
+
+class _Loader(Composer, _Events, SafeConstructor, Resolver):
+    """Composes with a count of the values that the document expands to; refuses what is not plain data."""
+
+    yaml_constructors: dict = {}
+    yaml_implicit_resolvers: dict = {first: [(tag, regexp) for tag, regexp in known if not tag.endswith(":timestamp")]
+                                     for first, known in Resolver.yaml_implicit_resolvers.items()}
+
+    def __init__(self, text: str):
+        _Events.__init__(self, text)
+        Composer.__init__(self)
+        SafeConstructor.__init__(self)
+        Resolver.__init__(self)
+        self._values, self._depth = 0, 0
+        self._sizes: dict[int, int] = {}
+
+    def compose_node(self, parent: Node | None, index: Any) -> Node:
+        """As Composer's; an alias counts as everything behind it."""
+        before = self._values
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            known = self.anchors.get(event.anchor)
+            if known is not None:
+                if id(known) not in self._sizes:
+                    raise ComposerError(None, None, f"alias '{event.anchor}' is inside what it stands for", event.start_mark)
+                self._count(self._sizes[id(known)], event)
+            return super().compose_node(parent, index)
+        event = self.peek_event()
+        self._count(1, event)
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise ComposerError(None, None, f"more than {MAX_DEPTH} tables and lists inside one another", event.start_mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        self._sizes[id(node)] = self._values - before
+        return node
+
+    def _count(self, more: int, event: Any) -> None:
+        self._values += more
+        if self._values > MAX_VALUES:
+            raise ComposerError(None, None, f"more than {MAX_VALUES} values, aliases expanded", event.start_mark)
+
+    def plain_map(self, node: MappingNode) -> dict[str, Any]:
+        """Table of a mapping. The keys are constructed before merge keys are flattened: only the table's own may clash."""
+        if not isinstance(node, MappingNode):
+            raise ConstructorError(None, None, "not a table", node.start_mark)
+        self._refuse_twice(node)
+        self.flatten_mapping(node)
+        return {self._key(key): self.construct_object(value, deep=True) for key, value in node.value}
+
+    def _refuse_twice(self, node: MappingNode) -> None:
+        seen: set = set()
+        for key_node, _ in node.value:
+            key = "<<" if key_node.tag.endswith(":merge") else self._key(key_node)
+            if key in seen:
+                raise ConstructorError(None, None, f"key '{key}' is given twice", key_node.start_mark)
+            seen.add(key)
+
+    def flatten_mapping(self, node: MappingNode) -> None:
+        """As SafeConstructor's, once per table: an alias to a table comes by again."""
+        if any(key.tag.endswith(":merge") for key, _ in node.value):
+            super().flatten_mapping(node)
+
+    def _key(self, node: Node) -> Any:
+        key = self.construct_object(node, deep=True) if isinstance(node, ScalarNode) else None
+        if not isinstance(key, (str, int, float)):
+            raise ConstructorError(None, None, "a key is not plain text", node.start_mark)
+        return key
+
+    def plain_scalar(self, node: ScalarNode) -> Any:
+        """Text, number, true/false or null, by its tag. No one writes a number of a hundred digits, and Python will not print
+        one of five thousand."""
+        kind = node.tag.rpartition(":")[2]
+        if kind in ("int", "float") and len(node.value) > MAX_DIGITS:
+            raise ConstructorError(None, None, f"a number of {len(node.value)} digits", node.start_mark)
+        try:
+            return getattr(self, f"construct_yaml_{kind}")(node)
+        except (ValueError, LookupError):  # only where the tag is written out: !!int abc
+            raise ConstructorError(None, None, f"not a YAML {kind}", node.start_mark) from None
+
+    def plain_seq(self, node: Node) -> list:
+        if not isinstance(node, yaml.SequenceNode):
+            raise ConstructorError(None, None, "not a list", node.start_mark)
+        return [self.construct_object(value, deep=True) for value in node.value]
+
+
+for _tag in ("null", "bool", "int", "float", "str"):
+    _Loader.yaml_constructors[f"tag:yaml.org,2002:{_tag}"] = _Loader.plain_scalar
+_Loader.yaml_constructors["tag:yaml.org,2002:map"] = _Loader.plain_map
+_Loader.yaml_constructors["tag:yaml.org,2002:seq"] = _Loader.plain_seq
+_Loader.yaml_constructors[None] = SafeConstructor.construct_undefined
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """Plain data from YAML text (None for an empty one); ConfigError with line and column when it is not YAML, or too much of it.
+
+    where : file or option, for the message."""
+    if len(text) > MAX_BYTES:
+        raise ConfigError("too large for a configuration", where=where, accepted=f"at most {MAX_BYTES} bytes")
+    loader = None
+    try:
+        loader = _Loader(text)
+        return loader.get_single_data()
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise ConfigError(f"not valid YAML: {problem}", where=place) from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Plain data of a YAML file. ConfigError: missing, unreadable, no regular file, too large, not UTF-8, not YAML."""
+    path = Path(path)
+    where = str(path)
+    try:
+        if path.exists() and not path.is_file():
+            raise ConfigError("cannot be read: not a regular file", where=where, accepted="a YAML file")
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError("file is too large for a configuration", where=where, accepted=f"at most {MAX_BYTES} bytes")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError("no such file", where=where, accepted="a YAML file") from None
+    except OSError as error:
+        raise ConfigError(f"cannot be read: {(error.strerror or str(error)).lower()}", where=where, accepted="a YAML file") from None
+    except ValueError:  # bytes that are no UTF-8, or a NUL in the name
+        raise ConfigError("cannot be read: not text in UTF-8", where=where, accepted="a YAML text file in UTF-8") from None
+    return parse_yaml(text, where)
+
+
+def read_table(path: str | Path, accepted: str = "key: value lines") -> dict[str, Any]:
+    """:func:`read_yaml` of a file that has to hold a table; an empty file is an empty table."""
+    tree = read_yaml(path)
+    if tree is None:
+        return {}
+    if not isinstance(tree, dict):
+        raise ConfigError("not a table of keys", where=str(path), value=tree, accepted=accepted)
+    return tree
+
+
+def to_yaml(tree: Any) -> str:
+    """YAML text that :func:`parse_yaml` reads as ``tree``; keys in their order, no aliases."""
+    return yaml.dump(tree, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True

@@ -1,0 +1,93 @@
+"""Events as a file claims them: nothing wraps round, nothing lies outside the sensor, nothing runs backwards.
+
+Every reader hands the columns it finds to :func:`events_of`; :class:`blinkgl.io.formats.EventFile`, the slicing readers and every
+writer ask :func:`check_events` for the rest. Positions in messages are indices of events, counted from the file's first.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.events.types import Events
+
+MAX_SIDE = 65536
+_MAX_TIME = 1 << 62
+"""µs; sums and differences of two such times still fit int64."""
+
+
+def events_of(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, where: str, first: int = 0, *, offset: int = 0,
+              signed: bool = False) -> Events:
+    """Columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
+
+    t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. first : index of the first of these events in the file.
+    Raises EventDataError, naming event and value, for what Events cannot hold: coordinates outside uint16 or between pixels, NaN,
+    times beyond int64, another polarity. AssetError: a column that is no 1-D array of numbers, or columns of different lengths."""
+    columns = {"x": np.asarray(x), "y": np.asarray(y), "t": np.asarray(t), "p": np.asarray(p)}
+    if any(c.ndim != 1 for c in columns.values()) or len({len(c) for c in columns.values()}) != 1:
+        raise AssetError("event columns differ in length", where=where, value={k: c.shape for k, c in columns.items()})
+    x = _whole(columns["x"], "x", np.uint16, 0, MAX_SIDE - 1, where, first)
+    y = _whole(columns["y"], "y", np.uint16, 0, MAX_SIDE - 1, where, first)
+    t = _whole(columns["t"], "t", np.int64, -_MAX_TIME - min(offset, 0), _MAX_TIME - max(offset, 0), where, first)
+    p = _whole(columns["p"], "p", np.int8, -1 if signed else 0, 1, where, first)
+    return Events(x, y, t + offset if offset else t, (p > 0).view(np.uint8) if signed else p.view(np.uint8))
+
+
+def microseconds(seconds: np.ndarray, where: str, first: int = 0) -> np.ndarray:
+    """int64 µs, rounded, of float seconds. Raises EventDataError, naming the event, for NaN, infinity and what int64 cannot hold."""
+    t = np.rint(np.asarray(seconds, np.float64) * 1e6)
+    if len(t) and not (np.abs(t) < _MAX_TIME).all():  # NaN compares False
+        i = int(np.argmin(np.abs(t) < _MAX_TIME))
+        raise EventDataError(f"time of event {first + i}", where=where, value=float(seconds[i]), accepted="seconds that fit int64 µs")
+    return t.astype(np.int64)
+
+
+def check_events(events: Events, where: str, first: int = 0, *, height: int | None = None, width: int | None = None,
+                 after: int | None = None) -> int | None:
+    """Refuses, naming event and value, what lies outside a sensor of that size (None: not known), a polarity other than 0 and 1, and
+    times that run backwards, also against ``after``, the last time before these events. Returns the last time (``after`` when there are
+    no events). Raises EventDataError."""
+    t = events.t
+    if not len(t):
+        return after
+    if after is not None and t[0] < after:
+        raise EventDataError(f"event times run backwards at event {first}", where=where, value=(after, int(t[0])))
+    if (back := t[1:] < t[:-1]).any():
+        i = int(np.argmax(back))
+        raise EventDataError(f"event times run backwards at event {first + i + 1}", where=where, value=(int(t[i]), int(t[i + 1])))
+    for name, side in (("x", width), ("y", height)):
+        column = getattr(events, name)
+        if side is not None and column.max() >= side:
+            i = int(np.argmax(column >= side))
+            raise EventDataError(f"event {first + i} is outside the sensor", where=where, value=(int(events.x[i]), int(events.y[i])),
+                                 accepted=", ".join(f"{k} < {n}" for k, n in (("x", width), ("y", height)) if n is not None))
+    if events.p.max() > 1:
+        i = int(np.argmax(events.p > 1))
+        raise EventDataError(f"polarity of event {first + i}", where=where, value=int(events.p[i]), accepted="0 or 1")
+    return int(t[-1])
+
+
+def check_size(height: int | None, width: int | None, where: str) -> None:
+    """AssetError when a sensor's declared size (None: not declared) is impossible."""
+    if not all(n is None or 0 < n <= MAX_SIDE for n in (height, width)):
+        raise AssetError("impossible sensor size", where=where, value=f"{width}x{height}", accepted=f"1 to {MAX_SIDE} px a side")
+
+
+def _whole(column: np.ndarray, name: str, dtype, low: int, high: int, where: str, first: int) -> np.ndarray:
+    """``column`` as ``dtype``, every value unchanged."""
+    if column.dtype.kind not in "iufb":
+        raise AssetError(f"event column '{name}' holds no numbers", where=where, value=str(column.dtype), accepted="integers or floats")
+    limits = None if column.dtype.kind in "fb" else np.iinfo(column.dtype)
+    fits = column.dtype.kind == "b" or (limits is not None and limits.min >= low and limits.max <= high)
+    if not fits and len(column) and not (column.min() >= low and column.max() <= high):  # NaN compares False
+        good = (column >= low) & (column <= high)
+        _refuse(column, good, name, f"{low} to {high}", where, first)
+    out = column.astype(dtype, copy=False)
+    if column.dtype.kind == "f" and not (good := out == column).all():
+        _refuse(column, good, name, "whole numbers", where, first)
+    return out
+
+
+def _refuse(column: np.ndarray, good: np.ndarray, name: str, accepted: str, where: str, first: int) -> None:
+    i = int(np.argmin(good))
+    raise EventDataError(f"{name} of event {first + i}", where=where, value=column[i].item(), accepted=accepted)

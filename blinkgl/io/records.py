@@ -1,0 +1,119 @@
+"""Records on disk that somebody else may have written or damaged: read with limits, and from regular files alone.
+
+A manifest, an index, a run's record: whatever stands in them, reading ends, and ends with data of the shape that its model asks
+for or with one line that says what is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, TypeAdapter, ValidationError
+
+from blinkgl.errors import AssetError
+
+MAX_RECORD_BYTES = 512 << 20
+MAX_NAME_BYTES = 1024
+_BLOCK = 1 << 20
+
+
+def open_regular(path: str | os.PathLike) -> int:
+    """A file descriptor for reading. OSError; AssetError for what is no regular file: a pipe would wait for a writer for ever, a
+    device has no end. A link at the end of the path is followed only to such a file."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise AssetError("not a regular file", where=str(path))
+    return descriptor
+
+
+def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:
+    """UTF-8 text of a regular file. FileNotFoundError; AssetError: unreadable, no text, more than ``limit`` bytes."""
+    try:
+        with open(open_regular(path), "rb") as file:
+            data = file.read(limit + 1)
+        if len(data) > limit:
+            raise AssetError("too large", where=str(path), accepted=f"at most {limit} bytes")
+        return data.decode("utf-8")
+    except FileNotFoundError:
+        raise
+    except ValueError:  # bytes that are no UTF-8; a path that holds NUL
+        raise AssetError("not a text file in UTF-8", where=str(path)) from None
+    except OSError as error:
+        raise AssetError(f"cannot be read: {error.strerror}", where=str(path)) from error
+
+
+def parse(text: str, model: TypeAdapter | None = None) -> Any:
+    """Plain data from JSON text, as written, once ``model`` has accepted it. ValueError says in one line what is wrong: no JSON, nested too deeply,
+    a key twice, or not of the model's shape."""
+    try:
+        data = json.loads(text, object_pairs_hook=_unique)
+        if model is not None:
+            model.validate_python(data)
+        return data
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = ".".join(shown(part) for part in first["loc"])
+        raise ValueError(f"{place}: {first['msg'].removeprefix('Value error, ').lower()}" if place else first["msg"].lower()) from None
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except json.JSONDecodeError as error:
+        raise ValueError(f"not JSON: {error.msg.lower()} at line {error.lineno}") from None
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) != len(pairs):
+        raise ValueError("a key is given twice")
+    return table
+
+
+def shown(name: Any, most: int = 160) -> str:
+    """A name from disk as it may be printed on a terminal: one line, no control characters, not too long."""
+    text = str(name)
+    text = text if text.isprintable() else ascii(text)[1:-1]
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def _inside(name: str) -> str:
+    """ValueError unless ``name`` is a plain relative POSIX path that stays where it starts."""
+    parts = name.split("/")
+    try:
+        sizes = [len(part.encode("utf-8")) for part in parts]
+    except UnicodeEncodeError:
+        raise ValueError("not a file name") from None
+    if "\0" in name or min(sizes) == 0 or {".", ".."} & set(parts):
+        raise ValueError("not a path inside the folder")
+    if max(sizes) > 255 or sum(sizes) + len(sizes) > MAX_NAME_BYTES:
+        raise ValueError("not a file name: too long")
+    return name
+
+
+InsidePath = Annotated[str, AfterValidator(_inside)]
+"""A relative path that neither leaves its folder nor names the folder itself."""
+
+
+def entries_below(folder: str | os.PathLike) -> Iterator[tuple[str, str, int]]:
+    """(POSIX path relative to ``folder``, kind, bytes) of everything below it; kind is "file", "empty folder", "symbolic link" or
+    "special file". Links are not followed. Folders that hold something are not listed themselves. OSError."""
+    pending = [""]
+    while pending:
+        prefix = pending.pop()
+        empty = True
+        with os.scandir(os.path.join(folder, prefix)) as found:
+            for entry in found:
+                empty = False
+                name = prefix + entry.name
+                status = entry.stat(follow_symlinks=False)
+                if stat.S_ISDIR(status.st_mode):
+                    pending.append(name + "/")
+                else:
+                    kind = "file" if stat.S_ISREG(status.st_mode) else "symbolic link" if stat.S_ISLNK(status.st_mode) else "special file"
+                    yield name, kind, status.st_size
+        if empty and prefix:
+            yield prefix[:-1], "empty folder", 0

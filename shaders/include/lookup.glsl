@@ -1,0 +1,44 @@
+// What a pass looks up in its texture, for the shader debugger: included by the variant SHOW_LOOKUP alone, which nothing
+// but tools/shader_debugger asks for. Every look-up that follows in the pass's own source is noted with the coordinates
+// and the level that it really uses, whatever expression the source has in its place.
+
+layout(location = 1) out vec4 shown_lookup; // u, v (times uv_scale), mip level (before clamping), light
+layout(location = 2) out vec4 shown_albedo; // what is multiplied by the light; number of look-ups
+
+vec4 noted = vec4(0.0); // sum over the look-ups of (u, v, level, 1)
+
+vec4 noted_texture(sampler2D image, vec2 at)
+{
+    noted += vec4(at, textureQueryLod(image, at).y, 1.0);
+    return texture(image, at);
+}
+
+vec4 noted_texture(sampler2D image, vec2 at, float bias)
+{
+    noted += vec4(at, textureQueryLod(image, at).y + bias, 1.0);
+    return texture(image, at, bias);
+}
+
+vec4 noted_texture_lod(sampler2D image, vec2 at, float level)
+{
+    noted += vec4(at, level, 1.0);
+    return textureLod(image, at, level);
+}
+
+vec4 noted_texture_grad(sampler2D image, vec2 at, vec2 along_x, vec2 along_y)
+{
+    vec2 size = vec2(textureSize(image, 0));
+    noted += vec4(at, log2(max(length(along_x * size), length(along_y * size))), 1.0);
+    return textureGrad(image, at, along_x, along_y);
+}
+
+// To be called once, when the albedo is known and the light has not been multiplied yet.
+void show_lookup(vec3 unlit, float light)
+{
+    shown_lookup = vec4(noted.xyz / max(noted.w, 1.0), light);
+    shown_albedo = vec4(unlit, noted.w);
+}
+
+#define texture noted_texture
+#define textureLod noted_texture_lod
+#define textureGrad noted_texture_grad

@@ -1,0 +1,240 @@
+"""The table of features: each top-level feature with its kinds, as changes of one tiny configuration, and what may not be combined.
+
+A *row* is one kind of every feature: a whole configuration. :func:`covering_rows` finds few rows in which any two kinds of any
+two features meet. Whoever adds a feature adds its kinds to ``FEATURES``; ``test_cross.py`` says so when that was forgotten.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import random
+import typing
+from typing import Any
+
+from pydantic import BaseModel
+
+from blinkgl.config.quality import QUALITIES
+from blinkgl.config.sensor import sensor_names
+from blinkgl.config.sequence import SequenceConfig
+
+WIDTH, HEIGHT, FPS = 32, 24, 100
+_POOLS = {"pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
+          "textures": {"procedural": ["checks", "fbm"], "variants": 8, "photographs": False, "max_size": 32, "test_fraction": 0.3}}
+_FAST = {"speed": [2, 5], "rotation_rate": [60, 200]}
+_RANDOM = {"kind": "random", **_POOLS, "objects": {"count": 3, "distance": [2, 5]}, "camera_motion": _FAST, "object_motion": _FAST}
+_KEYED = {"keyframes": [{"time": t, "position": [0, 20 * t, 0.1]} for t in (0, 4)], "interpolation": "linear"}
+_CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * t, 0], "look_at": [0, 14 * t, 0]} for t in (0, 2, 4)]}
+_EXPLICIT = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
+             "materials": {"checks": {"procedural": "checks", "max_size": 32}},
+             "objects": [{"mesh": "box", "material": "checks", **_KEYED}, {"mesh": "ball", "position": [1, 0, 0]}], "camera": _CAMERA}
+_FILE = {"kind": "file", "path": "scene.glb", "pose": _CAMERA}
+
+BASE = {"camera": {"width": WIDTH, "height": HEIGHT}, "time": {"duration": 0.03, "label_rate": FPS}, "scene": _RANDOM,
+        "preview": {"enabled": False}}
+
+
+def _frames(**more: Any) -> dict[str, Any]:
+    return {"frames": {"folders": ["P*"], "fps": FPS, **more}}
+
+
+NOTHING: dict[str, Any] = {}
+FEATURES: dict[str, dict[str, dict[str, Any]]] = {
+    "source": {
+        "random": NOTHING,
+        "still camera": {"scene": {"camera_motion": {"kind": "static"}}},
+        "explicit": {"scene": _EXPLICIT},
+        "file": {"scene": _FILE},
+        "frames, motion": _frames(interpolate="motion", max_px=0.5),
+        "frames, linear": _frames(interpolate="linear", flow="flow_flo", gamma="linear"),
+        "frames, cubic": _frames(interpolate="cubic", flow=None, first=1, count=4),
+    },
+    "emulator": {
+        "esim": {"events": {"emulator": "esim"}},
+        "esim, noisy": {"events": {"emulator": "esim", "threshold_jitter": 0.05, "refractory_us": 50, "contrast_threshold_off": 0.3}},
+        "v2e": {"events": {"emulator": "v2e"}},
+        "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean"}},
+        "v2e, noisy": {"events": {"emulator": "v2e", "preset": "noisy", "photoreceptor_noise": True, "cutoff_hz": 200, "hot_pixel_fraction": 0.01}},
+        "voltmeter": {"events": {"emulator": "voltmeter"}},
+        "voltmeter, 240": {"events": {"emulator": "voltmeter", "preset": "DVS240"}},
+    },
+    "timeline": {
+        "uniform": {"timeline": {"kind": "uniform", "fps": 400}},
+        "displacement": {"timeline": {"kind": "displacement", "max_px": 1}},
+        "brightness": {"timeline": {"kind": "brightness"}},
+        "budget": {"timeline": {"kind": "budget", "max_time_error_us": 300}},
+        "unsaid": NOTHING,
+    },
+    "between frames": {
+        "unsaid": NOTHING,
+        "pchip": {"timeline": {"reconstruction": "pchip"}},
+        "hermite": {"timeline": {"reconstruction": "hermite"}},
+    },
+    "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in QUALITIES}},
+    "sensor": {"unsaid": NOTHING, **{name: {"sensor": name} for name in sensor_names()}},
+    "readout": {
+        "unsaid": NOTHING,
+        "ample": {"readout": {"events_per_second": 1e9}},
+        "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
+    },
+    "anti-aliasing": {name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")},
+    "images": {**{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")}, "no images": {"labels": {"images": False}}},
+    "textures": {"plain": NOTHING, "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}}, "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}}},
+    "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
+    "light": {"lit": NOTHING, "unlit": {"scene": {"light": {"unlit": True}}}},
+    "flow": {"forward": NOTHING, "both": {"labels": {"flow": ["forward", "backward"]}}, "backward": {"labels": {"flow": ["backward"]}},
+             "none": {"labels": {"flow": []}}},
+    "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo", "h5")}},
+    "labels": {
+        "default": NOTHING,
+        "all": {"labels": {"depth": True, "ids": True, "normals": True, "velocity": True}},
+        "fewest": {"labels": {"occlusion": False}},
+    },
+    "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100, "slowdown": 10}}},
+    "time": {
+        "from 0": NOTHING,
+        "late": {"time": {"start": 3.0}},
+        "between microseconds": {"time": {"start": 7e-7, "label_rate": 90, "duration": 0.034}},
+        "drawn": {"time": {"duration": {"uniform": [0.02, 0.03]}}},
+    },
+    "camera": {"default": NOTHING, "odd": {"camera": {"width": WIDTH - 1, "height": HEIGHT - 1, "focal": 30, "cx": 12.3}}, "wide": {"camera": {"fov": 110, "near": 0.2}}},
+    "output": {"train": NOTHING, "test": {"output": {"split": "test", "name": "probe", "first_index": 1}}},
+    "seed": {"the group's": NOTHING, "its own": {"seed": 2**62 + 1}},
+}
+RUN_LEVEL = {"gl": "one OpenGL for all groups of a run; tests/gl tries the backends"}
+"""Top-level keys that are no feature of a sequence."""
+
+Kind = tuple[str, str]
+_STRAIGHT_ONLY = [("emulator", kind) for kind in FEATURES["emulator"] if not kind.startswith("esim")]
+REFUSED: dict[tuple[Kind, Kind], str] = {
+    **{((("between frames", curve)), emulator): "timeline.reconstruction: " + emulator[1].split(",")[0] + " follows straight lines alone"
+       for curve in ("pchip", "hermite") for emulator in _STRAIGHT_ONLY},
+}
+"""Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there they are no contradiction."""
+
+TOO_SLOW: set[tuple[Kind, Kind]] = {(one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))}
+"""Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with multi-sampling and anisotropy (beside a
+triangle that ends at the horizon the footprint of a pixel is endless, and it adds up every texel of it)."""
+
+ELSEWHERE = {
+    "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit and whether the camera moves",
+    "gl": RUN_LEVEL["gl"],
+}
+_SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}
+
+
+def merged(table: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
+    """``change`` laid over ``table``, key by key; a table of another kind replaces the one below."""
+    made = copy.deepcopy(table)
+    for key, value in change.items():
+        below = made.get(key)
+        if isinstance(value, dict) and isinstance(below, dict) and value.get("kind", below.get("kind")) == below.get("kind"):
+            made[key] = merged(below, value)
+        else:
+            made[key] = copy.deepcopy(value)
+    return made
+
+
+def configuration(row: dict[str, str]) -> dict[str, Any]:
+    """The tree of a row; features that it does not name are as in ``BASE``."""
+    tree = BASE
+    for feature in FEATURES:
+        if feature in row:
+            tree = merged(tree, FEATURES[feature][row[feature]])
+    return tree
+
+
+def refusal(row: dict[str, str]) -> str | None:
+    """What is said when this row is given; None: it is accepted."""
+    if row.get("source", "").startswith("frames"):
+        return None
+    return next((line for (a, b), line in REFUSED.items() if row.get(a[0]) == a[1] and row.get(b[0]) == b[1]), None)
+
+
+def fits(row: dict[str, str]) -> bool:
+    """Whether a row may be made here."""
+    return refusal(row) is None and not any(row.get(a[0]) == a[1] and row.get(b[0]) == b[1] for a, b in TOO_SLOW)
+
+
+def pairs(row: dict[str, str]) -> set[tuple[Kind, Kind]]:
+    return set(itertools.combinations(((f, row[f]) for f in FEATURES if f in row), 2))
+
+
+def all_pairs() -> set[tuple[Kind, Kind]]:
+    """Every pair of kinds of two features that is accepted by itself and not left out."""
+    kinds = [(feature, kind) for feature, those in FEATURES.items() for kind in those]
+    return {(a, b) for a, b in itertools.combinations(kinds, 2) if a[0] != b[0] and fits(dict((a, b)))}
+
+
+def covering_rows(seed: int = 0, tries: int = 12) -> list[dict[str, str]]:
+    """Rows, accepted each, in which every accepted pair meets. Greedy: each row begins with a pair that is missing and takes of every further
+    feature the kind that brings most of those; the best of ``tries`` orders. The same seed gives the same rows."""
+    rng, missing, rows = random.Random(seed), sorted(all_pairs()), []
+    while missing:
+        wanted = set(missing)
+        best: tuple[int, dict[str, str]] = (-1, {})
+        for _ in range(tries):
+            row = dict(missing[rng.randrange(len(missing))])
+            rest = [f for f in FEATURES if f not in row]
+            rng.shuffle(rest)
+            for feature in rest:
+                def gain(kind: str) -> int:
+                    return sum(((f, k), (feature, kind)) in wanted or ((feature, kind), (f, k)) in wanted for f, k in row.items())
+
+                fit = [kind for kind in FEATURES[feature] if fits({**row, feature: kind})]
+                most = max(map(gain, fit))
+                row[feature] = rng.choice([kind for kind in fit if gain(kind) == most])
+            best = max(best, (len(pairs(row) & wanted), row), key=lambda pair: pair[0])
+        rows.append({f: best[1][f] for f in FEATURES})
+        missing = [pair for pair in missing if pair not in pairs(rows[-1])]
+    return rows
+
+
+# ---- is the table whole? -----------------------------------------------------------------------------------------------
+
+
+def options_of_the_schema() -> set[tuple[str, Any]]:
+    """(dotted key, option) of every switch and every choice of the configuration, what is tested elsewhere left out."""
+    found: set[tuple[str, Any]] = set()
+
+    def literals(annotation: Any, path: str) -> None:
+        if annotation is bool:
+            found.update({(path, True), (path, False)})
+        elif typing.get_origin(annotation) is typing.Literal:
+            found.update((path, option) for option in typing.get_args(annotation))
+        elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            model(annotation, path)
+        else:
+            for inner in typing.get_args(annotation):
+                literals(inner, path)
+
+    def model(kind: type[BaseModel], path: str) -> None:
+        for name, field in kind.model_fields.items():
+            literals(field.annotation, f"{path}.{name}" if path else name)
+
+    model(SequenceConfig, "")
+    return {(path, option) for path, option in found if path.split(".")[0] not in ELSEWHERE or path in _SCENE_HERE}
+
+
+def options_of_the_table() -> set[tuple[str, Any]]:
+    """(dotted key, value) of everything the table says, and of the schema's defaults."""
+    found: set[tuple[str, Any]] = set()
+
+    def walk(node: Any, path: str) -> None:
+        if isinstance(node, dict):
+            for key, value in node.items():
+                walk(value, f"{path}.{key}" if path else key)
+        elif isinstance(node, (list, tuple)):
+            for value in node:
+                walk(value, path)
+        else:
+            found.add((path, node))
+
+    walk(SequenceConfig().model_dump(), "")
+    walk(BASE, "")
+    for change in (change for kinds in FEATURES.values() for change in kinds.values()):
+        walk(change, "")
+        for table in {"timeline", "events", "frames"} & change.keys():
+            if table == "frames" or {"kind", "emulator"} & change[table].keys():
+                walk(getattr(SequenceConfig.model_validate({table: change[table]}), table).model_dump(), table)
+    return found

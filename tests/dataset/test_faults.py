@@ -1,0 +1,494 @@
+"""What others do to a run while it is on: stopped workers, deleted files, clocks that jump, second drivers, links, refusals."""
+
+import fcntl
+import json
+import os
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tracemalloc
+from pathlib import Path
+
+import pytest
+
+from blinkgl.cli import run
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset import executor as executor_module
+from blinkgl.dataset import run_folder as run_folder_module
+from blinkgl.dataset import work
+from blinkgl.dataset.executor import Inline, Local
+from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.plan import Plan
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.run_folder import RunFolder
+from blinkgl.dataset.verify import verify_dataset
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError, may_pass
+from blinkgl.io import atomic
+from blinkgl.io import index as index_module
+from blinkgl.io.index import read_index, write_index
+from runs import RECIPE, recipe_file, start, temporaries, tree
+
+FLY = {"fly": {**RECIPE["groups"]["fly"], "output": {"sequences": 3}}}
+NAMES = [f"train/fly_{i:06d}" for i in range(3)]
+
+
+def template(folder: Path, **changes):
+    folder.mkdir(exist_ok=True)
+    return load_run(recipe_file(folder, **{"groups": FLY, **changes}))
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("reference")
+    list(generate_run(template(folder), folder / "out"))
+    return folder / "out"
+
+
+def assert_same(out: Path, reference: Path) -> None:
+    made = tree(out)
+    made.pop("index.jsonl")
+    assert made == tree(reference) and temporaries(out) == []
+
+
+class When:
+    """A display that acts once, at the first message of a kind (about a sequence, if one is named)."""
+
+    def __init__(self, kind: str, act, name: str | None = None):
+        self.kind, self.act, self.name, self.messages = kind, act, name, []
+
+    def begin(self, plan, outcome) -> None: ...
+    def end(self, outcome) -> None: ...
+
+    def message(self, name, message) -> None:
+        self.messages.append((name, dict(message)))
+        if self.act and message["kind"] == self.kind and self.name in (None, name):
+            act, self.act = self.act, None
+            act(name, message)
+
+
+# ---- which errors are worth another attempt ---------------------------------------------------------------------------
+
+
+def caused(error: Exception, cause: BaseException) -> Exception:
+    try:
+        try:
+            raise cause
+        except type(cause):
+            raise error from None
+    except type(error) as made:
+        return made
+
+
+@pytest.mark.parametrize("error, again", [
+    (ConfigError("x"), False), (AssetError("x"), False), (EventDataError("x"), False), (BlinkGLError("x"), False),
+    (OutputError("x"), True), (GLError("x"), True), (MemoryError(), True), (OSError(5, "Input/output error"), True),
+    (FileNotFoundError(2, "gone"), True), (RuntimeError("driver"), True), (Exception("moderngl raises these"), True),
+    (ValueError("a bug"), False), (KeyError("a bug"), False), (ZeroDivisionError(), False),
+    (caused(AssetError("cannot read the mesh"), OSError(116, "Stale file handle")), True),
+    (caused(AssetError("cannot read the mesh"), FileNotFoundError(2, "gone")), False),
+    (caused(AssetError("does not fit"), MemoryError()), True),
+])
+def test_what_may_pass_later(error, again):
+    assert may_pass(error) is again
+
+
+@pytest.mark.parametrize("error, attempts", [(AssetError("the mesh is corrupt"), 1), (EventDataError("time goes back"), 1),
+                                             (ValueError("a bug"), 1), (GLError("lost"), 3), (MemoryError("no memory"), 3)])
+def test_attempts(tmp_path, monkeypatch, error, attempts):
+    """One sequence of three fails, always alike."""
+    tried = []
+
+    def generate(config, index, *arguments, **options):
+        tried.append(index)
+        if index == 1:
+            raise error
+        return make(config, index, *arguments, **options)
+
+    make = work.generate_sequence
+    monkeypatch.setattr(work, "generate_sequence", generate)
+    outcome = run_dataset(template(tmp_path), tmp_path / "out")
+    assert tried.count(1) == attempts and list(outcome.set_aside) == [NAMES[1]] and len(outcome.made) == 2
+
+
+# ---- refused runs -----------------------------------------------------------------------------------------------------
+
+
+def test_a_refused_run_leaves_nothing(tmp_path, capsys):
+    """Not the folders above OUT, no record, no log; and what was there before stays."""
+    recipe = recipe_file(tmp_path, gl={"backend": "egl", "device": 99})
+    (tmp_path / "mine/empty").mkdir(parents=True)
+    for out, workers in (("a/b/out", []), ("a/b/out", ["--workers", "1"]), ("mine", [])):
+        assert run(["generate", str(recipe), "--out", str(tmp_path / out), *workers]) == 2
+        assert "no such EGL device" in capsys.readouterr().err
+        assert sorted(p.name for p in tmp_path.rglob("*")) == ["empty", "mine", "recipe.yaml"]
+
+
+def test_a_run_whose_only_sequence_cannot_be_made_leaves_nothing_but_what_was_put_away(tmp_path, monkeypatch):
+    run_dataset(template(tmp_path), tmp_path / "out", num=1)
+    (tmp_path / "out" / NAMES[0] / "mine.txt").write_text("notes of a user")
+
+    def generate(*arguments, **options):
+        raise AssetError("the mesh is corrupt", where="a.obj")
+
+    monkeypatch.setattr(work, "generate_sequence", generate)
+    (tmp_path / "out/of_the_user").mkdir()
+    with pytest.raises(BlinkGLError, match="a.obj: the mesh is corrupt"):
+        run_dataset(template(tmp_path), tmp_path / "out", num=1, resume=True)
+    left = sorted(p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if not any(p.glob("*")))
+    assert "of_the_user" in left and ".run/damaged/train/fly_000000-0/mine.txt" in left
+    assert not [p for p in left if "/damaged/" not in p and p != "of_the_user"]
+
+
+def test_workers_that_cannot_start_leave_the_log_their_error_names(tmp_path, monkeypatch):
+    monkeypatch.setattr(executor_module, "_BAD_STARTS", 1)
+    recipe = template(tmp_path)
+    (tmp_path / "blinkgl").mkdir()
+    (tmp_path / "blinkgl/__init__.py").write_text("raise ImportError('half an installation')")
+    monkeypatch.chdir(tmp_path)  # where 'python -m' looks first
+    with pytest.raises(BlinkGLError, match="workers cannot start: .*worker-0.log") as failure:
+        run_dataset(recipe, tmp_path / "out", Local(1))
+    assert "half an installation" in Path(failure.value.accepted.removeprefix("see ")).read_text()
+
+
+# ---- links ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["train", ".run"])
+def test_a_link_in_the_place_of_our_folder_is_refused(tmp_path, name):
+    for folder in ("out", "elsewhere"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "out" / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutputError, match=rf"out/{name}: is a symbolic link; expected a folder"):
+        run_dataset(template(tmp_path), tmp_path / "out")
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_out_may_be_a_link_and_is_followed_once(reference, tmp_path):
+    for folder in ("disk", "other"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "out").symlink_to(tmp_path / "disk")
+    run_dataset(template(tmp_path), tmp_path / "out")
+    assert_same(tmp_path / "disk", reference)
+
+    def turn(name, message):
+        (tmp_path / "link").unlink()
+        (tmp_path / "link").symlink_to(tmp_path / "other")
+
+    (tmp_path / "link").symlink_to(tmp_path / "disk2")
+    (tmp_path / "disk2").mkdir()
+    with pytest.raises(OutputError, match="link: was deleted, moved or replaced while the run was at work"):
+        run_dataset(template(tmp_path), tmp_path / "link", listener=When("done", turn))
+    assert list((tmp_path / "other").iterdir()) == [] and temporaries(tmp_path / "disk2") == []
+
+
+# ---- runs of millions -------------------------------------------------------------------------------------------------
+
+
+def test_tasks_know_their_numbers(tmp_path):
+    plan = Plan.of(template(tmp_path, groups={"a": {"output": {"sequences": 3, "first_index": 999_999}},
+                                              "b_1": {"output": {"sequences": 2, "split": "test"}}}))
+    names = [task.name for task in plan.tasks]
+    assert names == ["train/a_999999", "train/a_1000000", "train/a_1000001", "test/b_1_000000", "test/b_1_000001"]
+    assert [plan.tasks.number(name) for name in names] == list(range(5)) and plan.tasks[-1].name == names[-1]
+    assert [t.name for t in plan.tasks[1:3]] == names[1:3]
+    for foreign in ("train/a_0999999", "train/a_999998", "train/a_1000002", "train/b_1_000000", "test/b_1_00000", "a_999999", "train/a"):
+        assert plan.tasks.number(foreign) is None
+    with pytest.raises(IndexError):
+        plan.tasks[5]
+
+
+def peak_of(act) -> int:
+    tracemalloc.start()
+    try:
+        act()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
+    def begin(sequences: int):
+        class Enough(Exception): ...
+
+        def stop(name, message):
+            raise Enough
+
+        class Nothing(Inline):
+            def open(self, job):
+                super().open(job)
+                return [{"environment": {}, "assets": work.digest(self._maker.plan.check_assets())}]
+
+            def poll(self, timeout_s):
+                return [{"kind": "silent", "task": self._next[0], "error": "stop here"}]
+
+        def act():
+            with pytest.raises(Enough):
+                run_dataset(template(tmp_path, groups={"fly": {"output": {"sequences": sequences}}}), tmp_path / f"{sequences}", Nothing(),
+                            listener=When("silent", stop))
+        return act
+
+    begin(3)()
+    small, large = peak_of(begin(10)), peak_of(begin(10_000_000))
+    assert large < 1.5 * small + 1e6, f"{small} and {large} bytes"
+
+
+def test_the_index_is_sorted_in_parts(reference, tmp_path, monkeypatch):
+    monkeypatch.setattr(index_module, "_PART", 7)
+    manifest = json.loads((reference / NAMES[0] / "manifest.json").read_text())
+
+    def data_set(count: int) -> Path:
+        root = tmp_path / f"of{count}"
+        for k in range(count):
+            folder = root / ("train", "test")[k % 2] / f"s_{k * 7919 % count:06d}"
+            folder.mkdir(parents=True)
+            (folder / "manifest.json").write_text(json.dumps({**manifest, "sequence": k}))
+        return root
+
+    few, many = data_set(20), data_set(400)
+    write_index(few)
+    small, large = peak_of(lambda: write_index(few)), peak_of(lambda: write_index(many))
+    paths = [line["path"] for line in read_index(many)]
+    assert len(paths) == 400 and paths == sorted(paths)
+    # A part in memory, and a file's buffer for each part on the disk.
+    assert large < small + 58 * 40_000, f"{small} and {large} bytes"
+    assert sorted(p.name for p in many.iterdir()) == ["index.jsonl", "test", "train"]
+
+
+# ---- stopped workers --------------------------------------------------------------------------------------------------
+
+
+def test_a_stopped_worker_is_named_and_waited_for(reference, tmp_path, monkeypatch):
+    """SIGSTOP: said in one line after a while; the work goes on when the worker does, and nothing is tried twice."""
+    monkeypatch.setattr(executor_module, "_SILENT_S", 2.5)
+    executor = Local(1)
+
+    def stop(name, message):
+        os.kill(executor._processes[0].popen.pid, signal.SIGSTOP)
+
+    class Display(When):
+        def message(self, name, message):
+            super().message(name, message)
+            if message["kind"] == "silent":
+                os.kill(message["pid"], signal.SIGCONT)
+
+    display = Display("progress", stop)
+    outcome = run_dataset(template(tmp_path), tmp_path / "out", executor, listener=display)
+    (name, silent), = [(n, m) for n, m in display.messages if m["kind"] == "silent"]
+    assert f"worker 0 (pid {silent['pid']}) is stopped: no word from it for" in silent["error"] and "--time-limit" in silent["error"]
+    assert len(outcome.made) == 3 and not any(m["kind"] == "failed" for _, m in display.messages)
+    assert "is stopped" in (tmp_path / "out/.run/logs" / f"{name}.log").read_text()
+    assert_same(tmp_path / "out", reference)
+
+
+def test_a_worker_says_that_it_lives_whatever_it_does(tmp_path):
+    """Here: waits for its first order."""
+    process = executor_module._Process(0, tmp_path / "log", dict(os.environ))
+    try:
+        assert select.select([process.channel], [], [], 60)[0], "no word in a minute"
+        assert process.read() == ([{"kind": "alive"}], False)
+        assert process.silence() is None, "nothing was asked of it"
+    finally:
+        process.popen.kill()
+        process.popen.wait()
+        process.close()
+
+
+# ---- files deleted under a run ----------------------------------------------------------------------------------------
+
+
+def test_a_finished_sequence_that_is_deleted_or_cut_is_mended_by_resume(reference, tmp_path):
+    out = tmp_path / "out"
+
+    def delete(name, message):
+        (out / NAMES[0] / "poses.npz").unlink()
+
+    outcome = run_dataset(template(tmp_path), out, listener=When("progress", delete, NAMES[1]))
+    assert len(outcome.made) == 3
+    assert verify_dataset(out).problems == {NAMES[0]: ["poses.npz: missing"]}
+    shutil.rmtree(out / NAMES[2])
+    outcome = run_dataset(template(tmp_path), out, resume=True)
+    assert (outcome.found, len(outcome.made), list(outcome.damaged)) == (1, 2, [NAMES[0]])
+    assert_same(out, reference)
+    assert verify_dataset(out).clean
+
+
+@pytest.mark.parametrize("what", ["events.h5", "everything", "the folder"])
+def test_a_temporary_that_is_deleted_costs_an_attempt_and_no_half_sequence_appears(reference, tmp_path, what):
+    out = tmp_path / "out"
+
+    def delete(name, message):
+        folder, = temporaries(out)
+        if what == "the folder":
+            shutil.rmtree(folder)
+        else:
+            for path in [folder / what] if what != "everything" else [p for p in folder.rglob("*") if p.is_file()]:
+                path.unlink()
+
+    display = When("progress", delete, NAMES[1])
+    outcome = run_dataset(template(tmp_path), out, listener=display)
+    failed, = [m for _, m in display.messages if m["kind"] == "failed"]
+    assert NAMES[1] in failed["error"] and "tmp" not in failed["error"].replace(str(tmp_path), "") and failed["expected"]
+    assert len(outcome.made) == 3 and not outcome.set_aside
+    assert_same(out, reference)
+    assert verify_dataset(out).clean
+
+
+@pytest.mark.parametrize("executor", [Inline(), Local(1)], ids=["inline", "local"])
+def test_an_output_folder_that_is_deleted_stops_the_run(tmp_path, executor):
+    out = tmp_path / "out"
+    with pytest.raises(OutputError, match="out: was deleted, moved or replaced while the run was at work in it"):
+        run_dataset(template(tmp_path), out, executor, listener=When("done", lambda *_: shutil.rmtree(out)))
+    assert not temporaries(out) and not (out / "index.jsonl").exists() and not (out / ".run/run.json").exists()
+    assert all(verify_dataset(manifest.parent).clean for manifest in out.rglob("manifest.json")), "what was made since is whole"
+    run_dataset(template(tmp_path), out, resume=True)
+    assert verify_dataset(out).clean
+
+
+def test_a_record_that_is_deleted_is_written_again(reference, tmp_path):
+    out = tmp_path / "out"
+    run_dataset(template(tmp_path), out, listener=When("done", lambda *_: shutil.rmtree(out / ".run")))
+    assert_same(out, reference)
+    with pytest.raises(OutputError, match="another recipe"):
+        run_dataset(template(tmp_path, seed=12), out, resume=True)
+
+
+# ---- clocks -----------------------------------------------------------------------------------------------------------
+
+
+def foreign_temporary(out: Path) -> Path:
+    """What another machine on a shared disk is writing."""
+    path = out / f"train/.fly_000001.blinkgl-tmp-{'0' * 12}-1-0"
+    path.mkdir(parents=True)
+    (path / "events.h5").write_text("half")
+    return path
+
+
+@pytest.mark.parametrize("hours", [-5, 5, 24 * 365])
+def test_a_clock_that_jumps_changes_nothing(reference, tmp_path, monkeypatch, capsys, hours):
+    """The clock is set at every look at it: estimates stay, and nobody's temporary grows old."""
+    now, jumps = time.time, iter(range(10**9))
+    monkeypatch.setattr(time, "time", lambda: now() + next(jumps) % 2 * hours * 3600)
+    out = tmp_path / "out"
+    live = foreign_temporary(out)
+    os.utime(live / "events.h5", (0, 0))  # a file system whose clock is far behind
+    assert run(["generate", str(recipe_file(tmp_path, groups=FLY)), "--out", str(out), "--time-limit", "600"]) == 0
+    said = capsys.readouterr().out
+    left = [int(h) for h in re.findall(r"(-?\d+):\d\d:\d\d left", said)]
+    assert left and set(left) == {0}, said
+    assert (live / "events.h5").read_text() == "half"
+    shutil.rmtree(live)
+    assert_same(out, reference)
+
+
+def test_temporaries_of_other_machines_go_when_a_run_saw_them_lie_for_an_hour(tmp_path, monkeypatch):
+    out, clock = tmp_path / "out", [1000.0]
+    monkeypatch.setattr(run_folder_module.time, "monotonic", lambda: clock[0])
+    plan = Plan.of(template(tmp_path))
+    dead, other = foreign_temporary(out), out / f"train/.not_ours_000001.blinkgl-tmp-{'0' * 12}-1-0"
+    other.mkdir()
+    folder = RunFolder(out)
+    folder.sweep(plan)
+    clock[0] += 3500
+    folder.sweep(plan)
+    (dead / "events.h5").write_text("more")  # it lived
+    clock[0] += 3500
+    folder.sweep(plan)
+    clock[0] += 3500
+    folder.sweep(plan)
+    assert dead.is_dir()
+    clock[0] += 200
+    folder.sweep(plan)
+    assert not dead.exists() and other.is_dir()
+
+
+# ---- others at work ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_two_drivers_at_once(reference, tmp_path):
+    """Real processes, started together, on a folder that does not exist yet: one makes everything, the other says one line."""
+    recipe, out = recipe_file(tmp_path, groups=FLY), tmp_path / "deep/out"
+    drivers = [start(recipe, "--out", out, "--resume", "--workers", 1) for _ in range(2)]
+    said = [driver.communicate(timeout=120)[0] for driver in drivers]
+    states = sorted(driver.returncode for driver in drivers)
+    assert states in ([0, 0], [0, 2]), said
+    if states == [0, 2]:  # else the second came when the first was done
+        line = next(text for text, driver in zip(said, drivers, strict=True) if driver.returncode)
+        assert "another run is at work in this folder; " in line and line.count("\n") == 1
+    assert_same(out, reference)
+
+
+def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
+    """The loser made no folder, and the winner's empty one is not its to remove; a lock on a folder that is gone is none."""
+    out = tmp_path / "out"
+    first, second = RunFolder(out), RunFolder(out)
+    with first.locked():
+        with pytest.raises(OutputError, match="another run is at work"), second.locked():
+            raise AssertionError
+        assert out.is_dir() and first.in_place
+        shutil.rmtree(out)
+        with second.locked():
+            assert second.in_place and not first.in_place
+            with pytest.raises(OutputError, match="deleted"):
+                first.check_in_place()
+    assert not out.exists()
+
+
+def test_a_folder_that_goes_before_it_is_locked_is_made_again(tmp_path, monkeypatch):
+    """Another run was refused just then, and took away the empty folder that we had opened."""
+    out, flock, calls = tmp_path / "out", fcntl.flock, []
+
+    def late(handle, how):
+        if not calls:
+            out.rmdir()
+        calls.append(handle)
+        flock(handle, how)
+
+    monkeypatch.setattr(run_folder_module.fcntl, "flock", late)
+    with RunFolder(out).locked():
+        with pytest.raises(OutputError, match="another run is at work"), RunFolder(out).locked():
+            raise AssertionError
+    assert len(calls) == 3
+
+
+def test_a_live_temporary_of_another_user_stays(tmp_path, monkeypatch):
+    """Signal 0 to a process of another user: not permitted, and so it lives."""
+    path = tmp_path / f".x.blinkgl-tmp-{atomic.machine_token()}-4242-0"
+    path.mkdir()
+
+    def kill(pid, number):
+        assert (pid, number) == (4242, 0)
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "kill", kill)
+    assert atomic.remove_stale(tmp_path) == [] and path.is_dir()
+
+
+def test_a_live_temporary_of_another_user_stays_for_real():
+    """This process, root's, writes; one of nobody sweeps."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can become somebody else")
+    code = f"""
+import os, tempfile
+from pathlib import Path
+from blinkgl.io import atomic
+token = atomic.machine_token()
+atomic.machine_token = lambda: token  # Linux hides a process's namespaces from it when it changes its user
+with tempfile.TemporaryDirectory() as folder:
+    live = Path(folder, f".x.blinkgl-tmp-{{token}}-{{os.getppid()}}-0")
+    live.mkdir()
+    for path in (folder, live):
+        os.chmod(path, 0o777)
+    os.setresuid(65534, 65534, 0)
+    try:
+        os.kill(os.getppid(), 0)
+    except PermissionError:
+        print(atomic.remove_stale(Path(folder)), live.is_dir())
+    os.setresuid(0, 0, 0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "[] True\n", done.stderr

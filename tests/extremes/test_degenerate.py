@@ -1,0 +1,242 @@
+"""Triangles without width, by themselves or as they are seen: no NaN, no infinity, no pixel that they do not have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tests.extremes.measures import FACING
+from tests.render.render_scenes import LEVEL, camera, cube, drift, mesh, quad, scene, smooth_texture, still, thing
+from tests.shared_data import shared
+
+from blinkgl.config.lod import LodConfig
+from blinkgl.config.sequence import RenderConfig, RunTemplate
+from blinkgl.dataset.generate import generate_sequence
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.render import renderer as module
+from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.scene import primitives
+from blinkgl.scene.meshes import faces_in_float32
+from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
+
+MS = 1_000_000
+RAW = [("DEPTH", "R32F"), ("ID", "R32UI"), ("NORMAL", "RGBA32F"), ("VELOCITY", "RG32F"), ("FLOW_FORWARD", "RGBA32F"), ("FLOW_BACKWARD", "RGBA32F")]
+
+
+def sheet(corners: np.ndarray, seed: int = 1):
+    """A mesh of (n, 3, 3) separate triangles with random texture coordinates."""
+    vertices = corners.reshape(-1, 3)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), (0.0, 0.0, 1.0))
+    uvs = np.random.default_rng(seed).uniform(0, 1, (len(vertices), 2))
+    return mesh(vertices, np.arange(len(vertices)).reshape(-1, 3), np.repeat(normals, 3, axis=0), uvs)
+
+
+def directions(rng, n: int) -> np.ndarray:
+    d = rng.normal(size=(n, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def slivers(rng, n: int, ahead=(1.5, 5.0)) -> np.ndarray:
+    """(n, 3, 3) before a LEVEL camera at the origin, of relative height 1e-12 to 1e-3 in any direction."""
+    along, length = directions(rng, n), 10 ** rng.uniform(-2, 0.5, (n, 1))
+    up = np.cross(along, directions(rng, n))
+    up *= 10 ** rng.uniform(-12, -3, (n, 1)) * length / np.linalg.norm(up, axis=1, keepdims=True)
+    middle = np.stack([rng.uniform(-1.2, 1.2, n), rng.uniform(*ahead, n), rng.uniform(-1, 1, n)], axis=1)
+    start, end = middle - along * length / 2, middle + along * length / 2
+    return np.stack([start, end, start + rng.uniform(0, 1, (n, 1)) * (end - start) + up], axis=1)
+
+
+def edge_on(rng, n: int) -> np.ndarray:
+    """(n, 3, 3) of any shape in planes through the camera's centre, the origin."""
+    corners = slivers(rng, n)
+    a, b = corners[:, 0], corners[:, 1]
+    return np.stack([a, b, rng.uniform(0.3, 1.2, (n, 1)) * a + rng.uniform(0.0, 0.6, (n, 1)) * b], axis=1)
+
+
+def nasty() -> np.ndarray:
+    """Every kind at once: points, lines, needles, triangles across and in the camera plane and the near plane, of 1e-6 to 1e6 units."""
+    rng = np.random.default_rng(3)
+    line = np.array([[-1.0, 2, 0.1], [1.0, 3, 0.2], [0.0, 2.5, 0.15]])
+    needle = np.array([[-1.0, 2, 0.3], [1.0, 2, 0.3], [0.2, 2, 0.3 + 1e-7]])
+    through = np.array([[-1.0, -2, -0.5], [1.0, 3, -0.5], [0.5, 4, 0.5]])
+    in_plane = np.array([[-1.0, 0, -0.5], [1.0, 0, -0.5], [0.0, 0, 0.5]])
+    at_near = np.array([[-1.0, 0.05, -0.5], [1.0, 0.05, -0.5], [0.0, 0.05, 0.5]])
+    upright = np.array([[0.0, 2, -0.5], [0.0, 4, -0.5], [0.0, 3, 0.5]])  # exactly edge-on where the principal point lies on x = 0
+    point = np.full((3, 3), 2.0)
+    shapes = [line, needle, through, in_plane, at_near, upright, point, line[[0, 1, 1]], 1e6 * line, 1e-6 * line + (0, 2, 0), 1e6 * needle, 1e-4 * through]
+    return np.concatenate([np.stack(shapes), slivers(rng, 300), slivers(rng, 300, (-0.5, 0.5)), edge_on(rng, 300)])
+
+
+def raw_buffers(renderer) -> dict[str, np.ndarray]:
+    """Everything that every pass writes at 0, as it leaves the fragment shaders."""
+    rate = np.empty((renderer.height, renderer.width), np.float32)
+    buffers = renderer._geometry(0, RAW, 100 * MS, -100 * MS)
+    return {**buffers, "luminance": renderer.luminance(0), "with rate": renderer.luminance(0, rate=rate), "rate": rate, "colour": renderer.colour(0),
+            "brightness": renderer.brightness(0, 3), "motion": renderer.velocity(0, 3)}
+
+
+@pytest.mark.parametrize("antialiasing", ["none", "taps4", "msaa4", "ssaa2"])
+@pytest.mark.parametrize("textured", [True, False])
+@pytest.mark.parametrize("lines_drawn", [True, False])
+def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, textured, lines_drawn):
+    """The shaders do not rest on the lines' being dropped before."""
+    if lines_drawn:
+        monkeypatch.setattr(module, "without_collapsed_faces", lambda scene: scene)
+    corners = nasty()
+    world = []
+    for lit in (True, False):
+        for double_sided in (True, False):
+            paint = Material(texture=smooth_texture(1) if textured else None, unlit=not lit, double_sided=double_sided)
+            whole = replace(sheet(corners), closed=not double_sided)  # closed: culled, not two-sided
+            world.append(scene([thing("nasty", 1, whole, drift((0, 0, 0), (0.1, 0.05, -0.3)), paint)], camera(80, 60, 75.0, still(rotation=LEVEL))))
+    world.append(replace(world[0], camera=camera(81, 61, 64.0, drift((0, 0, 0), (0.1, 0.2, 0), LEVEL, LEVEL * Rotation.from_rotvec([0.1, 0, 0])))))
+    for one in world:
+        with Renderer(gl, one, RenderConfig(antialiasing=antialiasing, image_antialiasing="none")) as renderer:
+            for name, buffer in raw_buffers(renderer).items():
+                assert np.isfinite(buffer).all(), name
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_slivers_have_the_depth_and_the_light_of_what_they_are(gl, seed):
+    corners = slivers(np.random.default_rng(seed), 1000)
+    world = scene([thing("slivers", 1, sheet(corners), drift((0, 0, 0), (0.02, 0.01, 0.03)), Material(texture=smooth_texture(1)))], camera(near=0.01))
+    with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
+        buffers = raw_buffers(renderer)
+    hit = buffers["ID"] > 0
+    assert 10 < hit.sum() < 300 and all(np.isfinite(b).all() for b in buffers.values())
+    depth, reach = buffers["DEPTH"][hit], corners[..., 1]
+    assert depth.min() > 0.99 * reach.min() and depth.max() < 1.01 * reach.max()
+    np.testing.assert_array_equal(buffers["luminance"] > 0, hit)
+    assert buffers["luminance"].max() < 0.85 * (world.light.sun + world.light.sky)
+    np.testing.assert_allclose(np.linalg.norm(buffers["NORMAL"][hit], axis=-1), 1, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_seen_from_its_edge_is_not_seen(gl, seed):
+    """Snapped corners cover pixels; before there was a guard a third of 60 such pixels were NaN and most others at no depth of the mesh."""
+    world = scene([thing("edges", 1, sheet(edge_on(np.random.default_rng(seed), 3000)), still())], camera(near=0.01))
+    with Renderer(gl, world, RenderConfig()) as renderer:
+        assert not renderer.labels(0, LabelRequest(ids=True)).ids.any() and not renderer.luminance(0).any()
+
+
+@pytest.mark.parametrize("unlit", [True, False])
+@pytest.mark.parametrize("antialiasing", ["none", "taps4"])
+def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing, unlit):
+    """A ground that ends half a pixel below the horizon: in powers of two 1/w is exactly 0 in the row above its last, and derivatives
+    of texture coordinates and normals between those rows are infinite."""
+    vertices = np.array([[-128, 128, -1], [128, 128, -1], [-1, 1, -1]], float)
+    ground = mesh(vertices, [[2, 1, 0]], np.tile([0, 0, 1.0], (3, 1)), vertices[:, :2] / 4)
+    eye = replace(camera(128, 128, near=0.25, path=drift((0, 0, 0), (0, 0.1, 0), LEVEL)), fx=64.0, fy=64.0, cx=64.0, cy=32.0)
+    paint = smooth_texture(1)
+    with Renderer(gl, scene([thing("ground", 1, ground, still(), Material(texture=paint, unlit=unlit))], eye, Light(sun=0.0, sky=1.0)), RenderConfig(antialiasing=antialiasing)) as renderer:
+        buffers = raw_buffers(renderer)
+    last = buffers["ID"][33] > 0
+    assert last.sum() > 100 and not buffers["ID"][:33].any()
+    for name, buffer in buffers.items():
+        assert np.isfinite(buffer).all(), name
+    mean = paint.image.mean(axis=(0, 1)) @ (0.2126, 0.7152, 0.0722)
+    np.testing.assert_allclose(buffers["luminance"][33][last], mean, rtol=1e-4)  # thousands of repeats in a pixel
+
+
+# ---- which faces are lines ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0, 1e9])
+@pytest.mark.parametrize("offset", [0.0, 30.0])
+def test_lines_are_dropped_and_slivers_are_not(size, offset):
+    """Collinear in float64, and so in nothing that float32 makes of it; and slivers a few roundings high, far thinner than any model has."""
+    rng = np.random.default_rng(0)
+    corners = slivers(rng, 4000)
+    a, b = corners[:, 0] + offset, corners[:, 1] + offset
+    lines = np.stack([a, b, a + rng.uniform(0, 1, (len(a), 1)) * (b - a)], axis=1)
+    assert not faces_in_float32(sheet(size * lines)).any()
+    up = np.cross(b - a, directions(rng, len(a)))
+    up *= 8e-7 * np.abs(lines).max(axis=(1, 2))[:, None] / np.linalg.norm(up, axis=1, keepdims=True)
+    lines[:, 2] += up
+    assert faces_in_float32(sheet(size * lines)).all()
+
+
+def test_models_keep_their_faces():
+    for shape in (primitives.cuboid(), primitives.sphere(), primitives.torus(), primitives.icosphere(subdivisions=5), quad(1e5, 1e5, 32), cube(1e-6)):
+        assert faces_in_float32(shape).all()
+
+
+@pytest.mark.parametrize("lod", [False, True])
+def test_the_renderer_drops_lines_and_says_so(gl, lod):
+    ball = primitives.icosphere(subdivisions=4)
+    a, b = ball.vertices[ball.faces[0, :2]]
+    vertices = np.concatenate([ball.vertices, [(a + b) / 2]])
+    faces = np.concatenate([ball.faces, [[ball.faces[0, 0], ball.faces[0, 1], len(ball.vertices)]]]).astype(np.int32)
+    split = replace(ball, vertices=vertices, faces=faces, normals=np.concatenate([ball.normals, ball.normals[:1]]), uvs=np.concatenate([ball.uvs, ball.uvs[:1]]))
+    line = sheet(slivers(np.random.default_rng(0), 1) * 0 + np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2.0]]))
+    two = SceneObject("ball", 1, (Part(line, Material()), Part(split, Material())), still((0, 4, 0)))
+    world = scene([two, thing("other", 2, split, still((1, 5, 0)))])
+    with Renderer(gl, world, RenderConfig(lod=LodConfig(enabled=lod))) as renderer:
+        assert [len(o.parts) for o in renderer.scene.objects] == [1, 1]
+        assert renderer.scene.objects[0].parts[0].mesh is renderer.scene.objects[1].parts[0].mesh or lod
+        assert all(faces_in_float32(p.mesh).all() for o in renderer.scene.objects for p in o.parts)
+        assert "without width in float32" in renderer.scene.log[-1] and (lod or renderer.scene.log[-1].startswith("3 triangles"))
+        assert set(np.unique(renderer.labels(0, LabelRequest(ids=True)).ids)) == {0, 1, 2}
+    with Renderer(gl, scene([thing("ball", 1, ball, still((0, 4, 0)))]), RenderConfig()) as renderer:
+        assert not renderer.scene.log
+
+
+# ---- numbers that are none ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1e-3, 1e30])
+def test_a_texture_with_a_number_that_is_none_is_refused(gl, bad):
+    image = np.full((8, 8, 3), 0.5, np.float32)
+    image[2, 5] = bad
+    world = scene([thing("wall", 1, quad(), still((0, 3, 0), FACING), Material(texture=Texture(image, "poster")))])
+    for draw in (lambda r: r.luminance(0), lambda r: r.colour(0)):
+        with Renderer(gl, world, RenderConfig()) as renderer, pytest.raises(AssetError, match=r"^poster: texel x=5, y=2 cannot be drawn .*linear light from 0"):
+            draw(renderer)
+
+
+def test_a_mesh_with_a_number_that_is_none_is_refused(gl):
+    plain = quad()
+    for name in ("normals", "uvs"):
+        values = getattr(plain, name).copy()
+        values[2, 0] = np.nan
+        world = scene([thing("wall", 1, replace(plain, **{name: values}), still((0, 3, 0), FACING))])
+        with Renderer(gl, world, RenderConfig()) as renderer, pytest.raises(AssetError, match="^quad: vertex 2 has a .* finite numbers$"):
+            renderer.luminance(0)
+
+
+@pytest.mark.parametrize("color, background, seen", [((np.nan, 1.0, 1.0), 0.0, r"object 'wall' \(id 7\)"), ((-1.0, -1.0, -1.0), 0.0, r"object 'wall' \(id 7\)"),
+                                                     ((0.5, 0.5, 0.5), np.inf, "the background")])
+def test_the_message_names_what_is_seen_where_and_when(gl, color, background, seen):
+    from blinkgl.config.events import EsimConfig
+    from blinkgl.config.timeline import UniformTimeline
+    from blinkgl.dataset.event_pass import EventPass
+
+    wall = thing("wall", 7, quad(0.5, 0.5), still((0, 3, 0), FACING), Material(base_color=color, unlit=True))
+    world = replace(scene([wall], background=background), t0_ns=250 * MS, t1_ns=500 * MS)
+    with Renderer(gl, world, RenderConfig()) as renderer:
+        with pytest.raises(EventDataError, match=rf"^frame 0 at 0\.25 s: intensity at pixel x=\d+, y=\d+ cannot be used: it shows {seen} \(got .*\); expected a finite value") as caught:
+            list(EventPass(UniformTimeline(fps=100), EsimConfig(), renderer, 1))
+    assert "\n" not in str(caught.value)
+    x, y = caught.value.pixel
+    assert (abs(x - 78) < 27 and abs(y - 60) < 27) == (background == 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed, count", [(7, 40), (11, 81), (12, 81), (13, 81), (14, 81)])
+def test_a_sequence_of_81_small_models(gl, tmp_path, seed, count):
+    """640x480, 200 frames and every label, of 81 files, in some of which faces are lines: the first was lost to one NaN pixel in frame 117."""
+    folder = shared("data/assets/models_cc0")
+    tree = {"seed": seed, "camera": {"width": 640, "height": 480}, "time": {"duration": 0.5, "label_rate": 10}, "timeline": {"kind": "uniform", "fps": 199 / 0.6},
+            "scene": {"kind": "random", "objects": {"count": count}, "pool": {"primitives": [], "folders": [str(folder)], "keep_materials": True, "test_fraction": 0}},
+            "labels": {"flow": ["forward", "backward"], "depth": True, "ids": True, "normals": True, "velocity": True, "occlusion": True}, "preview": {"enabled": False}}
+    report = generate_sequence(RunTemplate(tree, Path(".")).sequence(0), 0, tmp_path, gl)
+    assert report.frames == 200 and verify_sequence(report.path) == []
+    for k in range(report.labels):
+        depth, normals, velocity = (np.load(report.path / f"{name}/{k:06d}.npy") for name in ("depth", "normals", "velocity"))
+        assert np.isfinite(depth).mean() > 0.9 and np.isfinite(normals).all() and np.isfinite(velocity).all()

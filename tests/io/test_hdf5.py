@@ -1,0 +1,194 @@
+"""HDF5 files are not followed out of themselves, their data sets are checked before they are believed, and nothing of the process changes."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import hdf5plugin
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.io.dsec import DsecEventReader, identity_rectify_map, write_rectify_map
+from blinkgl.io.formats import open_events, write_events
+from blinkgl.io.hdf5 import blosc_dataset, dataset, open_hdf5, write_rows
+from eflow.data.sources import FolderSource
+from tests.io.test_columns import GOOD, dsec, mvsec
+
+
+def external_storage(file, name, secret):
+    file.create_dataset(name, (100,), np.uint8, external=[(str(secret), 0, 100)])
+
+
+def external_link(file, name, secret):
+    file[name] = h5py.ExternalLink(str(secret), "/x")
+
+
+def virtual(file, name, secret):
+    layout = h5py.VirtualLayout((3,), "u2")
+    layout[:] = h5py.VirtualSource(str(secret), "x", (3,))
+    file.create_virtual_dataset(name, layout)
+
+
+def link_in_a_group(file, name, secret):
+    """Not read by anybody, but a soft link may lead there."""
+    file["deep/er/x"] = h5py.ExternalLink(str(secret), "/x")
+    file[name] = h5py.SoftLink("/deep/er/x")
+
+
+@pytest.mark.parametrize("how, message", [(external_storage, "a data set with external storage"), (external_link, "an external link"),
+                                          (virtual, "a virtual data set"), (link_in_a_group, "an external link")])
+@pytest.mark.parametrize("kind", ["dsec", "mvsec", "rectify_map"])
+def test_files_that_lead_elsewhere_are_refused(tmp_path, how, message, kind):
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(range(100)))
+    path = tmp_path / "e.h5"
+    if kind == "rectify_map":
+        with h5py.File(path, "w") as file:
+            how(file, "rectify_map", secret)
+        read = lambda: FolderSource([])._map(path)  # noqa: E731
+    else:
+        (dsec if kind == "dsec" else mvsec)(path)
+        with h5py.File(path, "r+") as file:
+            name = "events/x" if kind == "dsec" else "davis/left/events"
+            del file[name]
+            how(file, name, secret)
+        read = lambda: open_events(path).read()  # noqa: E731
+    with pytest.raises(AssetError, match=rf"e.h5: '.*' is {message}, which leads to other files; refused"):
+        read()
+
+
+def test_soft_links_inside_the_file_are_fine(tmp_path):
+    with h5py.File(dsec(tmp_path / "e.h5"), "r+") as file:
+        file.move("events/x", "columns")
+        file["events/x"] = h5py.SoftLink("/columns")
+    assert open_events(tmp_path / "e.h5").read().x.tolist() == GOOD["x"]
+
+
+def test_nobody_opens_hdf5_by_another_way():
+    """Reading goes through open_hdf5; what opens a file itself says "w"."""
+    root = Path(__file__).resolve().parents[2]
+    for path in [*root.glob("blinkgl/**/*.py"), *root.glob("eflow/**/*.py")]:
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            if "h5py.File(" in line and path.name != "hdf5.py":
+                assert '"w"' in line, f"{path.name}:{number}: {line.strip()}"
+
+
+@pytest.mark.parametrize("change, message", [
+    ({"t_offset": np.zeros(3, int)}, r"'t_offset' has the wrong shape or type \(got 'int64 \(3,\)'\)"), ({"t_offset": "late"}, "'t_offset' has the wrong"),
+    ({"t_offset": h5py.Empty("i8")}, "'t_offset' has the wrong"), ({"t_offset": None}, "no dataset 't_offset'"), ({"t_offset": 1 << 62}, "t of event"),
+    ({"ms_to_idx": np.zeros((2, 2), int)}, "'ms_to_idx' has the wrong"), ({"ms_to_idx": np.zeros(2)}, "'ms_to_idx' has the wrong"),
+    ({"ms_to_idx": None}, "no dataset 'ms_to_idx'"), ({"events/x": None}, "no dataset 'events/x'"), ({"events/p": np.zeros((3, 1), int)}, "'events/p' has the wrong"),
+    ({"events/x": np.zeros(3)}, "'events/x' has the wrong"), ({"events/x": np.zeros(4, int)}, "differ in length"),
+    ({"events/y": np.zeros(3, [("a", "i4")])}, "'events/y' has the wrong"),
+])
+def test_dsec_data_sets_of_wrong_shape_or_type(tmp_path, change, message):
+    with h5py.File(dsec(tmp_path / "e.h5"), "r+") as file:
+        for name, value in change.items():
+            if name in file:
+                del file[name]
+            file.create_group(name) if value is None else file.create_dataset(name, data=value)
+    with pytest.raises(BlinkGLError, match=message):
+        open_events(tmp_path / "e.h5").read()
+
+
+@pytest.mark.parametrize("value", [None, np.zeros(4), np.zeros((4, 3)), np.zeros((4, 4), int), np.array(["a"])])
+def test_mvsec_table_of_wrong_shape_or_type(tmp_path, value):
+    with h5py.File(tmp_path / "e.hdf5", "w") as file:
+        file.create_group("davis/left/events") if value is None else file.create_dataset("davis/left/events", data=np.asarray(value).astype("S") if value.dtype.kind == "U" else value)
+    with pytest.raises(AssetError, match="'davis/left/events'"):
+        open_events(tmp_path / "e.hdf5").read()
+
+
+def test_claims_without_data(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("chunked", (10**12,), "u8", chunks=(1 << 17,), compression="gzip")
+        file.create_dataset("plain", (10**12,), "u8")
+        file.create_dataset("chunk", (1 << 29,), "u8", chunks=(1 << 26,), compression="gzip")
+        file.create_dataset("none", (0,), "u8", maxshape=(None,))
+        file["one"] = np.uint64(5)
+    with open_hdf5(tmp_path / "a.h5") as file:
+        for name, message in (("chunked", "claims 1000000000000 values, but fewer"), ("plain", "but fewer"), ("chunk", "chunks too large")):
+            with pytest.raises(AssetError, match=message):
+                dataset(file, name, tmp_path / "a.h5", shape=(None,))
+        assert len(dataset(file, "none", tmp_path / "a.h5", shape=(None,))) == 0 and dataset(file, "one", tmp_path / "a.h5", shape=())[()] == 5
+
+
+def test_a_filter_that_is_not_installed_is_named(tmp_path):
+    path = dsec(tmp_path / "e.h5")
+    with h5py.File(path, "r+") as file:
+        del file["events/x"]
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        layout.set_chunk((3,))
+        layout.set_filter(40000, h5py.h5z.FLAG_OPTIONAL, ())
+        space = h5py.h5s.create_simple((3,))
+        made = h5py.h5d.create(file["events"].id, b"x", h5py.h5t.STD_U16LE, space, layout)
+        made.write_direct_chunk((0,), np.zeros(3, np.uint16).tobytes())
+    with pytest.raises(AssetError, match="compressed with an HDF5 filter that is not installed .*hdf5plugin"):
+        open_events(path).read()
+
+
+def test_blosc_without_its_parameters_does_not_crash(tmp_path):
+    """Found by the fuzz: the filter reads them without asking how many there are."""
+    path = tmp_path / "m.h5"
+    write_rectify_map(path, identity_rectify_map(24, 32))
+    data = bytearray(path.read_bytes())
+    at = data.find(struct.pack("<H", hdf5plugin.Blosc.filter_id))
+    assert struct.unpack_from("<HH", data, at + 4) == (1, 7)  # optional, seven parameters
+    data[at + 6] = 0
+    path.write_bytes(data)
+    with open_hdf5(path) as file, pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'rectify_map' lacks what Blosc needs"):
+        dataset(file, "rectify_map", path, shape=(24, 32, 2), kinds="f")
+
+
+def test_rows_written_here_are_those_of_the_filter(tmp_path):
+    """Byte for byte what h5py writes through HDF5's filter with one thread, incompressible chunks and partial ones included."""
+    rng = np.random.default_rng(0)
+    rows = np.concatenate([rng.integers(0, 50, 9000), rng.integers(0, 2**63, 4096), np.zeros(500, int)]).astype(np.uint64)
+    cuts = [0, 10, 4096, 5000, 12_000, len(rows)]
+    for name in "ab":
+        with h5py.File(tmp_path / name, "w", rdcc_nbytes=0) as file:
+            data = blosc_dataset(file, "d", (0,), np.uint64, (4096,))
+            for i, j in zip(cuts, cuts[1:]):
+                if name == "a":
+                    write_rows(data, i, rows[i:j])
+                else:
+                    data.resize((j,))
+                    data[i:j] = rows[i:j]
+            np.testing.assert_array_equal(data[()], rows)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+_PROGRAM = """
+import hashlib, os, sys
+import numpy as np
+from blinkgl.events.types import Events
+from blinkgl.io.formats import open_events, write_events
+before = dict(os.environ)
+rng, n = np.random.default_rng(0), 150_000
+events = Events(rng.integers(0, 64, n).astype("u2"), rng.integers(0, 48, n).astype("u2"), np.sort(rng.integers(0, 10**6, n)), rng.integers(0, 2, n).astype("u1"))
+write_events(sys.argv[1], events, 48, 64)
+assert len(open_events(sys.argv[1]).read()) == n and dict(os.environ) == before, "the environment was changed"
+print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())
+"""
+
+
+def test_the_environment_is_left_alone_and_does_not_change_the_bytes(tmp_path):
+    environment = {k: v for k, v in os.environ.items() if k != "BLOSC_NTHREADS"}
+    digests = {subprocess.run([sys.executable, "-c", _PROGRAM, str(tmp_path / "e.h5")], env={**environment, **extra}, capture_output=True, text=True,
+                              check=True).stdout for extra in ({}, {"BLOSC_NTHREADS": "3"})}
+    assert len(digests) == 1
+
+
+def test_hdf5plugin_is_all_that_h5py_needs(tmp_path):
+    """What the documentation tells readers to import."""
+    write_events(tmp_path / "e.h5", open_events(dsec(tmp_path / "d.h5")).read(), 10, 10)
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert file["events/x"][()].tolist() == GOOD["x"] and hdf5plugin.Blosc.filter_id in [int(k) for k in file["events/x"]._filters]
+    with DsecEventReader(tmp_path / "e.h5") as reader:
+        assert reader.count == 3

@@ -38,7 +38,8 @@ THREADS = (1, 2)
 @contextlib.contextmanager
 def spinning(count: int) -> Iterator[None]:
     """``count`` processes that keep a core busy each, for as long as the block lasts."""
-    children = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    program = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    sum(range(100_000))"  # none outlives this process
+    children = [subprocess.Popen([sys.executable, "-c", program]) for _ in range(count)]
     try:
         yield
     finally:

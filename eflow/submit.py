@@ -7,7 +7,6 @@ import os
 import struct
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np

@@ -20,7 +20,7 @@ import numpy as np
 
 from blinkgl.bench import machine_line
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import apply_overrides, load_run
+from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
 
 BASE = {

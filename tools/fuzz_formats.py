@@ -8,7 +8,6 @@ use no reader of BlinkGL for what they compare with.
 from __future__ import annotations
 
 import importlib.util
-import io
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

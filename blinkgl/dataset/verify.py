@@ -27,7 +27,7 @@ from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.flow_png import read_flow_png
-from blinkgl.io.hdf5 import open_hdf5
+from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.images import read_image, read_npy
 from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
 from blinkgl.io.records import open_regular, shown
@@ -199,8 +199,8 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
     """Sorted, inside the sensor and the sequence's time, counted as the manifest says, and ``ms_to_idx`` right at every millisecond."""
     problems = []
     with open_hdf5(path) as file:
-        columns = {k: file[f"events/{k}"] for k in "xytp"}
-        offset = int(file["t_offset"][()])
+        columns = {k: dataset(file, f"events/{k}", path, shape=(None,)) for k in "xytp"}
+        offset = int(dataset(file, "t_offset", path, shape=())[()])
         counts = {k: len(c) for k, c in columns.items()}
         if set(counts.values()) != {manifest["events"]}:
             return [f"events.h5: columns of {sorted(set(counts.values()))} events, manifest says {manifest['events']}"]
@@ -208,9 +208,10 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
             problems.append(f"events.h5: t_offset is {offset}, manifest says {manifest['t_offset_us']}")
         last, end = 0, manifest["duration_us"]
         needed = -(-end // 1000) + 1
-        if not needed <= len(file["ms_to_idx"]) <= needed + 1:  # before it is read: it may claim to be of any length
-            return [*problems, f"events.h5: ms_to_idx has {len(file['ms_to_idx'])} entries, {needed} are needed"]
-        ms_to_idx = file["ms_to_idx"][()].astype(np.int64)
+        table = dataset(file, "ms_to_idx", path, shape=(None,))
+        if not needed <= len(table) <= needed + 1:
+            return [*problems, f"events.h5: ms_to_idx has {len(table)} entries, {needed} are needed"]
+        ms_to_idx = table[()].astype(np.int64)
         expected = np.zeros(len(ms_to_idx), np.int64)
         marks = np.arange(len(ms_to_idx), dtype=np.int64) * 1000
         for begin in range(0, manifest["events"], _BLOCK):

@@ -43,8 +43,10 @@ def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
     assert len(outcome.made) == 3
     said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
     assert said == ["note: " + LINE]
-    for made in outcome.made:
-        assert json.loads((made.path / "manifest.json").read_text())["not_drawn"] == [LINE]
+    manifests = sorted((tmp_path / "out").glob("*/*/manifest.json"))
+    assert len(manifests) == 3
+    for manifest in manifests:
+        assert json.loads(manifest.read_text())["not_drawn"] == [LINE]
     assert explain(load_run(path)).scene["not drawn"] == LINE
 
 

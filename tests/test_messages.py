@@ -1,0 +1,182 @@
+"""What users are told when something is wrong, as golden files that a person reads as a text.
+
+``tests/golden/messages.txt`` has every sentence of the sources (``python -m blinkgl.tools.messages`` makes it again);
+``tests/golden/commands.txt`` what the commands really print for some fifty mistakes (``BLINKGL_UPDATE_GOLDEN=1`` makes it again).
+A change of wording is a change of these files, to be reviewed there.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from blinkgl import cli
+from blinkgl.tools import messages
+
+GOLDEN = Path(__file__).parent / "golden" / "commands.txt"
+
+BASE = "camera: {width: 32, height: 24}\n"
+FILES = {
+    "good.yaml": BASE,
+    "unknown_key.yaml": BASE + "evnts: {emulator: esim}\n",
+    "brackets.yaml": BASE + "'[bold]red[/bold]': 1\n",
+    "tabs.yaml": "camera:\n\twidth: 3\n",
+    "list.yaml": "- 1\n- 2\n",
+    "type.yaml": "camera: {width: wide}\n",
+    "negative.yaml": "camera: {width: -3}\n",
+    "fraction.yaml": "camera: {width: 3.5}\n",
+    "both.yaml": "camera: {fov: 60, focal: 300}\n",
+    "kind.yaml": "timeline: {kind: sometimes}\n",
+    "flow.yaml": "labels: {flow: both}\n",
+    "emulator.yaml": "events: {emulator: magic}\n",
+    "curve.yaml": "events: {emulator: v2e}\ntimeline: {kind: uniform, reconstruction: pchip}\n",
+    "sensor.yaml": "sensor: davis1000\n",
+    "quality.yaml": "quality: superb\n",
+    "empty_range.yaml": "events: {contrast_threshold: {uniform: [0.3, 0.1]}}\n",
+    "bad_range.yaml": "events: {contrast_threshold: {uniform: 0.3}}\n",
+    "weights.yaml": "events: {contrast_threshold: {weighted: [1, 2]}}\n",
+    "seed.yaml": "seed: -1\n",
+    "texture.yaml": "scene: {kind: explicit, objects: [{primitive: cuboid, texture: missing.png}]}\n",
+    "primitive.yaml": "scene: {kind: explicit, objects: [{primitive: dodecahedron}]}\n",
+    "parameter.yaml": "scene: {kind: explicit, objects: [{primitive: sphere, parameters: {sides: 3}}]}\n",
+    "mesh.yaml": "scene: {kind: explicit, objects: [{file: broken.obj}]}\n",
+    "keyframes.yaml": "scene: {kind: explicit, objects: [{primitive: cuboid, keyframes: [{time: 1, position: [0, 0, 1]}, {time: 0, position: [0, 0, 2]}]}]}\n",
+    "pool.yaml": "scene: {kind: random, pool: {folders: [nowhere]}}\n",
+    "frames.yaml": "frames: {folders: [nowhere], fps: 30}\n",
+    "broken.obj": "v 0 0 0\nf 1 2 3\n",
+    "broken.h5": "this is no HDF5\n",
+    "broken.glb": "glTF but not really\n",
+    "broken.raw": "% evt 9.0\n",
+    "words.txt": "not\nevents\n",
+    "outside.csv": "0.001,500,2,1\n",
+    "notes.md": "# notes\n",
+}
+COMMANDS = """
+generate missing.yaml --out out
+generate unknown_key.yaml --out out
+generate brackets.yaml --out out
+generate tabs.yaml --out out
+generate list.yaml --out out
+generate type.yaml --out out
+generate negative.yaml --out out
+generate fraction.yaml --out out
+generate both.yaml --out out
+generate kind.yaml --out out
+generate flow.yaml --out out
+generate emulator.yaml --out out
+generate curve.yaml --out out
+generate sensor.yaml --out out
+generate quality.yaml --out out
+generate empty_range.yaml --out out
+generate bad_range.yaml --out out
+generate weights.yaml --out out
+generate seed.yaml --out out
+generate texture.yaml --out out
+generate primitive.yaml --out out
+generate parameter.yaml --out out
+generate mesh.yaml --out out
+generate keyframes.yaml --out out
+generate pool.yaml --out out
+generate frames.yaml --out out
+generate good.yaml --out notes.md
+generate good.yaml --out out --set camera.width
+generate good.yaml --out out --set camera.width=[1,2]
+generate good.yaml --out out --set camera.width.x=3
+generate good.yaml --out out --executor slurm
+generate good.yaml --out out --devices 0,one
+generate good.yaml --out out --address 10.0.0.1:6379
+explain missing.yaml
+explain kind.yaml
+verify nowhere
+verify notes.md
+report nowhere
+export nowhere --out shards
+simulate missing.mp4 --out events.h5
+simulate notes.md --out events.h5
+simulate pictures --out events.h5
+simulate pictures --out events.xyz --fps 100
+simulate pictures --out events.h5 --fps 100 --sensor davis1000
+simulate pictures --out events.h5 --fps 100 --emulator magic
+simulate pictures --out events.h5 --fps 100 --gamma wide
+convert missing.h5 events.raw
+convert broken.h5 events.raw
+convert broken.raw events.h5
+convert words.txt events.h5
+convert outside.csv events.h5 --size 240x180
+convert outside.csv events.h5 --size big
+convert notes.md events.h5
+compare missing.h5 broken.h5
+trade missing.yaml --out trade
+trade frames.yaml --out trade
+shader show nothing.glsl
+shader probe good.yaml --time 0.3 --pixel middle
+shader probe good.yaml --time 900 --pixel 1,1
+shader diff good.yaml --time 0.3 --tolerance much --out diff
+shader passes good.yaml --time 0.3 --shaders nowhere --out passes
+""".split("\n")[1:-1]
+EFLOW_COMMANDS = """
+train missing.yaml --out run
+train unknown_key.yaml --out run
+evaluate nowhere nowhere --out scores
+predict nowhere broken.h5 --out flow
+submit nowhere nowhere --out submission.zip
+""".split("\n")[1:-1]
+
+
+def test_every_sentence_is_reviewed():
+    assert messages.text() == messages.GOLDEN.read_text(), "python -m blinkgl.tools.messages writes the file anew: read what has changed"
+
+
+def test_sentences_are_for_people():
+    for line in (line for lines in messages.sentences().values() for line in lines):
+        said = re.sub(r"\{[^{}]*\}", "X", line)
+        assert not said.rstrip().endswith("."), f"an error is a clause, not a sentence with a full stop: {line}"
+        for word in ("NoneType", "dtype", "kwargs", "TypeError", "KeyError", "NotImplemented", "assert", "TODO", "tuple", "ndarray", "Traceback", "pydantic"):
+            assert word not in said, f"'{word}' is for programmers: {line}"
+        assert "  " not in said.strip() or "{" in line, line
+        problem = said.split(": ", 1)[-1]
+        assert len(problem) < 420, f"one line, please: {line}"
+
+
+def _said(run, capsys, words: str, folder: Path) -> str:
+    status = run(words.split())
+    captured = capsys.readouterr()
+    text = captured.err.replace(str(folder), "…").strip()
+    leftovers = sorted(p.name for p in folder.iterdir() if p.name not in FILES and p.name != "pictures")
+    for name in leftovers:
+        text += f"\n  (left behind: {name})"
+    return f"$ {words}\n{text}\n[{status}]"
+
+
+def test_commands_say_what_is_wrong(tmp_path, monkeypatch, capsys):
+    import cv2
+
+    monkeypatch.chdir(tmp_path)
+    for name, content in FILES.items():
+        (tmp_path / name).write_text(content)
+    (tmp_path / "pictures").mkdir()
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / "pictures" / f"{k}.png"), np.full((24, 32), 50 * k, np.uint8))
+    said = [_said(cli.run, capsys, words, tmp_path) for words in COMMANDS]
+    try:
+        from eflow import cli as eflow_cli
+    except ImportError:
+        eflow_cli = None
+    if eflow_cli is not None:
+        said += ["eflow " + _said(eflow_cli.run, capsys, words, tmp_path) for words in EFLOW_COMMANDS]
+    for entry in said:
+        assert "Traceback" not in entry and "left behind" not in entry, entry
+        assert entry.endswith("[2]"), f"exit status 2: {entry}"
+        lines = entry.split("\n")[1:-1]
+        assert lines and (lines[0].startswith("error: ") or "Usage" in lines[0]), entry
+    text = "\n\n".join(said) + "\n"
+    if os.environ.get("BLINKGL_UPDATE_GOLDEN"):
+        GOLDEN.write_text(text)
+    golden = GOLDEN.read_text()
+    if eflow_cli is None:
+        golden = golden.split("eflow $")[0].rstrip() + "\n"
+    assert text == golden, "BLINKGL_UPDATE_GOLDEN=1 writes the file anew: read what has changed"

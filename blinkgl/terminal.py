@@ -1,5 +1,5 @@
 """What is printed for people. Rich reads words in square brackets as its markup and drops them: "(extra [cluster])" becomes "(extra )",
-a path "run[1]" loses its end. Every console and progress column of the project is made here, and takes text as it stands.
+a path "run[x]" loses its end. Every console and progress column of the project is made here, and takes text as it stands.
 
 And what is printed where not every character can be: :func:`never_fail_to_print`."""
 

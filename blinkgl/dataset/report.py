@@ -54,6 +54,7 @@ class Totals:
     labels: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
     total_s: float = 0.0
+    compile_s: float = 0.0
 
     def __len__(self) -> int:
         return self.count
@@ -66,6 +67,7 @@ class Totals:
         self.events += report.events
         self.labels += report.labels
         self.total_s += report.total_s
+        self.compile_s = max(self.compile_s, report.compile_s)  # workers compile at once
         for stage, seconds in report.seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
         return self

@@ -136,7 +136,7 @@ def _size(size: float) -> str:
 
 def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
     """The final table, and what was set aside."""
-    if line := compiling_line(max((report.compile_s for report in outcome.made), default=0.0)):  # workers compile at once, or wait for one
+    if line := compiling_line(outcome.made.compile_s):
         console.print(line, highlight=False)
     if outcome.made:
         show_table(console, outcome.made, outcome.elapsed_s)

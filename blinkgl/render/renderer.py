@@ -10,12 +10,12 @@ targets are made the first time something asks for them, and only in the variant
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
 
+from blinkgl.compiling import working_clock
 from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.frames import Flow, LabelFrame, LabelRequest, RenderStats
 from blinkgl.render.matrices import (
@@ -127,7 +127,7 @@ class Renderer:
         (edges that pass are not in it); a shader variant of its own, not compiled otherwise.
         With a still camera only what moves is drawn, and when ``out`` and ``rate`` are those of the call before, only what
         has changed is written: leave them as they were returned. ``changed`` then says where."""
-        started = time.perf_counter()
+        started = working_clock()
         samples, (name, fmt) = self._samples, ("luminance", "R32F") if rate is None else ("luminance+rate", "RG32F")
         target = self._target(name, samples.grid, (fmt,), samples.multi)
         moment = self._moment(t_ns)
@@ -147,7 +147,7 @@ class Renderer:
         """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures filtered as for the
         whole image. h = max(1, H // every), w likewise: the small picture covers the whole image, so that its pixels are H / h and W / w
         pixels apart, a little more than ``every`` where that is no divisor."""
-        started = time.perf_counter()
+        started = working_clock()
         target = self._target("brightness", 1, ("RG32F",), every=every)
         moment = self._moment(t_ns)
         self._begin(target, moment, (self.scene.background, 0.0))
@@ -167,7 +167,7 @@ class Renderer:
         """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit.
         ``reduce`` samples every n-th pixel, h and w as for :meth:`brightness`: enough to find the largest motion, at 1/n² the cost.
         ``moving_only`` leaves out objects that stand still, also where they hide something."""
-        started = time.perf_counter()
+        started = working_clock()
         target = self._target("velocity", 1, ("RG32F",), every=reduce)
         moment = self._moment(t_ns)
         rate, _ = self._rates(t_ns, moment)
@@ -223,7 +223,7 @@ class Renderer:
 
     def colour(self, t_ns: int, antialiasing: str | None = None) -> np.ndarray:
         """Linear radiance at t_ns, (H, W, 3) float32; ``antialiasing`` overrides the configuration's."""
-        started = time.perf_counter()
+        started = working_clock()
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
         target = self._target("colour", samples.grid, ("RGBA32F",), samples.multi)
         moment = self._moment(t_ns)
@@ -295,7 +295,7 @@ class Renderer:
         if not (same_kind and held[1] is image and held[2] is rate):
             stale = [self._whole]
         ctx.finish()
-        drawn = time.perf_counter()
+        drawn = working_clock()
         for r in stale:
             if r == self._whole and rate is None:
                 result.read(0, out=image)
@@ -306,14 +306,14 @@ class Renderer:
             else:
                 image[place], rate[place] = part[..., 0], part[..., 1]
         self.stats.render_s += drawn - started
-        self.stats.readback_s += time.perf_counter() - drawn
+        self.stats.readback_s += working_clock() - drawn
         return image
 
     # ---- parts of the label pass -------------------------------------------------------------------------------
 
     def _geometry(self, t_ns: int, outputs: list[tuple[str, str]], t_forward_ns: int | None,
                   t_backward_ns: int | None) -> dict[str, np.ndarray]:
-        started = time.perf_counter()
+        started = working_clock()
         defines = {f"OUT_{name}": i for i, (name, _) in enumerate(outputs)}
         target = self._target("geometry:" + ",".join(defines), 1, tuple(fmt for _, fmt in outputs))
         moment = self._moment(t_ns)
@@ -334,12 +334,12 @@ class Renderer:
                 rotation = moment.T_cam_obj[item.object_index, :3, :3]
                 uniforms["camera_from_local"].write(np.ascontiguousarray(rotation.T, np.float32).tobytes())
             self._draw(uniforms, item)
-        return {name: self._read(target, i, started if i == 0 else time.perf_counter(), None)
+        return {name: self._read(target, i, started if i == 0 else working_clock(), None)
                 for i, (name, _) in enumerate(outputs)}
 
     def _flow(self, buffer: np.ndarray, ids: np.ndarray | None, t_other_ns: int, occlusion: bool) -> Flow:
         surface = self._surface(t_other_ns) if occlusion else None
-        started = time.perf_counter()
+        started = working_clock()
         w_next = buffer[..., 2]
         hit = buffer[..., 3] > 0
         valid = hit & (w_next > 0)
@@ -347,7 +347,7 @@ class Renderer:
         occluded = None
         if surface is not None:
             occluded = occlusion_mask(flow, w_next, valid, ids, *surface, self.scene.camera.near)
-        self.stats.render_s += time.perf_counter() - started
+        self.stats.render_s += working_clock() - started
         return Flow(flow, valid, occluded)
 
     def _surface(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -482,8 +482,8 @@ class Renderer:
 
     def _read(self, target, index: int, started: float, out: np.ndarray | None) -> np.ndarray:
         self.gl.ctx.finish()
-        drawn = time.perf_counter()
+        drawn = working_clock()
         image = target.read(index, out=out)
         self.stats.render_s += drawn - started
-        self.stats.readback_s += time.perf_counter() - drawn
+        self.stats.readback_s += working_clock() - drawn
         return image

@@ -1,6 +1,6 @@
 """Times settings and judges their events: the measurement behind ``blinkgl trade``.
 
-A clip of one sequence goes through pass 1 of ``blinkgl generate`` (frames, event kernel; nothing is written), once per setting and
+A clip of one sequence goes through pass 1 of ``blinkgl generate`` (:class:`~blinkgl.dataset.event_pass.EventPass`; nothing is written), once per setting and
 round. Rounds are interleaved, so that a busy moment of the machine falls on all settings alike.
 """
 

@@ -2,6 +2,7 @@
 
 import os
 import threading
+from queue import SimpleQueue
 
 import numba
 import numpy as np
@@ -43,6 +44,7 @@ def test_helpers_begin_at_places_of_their_own():
 def test_the_caller_does_not_wait_for_who_has_not_begun(monkeypatch):
     """No helper ever gets a core here: the work is done all the same."""
     monkeypatch.setattr(threads, "_helpers", [None])
+    monkeypatch.setattr(threads, "_jobs", SimpleQueue())
     counts = np.zeros(100, np.int64)
     threads.run(_count, 100, (counts,), 2)
     assert (counts == 1).all()

@@ -23,7 +23,14 @@ def test_the_same_seed_makes_the_same_configurations():
     assert any(c[1] for c in texts), "some with --set"
 
 
-@pytest.mark.parametrize("error, kind", [(KeyError("x"), "bug"), (ConfigError("two\nlines"), "lines"), (ConfigError("one line"), "refused"), (MemoryError(), "died"),
+class TwoLines(ConfigError):
+    """What errors.py would not let happen."""
+
+    def __str__(self) -> str:
+        return "two\nlines"
+
+
+@pytest.mark.parametrize("error, kind", [(KeyError("x"), "bug"), (TwoLines("two"), "lines"), (ConfigError("one line"), "refused"), (MemoryError(), "died"),
                                          (RecursionError("deep"), "bug")])
 def test_what_counts_as_a_defect(tmp_path, monkeypatch, error, kind):
     def fail(*_):

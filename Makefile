@@ -1,7 +1,7 @@
 # make demo    install into .venv, check OpenGL, generate the demo sequence into out/demo
 # make test    install into .venv, check OpenGL, run the tests
 # make slow    the tests that take long       make bench   the benchmarks
-# make fuzz    damaged files of every format, 1000 each: half an hour; what went wrong lies in out/fuzz
+# make fuzz    damaged files and strange configurations (an hour)      make mutate   are there tests that notice a wrong line?
 # make clean   remove what was built (not .venv, not out/)
 #
 # PYTHON=python3.12 chooses the interpreter .venv is made with, JOBS=4 the number of test processes.
@@ -12,15 +12,15 @@ PIP = .venv/bin/python -m pip --disable-pip-version-check
 INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
 INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 
-.PHONY: demo test slow bench fuzz doctor setup opengl clean
+.PHONY: demo test slow bench fuzz mutate doctor setup opengl clean
 .DELETE_ON_ERROR:
 
-demo: .venv/.installed-core opengl
+demo: .venv/.kernels opengl
 	@rm -rf out/demo
 	.venv/bin/blinkgl generate configs/demo.yaml --out out/demo
 	@echo "beside it: events.h5, flow/, images/ in DSEC's layout; README.md says what to do next"
 
-test: .venv/.installed-dev opengl
+test: .venv/.installed-dev .venv/.kernels opengl
 	.venv/bin/python -m pytest -q -n $(JOBS) --maxprocesses 4 --dist worksteal
 
 slow: .venv/.installed-dev opengl
@@ -29,8 +29,13 @@ slow: .venv/.installed-dev opengl
 bench: .venv/.installed-dev opengl
 	@for program in tools/bench_*.py; do echo "== $$program"; .venv/bin/python $$program || exit 1; done
 
-fuzz: .venv/.installed-dev
-	.venv/bin/python -m blinkgl.tools.fuzz_files --mutants 1000 --out out/fuzz --json out/fuzz/report.json
+fuzz: .venv/.installed-dev opengl
+	.venv/bin/python -m blinkgl.tools.fuzz_files --mutants 1000 --out out/fuzz/files --json out/fuzz/files.json
+	.venv/bin/python -m blinkgl.tools.fuzz_configs --count 10000 --runs 300 --out out/fuzz/configs --json out/fuzz/configs.json
+
+mutate: .venv/.installed-dev opengl
+	.venv/bin/python -m blinkgl.tools.mutate --map
+	.venv/bin/python -m blinkgl.tools.mutate --count 200 --seed 1 --out out/mutants.json
 
 doctor: .venv/.installed-core
 	.venv/bin/blinkgl doctor
@@ -58,6 +63,11 @@ setup: .venv/.installed-dev opengl
 	@$(INSTALL) -e '.[cluster]' || echo "Ray could not be installed: the tests of the Ray executor will be skipped"
 	@$(INSTALL) --no-deps pyrender PyOpenGL==3.1.10 freetype-py pyglet six \
 		|| echo "pyrender could not be installed: the comparisons with it will be skipped"
+	@touch $@
+
+# Once per machine instead of in somebody's first run; where it fails, the first run compiles.
+.venv/.kernels: .venv/.installed-core $(wildcard blinkgl/events/*.py)
+	-@.venv/bin/python -m blinkgl.compiling
 	@touch $@
 
 # No stamp: it takes half a second, and system packages come and go without make seeing it.

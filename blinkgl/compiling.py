@@ -46,3 +46,23 @@ def working_clock() -> float:
 def compiling_line(seconds: float) -> str:
     """"compiling kernels, once per machine: 14 s"; "" where there was next to nothing to compile."""
     return f"compiling kernels, once per machine: {seconds:.0f} s" if seconds >= 0.5 else ""
+
+
+def compile_ahead(emulators: tuple[str, ...] = ("esim", "v2e", "voltmeter")) -> float:
+    """Compiles the kernels of these emulators, for frames of either type, so that no later process has to. Seconds that it took."""
+    import numpy as np
+
+    from blinkgl.simulation import simulate
+
+    before, waves = compiled_s(), np.sin(np.arange(64 * 64, dtype=np.float32).reshape(64, 64) / 9)
+    for emulator in emulators:
+        for frames in ([0.5 + 0.4 * np.roll(waves, k) for k in range(4)], [np.uint8(127 + 90 * np.roll(waves, k)) for k in range(4)]):
+            for _ in simulate(frames, fps=100, emulator=emulator):
+                pass
+    return compiled_s() - before
+
+
+if __name__ == "__main__":
+    from blinkgl import compiling  # the module that numba's events are told, not this second copy of it
+
+    print(compiling.compiling_line(compiling.compile_ahead()) or "kernels: compiled before")

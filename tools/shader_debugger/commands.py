@@ -24,10 +24,10 @@ def write_passes(subject: Subject, when: When, out: str, names: list[str] | None
     from blinkgl.tools.shader_debugger import picture
 
     names = [check_pass(name) for name in names] if names else list(PASSES)
-    folder = _folder(out)
     paths, tiles = [], []
     caption = f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
     with open_renderer(subject, shaders, as_configured=True) as renderer:
+        folder = _folder(out)  # not before there is something to put into it
         gpu = GpuMoment(renderer, when, subject.log_eps)
         for name in names:
             info, array = PASSES[name], gpu[name]

@@ -37,9 +37,9 @@ from pathlib import Path
 
 import numpy as np
 
-# A process with threads cannot be forked safely.
-for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
+if __name__ == "__main__":  # a process with threads cannot be forked safely; where this is imported they are somebody else's
+    for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(_name, "1")
 
 from blinkgl.errors import BlinkGLError  # noqa: E402
 from blinkgl.tools.fuzz_formats import FORMATS, MARK, Format  # noqa: E402

@@ -467,7 +467,7 @@ _RECIPE = {
 
 def _make_data_set(folder: Path) -> None:
     """One sequence, its index and the run's record; nothing of it was rendered."""
-    import yaml
+    from blinkgl.config.reader import to_yaml
 
     from blinkgl.config.sequence import load_run
     from blinkgl.dataset.plan import Plan
@@ -475,11 +475,11 @@ def _make_data_set(folder: Path) -> None:
     from blinkgl.io.index import write_index
     from blinkgl.io.sequence_dir import SequenceWriter
 
-    (folder / "recipe.yaml").write_text(yaml.safe_dump(_RECIPE))
+    (folder / "recipe.yaml").write_text(to_yaml(_RECIPE))
     out = folder / "out"
     plan = Plan.of(load_run(folder / "recipe.yaml"))
     flow, valid = _flow()
-    with SequenceWriter(out / plan.tasks[0].name, HEIGHT, WIDTH, config_yaml=yaml.safe_dump(plan.template.tree)) as writer:
+    with SequenceWriter(out / plan.tasks[0].name, HEIGHT, WIDTH, config_yaml=to_yaml(plan.template.tree)) as writer:
         writer.append_events(_events())
         for k in range(2):
             t = 20_000 * (k + 1)
@@ -597,9 +597,9 @@ def _judge_mvsec_set(folder: Path) -> str | None:
 
 
 def _make_yaml(folder: Path) -> list[str]:
-    import yaml
+    from blinkgl.config.reader import to_yaml
 
-    (folder / "r.yaml").write_text(yaml.safe_dump(_RECIPE))
+    (folder / "r.yaml").write_text(to_yaml(_RECIPE))
     return ["r.yaml"]
 
 
@@ -614,12 +614,12 @@ def _judge_yaml(folder: Path) -> str | None:
 
 
 def _make_explicit(folder: Path) -> list[str]:
-    import yaml
+    from blinkgl.config.reader import to_yaml
 
     tree = {"camera": {"width": 32, "height": 24, "fov": 60}, "time": {"duration": 0.1, "label_rate": 20},
             "scene": {"kind": "explicit", "meshes": {"a": {"primitive": "cuboid"}}, "objects": [{"mesh": "a", "position": [0, 0, 0], "euler": [0, 10, 0]}],
                       "camera": {"keyframes": [{"time": 0.0, "position": [0, -3, 0], "look_at": [0, 0, 0]}, {"time": 0.1, "position": [0.1, -3, 0]}]}}}
-    (folder / "r.yaml").write_text(yaml.safe_dump(tree))
+    (folder / "r.yaml").write_text(to_yaml(tree))
     return ["r.yaml"]
 
 
@@ -683,9 +683,9 @@ def _judge_checkpoint_state(folder: Path) -> str | None:
 
 
 def _make_train_yaml(folder: Path) -> list[str]:
-    import yaml
+    from blinkgl.config.reader import to_yaml
 
-    (folder / "t.yaml").write_text(yaml.safe_dump({"seed": 0, "model": {"name": "eraft", "iterations": 3}, "data": {"crop": [64, 64], "train": [{"path": "x", "weight": 1.0}]},
+    (folder / "t.yaml").write_text(to_yaml({"seed": 0, "model": {"name": "eraft", "iterations": 3}, "data": {"crop": [64, 64], "train": [{"path": "x", "weight": 1.0}]},
                                                    "optim": {"steps": 10}}))
     return ["t.yaml"]
 

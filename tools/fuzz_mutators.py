@@ -199,9 +199,9 @@ def json_lines(rng, data):
 
 
 def yaml_tree(rng, data):
-    import yaml
+    from blinkgl.config.reader import parse_yaml, to_yaml
 
-    return yaml.safe_dump(tree(rng, yaml.safe_load(data)), default_flow_style=bool(rng.random() < 0.5)).encode("utf-8", "surrogatepass")
+    return to_yaml(tree(rng, parse_yaml(data.decode(), "seed"))).encode("utf-8", "surrogatepass")
 
 
 def glb_tree(rng, data):

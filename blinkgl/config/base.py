@@ -162,6 +162,15 @@ def below(annotation: Any, step: str | int) -> list[Any]:
     return []
 
 
+def _limits_below(annotation: Any, step: str | int) -> FieldInfo | None:
+    """The limits of an entry of a list, which stand in its annotation."""
+    arguments = typing.get_args(annotation)
+    if typing.get_origin(annotation) not in (tuple, list) or not str(step).isdigit() or not arguments:
+        return None
+    entry = arguments[min(int(step), len(arguments) - 1) if arguments[-1] is not Ellipsis else 0]
+    return next((a for a in typing.get_args(entry)[1:] if isinstance(a, FieldInfo)), None) if typing.get_origin(entry) is Annotated else None
+
+
 def _fits(annotation: Any, path: Iterable[str]) -> bool:
     here = [annotation]
     for step in path:
@@ -284,7 +293,7 @@ def _locate(model: type[BaseModel], loc: tuple, kind: str) -> tuple[list[str], l
         if inner:
             path.append(str(step))
             owners = [m for m in models if step in m.model_fields]
-            info = owners[0].model_fields[step] if owners else None
+            info = owners[0].model_fields[step] if owners else next(filter(None, (_limits_below(a, step) for a in here)), None)
             here = inner
             continue
         tagged = [m for m in models if step in (tag_of(m) or ())[1:]]

@@ -21,7 +21,7 @@ class FramesConfig(Config):
     images: str = Field("image_left", description="sub-folder of the images, or '.'")
     flow: str | None = Field("flow", description="sub-folder of the optical flow, one file per pair of frames in their order: .npy "
                              "(H, W, 2 or 3), .flo or DSEC .png; null: none")
-    fps: float = Field(10.0, gt=0, le=1e6, description="frames per second that the frames are taken to have, Hz; flow labels come at this rate")
+    fps: float = Field(10.0, ge=0.001, le=1e6, description="frames per second that the frames are taken to have, Hz; flow labels come at this rate")
     first: int = Field(0, ge=0, description="frames left out at the beginning")
     count: int | None = Field(None, ge=3, description="frames used; null: all")
     gamma: Literal["srgb", "linear"] = Field("srgb", description="transfer curve of the images")

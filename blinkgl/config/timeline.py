@@ -20,13 +20,13 @@ class UniformTimeline(_Timeline):
     """Event frames at a fixed rate."""
 
     kind: Literal["uniform"] = "uniform"
-    fps: float = Field(300.0, gt=0, le=1e9, description="frames per second, Hz")
+    fps: float = Field(300.0, ge=0.001, le=1e9, description="frames per second, Hz; emulators take frames at most 17 minutes apart")
 
 
 class _AdaptiveTimeline(_Timeline):
     sample_every: int = Field(4, ge=1, le=64, description="the small picture that decides the step looks at every n-th pixel in x and y; 1 at all of them")
     min_step_us: float = Field(200.0, ge=0.001, description="the step is never shorter, µs")
-    max_step_us: float = Field(20000.0, ge=0.001, description="the step is never longer, µs")
+    max_step_us: float = Field(20000.0, ge=0.001, le=1e9, description="the step is never longer, µs; emulators take frames at most 17 minutes apart")
 
     @rule("min_step_us", "max_step_us")
     def _ordered(least, most):

@@ -53,7 +53,7 @@ def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
 def test_a_pool_of_textures_of_its_own_asks_for_nothing(tmp_path, capsys):
     """Materials that the pool's textures replace are nobody's wish."""
     path = recipe(tmp_path, {**RANDOM, "pool": {**RANDOM["pool"], "keep_materials": False}})
-    (made, *_) = generate_with_progress(str(path), str(tmp_path / "out"), num=1).made
+    made = generate_with_progress(str(path), str(tmp_path / "out"), num=1).made.first
     assert "note: " not in capsys.readouterr().out and json.loads((made.path / "manifest.json").read_text())["not_drawn"] == []
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
-from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.sequence_dir import verify_sequence
 
@@ -44,22 +44,22 @@ def events_of(path: Path) -> tuple[np.ndarray, int, h5py.Dataset]:
         return file["events/t"][:].astype(np.int64) + int(file["t_offset"][()]), int(file["t_offset"][()]), file["ms_to_idx"].shape[0]
 
 
-def test_a_still_day(gl, tmp_path, promise):
-    """24 h and one label interval, from 10^6 s on, in 101 frames of at most 15 minutes."""
-    day = {"duration": 86_400, "label_rate": 1 / 3600, "start": 1_000_000}
-    report = generate(gl, tmp_path, time=day, timeline={"kind": "displacement", "max_step_us": 9e8})
-    assert report.labels == 24 and report.frames == 101
-    promise("a still day as a sequence: events", report.events, 0)
+def test_the_longest_still_sequence(gl, tmp_path, promise):
+    """An hour and one label interval, from 10^6 s on, in frames of at most 15 minutes: what an event file can hold."""
+    hour = {"duration": 3600, "label_rate": 1 / 600, "start": 1_000_000}
+    report = generate(gl, tmp_path, time=hour, timeline={"kind": "displacement", "max_step_us": 9e8})
+    assert report.labels == 6 and report.frames == 6  # 4200 s in steps of 900 s
+    promise("a still hour as a sequence: events", report.events, 0)
     flow = np.stack([np.load(f) for f in sorted((report.path / "flow/forward_npy").iterdir())])
-    assert flow.shape[0] == 24 and flow[..., 2].any()
-    promise("a still day as a sequence: flow", np.abs(flow[..., :2]).max(), 0.0, "px")
+    assert flow.shape[0] == 6 and flow[..., 2].any()
+    promise("a still hour as a sequence: flow", np.abs(flow[..., :2]).max(), 0.0, "px")
     _, offset, milliseconds = events_of(report.path)
-    assert offset == 10**12 and milliseconds == 25 * 3_600_000 + 1  # covers the eventless tail, to the last millisecond
+    assert offset == 10**12 and milliseconds == 4_200_000 + 1  # covers the eventless tail, to the last millisecond
 
 
 def test_longer_than_the_event_format_can_hold(gl, tmp_path):
-    """DSEC's u4 of microseconds ends after 71.6 minutes; events beyond are an error and leave no half-written folder."""
-    with pytest.raises(EventDataError, match="71.6 minutes per file"):
+    """DSEC's u4 of microseconds ends after 71.6 minutes: known when the configuration is read."""
+    with pytest.raises(ConfigError, match=r"time.duration: .* 10800 s are more than the 4295.0 s \(71.6 minutes\)"):
         generate(gl, tmp_path, time={"duration": 7200, "label_rate": 1 / 3600}, scene=moving(10_800, 1.0), timeline={"kind": "uniform", "fps": 0.01})
     assert not any(tmp_path.rglob("*.h5"))
 
@@ -129,5 +129,6 @@ def test_light_beyond_the_emulators_is_refused_where_it_is_seen(gl, tmp_path):
 
 
 def test_frames_further_apart_than_17_minutes_are_refused(gl, tmp_path):
-    with pytest.raises(EventDataError, match="at most 17 minutes between two frames"):
-        generate(gl, tmp_path, time={"duration": 7200, "label_rate": 1 / 3600}, timeline={"kind": "uniform", "fps": 1 / 3600})
+    with pytest.raises(ConfigError, match=r"timeline.fps: .* expected a number from 0.001"):
+        generate(gl, tmp_path, time={"duration": 2400, "label_rate": 1 / 1200}, timeline={"kind": "uniform", "fps": 1 / 1200})
+    assert not any(tmp_path.rglob("*.h5"))

@@ -88,7 +88,7 @@ def test_meshes_materials_and_textures_are_written_once(tmp_path):
     # v upwards, and the same place in the texture but for whole repeats
     back = arrays["uvs1"] * [1, -1] + [0, 1] - ball.uvs * np.array([3.0, 400.0])
     np.testing.assert_allclose(back, np.rint(back), atol=3e-5)
-    assert np.abs(arrays["uvs1"]).max() < 0.6 * 400 and job["light"]["sun"] == 0.8
+    assert np.abs(arrays["uvs1"]).max() < 0.6 * 400 and job["light"]["sun"] == Light().sun
 
 
 def test_rotations_of_the_worker():

@@ -40,11 +40,18 @@ FILES = {
     "bad_range.yaml": "events: {contrast_threshold: {uniform: 0.3}}\n",
     "weights.yaml": "events: {contrast_threshold: {weighted: [1, 2]}}\n",
     "seed.yaml": "seed: -1\n",
-    "texture.yaml": "scene: {kind: explicit, objects: [{primitive: cuboid, texture: missing.png}]}\n",
-    "primitive.yaml": "scene: {kind: explicit, objects: [{primitive: dodecahedron}]}\n",
-    "parameter.yaml": "scene: {kind: explicit, objects: [{primitive: sphere, parameters: {sides: 3}}]}\n",
-    "mesh.yaml": "scene: {kind: explicit, objects: [{file: broken.obj}]}\n",
-    "keyframes.yaml": "scene: {kind: explicit, objects: [{primitive: cuboid, keyframes: [{time: 1, position: [0, 0, 1]}, {time: 0, position: [0, 0, 2]}]}]}\n",
+    "inline.yaml": "scene: {kind: explicit, objects: [{primitive: cuboid}]}\n",
+    "name.yaml": "scene: {kind: explicit, meshes: {a: {primitive: cuboid}}, objects: [{mesh: b}]}\n",
+    "texture.yaml": "scene: {kind: explicit, meshes: {a: {primitive: cuboid}}, materials: {m: {texture: missing.png}}, objects: [{mesh: a, material: m}]}\n",
+    "primitive.yaml": "scene: {kind: explicit, meshes: {a: {primitive: dodecahedron}}, objects: [{mesh: a}]}\n",
+    "parameter.yaml": "scene: {kind: explicit, meshes: {a: {primitive: sphere, parameters: {sides: 3}}}, objects: [{mesh: a}]}\n",
+    "mesh.yaml": "scene: {kind: explicit, meshes: {a: {file: broken.obj}}, objects: [{mesh: a}]}\n",
+    "glb.yaml": "scene: {kind: file, path: broken.glb}\n",
+    "keyframes.yaml": "scene: {kind: explicit, meshes: {a: {primitive: cuboid}}, objects: [{mesh: a, keyframes: [{time: 1}, {time: 0}]}]}\n",
+    "turn.yaml": "scene: {kind: explicit, meshes: {a: {primitive: cuboid}}, objects: [{mesh: a, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 40000]}]}]}\n",
+    "corner.yaml": "timeline: {min_step_us: {uniform: [100, 900]}, max_step_us: {uniform: [500, 2000]}}\n",
+    "long.yaml": "time: {duration: 5000}\n",
+    "bomb.yaml": "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" if k else "a0: &a0 [1]\n" for k in range(10)),
     "pool.yaml": "scene: {kind: random, pool: {folders: [nowhere]}}\n",
     "frames.yaml": "frames: {folders: [nowhere], fps: 30}\n",
     "broken.obj": "v 0 0 0\nf 1 2 3\n",
@@ -75,11 +82,18 @@ generate empty_range.yaml --out out
 generate bad_range.yaml --out out
 generate weights.yaml --out out
 generate seed.yaml --out out
+generate inline.yaml --out out
+generate name.yaml --out out
 generate texture.yaml --out out
 generate primitive.yaml --out out
 generate parameter.yaml --out out
 generate mesh.yaml --out out
+generate glb.yaml --out out
 generate keyframes.yaml --out out
+generate turn.yaml --out out
+generate corner.yaml --out out
+generate long.yaml --out out
+generate bomb.yaml --out out
 generate pool.yaml --out out
 generate frames.yaml --out out
 generate good.yaml --out notes.md

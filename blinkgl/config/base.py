@@ -246,7 +246,7 @@ def _translate(model: type[BaseModel], error: ValidationError, where: str, start
         tags = [tag_of(a) for a in annotations if is_model(a)]
         key = context.get("discriminator", "kind").strip("'")
         got = first["input"].get(key, ...) if isinstance(first["input"], dict) else first["input"]
-        return ConfigError("unknown or missing choice", where=f"{dotted}.{key}", value=got,
+        return ConfigError("missing choice" if got is ... else "unknown choice", where=f"{dotted}.{key}", value=got,
                            accepted="one of " + ", ".join(f"'{tag[1]}'" for tag in tags if tag))
     if kind == "missing":
         short = path and path[-1].isdigit() and not owners

@@ -40,6 +40,8 @@ def export_shards(root: str | Path, out: str | Path, *, shard_bytes: int = 512_0
     root, out = Path(root), Path(out)
     if out.is_dir() and any(out.glob("*-*.tar")):
         raise OutputError("holds shards", where=str(out), accepted="a new folder name")
+    if not root.is_dir():
+        raise AssetError("no such data set", where=str(root), accepted="a folder of sequences")
     labels: dict[str, list[tuple[Path, int]]] = {}
     for folder in sequence_folders(root):
         if problems := verify_sequence(folder, checksums=False):

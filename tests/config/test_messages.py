@@ -92,8 +92,8 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
     ("timeline: {fps: 100}", "timeline.fps: unknown key; expected one of: kind, max_px, max_px_peak, max_step_us, min_step_us, percentile, reconstruction, "
      "sample_every; it is a key of kind: uniform"),
     ("events: {k1: 3}", "events.k1: unknown key; expected one of: contrast_threshold"),
-    ("timeline: {kind: regular}", "timeline.kind: unknown or missing choice (got 'regular'); expected one of 'uniform', 'displacement', 'brightness', 'budget'"),
-    ("events: {emulator: [esim]}", "events.emulator: unknown or missing choice (got ['esim']); expected one of 'esim', 'v2e', 'voltmeter'"),
+    ("timeline: {kind: regular}", "timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement', 'brightness', 'budget'"),
+    ("events: {emulator: [esim]}", "events.emulator: unknown choice (got ['esim']); expected one of 'esim', 'v2e', 'voltmeter'"),
     ("scene: {kind: file}", "scene.path: is required; expected text"),
     ("scene: {kind: file, path: x, camera: [1]}", "scene.camera: not accepted (got [1]); expected text, a whole number, or null"),
     ("uniform: [1, 2]", "uniform: the whole file cannot be drawn"),

@@ -70,7 +70,7 @@ def test_tables_of_another_kind_replace():
     ({"events": {"shares": [{"share": 0.8, "value": {"emulator": "v2e"}}, {"share": 0.3, "value": {"emulator": "voltmeter"}}]}},
      "events.shares: in group 'a': the shares do not sum to 1"),
     ({"events": {"shares": [{"share": 1.0}]}}, "events.shares: in group 'a': not a list of shares"),
-    ({"events": {"shares": [{"share": 0.5, "value": {"emulator": "v2e"}}, {"share": 0.5, "value": {"emulator": "blender"}}]}}, "events.emulator: in group 'a': unknown or missing choice"),
+    ({"events": {"shares": [{"share": 0.5, "value": {"emulator": "v2e"}}, {"share": 0.5, "value": {"emulator": "blender"}}]}}, "events.emulator: in group 'a': unknown choice"),
 ])
 def test_bad_recipes(tmp_path, changes, message):
     with pytest.raises(ConfigError) as error:

@@ -285,7 +285,7 @@ def test_preview_shows_the_sequence(tmp_path):
     ("scene.pool.folders=[nowhere]", "scene.pool.folders.0: "),
     ("scene.pool={primitives: [], urdfs: false}", "scene.pool: "),
     ("gl={backend: egl, device: 99}", "gl"),
-    ("events.emulator=blender", "events.emulator: unknown or missing choice"),
+    ("events.emulator=blender", "events.emulator: unknown choice"),
 ])
 def test_bad_input_is_one_line_and_status_2(tmp_path, capsys, option, message):
     out = tmp_path / "out"

@@ -210,7 +210,7 @@ def test_data_parallel_equals_one_process(tmp_path, data):
 
 
 @pytest.mark.parametrize("override, message", [
-    ("optim.stepz=3", r"optim\.stepz: unknown key; expected 'steps'"), ("model.name=raft", r"model\.name: unknown or missing choice"),
+    ("optim.stepz=3", r"optim\.stepz: unknown key; expected 'steps'"), ("model.name=raft", r"model\.name: unknown choice"),
     ("data.augment.horizontal_flip=2", r"data\.augment\.horizontal_flip"), ("model.variant=base", r"variant: unknown key"),
     ("data.train=[]", r"data\.train"), ("optim.lr=fast", r"optim\.lr")])
 def test_bad_configurations(tmp_path, data, override, message, capsys):

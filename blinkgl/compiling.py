@@ -48,14 +48,15 @@ def compiling_line(seconds: float) -> str:
     return f"compiling kernels, once per machine: {seconds:.0f} s" if seconds >= 0.5 else ""
 
 
-def compile_ahead(emulators: tuple[str, ...] = ("esim", "v2e", "voltmeter")) -> float:
-    """Compiles the kernels of these emulators, for frames of either type, so that no later process has to. Seconds that it took."""
+def compile_ahead(emulators: tuple[str, ...] = ()) -> float:
+    """Compiles the kernels of these emulators (default: all), for frames of either type, so that no later process has to. Seconds that it took."""
     import numpy as np
 
+    from blinkgl.events.table import EMULATORS
     from blinkgl.simulation import simulate
 
     before, waves = compiled_s(), np.sin(np.arange(64 * 64, dtype=np.float32).reshape(64, 64) / 9)
-    for emulator in emulators:
+    for emulator in emulators or EMULATORS:
         for frames in ([0.5 + 0.4 * np.roll(waves, k) for k in range(4)], [np.uint8(127 + 90 * np.roll(waves, k)) for k in range(4)]):
             for _ in simulate(frames, fps=100, emulator=emulator):
                 pass

@@ -19,8 +19,7 @@ from rich.table import Table
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.dataset.frames import flow_files, folder_of, read_frame, used_images
-from blinkgl.events import make_emulator
-from blinkgl.events.response import response_of
+from blinkgl.events import emulator_of, make_emulator
 from blinkgl.gl import GLContext, create_context
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import LabelRequest, Renderer
@@ -165,7 +164,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     if timeline.kind == "uniform":
         result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:
-        strategy = make_timeline(timeline, t0, t1, renderer, response_of(config.events))
+        strategy = make_timeline(timeline, t0, t1, renderer, emulator_of(config.events).response(config.events))
         if timeline.kind == "budget":  # a short stretch, for the first measurements of the error
             for t in islice(strategy, 2 * PROBES):
                 strategy.observe(t, renderer.luminance(t, out=luminance, rate=rate), rate)

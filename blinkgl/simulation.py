@@ -19,8 +19,8 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from blinkgl.config.base import Config
-from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.base import validate
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
@@ -29,7 +29,6 @@ from blinkgl.io.frames import open_frames
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.timeline import interpolate as between
 
-EMULATORS: dict[str, type[Config]] = {"esim": EsimConfig, "v2e": V2eConfig, "voltmeter": VoltmeterConfig}
 INTERPOLATIONS = ("linear", "cubic", "motion")
 _LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 """ITU-R BT.709, on linear light."""
@@ -61,7 +60,7 @@ class SimulationReport:
         return (self.last_ns - self.first_ns) * 1e-9
 
 
-def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | Config = "esim", gamma: str | float | None = None,
+def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | EmulatorConfig = EmulatorConfig.members.default, gamma: str | float | None = None,
              interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, readout: ReadoutConfig | None = None,
              report: SimulationReport | None = None, on_frame: Callable[[np.ndarray, int, Events], None] | None = None) -> Iterator[Events]:
     """Events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
@@ -70,7 +69,7 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | Conf
     ----------
     frames : iterable of (H, W) or (H, W, 3) RGB arrays with ``fps``, of (array, t_ns) pairs or (array, t_ns, name)
         triples (a :class:`~blinkgl.io.frames.FrameSource` is that). uint8, uint16 (full scale 1.0) or float (1.0 is white, more is fine).
-    emulator : "esim", "v2e", "voltmeter", or a config of one.
+    emulator : name of one ("esim", "v2e", "voltmeter"), or a config of one.
     gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: srgb for integers, linear for floats.
     interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1`` frames in between
         by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
@@ -244,16 +243,16 @@ def _luma_by_table(frame, table, weights, out):
             out[y, x] = weights[0] * table[frame[y, x, 0]] + weights[1] * table[frame[y, x, 1]] + weights[2] * table[frame[y, x, 2]]
 
 
-def emulator_config(emulator: str | Config | dict) -> Config:
+def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
     """A validated emulator config from a name, a plain mapping with ``emulator``, or a config."""
-    from blinkgl.config.base import validate
-    if isinstance(emulator, Config):
+    if isinstance(emulator, EmulatorConfig):
         return emulator
     data = {"emulator": emulator} if isinstance(emulator, str) else dict(emulator)
-    kind = data.get("emulator", "esim")
-    if not isinstance(kind, str) or kind not in EMULATORS:
-        raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(EMULATORS))
-    return validate(EMULATORS[kind], data, where=kind)
+    members = EmulatorConfig.members
+    kind = data.get("emulator", members.default)
+    if not isinstance(kind, str) or kind not in members.models:
+        raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(members.models))
+    return validate(members.models[kind], data, where=kind)
 
 
 def _checked_gamma(gamma: str | float | None) -> str | float | None:

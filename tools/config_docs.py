@@ -18,7 +18,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from blinkgl.config.base import tag_of
+from blinkgl.config.base import is_model, members, tag_of
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.scene.primitives import BUILDERS, PARAMETERS, parameters
 from eflow.config import TrainConfig
@@ -97,8 +97,8 @@ def _about(info: FieldInfo) -> str:
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
+    if is_model(annotation):
+        return members(annotation)
     return [m for a in typing.get_args(annotation) for m in _models(a)]
 
 

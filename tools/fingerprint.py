@@ -22,6 +22,7 @@ from blinkgl.bench import machine_line
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
+from blinkgl.events.table import EMULATORS
 
 BASE = {
     "seed": 5,
@@ -83,7 +84,7 @@ def frames(scratch: Path) -> dict[str, str]:
     for k in range(12):
         picture = 128 + 90 * np.sin((x + 1.3 * k) / 5) * np.cos((y - 0.4 * k) / 7)
         cv2.imwrite(str(folder / f"{k:06d}.png"), np.round(picture).astype(np.uint8))
-    for emulator in ("esim", "v2e", "voltmeter"):
+    for emulator in EMULATORS:
         simulate_file(folder, scratch / "out" / f"{emulator}.npz", fps=100, emulator=emulator, seed=3)
     return sums(scratch / "out")
 

@@ -31,6 +31,7 @@ from typing import Annotated, Any, ClassVar
 import annotated_types
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, TypeAdapter, ValidationError, model_validator
 from pydantic.fields import FieldInfo
+from pydantic_core import core_schema
 
 from blinkgl.errors import ConfigError
 
@@ -119,6 +120,60 @@ def _with_tag(tag: str, default: str, data: Any) -> Any:
     return {tag: default, **data} if isinstance(data, dict) and tag not in data else data
 
 
+class Members:
+    """Models told apart by the value of their key ``tag`` (``default`` where that is not given), in the order in which they were
+    added. More may be added at any time: see :class:`Family`."""
+
+    def __init__(self, tag: str, default: str):
+        self.tag, self.default = tag, default
+        self.models: dict[str, type[Config]] = {}
+        """By the value of the tag."""
+        self._adapter: TypeAdapter | None = None
+
+    def add(self, model: type[Config]) -> None:
+        """Raises TypeError for a model without the tag, or with another's value of it."""
+        tag = tag_of(model)
+        if tag is None or tag[0] != self.tag:
+            raise TypeError(f"{model.__name__} has no key `{self.tag}: Literal[...]` of one name")
+        if self.models.get(tag[1], model) is not model:
+            raise TypeError(f"there is another {self.tag} '{tag[1]}'")
+        self.models[tag[1]], self._adapter = model, None
+
+    def remove(self, value: str) -> None:
+        """Raises KeyError where there is none."""
+        del self.models[value]
+        self._adapter = None
+
+    def adapter(self) -> TypeAdapter:
+        """Of the union of the models as they are now."""
+        if self._adapter is None:
+            self._adapter = TypeAdapter(one_of(self.tag, *self.models.values(), default=self.default))
+        return self._adapter
+
+
+def stands_for_many(annotation: Any) -> bool:
+    """Whether it is the model that stands for a :class:`Family`, and not a member of it."""
+    return isinstance(annotation, type) and isinstance(vars(annotation).get("members"), Members)
+
+
+class Family(Config):
+    """A model that stands for all that are in its ``members``: a field annotated by it takes any of those. Which there are is looked
+    up when a value is validated and when the models are walked (:func:`members`), not when the field's model is made; so one that is
+    added later counts as much as the first. Members are subclasses of it, by which they are known to share what it declares."""
+
+    members: ClassVar[Members]
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
+        if not stands_for_many(cls):
+            return handler(source)
+        return core_schema.no_info_plain_validator_function(lambda data: cls.members.adapter().validate_python(data))
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: core_schema.CoreSchema, handler: Any) -> dict[str, Any]:
+        return handler(cls.members.adapter().core_schema if stands_for_many(cls) else schema)
+
+
 def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
     """Key and value that tell the model from the others of its union; None for a model that stands alone."""
     for key in ("kind", "emulator", "name"):
@@ -133,7 +188,9 @@ def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
 
 
 def members(annotation: Any) -> list[Any]:
-    """Members of a union (through Annotated) without null; another annotation alone."""
+    """Members of a union (through Annotated) or of a family, without null; another annotation alone."""
+    if stands_for_many(annotation):
+        return list(annotation.members.models.values())
     origin = typing.get_origin(annotation)
     if origin is Annotated:
         return members(typing.get_args(annotation)[0])
@@ -272,7 +329,7 @@ def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseMode
     near = difflib.get_close_matches(path[-1], known, n=1)
     if near:
         return f"'{near[0]}' (nearest)"
-    here: list[Any] = [model]
+    here: list[Any] = members(model)
     for step in path[:-1]:
         here = [x for a in here for x in below(a, step)]
     others = [tag_of(m) for m in here if is_model(m) and m not in owners and path[-1] in m.model_fields]
@@ -284,7 +341,7 @@ def _locate(model: type[BaseModel], loc: tuple, kind: str) -> tuple[list[str], l
     """Config path of a pydantic location without the labels that pydantic inserts for members of unions; the models that may
     own its last key; the annotations that are accepted there; and the field that they are of."""
     path: list[str] = []
-    here: list[Any] = [model]
+    here: list[Any] = members(model)
     owners: list[type[BaseModel]] = []
     info: FieldInfo | None = None
     for number, step in enumerate(loc):

@@ -18,7 +18,6 @@ from __future__ import annotations
 import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 from blinkgl.config.base import Config, Path, Rule, below, is_model, members
@@ -219,7 +218,6 @@ def _has_models(annotation: Any) -> bool:
     return any(_has_models(x) for a in typing.get_args(annotation) if a is not type(None) for x in members(a))
 
 
-@lru_cache
 def placed_rules(model: type[Config]) -> tuple[tuple[Path, Rule], ...]:
     """Every rule of ``model`` and of the models below it, with the path of the model that it belongs to ("*": any entry)."""
     found: list[tuple[Path, Rule]] = []

@@ -1,16 +1,20 @@
 """Event emulators: parameters, units, defaults and where each comes from.
 
-``emulator: esim | v2e | voltmeter`` picks the model; ``preset`` fills in published parameter sets, and any key
-given beside it wins over the preset.
+``emulator`` picks the model; ``preset`` fills in published parameter sets, and any key given beside it wins over the preset.
+What configuration has to know of an emulator stands in its model here; what runs, and the table of both, in :mod:`blinkgl.events.table`.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from abc import abstractmethod
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Config, Refused, one_of, rule
+from blinkgl.config.base import Family, Members, Refused, rule
+
+if TYPE_CHECKING:
+    from blinkgl.config.sensor import SensorConfig
 
 _MAX_EVENTS = Field(2**25, ge=1_000, le=2**31 - 1, description="Most events one step may emit, shared out equally among blocks "
                     "of 1024 pixels (a block may always emit one per pixel). Where more could fire, each pixel of the block "
@@ -19,9 +23,35 @@ _MAX_EVENTS = Field(2**25, ge=1_000, le=2**31 - 1, description="Most events one 
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
-class EsimConfig(Config):
+class EmulatorConfig(Family):
+    """The configuration of any emulator; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its name,
+    ``emulator: Literal["..."] = "..."``, takes no argument without a default, and says what stands here."""
+
+    members = Members("emulator", default="esim")
+
+    reconstructions: ClassVar[tuple[str, ...]]
+    """Paths between frames that the emulator can follow; "linear" is one of them."""
+
+    @classmethod
+    @abstractmethod
+    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
+        """Values of those of its keys of which a camera's data sheet says something."""
+
+
+def followers(reconstruction: str) -> list[str]:
+    """Names of the emulators that can follow this path between frames."""
+    return [kind for kind, model in EmulatorConfig.members.models.items() if reconstruction in model.reconstructions]
+
+
+def _pixel(sensor: SensorConfig) -> dict[str, Any]:
+    return dict(contrast_threshold=sensor.contrast_threshold, contrast_threshold_off=sensor.contrast_threshold_off,
+                threshold_sigma=sensor.threshold_sigma, refractory_us=sensor.refractory_us)
+
+
+class EsimConfig(EmulatorConfig):
     """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
 
+    reconstructions = ("linear", "pchip", "hermite")
     emulator: Literal["esim"] = "esim"
     contrast_threshold: float = Field(0.2, **_THRESHOLD, description="C+, change of ln(intensity) per ON event. "
                                       "BlinkSim draws 0.18-0.25 per sequence.")
@@ -38,6 +68,10 @@ class EsimConfig(Config):
                                  "passed in it is lost, as in rpg_esim.")
     max_events_per_step: int = _MAX_EVENTS
 
+    @classmethod
+    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
+        return _pixel(sensor)
+
 
 V2E_PRESETS = {
     # v2e's `--dvs_params clean` and `noisy` (emulator.py, set_dvs_params).
@@ -48,9 +82,10 @@ V2E_PRESETS = {
 }
 
 
-class V2eConfig(Config):
+class V2eConfig(EmulatorConfig):
     """V2E (Hu, Liu, Delbruck, CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period."""
 
+    reconstructions = ("linear",)
     presets = V2E_PRESETS
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field("default", description="v2e's command-line defaults, or its `clean` "
@@ -82,6 +117,11 @@ class V2eConfig(Config):
         if noise and cutoff_hz == 0:
             raise Refused("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
 
+    @classmethod
+    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
+        return {**_pixel(sensor), "cutoff_hz": sensor.cutoff_hz, "leak_rate_hz": sensor.leak_rate_hz,
+                "shot_noise_rate_hz": sensor.shot_noise_rate_hz}
+
 
 VOLTMETER_PRESETS = {
     # Lin, Ma, Guo, Wen, "DVS-Voltmeter", ECCV 2022, calibrated k1..k6 of the two cameras.
@@ -90,9 +130,10 @@ VOLTMETER_PRESETS = {
 }
 
 
-class VoltmeterConfig(Config):
+class VoltmeterConfig(EmulatorConfig):
     """DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion with drift between two absorbing thresholds."""
 
+    reconstructions = ("linear",)
     presets = VOLTMETER_PRESETS
     emulator: Literal["voltmeter"] = "voltmeter"
     preset: Literal["DVS346", "DVS240"] = Field("DVS346", description="Camera whose calibrated k1...k6 are the defaults.")
@@ -108,6 +149,12 @@ class VoltmeterConfig(Config):
     refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time after an event, microseconds (the paper has none).")
     max_events_per_step: int = _MAX_EVENTS
 
+    @classmethod
+    def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
+        """k1 = 1 / threshold replaces the calibrated gain only where the sensor is not the calibrated camera itself."""
+        gain = {} if sensor.name in ("DAVIS346", "DAVIS240C") else {"k1": 1 / sensor.contrast_threshold}
+        return {"preset": sensor.voltmeter, "refractory_us": sensor.refractory_us, **gain}
 
-EmulatorConfig = one_of("emulator", EsimConfig, V2eConfig, VoltmeterConfig, default="esim")
-"""The union as a field annotation; a model holds ``events: EmulatorConfig = EsimConfig()``."""
+
+for _model in (EsimConfig, V2eConfig, VoltmeterConfig):
+    EmulatorConfig.members.add(_model)

@@ -7,6 +7,7 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any, Literal
 
+from blinkgl.config.events import EmulatorConfig, followers
 from blinkgl.config.reader import parse_yaml
 
 Quality = Literal["fast", "balanced", "accurate", "reference"]
@@ -28,13 +29,14 @@ def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any) -> dict[st
     ``quality`` names no known one.
 
     A timeline of another kind than the preset's takes the preset's reconstruction alone: the other values
-    mean nothing to it. Emulators that follow straight lines alone take everything but the reconstruction."""
+    mean nothing to it. Emulators that cannot follow the preset's reconstruction take everything but that."""
     if quality not in QUALITIES:
         return {}
     preset = load_quality(quality)
     given = preset["timeline"]
     if kind not in (None, given["kind"]):
         given = {key: value for key, value in given.items() if key == "reconstruction"}
-    if emulator not in (None, "esim") and frames is None:
+    able = followers(given.get("reconstruction", "linear"))
+    if (EmulatorConfig.members.default if emulator is None else emulator) not in able and frames is None:
         given = {key: value for key, value in given.items() if key != "reconstruction"}
     return {"timeline": given, "render": preset["render"]}

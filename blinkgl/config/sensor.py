@@ -9,7 +9,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, rule, validate
-from blinkgl.config.events import EmulatorConfig, EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.reader import parse_yaml
 from blinkgl.errors import ConfigError
 
@@ -57,25 +57,14 @@ class SensorConfig(Config):
     voltmeter: Literal["DVS346", "DVS240"] = Field("DVS346", description="Nearest camera that DVS-Voltmeter was calibrated on.")
     readout: ReadoutConfig = Field(description="Read-out limit.")
 
-    def values(self, emulator: str) -> dict[str, Any]:
-        """What this sensor says about the keys of ``esim``, ``v2e`` or ``voltmeter``; of another emulator nothing.
-
-        For the Voltmeter k1 = 1 / threshold replaces the calibrated gain only where the sensor is not the
-        calibrated camera itself."""
-        pixel = dict(contrast_threshold=self.contrast_threshold, contrast_threshold_off=self.contrast_threshold_off,
-                     threshold_sigma=self.threshold_sigma, refractory_us=self.refractory_us)
-        if emulator == "esim":
-            return pixel
-        if emulator == "v2e":
-            return {**pixel, "cutoff_hz": self.cutoff_hz, "leak_rate_hz": self.leak_rate_hz, "shot_noise_rate_hz": self.shot_noise_rate_hz}
-        if emulator == "voltmeter":
-            gain = {} if self.name in ("DAVIS346", "DAVIS240C") else {"k1": 1 / self.contrast_threshold}
-            return {"preset": self.voltmeter, "refractory_us": self.refractory_us, **gain}
-        return {}
+    def values(self, emulator: Any) -> dict[str, Any]:
+        """What this sensor says about the keys of the emulator of this name; of one that is not known nothing."""
+        models = EmulatorConfig.members.models
+        return models[emulator].from_sensor(self) if isinstance(emulator, str) and emulator in models else {}
 
     def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
-        """Config of ``esim``, ``v2e`` or ``voltmeter`` with this sensor's values, ``overrides`` on top. Raises ConfigError."""
-        models = {"esim": EsimConfig, "v2e": V2eConfig, "voltmeter": VoltmeterConfig}
+        """Config of the emulator of this name with this sensor's values, ``overrides`` on top. Raises ConfigError."""
+        models = EmulatorConfig.members.models
         if not isinstance(emulator, str) or emulator not in models:
             raise ConfigError("unknown emulator", where="events.emulator", value=emulator, accepted="one of " + ", ".join(models))
         return validate(models[emulator], {**self.values(emulator), **overrides}, where="events")
@@ -109,9 +98,9 @@ def _shipped(known: str) -> SensorConfig:
 
 
 def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
-    """What the sensor called ``sensor`` says about a configuration with ``emulator`` (None: esim); nothing for an unknown one."""
+    """What the sensor called ``sensor`` says about a configuration with ``emulator`` (None: the default one); nothing for an unknown one."""
     if known_sensor(sensor) is None:
         return {}
     camera = load_sensor(sensor)
     return {"camera": {"width": camera.width, "height": camera.height}, "readout": camera.readout.model_dump(),
-            "events": camera.values("esim" if emulator is None else emulator)}
+            "events": camera.values(EmulatorConfig.members.default if emulator is None else emulator)}

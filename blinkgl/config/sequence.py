@@ -20,7 +20,7 @@ from pydantic import AfterValidator, Field
 from blinkgl.config.base import Config, Refused, rule, validate, validate_field
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
-from blinkgl.config.events import EmulatorConfig, EsimConfig
+from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
 from blinkgl.config.lod import LodConfig
@@ -211,10 +211,12 @@ class SequenceConfig(Config):
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
     @rule("timeline.reconstruction", "events.emulator", "?frames")
-    def _cubics_are_for_esim(path, emulator, frames):
-        if path != "linear" and emulator != "esim" and not frames:
-            raise Refused(f"{emulator} follows straight lines alone", where="timeline.reconstruction", value=path,
-                          accepted="linear, or events.emulator: esim")
+    def _the_emulator_follows(path, emulator, frames):
+        able = followers(path)
+        if emulator not in able and not frames:
+            own = EmulatorConfig.members.models[emulator].reconstructions
+            raise Refused(f"{emulator} follows straight lines alone" if own == ("linear",) else f"{emulator} cannot follow this path",
+                          where="timeline.reconstruction", value=path, accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}")
 
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
     def _late_events_fit(duration, label_rate, rate, row_ns, queue):

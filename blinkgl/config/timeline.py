@@ -7,13 +7,14 @@ from typing import Literal
 from pydantic import Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
+from blinkgl.config.events import followers
 
 
 class _Timeline(Config):
     reconstruction: Literal["linear", "pchip", "hermite"] = Field(
         "linear", description="log intensity between two frames. linear: straight lines. pchip: monotone cubics over the neighbouring frames, free "
         "of rendering. hermite: monotone cubics with dL/dt from the shader, which makes frames dearer and fewer enough. "
-        "The cubics are for `events.emulator: esim`")
+        f"The cubics are for `events.emulator: {' or '.join(followers('pchip'))}`")
 
 
 class UniformTimeline(_Timeline):

@@ -8,8 +8,7 @@ import numpy as np
 
 from blinkgl.dataset.clock import StageClock
 from blinkgl.errors import EventDataError
-from blinkgl.events import Emulator, Events, make_emulator
-from blinkgl.events.response import response_of
+from blinkgl.events import Emulator, Events, emulator_of, make_emulator
 from blinkgl.render.renderer import Renderer
 from blinkgl.timeline import make_timeline
 
@@ -27,7 +26,7 @@ class EventPass:
         self.renderer, self._clock = renderer, clock or StageClock()
         self.emulator: Emulator = make_emulator(events, renderer.height, renderer.width, seed, timeline.reconstruction)
         first_ns, last_ns = window_ns or (renderer.scene.t0_ns, renderer.scene.t1_ns)
-        self.timeline = make_timeline(timeline, first_ns, last_ns, renderer, response_of(events))
+        self.timeline = make_timeline(timeline, first_ns, last_ns, renderer, emulator_of(events).response(events))
         self.frames = 0
 
     def __iter__(self) -> Iterator[tuple[int, Events]]:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import LOG_MAX_INPUT
 from blinkgl.events.packing import MAX_INTERVAL_NS, PackedBuffer
+from blinkgl.events.response import Response
 from blinkgl.events.threads import run, thread_count
 from blinkgl.events.types import Events
 
@@ -49,17 +51,27 @@ class Emulator(ABC):
     then untouched and the next good frame goes on.
     """
 
-    reconstructions: tuple[str, ...] = ("linear",)
-    """Paths between frames that this emulator can follow."""
+    Config: ClassVar[type[EmulatorConfig]]
+    """Its configuration: name, keys, the paths between frames that it can follow, and what a sensor sets."""
     _still_pixels_sleep = False
     """Whether a pixel whose luminance does not change has no events and no changing state."""
     _state: tuple[str, ...] = ()
     """Names of the array attributes that make up the state; ``None`` entries are features that are off."""
 
+    @classmethod
+    @abstractmethod
+    def response(cls, config: EmulatorConfig) -> Response:
+        """How luminance becomes the signal that timelines watch, and how far that moves from event to event."""
+
+    @classmethod
+    @abstractmethod
+    def noiseless(cls, config: EmulatorConfig) -> EmulatorConfig:
+        """What is left of it when noise and bandwidth are taken away: of this or another emulator, whose events `trade` judges by."""
+
     def __init__(self, height: int, width: int, seed: int, reconstruction: str = "linear"):
-        if reconstruction not in self.reconstructions:
+        if reconstruction not in self.Config.reconstructions:
             raise EventDataError(f"{type(self).__name__} cannot follow this path between frames", where="timeline.reconstruction",
-                                 value=reconstruction, accepted=", ".join(self.reconstructions))
+                                 value=reconstruction, accepted=", ".join(self.Config.reconstructions))
         self.reconstruction = reconstruction
         if not (1 <= height < MAX_SIDE and 1 <= width < MAX_SIDE and height * width < 2**31):
             raise EventDataError("frame size out of range", value=(height, width), accepted=f"1 to {MAX_SIDE - 1} rows and columns")

@@ -31,6 +31,7 @@ from blinkgl.events.curve import Curve, curve_time, end_slopes, limited, slope_b
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, NO_LOG, Emulator
 from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters
+from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
 
@@ -281,8 +282,17 @@ class Esim(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. State: 12 bytes per pixel; spread thresholds
     (constant) and the refractory period add 8 each, jitter and the slopes of ``hermite`` 4, the neighbours of ``pchip`` 12."""
 
-    reconstructions = ("linear", "pchip", "hermite")
+    Config = EsimConfig
     _still_pixels_sleep = True
+
+    @classmethod
+    def response(cls, config: EsimConfig) -> Response:
+        return Response(smallest_threshold(config), 1.0, config.log_eps)
+
+    @classmethod
+    def noiseless(cls, config: EsimConfig) -> EsimConfig:
+        return EsimConfig(contrast_threshold=config.contrast_threshold, contrast_threshold_off=config.contrast_threshold_off,
+                          threshold_sigma=config.threshold_sigma)
 
     def __init__(self, height: int, width: int, config: EsimConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
         super().__init__(height, width, seed, reconstruction)

@@ -6,7 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from blinkgl.config.events import EsimConfig, V2eConfig
+
+def smallest_threshold(config) -> float:
+    """Of a configuration with ``contrast_threshold`` and ``contrast_threshold_off``."""
+    return min(config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold)
 
 
 class Response(NamedTuple):
@@ -28,16 +31,3 @@ class Response(NamedTuple):
         """d(signal)/dt of luminances and their rates of change, in the rates' unit of time."""
         slope = np.float32(self.gain) / (np.maximum(luminance, np.float32(self.joint)) + np.float32(self.offset))
         return rate * (np.where(luminance > self.joint, slope, np.float32(self.low_slope)) if self.low_slope else slope)
-
-
-def response_of(config) -> Response:
-    """Of ``EsimConfig``, ``V2eConfig`` or ``VoltmeterConfig``."""
-    if isinstance(config, EsimConfig):
-        return Response(_smallest(config), 1.0, config.log_eps)
-    if isinstance(config, V2eConfig):  # lin-log: linear up to 20 digital numbers
-        return Response(_smallest(config), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale)
-    return Response(1.0, config.k1, config.k2 / config.full_scale)
-
-
-def _smallest(config) -> float:
-    return min(config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold)

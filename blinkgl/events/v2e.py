@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from blinkgl.config.events import V2eConfig
+from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import select
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
@@ -34,6 +34,7 @@ from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
 from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
+from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
 from blinkgl.events.v2e_model import (DARKEST, REBASE, crossing_fraction, curve_of, draw_leaks, draw_start_noise, lin_log,
@@ -410,8 +411,19 @@ class V2e(Emulator):
     State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first or
     shot noise asks for it, 8 with the dead time. Constants: 16 bytes per pixel, 8 more with shot noise."""
 
+    Config = V2eConfig
     _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",
               "_clock_index", "_epoch_ns", "_brightest")
+
+    @classmethod
+    def response(cls, config: V2eConfig) -> Response:
+        """lin-log: linear up to 20 digital numbers."""
+        return Response(smallest_threshold(config), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale)
+
+    @classmethod
+    def noiseless(cls, config: V2eConfig) -> EsimConfig:
+        return EsimConfig(contrast_threshold=config.contrast_threshold, contrast_threshold_off=config.contrast_threshold_off,
+                          threshold_sigma=config.threshold_sigma)
 
     def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
         super().__init__(height, width, seed, reconstruction)

@@ -23,12 +23,13 @@ import numba
 import numpy as np
 from numba.extending import register_jitable
 
-from blinkgl.config.events import VoltmeterConfig
+from blinkgl.config.events import EsimConfig, VoltmeterConfig
 from blinkgl.events.arith import exp_f64, select
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.packing import JIT, T_SHIFT
 from blinkgl.events.philox import Stream, normal_and_uniform, uniform2
+from blinkgl.events.response import Response
 from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
 
@@ -282,7 +283,16 @@ class DvsVoltmeter(Emulator):
     State: 8 bytes per pixel, 8 more with a dead time. V starts at 0. ``saturated`` counts the expected number of
     the events that were not drawn."""
 
+    Config = VoltmeterConfig
     _state = ("_intensity", "_v", "_release")
+
+    @classmethod
+    def response(cls, config: VoltmeterConfig) -> Response:
+        return Response(1.0, config.k1, config.k2 / config.full_scale)
+
+    @classmethod
+    def noiseless(cls, config: VoltmeterConfig) -> EsimConfig:
+        return EsimConfig(contrast_threshold=min(max(1 / config.k1, 0.001), 10))
 
     def __init__(self, height: int, width: int, config: VoltmeterConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
         super().__init__(height, width, seed, reconstruction)

@@ -1,6 +1,6 @@
 """The strategies of ``timeline:``: frame times that adapt to what is drawn.
 
-    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer, response_of(config.events))
+    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer, emulator_of(config.events).response(config.events))
     for t_ns in timeline:
         luminance = ...                              # the frame at t_ns
         timeline.observe(t_ns, luminance, rate)

@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
 from blinkgl.dataset.event_pass import EventPass
 from blinkgl.errors import ConfigError
-from blinkgl.events.types import Events
+from blinkgl.events import Events, emulator_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
@@ -121,9 +120,10 @@ class Bench:
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
-        self._template = RunTemplate(apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])]), template.base)
         # Labels and previews take no part in this; noise would drown the errors that are asked for.
-        self.emulator = noiseless(base.events)
+        self.emulator = emulator_of(base.events).noiseless(base.events)
+        tree = apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])])
+        self._template = RunTemplate({**tree, "events": self.emulator.model_dump()}, template.base)
         self._scenes: dict[str, Scene] = {}
         self.base = self.config(())
         self.scene = self.scene_of(self.base)
@@ -249,14 +249,6 @@ class Bench:
     def _affordable(self, levels: list[Level], scale: int, max_px: float, spent: float) -> bool:
         last = levels[-1]
         return spent + last.seconds * (scale / last.scale) ** 2 * last.max_px / max_px <= self.options.reference_s
-
-
-def noiseless(config) -> EsimConfig:
-    """ESIM with the thresholds of any emulator's configuration: what is left of it when noise and bandwidth are taken away."""
-    if config.emulator == "voltmeter":
-        return EsimConfig(contrast_threshold=min(max(1 / config.k1, 0.001), 10))
-    return EsimConfig(contrast_threshold=config.contrast_threshold, contrast_threshold_off=config.contrast_threshold_off,
-                      threshold_sigma=config.threshold_sigma)
 
 
 def _sized(config: SequenceConfig, factor: float) -> list[str]:

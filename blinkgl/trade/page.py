@@ -108,7 +108,7 @@ def _terms(result: dict, size: dict) -> str:
     }
     what = ", ".join(f"{k} {v:g}" for k, v in size["emulator"].items() if isinstance(v, float) and k.startswith(("contrast", "threshold_sigma")))
     return ("<h2>Words</h2><dl>" + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in terms.items())
-            + f"</dl><p class=dim>Events by ESIM without noise, {escape(what)}: noise would drown the errors asked for here.</p>")
+            + f"</dl><p class=dim>Events by {escape(size['emulator']['emulator'].upper())} without noise, {escape(what)}: noise would drown the errors asked for here.</p>")
 
 
 def _origin(result: dict) -> str:

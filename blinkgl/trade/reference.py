@@ -13,7 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from blinkgl.config.events import EsimConfig
+from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import make_emulator
 from blinkgl.events.types import Events
@@ -87,7 +87,7 @@ class FineTiles:
         return displacement_times(max_px, 1000, MAX_STEP_NS, t0_ns, t1_ns, self.speed)
 
 
-def reference_events(source: FrameSource, times: Iterable[int], config: EsimConfig, height: int, width: int, seed: int,
+def reference_events(source: FrameSource, times: Iterable[int], config: EmulatorConfig, height: int, width: int, seed: int,
                      mask: np.ndarray) -> tuple[Events, int]:
     """Events (of the masked pixels) of the frames of a source, linear in time between them; and the number of frames.
 

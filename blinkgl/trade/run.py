@@ -14,6 +14,7 @@ from blinkgl.bench import machine_line
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.errors import ConfigError
+from blinkgl.events import emulator_of
 from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.trade.front import front
@@ -43,7 +44,9 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
     started = time.perf_counter()
     options = options or (QUICK if quick else Options())
     base = template.sequence(options.sequence)
-    settings = chosen(settings or design(quick, isinstance(base.scene, RandomSceneConfig)), only or [], skip or [])
+    follows = emulator_of(base.events).noiseless(base.events).reconstructions
+    settings = tuple(s for s in settings or design(quick, isinstance(base.scene, RandomSceneConfig)) if s.reconstruction in follows)
+    settings = chosen(settings, only or [], skip or [])
     rows: list[dict] = []
     sizes: dict[str, dict] = {}
     with create_context(base.gl.backend, base.gl.device) as gl:

@@ -14,6 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from blinkgl.config.base import is_model, members
 from blinkgl.config.quality import QUALITIES
 from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import SequenceConfig
@@ -202,8 +203,9 @@ def options_of_the_schema() -> set[tuple[str, Any]]:
             found.update({(path, True), (path, False)})
         elif typing.get_origin(annotation) is typing.Literal:
             found.update((path, option) for option in typing.get_args(annotation))
-        elif isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            model(annotation, path)
+        elif is_model(annotation):
+            for one in members(annotation):  # a family has several
+                model(one, path)
         else:
             for inner in typing.get_args(annotation):
                 literals(inner, path)

@@ -12,8 +12,7 @@ from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, DisplacementTimeline, UniformTimeline
 from blinkgl.dataset.event_pass import EventPass
-from blinkgl.events import Events
-from blinkgl.events.response import response_of
+from blinkgl.events import Esim, Events, emulator_of
 from blinkgl.events.v2e_model import lin_log
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.timeline import make_timeline
@@ -35,7 +34,7 @@ def world():
     return replace(mixed_scene(96, 72), t1_ns=150 * MS)
 
 
-def times_of(config, renderer, response=response_of(ESIM)) -> np.ndarray:
+def times_of(config, renderer, response=Esim.response(ESIM)) -> np.ndarray:
     scene = renderer.scene
     return np.array(list(make_timeline(config, scene.t0_ns, scene.t1_ns, renderer, response)))
 
@@ -65,7 +64,7 @@ def test_a_still_background_has_no_say_in_the_percentile():
             speed[0, :5, 0] = [100, 100, 100, 100, np.inf]
             return speed
 
-    t = make_timeline(DisplacementTimeline(max_px=1.0, percentile=50), 0, 100 * MS, Picture(), response_of(ESIM))
+    t = make_timeline(DisplacementTimeline(max_px=1.0, percentile=50), 0, 100 * MS, Picture(), Esim.response(ESIM))
     assert t.pace(0) == pytest.approx(100) and set(np.diff(list(t))) == {10 * MS} and t.looks >= 11
 
 
@@ -90,12 +89,12 @@ def test_response_is_the_emulators_own_slope():
     for config, signal in ((EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2), lambda i: np.log(i + 1e-3)),
                            (V2eConfig(), lambda i: np.array([lin_log(np.float32(v * V2eConfig().full_scale)) for v in i], float)),
                            (VoltmeterConfig(), lambda i: VoltmeterConfig().k1 * np.log(i * VoltmeterConfig().full_scale + VoltmeterConfig().k2))):
-        response, h = response_of(config), 1e-3 * luminance.astype(float) + 1e-6
+        response, h = emulator_of(config).response(config), 1e-3 * luminance.astype(float) + 1e-6
         slope = response.change(luminance, np.ones_like(luminance))
         np.testing.assert_allclose(slope, (signal(luminance + h) - signal(luminance + 0.0)) / h, rtol=0.02)
         drawn = response.signal(luminance)
         np.testing.assert_allclose(np.diff(drawn), np.diff(signal(luminance.astype(float))), rtol=1e-3, atol=1e-5)
-    assert response_of(EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2)).threshold == 0.2
+    assert Esim.response(EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2)).threshold == 0.2
 
 
 @pytest.mark.parametrize("reconstruction", ["linear", "pchip", "hermite"])
@@ -154,7 +153,7 @@ def drifting(config: BudgetTimeline, fast: float = 1.0, seconds: float = 1.5):
     that is said to be 50 px/s all the time."""
     x, rate, half = np.linspace(0, 2 * np.pi, 600, endpoint=False)[None], 40.0, 0.04
     speed = np.full((1, 600, 2), (50.0, 0.0), np.float32)
-    timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(motion=lambda t, n: speed), response_of(ESIM))
+    timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(motion=lambda t, n: speed), Esim.response(ESIM))
     for t_ns in timeline:
         k, t = divmod(t_ns * 1e-9, 2 * half)
         x_now = x - rate * (k * half * (1 + fast) + min(t, half) + fast * max(t - half, 0.0))
@@ -181,7 +180,7 @@ def test_as_many_events_are_beyond_the_target_as_the_percentile_says(fast, targe
 
 def test_nothing_moves_nothing_is_measured():
     still = SimpleNamespace(motion=lambda t, n: np.zeros((3, 4, 2), np.float32))
-    timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, response_of(ESIM))
+    timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, Esim.response(ESIM))
     count = 0
     for t in timeline:
         timeline.observe(t, np.ones((12, 16), np.float32))
@@ -194,7 +193,7 @@ def test_nothing_moves_nothing_is_measured():
 def test_images_smaller_than_the_sampling_or_no_multiple_of_it(shape, small):
     """The small picture of speeds is max(1, size // n) pixels a side; the signal is looked up at the same places."""
     world = SimpleNamespace(motion=lambda t, n: np.full((*small, 2), 50.0, np.float32))
-    timeline = make_timeline(BudgetTimeline(max_time_error_us=100.0, max_step_us=1000), 0, 10 * MS, world, response_of(ESIM))
+    timeline = make_timeline(BudgetTimeline(max_time_error_us=100.0, max_step_us=1000), 0, 10 * MS, world, Esim.response(ESIM))
     for t in timeline:
         timeline.observe(t, np.full(shape, 1 + 0.5 * math.sin(t * 1e-6), np.float32))
     assert timeline.info()["time_error"]["measurements"] > 0

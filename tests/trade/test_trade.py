@@ -13,13 +13,14 @@ import yaml
 from rich.console import Console
 
 from blinkgl.cli import run
-from blinkgl.config.events import V2eConfig, VoltmeterConfig
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import load_run
+from blinkgl.events.table import EMULATORS
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.still import Rectangle
 from blinkgl.tools import peer_cycles
 from blinkgl.trade.front import dominating, front
-from blinkgl.trade.measure import Bench, Level, Options, noiseless
+from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
 from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
@@ -102,8 +103,18 @@ def test_events_are_the_same_in_every_round_and_order(gl, config):
 
 
 def test_noise_is_taken_out():
-    assert noiseless(V2eConfig(contrast_threshold=0.3, threshold_sigma=0.01)).model_dump()["contrast_threshold"] == 0.3
-    assert noiseless(VoltmeterConfig(k1=5)).contrast_threshold == pytest.approx(0.2)
+    twins = [EMULATORS[kind].noiseless(config) for kind, config in (
+        ("esim", EsimConfig(contrast_threshold=0.3, threshold_jitter=0.1, refractory_us=9)),
+        ("v2e", V2eConfig(contrast_threshold=0.3, threshold_sigma=0.01)), ("voltmeter", VoltmeterConfig(k1=5)))]
+    assert [t.contrast_threshold for t in twins] == [0.3, 0.3, pytest.approx(0.2)]
+    assert [(t.emulator, t.threshold_sigma, t.threshold_jitter, t.refractory_us) for t in twins] == [
+        ("esim", 0.021, 0, 0), ("esim", 0.01, 0, 0), ("esim", 0.021, 0, 0)]
+
+
+def test_a_noisy_emulators_settings_are_its_twins(gl, config):
+    """V2E follows straight lines alone; the events that are judged are ESIM's, which follows cubics as well."""
+    bench = Bench(gl, load_run(config, ["events={emulator: v2e, contrast_threshold: 0.3}", "sensor=davis346", "camera.width=64", "camera.height=48"]), OPTIONS)
+    assert bench.config(Setting("displacement 2 px", "pchip").overrides).events == bench.emulator == EsimConfig(contrast_threshold=0.3, threshold_sigma=0.03)
 
 
 def test_design():

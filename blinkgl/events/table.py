@@ -1,0 +1,107 @@
+"""Which emulators there are: one table of classes, and nothing else that asks which kind an emulator is.
+
+    @register
+    class Mine(Emulator):
+        class Config(EmulatorConfig): ...      # name, keys, reconstructions, from_sensor
+        def response(cls, config): ...         # the signal that timelines watch
+        def noiseless(cls, config): ...        # whose events `trade` judges by
+        def _start(self, frame, t_ns, rate): ...
+        def _advance(self, frame, t_ns, rate): ...
+
+docs/extending.md has the whole of one. What configuration needs is in ``Config``, which a class hands to
+:class:`~blinkgl.config.events.EmulatorConfig` when it is registered, so that configuration never looks up the stream.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from blinkgl.config.base import tag_of, validate
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.sensor import ReadoutConfig, SensorConfig
+from blinkgl.events.emulator import Emulator
+from blinkgl.events.response import Response
+
+EMULATORS: dict[str, type[Emulator]] = {}
+"""By ``Config``'s key ``emulator``."""
+_SOME_SENSOR = SensorConfig(name="some", width=4, height=3, pixel_pitch_um=10, contrast_threshold=0.2, refractory_us=10,
+                            readout=ReadoutConfig(events_per_second=1e6))
+
+
+def register(emulator: type[Emulator]) -> type[Emulator]:
+    """Puts a class into the table after a look at every part of it; returns it, so that it may stand above the class.
+
+    Raises TypeError naming the emulator and the part that is missing or of the wrong kind, or that another has its name; nothing is then
+    registered."""
+    kind = _checked(emulator)
+    if EMULATORS.get(kind, emulator) is not emulator:
+        raise TypeError(f"emulator '{kind}': there is one already, {EMULATORS[kind].__name__}")
+    EmulatorConfig.members.add(emulator.Config)
+    EMULATORS[kind] = emulator
+    return emulator
+
+
+def unregister(kind: str) -> None:
+    """Takes the emulator of this name out again. Raises KeyError where there is none."""
+    del EMULATORS[kind]
+    EmulatorConfig.members.remove(kind)
+
+
+def emulator_of(config: EmulatorConfig) -> type[Emulator]:
+    """The class that a configuration is of. Raises TypeError for one that is not in the table."""
+    for emulator in EMULATORS.values():
+        if type(config) is emulator.Config:
+            return emulator
+    raise TypeError(f"no emulator for {type(config).__name__}")
+
+
+def make_emulator(config: EmulatorConfig, height: int, width: int, seed: int = 0, reconstruction: str = "linear") -> Emulator:
+    """The emulator a config asks for; ``reconstruction``: its path between frames, see :class:`Emulator`."""
+    return emulator_of(config)(height, width, config, seed, reconstruction)
+
+
+def _checked(emulator: Any) -> str:
+    """The class's name in the table. Raises TypeError as :func:`register`."""
+    if not (isinstance(emulator, type) and issubclass(emulator, Emulator)):
+        raise TypeError(f"{emulator!r} is not a subclass of Emulator")
+    name = emulator.__name__
+
+    def unless(right: Any, part: str, problem: str) -> None:
+        if not right:
+            raise TypeError(f"emulator {name}: `{part}` {problem}")
+
+    def result(part: str, call: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return call(*arguments)
+        except Exception as error:
+            raise TypeError(f"emulator {name}: `{part}` fails: {error}") from error
+
+    model = getattr(emulator, "Config", None)
+    unless(model is not None, "Config", "is missing")
+    unless(isinstance(model, type) and issubclass(model, EmulatorConfig) and model is not EmulatorConfig, "Config",
+           f"is {model!r} and not an EmulatorConfig of its own")
+    unless("emulator" in model.model_fields, "Config.emulator", "is missing")
+    kind = model.model_fields["emulator"].default
+    unless(tag_of(model) == ("emulator", kind), "Config.emulator", 'is not of the form `emulator: Literal["name"] = "name"`')
+    name = f"'{kind}'"
+    required = [key for key, info in model.model_fields.items() if info.is_required()]
+    unless(not required, "Config", f"has keys without a default: {', '.join(required)}")
+    paths = getattr(model, "reconstructions", None)
+    unless(paths is not None, "Config.reconstructions", "is missing")
+    unless(isinstance(paths, tuple) and "linear" in paths and set(paths) <= {"linear", "pchip", "hermite"}, "Config.reconstructions",
+           f"is {paths!r} and not a tuple of 'linear' and, where it can, 'pchip' and 'hermite'")
+    for part in sorted(model.__abstractmethods__):
+        unless(False, f"Config.{part}", "is missing")
+    values = result("Config.from_sensor", model.from_sensor, _SOME_SENSOR)
+    unless(isinstance(values, dict), "Config.from_sensor", f"gives {values!r} and not a table of keys")
+    result("Config.from_sensor", validate, model, values)
+    config = result("Config", model)
+
+    for part in sorted(emulator.__abstractmethods__):
+        unless(False, part, "is missing")
+    response, twin = result("response", emulator.response, config), result("noiseless", emulator.noiseless, config)
+    unless(isinstance(response, Response), "response", f"gives {response!r} and not a Response")
+    known = (model, *(other.Config for other in EMULATORS.values()))
+    unless(type(twin) in known, "noiseless", f"gives {twin!r} and not the configuration of an emulator in the table")
+    return kind

@@ -312,13 +312,13 @@ class Reach:
         return sorted(ids, key=lambda t: (self.seconds.get(t, 1.0), t))
 
     def _around(self, mutant: Mutant) -> list[str]:
-        """Coverage names the first line of a statement only."""
+        """Coverage names the first line of a statement only. What runs when a module is imported (a default, a constant) concerns all
+        that use the module, shortest first."""
         lines = self.lines(mutant.path)
         for line in range(mutant.line, 0, -1):
-            if lines.get(line):
-                return lines[line]
-            if line in lines or (ROOT / mutant.path).read_text().splitlines()[line - 1].lstrip().startswith(("def ", "class ")):
-                break
+            if line in lines:
+                reached = [c for c in lines[line] if c]
+                return reached or ([c for contexts in lines.values() for c in contexts] if "" in lines[line] else [])
         return []
 
 

@@ -302,12 +302,15 @@ class Reach:
             raise SystemExit(f"{mutant.path} has changed since --map: run it again")
         if mutant.path.endswith(".glsl"):
             contexts = [t for t in self.seconds if t.startswith("tests/render/") and "pyrender" not in t and "cycles" not in t]
-        elif mutant.compiled:
-            room = Path(mutant.path).parent.name
-            reached = {c for contexts in self.lines(mutant.path).values() for c in contexts}
-            contexts = [c for c in reached if c.startswith(f"tests/{room}/")] or list(reached)
         else:
-            contexts = self._around(mutant)
+            room = f"tests/{Path(mutant.path).parent.name}/"
+            reached = {c for contexts in self.lines(mutant.path).values() for c in contexts if c}
+            if not reached:  # compiled as a whole, or run in a process of its own
+                contexts = [t for t in self.seconds if t.startswith(room)]
+            elif mutant.compiled:
+                contexts = [c for c in reached if c.startswith(room)] or list(reached)
+            else:
+                contexts = self._around(mutant)
         ids = {c.split("|")[0] for c in contexts if c}
         return sorted(ids, key=lambda t: (self.seconds.get(t, 1.0), t))
 

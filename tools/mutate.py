@@ -41,8 +41,8 @@ MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
 SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",
                "examples")
-MOST_TESTS = 150
-"""of the shortest that reach a line, for one mutant"""
+MOST_TESTS, MOST_S = 120, 40.0
+"""of the shortest that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
 """bytes of address space: a mutant that never stops collecting must not take the machine with it"""
 
@@ -302,23 +302,32 @@ class Reach:
             raise SystemExit(f"{mutant.path} has changed since --map: run it again")
         if mutant.path.endswith(".glsl"):
             contexts = [t for t in self.seconds if t.startswith("tests/render/") and "pyrender" not in t and "cycles" not in t]
-        elif mutant.compiled:
-            room = Path(mutant.path).parent.name
-            reached = {c for contexts in self.lines(mutant.path).values() for c in contexts}
-            contexts = [c for c in reached if c.startswith(f"tests/{room}/")] or list(reached)
         else:
-            contexts = self._around(mutant)
+            room = f"tests/{Path(mutant.path).parent.name}/"
+            reached = {c for contexts in self.lines(mutant.path).values() for c in contexts if c}
+            if not reached:  # compiled as a whole, or run in a process of its own
+                contexts = [t for t in self.seconds if t.startswith(room)]
+            elif mutant.compiled:
+                contexts = [c for c in reached if c.startswith(room)] or list(reached)
+            else:
+                contexts = self._around(mutant)
         ids = {c.split("|")[0] for c in contexts if c}
-        return sorted(ids, key=lambda t: (self.seconds.get(t, 1.0), t))
+        chosen, together = [], 0.0
+        for test in sorted(ids, key=lambda t: (self.seconds.get(t, 1.0), t)):
+            together += self.seconds.get(test, 1.0)
+            if len(chosen) == MOST_TESTS or (chosen and together > MOST_S):
+                break
+            chosen.append(test)
+        return chosen
 
     def _around(self, mutant: Mutant) -> list[str]:
-        """Coverage names the first line of a statement only."""
+        """Coverage names the first line of a statement only. What runs when a module is imported (a default, a constant) concerns all
+        that use the module, shortest first."""
         lines = self.lines(mutant.path)
         for line in range(mutant.line, 0, -1):
-            if lines.get(line):
-                return lines[line]
-            if line in lines or (ROOT / mutant.path).read_text().splitlines()[line - 1].lstrip().startswith(("def ", "class ")):
-                break
+            if line in lines:
+                reached = [c for c in lines[line] if c]
+                return reached or ([c for contexts in lines.values() for c in contexts] if "" in lines[line] else [])
         return []
 
 
@@ -358,8 +367,18 @@ class Copy:
             return "time", ""
         return ("passed" if process.returncode == 0 else "failed"), output[-3000:]
 
+    sound: set[str] = set()
+    unfit: set[str] = set()
+    """tests that pass, and that fail, in a copy without any mutant; known to all copies"""
+
+    def passes(self, test: str) -> bool:
+        """Whether a test passes here with the source as it is; asked about each test once."""
+        if test not in self.sound | self.unfit:
+            (self.sound if self.run([test], 300, None)[0] == "passed" else self.unfit).add(test)
+        return test in self.sound
+
     def judge(self, mutant: Mutant, reach: Reach) -> dict:
-        tests = reach.tests(mutant)[:MOST_TESTS]
+        tests = [t for t in reach.tests(mutant) if t not in self.unfit]
         result = {**asdict(mutant), "name": mutant.name, "tests": len(tests), "by": ""}
         if not tests:
             return {**result, "outcome": "no test"}
@@ -374,7 +393,9 @@ class Copy:
                 outcome, output = self.run(tests, 60 + 5 * expected, Path(kernels) if mutant.compiled and mutant.path.endswith(".py") else None)
             finally:
                 path.write_text(source)
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.M)
+        failed = re.search(r"^(?:FAILED|ERROR) (\S+?)(?: - .*)?$", output, re.M)
+        if outcome == "failed" and failed and not self.passes(failed.group(1)):
+            return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
         return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed.group(1) if failed else "",
                 "seconds": round(time.monotonic() - started, 1)}
 
@@ -420,7 +441,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--show", metavar="FILE", help="list the mutants of a module")
     parser.add_argument("--only", metavar="FILE[:LINE]", help="all mutants of a module or a line")
     parser.add_argument("--at-least", type=float, default=0.9, help="share that must die")
-    parser.add_argument("--out", type=Path, help="results as JSON")
+    parser.add_argument("--out", type=Path, help="results as JSON; those that are there already are kept")
     options = parser.parse_args(arguments)
     if options.map:
         make_map(str(options.jobs))
@@ -435,7 +456,11 @@ def main(arguments: list[str] | None = None) -> int:
         mutants = drawn(options.count, options.seed)
     reasons, results = equivalent(), []
     excused = [m for m in mutants if key_of(m.name) in reasons]
-    for result in judged([m for m in mutants if m not in excused], Reach(), options.jobs):
+    if options.out and options.out.exists():  # an earlier run's, as far as they are of these mutants
+        names = {m.name for m in mutants if m not in excused}
+        results = [r for r in json.loads(options.out.read_text()) if r["name"] in names]
+    known = {r["name"] for r in results}
+    for result in judged([m for m in mutants if m not in excused and m.name not in known], Reach(), options.jobs):
         results.append(result)
         print(f"[{len(results)}/{len(mutants) - len(excused)}] {result['outcome']:9} {result['name']}  {result['by']}", flush=True)
         if options.out:

@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -21,6 +22,7 @@ from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.io.formats import open_events
 from blinkgl.simulation import simulate
+from blinkgl.tools import fuzz_configs
 from blinkgl.tools.config_docs import page
 from blinkgl.trade.measure import Options
 from blinkgl.trade.run import trade, write
@@ -166,10 +168,25 @@ def test_the_configuration_knows_a_toy_emulator_while_it_is_registered(tmp_path)
             load_run(written(tmp_path), ["timeline.reconstruction=pchip"])
         assert load_run(written(tmp_path), ["quality=fast"]).sequence(0).timeline.reconstruction == "linear"
         assert "## `events` with `emulator: toy`" in page()
+        assert ("events", "dead_us") in set(fuzz_configs._paths(SequenceConfig))
         assert "toy" in SequenceConfig.model_json_schema()["properties"]["events"]["discriminator"]["mapping"]
     finally:
         unregister("toy")
     assert page() == before and SequenceConfig.model_json_schema() == schema
+
+
+def test_the_page_shows_this_toy():
+    text = (Path(__file__).parents[1] / "docs" / "extending.md").read_text(encoding="utf-8")
+    assert inspect.getsource(Toy) in text
+    shown = {"__name__": __name__}
+    exec(text.partition("```python\n")[2].partition("```")[0].replace("register(Toy)", ""), shown)
+    assert shown["Toy"].Config().dead_us == 1000
+
+
+def test_the_command_line_names_every_emulator(capsys):
+    assert run(["simulate", "--help"]) == 0
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert all(kind in said for kind in EMULATORS)
 
 
 def test_the_table_is_whole():

@@ -153,7 +153,7 @@ class VoltmeterConfig(EmulatorConfig):
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
         """k1 = 1 / threshold replaces the calibrated gain only where the sensor is not the calibrated camera itself."""
         gain = {} if sensor.name in ("DAVIS346", "DAVIS240C") else {"k1": 1 / sensor.contrast_threshold}
-        return {"preset": sensor.voltmeter, "refractory_us": sensor.refractory_us, **gain}
+        return {"preset": sensor.calibrated.get("voltmeter", "DVS346"), "refractory_us": sensor.refractory_us, **gain}
 
 
 for _model in (EsimConfig, V2eConfig, VoltmeterConfig):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from importlib import resources
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field
 
@@ -54,7 +54,8 @@ class SensorConfig(Config):
     refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time of a pixel, microseconds.")
     leak_rate_hz: float = Field(0.0, ge=0, le=1e4, description="Leak events per second and pixel.")
     shot_noise_rate_hz: float = Field(0.0, ge=0, le=1e4, description="Noise events per second and pixel in the dark.")
-    voltmeter: Literal["DVS346", "DVS240"] = Field("DVS346", description="Nearest camera that DVS-Voltmeter was calibrated on.")
+    calibrated: dict[str, str] = Field({}, description="Presets of emulators that were calibrated on this camera or, failing that, on the "
+                                       "nearest one, by the emulator's name.")
     readout: ReadoutConfig = Field(description="Read-out limit.")
 
     def values(self, emulator: Any) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from pydantic import Field
 
+import blinkgl
 from blinkgl.cli import run
 from blinkgl.config.events import EmulatorConfig, EsimConfig
 from blinkgl.config.sequence import SequenceConfig, load_run
@@ -198,6 +199,21 @@ def test_the_table_is_whole():
         assert type(emulator.noiseless(emulator.Config())) is EsimConfig
     with pytest.raises(TypeError, match="no emulator for Config"):
         make_emulator(Toy.Config(), 3, 4)
+
+
+def test_nothing_else_asks_which_kind_an_emulator_is():
+    """The names of the kinds, and of their configurations, stand where they are declared, and where one is the default."""
+    root = Path(blinkgl.__file__).parent
+    models = {emulator.Config.__name__ for emulator in EMULATORS.values()}
+    found = {}
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            said = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in EMULATORS else \
+                node.id if isinstance(node, ast.Name) and node.id in models else None
+            if said:
+                found.setdefault(path.relative_to(root).as_posix(), set()).add(said)
+    assert found.pop("cli.py") == {"esim"} and found.pop("config/sequence.py") == {"EsimConfig"}
+    assert set(found) == {"config/events.py", *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter", "reference"))}
 
 
 # --- what is forgotten is named -------------------------------------------------------------------------------------

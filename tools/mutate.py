@@ -255,9 +255,10 @@ def drawn(count: int, seed: int) -> list[Mutant]:
         for mutant in everything:
             if (mutant.path, mutant.line) not in lines and few:
                 lines.add((mutant.path, mutant.line))
-                chosen.append(mutant)
+                chosen.append((few, mutant))
                 few -= 1
-    return chosen
+    # In turns over the rooms, so that a run that is stopped says something about all of them.
+    return [mutant for _, mutant in sorted(chosen, key=lambda pair: -pair[0])]
 
 
 # ---- which tests reach a line --------------------------------------------------------------------------------------

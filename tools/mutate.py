@@ -402,16 +402,24 @@ class Copy:
 
 
 def equivalent() -> dict[str, str]:
-    """"path: before -> after" of mutants that change nothing, with the reason."""
+    """Keys of mutants that change nothing, with the reason."""
     if not EQUIVALENT.exists():
         return {}
-    entries = (line.split("  # ", 1) for line in EQUIVALENT.read_text().splitlines() if line.strip() and not line.startswith("#"))
+    entries = [line.rsplit("  # ", 1) for line in EQUIVALENT.read_text().splitlines() if line.strip() and not line.startswith("#")]
     return {entry[0].strip(): entry[1].strip() for entry in entries}
 
 
-def key_of(name: str) -> str:
-    """A mutant's name without its place in the file, which moves."""
-    return re.sub(r":\d+:\d+: ", ": ", name)
+def key_of(mutant: Mutant, source: str) -> str:
+    """A mutant's name by the text of its line instead of the line's number, which moves."""
+    line = source.splitlines()[mutant.line - 1]
+    return f"{mutant.path} | {line.strip()} | {mutant.column - (len(line) - len(line.lstrip()))}: {mutant.before} -> {mutant.after or '(nothing)'}"
+
+
+def excuses(mutants: list[Mutant]) -> dict[str, str]:
+    """Name -> reason of those that are listed as equivalent."""
+    reasons = equivalent()
+    found = {m.name: key_of(m, (ROOT / m.path).read_text()) for m in mutants}
+    return {name: reasons[key] for name, key in found.items() if key in reasons}
 
 
 def judged(mutants: list[Mutant], reach: Reach, jobs: int) -> Iterator[dict]:
@@ -455,8 +463,8 @@ def main(arguments: list[str] | None = None) -> int:
         mutants = [m for m in mutants_of(path, (ROOT / path).read_text()) if not line or m.line == int(line)]
     else:
         mutants = drawn(options.count, options.seed)
-    reasons, results = equivalent(), []
-    excused = [m for m in mutants if key_of(m.name) in reasons]
+    reasons, results = excuses(mutants), []
+    excused = [m for m in mutants if m.name in reasons]
     if options.out and options.out.exists():  # an earlier run's, as far as they are of these mutants
         names = {m.name for m in mutants if m not in excused}
         results = [r for r in json.loads(options.out.read_text()) if r["name"] in names]
@@ -470,7 +478,7 @@ def main(arguments: list[str] | None = None) -> int:
     share = 1 - len(survivors) / max(len(results), 1)
     print(f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as equivalent")
     print(*(f"survived: {r['name']}  ({r['outcome']}, {r['tests']} tests)" for r in sorted(survivors, key=lambda r: r["name"])), sep="\n")
-    print(*(f"equivalent: {m.name}  ({reasons[key_of(m.name)]})" for m in excused), sep="\n")
+    print(*(f"equivalent: {m.name}  ({reasons[m.name]})" for m in excused), sep="\n")
     return 0 if share >= options.at_least else 1
 
 

@@ -202,17 +202,21 @@ def test_the_table_is_whole():
 
 
 def test_nothing_else_asks_which_kind_an_emulator_is():
-    """The names of the kinds, and of their configurations, stand where they are declared, and where one is the default."""
+    """The names of the kinds, and of their configurations, stand where they are declared; that of the default one also as a default."""
     root = Path(blinkgl.__file__).parent
     models = {emulator.Config.__name__ for emulator in EMULATORS.values()}
-    found = {}
+    default, found = EmulatorConfig.members.default, {}
     for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            said = node.value if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in EMULATORS else \
-                node.id if isinstance(node, ast.Name) and node.id in models else None
+            here = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant)] if isinstance(node, ast.Compare) else []
+            said = {s for s in here if isinstance(s, str) and s in EMULATORS}
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in EMULATORS and node.value != default:
+                said.add(node.value)
+            if isinstance(node, ast.Name) and node.id in models:
+                said.add(node.id)
             if said:
-                found.setdefault(path.relative_to(root).as_posix(), set()).add(said)
-    assert found.pop("cli.py") == {"esim"} and found.pop("config/sequence.py") == {"EsimConfig"}
+                found.setdefault(path.relative_to(root).as_posix(), set()).update(said)
+    assert found.pop("config/sequence.py") == {"EsimConfig"}, "the default of `events:`"
     assert set(found) == {"config/events.py", *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter", "reference"))}
 
 

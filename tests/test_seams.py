@@ -202,16 +202,15 @@ def test_the_table_is_whole():
 
 
 def test_nothing_else_asks_which_kind_an_emulator_is():
-    """The names of the kinds, and of their configurations, stand where they are declared; that of the default one also as a default."""
+    """No name of a kind is compared with or stands in a list or table; the models of the kinds are named where they are declared alone."""
     root = Path(blinkgl.__file__).parent
     models = {emulator.Config.__name__ for emulator in EMULATORS.values()}
-    default, found = EmulatorConfig.members.default, {}
+    found = {}
     for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            here = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant)] if isinstance(node, ast.Compare) else []
-            said = {s for s in here if isinstance(s, str) and s in EMULATORS}
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value in EMULATORS and node.value != default:
-                said.add(node.value)
+            here = {ast.Compare: lambda n: [n.left, *n.comparators], ast.Dict: lambda n: n.keys, ast.Tuple: lambda n: n.elts, ast.List: lambda n: n.elts,
+                    ast.Set: lambda n: n.elts}.get(type(node), lambda n: [])(node)
+            said = {n.value for n in here if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in EMULATORS}
             if isinstance(node, ast.Name) and node.id in models:
                 said.add(node.id)
             if said:

@@ -16,7 +16,7 @@ def main(out: Path) -> None:
     flight = Keyframes({0: look_at((-3, -0.2, 1.2), (0, 0, 0.4)), 0.2: look_at((-2.8, 0.2, 1.2), (0, 0, 0.4))})
     spin = Keyframes({0: Pose((0, 0.7, 0.5)), 0.2: Pose((0, 0.7, 0.5), euler=(0, 0, 40))})
     scene = Scene(Camera(240, 180, fov=50, pose=flight))
-    scene += Primitive("grid", width=10, depth=10, material=Material(procedural="bricks", seed=1, uv_scale=(8, 8)), category="ground")
+    scene += Primitive("grid", width=10, depth=10, material=Material(procedural="bricks", uv_scale=(8, 8)), category="ground")
     scene += Primitive("cuboid", pose=spin, scale=0.9, material=Material(photograph="astronaut"))
     scene += Primitive("capsule", pose=(-0.4, -0.6, 0.5), material=Material(procedural="dots"))
 

@@ -41,8 +41,8 @@ MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
 SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",
                "examples")
-MOST_TESTS = 150
-"""of the shortest that reach a line, for one mutant"""
+MOST_TESTS, MOST_S = 120, 40.0
+"""of the shortest that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
 """bytes of address space: a mutant that never stops collecting must not take the machine with it"""
 
@@ -255,9 +255,10 @@ def drawn(count: int, seed: int) -> list[Mutant]:
         for mutant in everything:
             if (mutant.path, mutant.line) not in lines and few:
                 lines.add((mutant.path, mutant.line))
-                chosen.append(mutant)
+                chosen.append((few, mutant))
                 few -= 1
-    return chosen
+    # In turns over the rooms, so that a run that is stopped says something about all of them.
+    return [mutant for _, mutant in sorted(chosen, key=lambda pair: -pair[0])]
 
 
 # ---- which tests reach a line --------------------------------------------------------------------------------------
@@ -302,23 +303,32 @@ class Reach:
             raise SystemExit(f"{mutant.path} has changed since --map: run it again")
         if mutant.path.endswith(".glsl"):
             contexts = [t for t in self.seconds if t.startswith("tests/render/") and "pyrender" not in t and "cycles" not in t]
-        elif mutant.compiled:
-            room = Path(mutant.path).parent.name
-            reached = {c for contexts in self.lines(mutant.path).values() for c in contexts}
-            contexts = [c for c in reached if c.startswith(f"tests/{room}/")] or list(reached)
         else:
-            contexts = self._around(mutant)
+            room = f"tests/{Path(mutant.path).parent.name}/"
+            reached = {c for contexts in self.lines(mutant.path).values() for c in contexts if c}
+            if not reached:  # compiled as a whole, or run in a process of its own
+                contexts = [t for t in self.seconds if t.startswith(room)]
+            elif mutant.compiled:
+                contexts = [c for c in reached if c.startswith(room)] or list(reached)
+            else:
+                contexts = self._around(mutant)
         ids = {c.split("|")[0] for c in contexts if c}
-        return sorted(ids, key=lambda t: (self.seconds.get(t, 1.0), t))
+        chosen, together = [], 0.0
+        for test in sorted(ids, key=lambda t: (self.seconds.get(t, 1.0), t)):
+            together += self.seconds.get(test, 1.0)
+            if len(chosen) == MOST_TESTS or (chosen and together > MOST_S):
+                break
+            chosen.append(test)
+        return chosen
 
     def _around(self, mutant: Mutant) -> list[str]:
-        """Coverage names the first line of a statement only."""
+        """Coverage names the first line of a statement only. What runs when a module is imported (a default, a constant) concerns all
+        that use the module, shortest first."""
         lines = self.lines(mutant.path)
         for line in range(mutant.line, 0, -1):
-            if lines.get(line):
-                return lines[line]
-            if line in lines or (ROOT / mutant.path).read_text().splitlines()[line - 1].lstrip().startswith(("def ", "class ")):
-                break
+            if line in lines:
+                reached = [c for c in lines[line] if c]
+                return reached or ([c for contexts in lines.values() for c in contexts] if "" in lines[line] else [])
         return []
 
 
@@ -358,8 +368,18 @@ class Copy:
             return "time", ""
         return ("passed" if process.returncode == 0 else "failed"), output[-3000:]
 
+    sound: set[str] = set()
+    unfit: set[str] = set()
+    """tests that pass, and that fail, in a copy without any mutant; known to all copies"""
+
+    def passes(self, test: str) -> bool:
+        """Whether a test passes here with the source as it is; asked about each test once."""
+        if test not in self.sound | self.unfit:
+            (self.sound if self.run([test], 300, None)[0] == "passed" else self.unfit).add(test)
+        return test in self.sound
+
     def judge(self, mutant: Mutant, reach: Reach) -> dict:
-        tests = reach.tests(mutant)[:MOST_TESTS]
+        tests = [t for t in reach.tests(mutant) if t not in self.unfit]
         result = {**asdict(mutant), "name": mutant.name, "tests": len(tests), "by": ""}
         if not tests:
             return {**result, "outcome": "no test"}
@@ -374,22 +394,32 @@ class Copy:
                 outcome, output = self.run(tests, 60 + 5 * expected, Path(kernels) if mutant.compiled and mutant.path.endswith(".py") else None)
             finally:
                 path.write_text(source)
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.M)
+        failed = re.search(r"^(?:FAILED|ERROR) (\S+?)(?: - .*)?$", output, re.M)
+        if outcome == "failed" and failed and not self.passes(failed.group(1)):
+            return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
         return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed.group(1) if failed else "",
                 "seconds": round(time.monotonic() - started, 1)}
 
 
 def equivalent() -> dict[str, str]:
-    """"path: before -> after" of mutants that change nothing, with the reason."""
+    """Keys of mutants that change nothing, with the reason."""
     if not EQUIVALENT.exists():
         return {}
-    entries = (line.split("  # ", 1) for line in EQUIVALENT.read_text().splitlines() if line.strip() and not line.startswith("#"))
+    entries = [line.rsplit("  # ", 1) for line in EQUIVALENT.read_text().splitlines() if line.strip() and not line.startswith("#")]
     return {entry[0].strip(): entry[1].strip() for entry in entries}
 
 
-def key_of(name: str) -> str:
-    """A mutant's name without its place in the file, which moves."""
-    return re.sub(r":\d+:\d+: ", ": ", name)
+def key_of(mutant: Mutant, source: str) -> str:
+    """A mutant's name by the text of its line instead of the line's number, which moves."""
+    line = source.splitlines()[mutant.line - 1]
+    return f"{mutant.path} | {line.strip()} | {mutant.column - (len(line) - len(line.lstrip()))}: {mutant.before} -> {mutant.after or '(nothing)'}"
+
+
+def excuses(mutants: list[Mutant]) -> dict[str, str]:
+    """Name -> reason of those that are listed as equivalent."""
+    reasons = equivalent()
+    found = {m.name: key_of(m, (ROOT / m.path).read_text()) for m in mutants}
+    return {name: reasons[key] for name, key in found.items() if key in reasons}
 
 
 def judged(mutants: list[Mutant], reach: Reach, jobs: int) -> Iterator[dict]:
@@ -420,7 +450,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--show", metavar="FILE", help="list the mutants of a module")
     parser.add_argument("--only", metavar="FILE[:LINE]", help="all mutants of a module or a line")
     parser.add_argument("--at-least", type=float, default=0.9, help="share that must die")
-    parser.add_argument("--out", type=Path, help="results as JSON")
+    parser.add_argument("--out", type=Path, help="results as JSON; those that are there already are kept")
     options = parser.parse_args(arguments)
     if options.map:
         make_map(str(options.jobs))
@@ -433,9 +463,13 @@ def main(arguments: list[str] | None = None) -> int:
         mutants = [m for m in mutants_of(path, (ROOT / path).read_text()) if not line or m.line == int(line)]
     else:
         mutants = drawn(options.count, options.seed)
-    reasons, results = equivalent(), []
-    excused = [m for m in mutants if key_of(m.name) in reasons]
-    for result in judged([m for m in mutants if m not in excused], Reach(), options.jobs):
+    reasons, results = excuses(mutants), []
+    excused = [m for m in mutants if m.name in reasons]
+    if options.out and options.out.exists():  # an earlier run's, as far as they are of these mutants
+        names = {m.name for m in mutants if m not in excused}
+        results = [r for r in json.loads(options.out.read_text()) if r["name"] in names]
+    known = {r["name"] for r in results}
+    for result in judged([m for m in mutants if m not in excused and m.name not in known], Reach(), options.jobs):
         results.append(result)
         print(f"[{len(results)}/{len(mutants) - len(excused)}] {result['outcome']:9} {result['name']}  {result['by']}", flush=True)
         if options.out:
@@ -444,7 +478,7 @@ def main(arguments: list[str] | None = None) -> int:
     share = 1 - len(survivors) / max(len(results), 1)
     print(f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as equivalent")
     print(*(f"survived: {r['name']}  ({r['outcome']}, {r['tests']} tests)" for r in sorted(survivors, key=lambda r: r["name"])), sep="\n")
-    print(*(f"equivalent: {m.name}  ({reasons[key_of(m.name)]})" for m in excused), sep="\n")
+    print(*(f"equivalent: {m.name}  ({reasons[m.name]})" for m in excused), sep="\n")
     return 0 if share >= options.at_least else 1
 
 

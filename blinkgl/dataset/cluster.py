@@ -36,11 +36,13 @@ class RayCluster:
     """
 
     def __init__(self, workers: int | None = None, *, address: str | None = None, gpus: float = 0.0):
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        # Ray reads these when it is imported and started; they are taken back when the run is over.
+        self._own_variables = [name for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO") if name not in os.environ]
+        os.environ.update(dict.fromkeys(self._own_variables, "0"))
         try:
             import ray
         except ImportError:
+            self._restore_environment()
             raise ConfigError("Ray is not installed", where="--executor", value="ray", accepted=f"run {install('ray')}") from None
         self._ray, self._workers, self._address, self._gpus = ray, workers, address, gpus
         self.listener: Callable[[Message], None] = lambda message: None
@@ -91,6 +93,7 @@ class RayCluster:
 
     def close(self) -> None:
         ray = self._ray
+        self._restore_environment()
         if not ray.is_initialized():
             self._discard_folder()
             return
@@ -112,6 +115,11 @@ class RayCluster:
             if self._ours:
                 ray.shutdown()
             self._discard_folder()
+
+    def _restore_environment(self) -> None:
+        for name in self._own_variables:
+            os.environ.pop(name, None)
+        self._own_variables = []
 
     def _discard_folder(self) -> None:
         if self._folder is not None:

@@ -90,6 +90,8 @@ class Scan:
 def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypatch):
     short = tempfile.mkdtemp(prefix="b-", dir="/tmp")
     monkeypatch.setattr(tempfile, "tempdir", short)
+    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
+    before = dict(os.environ)
     scan = Scan()
     try:
         outcome = run_dataset(load_run(recipe_file(tmp_path, groups={"one": {}})), tmp_path / "out", RayCluster(1), listener=scan)
@@ -100,6 +102,8 @@ def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypat
     assert [str(s) for s in scan.found if not s.loopback] == []
     assert scan.modes == ["0o700"], "no other user gets at its Unix sockets and logs"
     assert len(outcome.made) == 1 and os.listdir(short) == [], "nothing is left"
+    ours = ("RAY_USAGE_STATS_ENABLED", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO")
+    assert [os.environ.get(k) for k in ours] == [before.get(k) for k in ours]
     os.rmdir(short)
 
 

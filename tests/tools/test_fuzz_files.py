@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import signal
+import mmap
 import time
 
 import numpy as np
@@ -62,7 +63,7 @@ def _judge(how: str, folder):
     if how == "sleep":
         time.sleep(60)
     if how == "memory":
-        np.ones(40 << 20, np.uint8).sum()
+        mmap.mmap(-1, 40 << 20).write(bytes(40 << 20))  # pages of its own: the heap may have as much lying about
     return None
 
 

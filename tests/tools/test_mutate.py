@@ -24,7 +24,7 @@ def kernel(a):
 
 
 def edits(source: str = SOURCE) -> list[str]:
-    return [key_of(m.name).removeprefix("m.py: ") for m in mutants_of("m.py", source)]
+    return [m.name.split(": ", 1)[1] for m in mutants_of("m.py", source)]
 
 
 def test_every_kind_of_edit_is_there():
@@ -68,8 +68,14 @@ def test_an_edit_of_another_source_is_refused():
         mutant.apply("x = 1\n" * 20)
 
 
+def test_a_key_knows_the_line_and_the_place_in_it():
+    first, second = [m for m in mutants_of("m.py", "if a < b and c < d:\n    pass\n") if m.after == "<="]
+    assert key_of(first, "if a < b and c < d:") == "m.py | if a < b and c < d: | 6: < -> <=" != key_of(second, "if a < b and c < d:")
+
+
 def test_what_is_called_equivalent_exists_and_says_why():
     for entry, reason in equivalent().items():
-        path = entry.split(": ")[0]
-        assert entry in {key_of(m.name) for m in mutants_of(path, (ROOT / path).read_text())}, f"{entry} is no mutant any more"
+        path = entry.split(" | ")[0]
+        source = (ROOT / path).read_text()
+        assert entry in {key_of(m, source) for m in mutants_of(path, source)}, f"{entry} is no mutant any more"
         assert len(reason) > 10, entry

@@ -16,7 +16,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.events.readout import Readout
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import LABELS, Emulator, Source, Timeline, configured
+from blinkgl.front.runs import Emulator, Source, Timeline, configured, label_names
 from blinkgl.front.scenes import Scene
 from blinkgl.gl import create_context
 from blinkgl.render.frames import LabelFrame, LabelRequest
@@ -144,10 +144,7 @@ class Renderer:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
         labels : as of :func:`record`.   to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
-        wanted = set(check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels"))
-        for name in wanted:
-            if name not in LABELS:
-                raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(LABELS))
+        wanted = label_names(labels)
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
         request = LabelRequest(colour="images" in wanted, flow_forward="flow" in wanted, flow_backward="flow_backward" in wanted,
                                **{name: name in wanted for name in ("depth", "ids", "normals", "velocity", "occlusion")})

@@ -115,10 +115,16 @@ def events_tree(emulator: Emulator) -> dict[str, Any]:
     return tree
 
 
-def _labels_tree(labels: Sequence[str]) -> dict[str, Any]:
-    wanted = set(check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels"))
+def label_names(labels: Sequence[str]) -> set[str]:
+    """Raises ConfigError: not of :data:`LABELS`."""
+    wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
     for name in wanted:
         if name not in LABELS:
             raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(LABELS))
+    return set(wanted)
+
+
+def _labels_tree(labels: Sequence[str]) -> dict[str, Any]:
+    wanted = label_names(labels)
     flow = [direction for name, direction in (("flow", "forward"), ("flow_backward", "backward")) if name in wanted]
     return {"flow": flow, **{name: name in wanted for name in LABELS if not name.startswith("flow")}}

@@ -36,12 +36,12 @@ class _Piece:
     tree: dict[str, Any]
 
     def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
-        """``tree`` as it is, when the model takes it. renamed : what keys of the model are called as arguments."""
+        """``tree`` as it is, when the model takes it. renamed : what keys of the model are called as arguments; "": by their own keys."""
         try:
             validate(model, tree)
         except ConfigError as error:
             first, *rest = (error.where or "config").split(".")
-            at = [] if first == "config" else [renamed.get(first, first), *rest]
+            at = [step for step in (renamed.get(first, first), *rest) if step not in ("", "config")]
             raise ConfigError(error.problem, where=".".join([type(self).__name__, *at]), value=error.value,
                               accepted=error.accepted) from None
         return tree
@@ -251,7 +251,7 @@ class Scene(_Piece):
         self._plain = {"background": check.plain(background), "collisions": check.plain(collisions)}
         self._run = {"seed": check.plain(seed), "time": {"duration": check.plain(duration), "label_rate": check.plain(label_rate),
                                                          "start": check.plain(start)}}
-        self._checked(SequenceConfig, self._run)
+        self._checked(SequenceConfig, self._run, time="")
         # A scene without bodies is refused where it is used: `scene + body` begins with one.
         named, meshes, materials = [], {}, {}
         self._memory = InMemory()

@@ -94,6 +94,17 @@ def test_the_camera_keeps_its_target_in_view():
         assert statistics(path, 0, SECOND).mean_speed == pytest.approx(1.0, rel=5e-3)
 
 
+def test_the_cameras_first_horizon_is_within_half_the_roll():
+    config = CameraMotion(speed=1.0, rotation_rate=45.0, roll=40.0)
+    space = FreeSpace((-4, -4, 0), (4, 4, 3), 0.0, [TARGET], [1.5])
+    rolls = []
+    for seed in range(60):
+        R = random_camera_path(rng(seed), 0, SECOND, config, space, 0.2, TARGET).pose(0)[:3, :3]
+        level = look_rotation(R[:, 2])  # the same direction of view with a level horizon
+        rolls.append(math.degrees(math.atan2(*(level.T @ R)[:2, 0][::-1])))
+    assert 17 < max(map(abs, rolls)) <= 20.001 and min(rolls) < -10 and max(rolls) > 10
+
+
 def test_the_camera_follows_a_moving_target():
     # The target passes at 3 units/s, 4 units away: about 40 deg/s are needed.
     target = SplinePath([0, SECOND], [[-1.5, 0, 1], [1.5, 0, 1]], Rotation.identity(2))

@@ -1,12 +1,54 @@
-"""BlinkGL: event-camera and optical-flow data sets by rasterisation."""
+"""BlinkGL: event-camera and optical-flow data sets by rasterisation.
+
+    import blinkgl
+
+gives every name in ``__all__``, each by this one path; what lies in the rooms below may move. Names are loaded when they are first
+used, so that ``import blinkgl`` itself takes no time.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
+_HOMES = {
+    "blinkgl.front.scenes": ("Camera", "Keyframes", "Light", "Material", "Mesh", "Pose", "Primitive", "Scene", "look_at"),
+    "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
+    "blinkgl.front.drawing": ("Recording", "Renderer", "record", "render_frame"),
+    "blinkgl.front.sensors": ("DvsVoltmeter", "Esim", "V2e", "load_sensor"),
+    "blinkgl.front.files": ("compare", "convert", "open_events", "read_events", "read_flow", "simulate", "simulate_file", "write_events", "write_flow"),
+    "blinkgl.events.types": ("Events",),
+    "blinkgl.render.frames": ("Flow", "LabelFrame"),
+    "blinkgl.errors": ("AssetError", "BlinkGLError", "ConfigError", "EventDataError", "GLError", "OutputError"),
+}
+_HOME = {name: module for module, names in _HOMES.items() for name in names}
 
-def __getattr__(name: str):
-    # Lazy, so that `import blinkgl` stays instant: the emulators bring numba.
-    if name == "simulate":
-        from blinkgl.simulation import simulate
+if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it with the table
+    from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError
+    from blinkgl.events.types import Events
+    from blinkgl.front.drawing import Recording, Renderer, record, render_frame
+    from blinkgl.front.files import compare, convert, open_events, read_events, read_flow, simulate, simulate_file, write_events, write_flow
+    from blinkgl.front.runs import Timeline, generate, load, verify
+    from blinkgl.front.scenes import Camera, Keyframes, Light, Material, Mesh, Pose, Primitive, Scene, look_at
+    from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
+    from blinkgl.render.frames import Flow, LabelFrame
 
-        return simulate
-    raise AttributeError(f"module 'blinkgl' has no attribute {name!r}")
+__all__ = [
+    "AssetError", "BlinkGLError", "Camera", "ConfigError", "DvsVoltmeter", "Esim", "EventDataError", "Events", "Flow", "GLError", "Keyframes",
+    "LabelFrame", "Light", "Material", "Mesh", "OutputError", "Pose", "Primitive", "Recording", "Renderer", "Scene", "Timeline", "V2e", "compare",
+    "convert", "generate", "load", "load_sensor", "look_at", "open_events", "read_events", "read_flow", "record", "render_frame", "simulate",
+    "simulate_file", "verify", "write_events", "write_flow",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'blinkgl' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_HOME[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

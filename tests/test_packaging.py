@@ -67,7 +67,7 @@ def expected_files() -> set[str]:
     found = set()
     for here, there in PACKAGES.items():
         for path in (REPOSITORY / here).rglob("*"):
-            if path.suffix in (".py", ".glsl", ".yaml", ".html", ".js", ".css") and "__pycache__" not in path.parts:
+            if path.suffix in (".py", ".typed", ".glsl", ".yaml", ".html", ".js", ".css") and "__pycache__" not in path.parts:
                 found.add(f"{there}/{path.relative_to(REPOSITORY / here).as_posix()}")
     return found
 

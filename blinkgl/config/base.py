@@ -268,7 +268,8 @@ def validate_field(model: type[Config], name: str, value: Any) -> Any:
     """``value`` as the model's field ``name`` alone would hold it. Raises ConfigError as :func:`validate`."""
     info = model.model_fields[name]
     try:
-        return TypeAdapter(Annotated[info.annotation, *info.metadata]).validate_python(value)
+        kind = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
+        return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:
         raise _translate(model, error, "", (name,)) from None
 

@@ -23,8 +23,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.clock import StageClock
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.io.flo import read_flo
-from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.flow import read_flow
 from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
 from blinkgl.io.preview import PreviewWriter
@@ -185,17 +184,7 @@ def flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path
 
 
 def _flow(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    if path.suffix == ".flo":
-        flow, valid = read_flo(path)
-    elif path.suffix == ".png":
-        flow, valid = read_flow_png(path)
-    else:
-        data = read_npy(path)
-        if data.ndim != 3 or data.shape[2] not in (2, 3) or data.dtype.kind != "f":
-            raise AssetError("not a flow field", where=str(path), value=f"{data.dtype} {data.shape}", accepted="float (H, W, 2) or (H, W, 3)")
-        flow = data[..., :2].astype(np.float32)
-        valid = np.isfinite(flow).all(-1) & (data[..., 2] > 0 if data.shape[2] == 3 else True)
-        flow = np.where(valid[..., None], flow, np.float32(0))
+    flow, valid = read_flow(path)
     if flow.shape[:2] != size:
         raise AssetError("flow and image differ in size", where=str(path), value=flow.shape[:2], accepted=str(size))
     return flow, valid

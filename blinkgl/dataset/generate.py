@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import blinkgl
-from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.config.sequence import LabelsConfig, RunTemplate, SequenceConfig
 from blinkgl.dataset.clock import StageClock
 from blinkgl.dataset.event_pass import EventPass
 from blinkgl.dataset.frames import convert_sequence
@@ -119,9 +119,7 @@ def _write_labels(config: SequenceConfig, renderer: Renderer, writer: SequenceWr
                   report: SequenceReport) -> None:
     """Pass 2: images at every label time, ground truth at every one but the last (whose flow has no end)."""
     labels = config.labels
-    request = LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
-                           flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow,
-                           occlusion=labels.occlusion)
+    request = label_request(labels)
     times = config.time.label_times_ns
     interval = config.time.interval_ns
     for k, t_ns in enumerate(times):
@@ -144,6 +142,12 @@ def _write_labels(config: SequenceConfig, renderer: Renderer, writer: SequenceWr
                 if (array := getattr(frame, name)) is not None:
                     getattr(writer, name)(k, array)
         report.labels += 1
+
+
+def label_request(labels: LabelsConfig) -> LabelRequest:
+    """The buffers of pass 2 that ``labels:`` asks for; images are drawn by themselves."""
+    return LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
+                        flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=labels.occlusion)
 
 
 def poses_of(scene: Scene, times_ns: list[int]) -> dict[str, np.ndarray]:

@@ -164,7 +164,10 @@ class Emulator(ABC):
         return Events.empty()
 
     def _checked_time(self, t_ns: int) -> int:
-        t_ns = int(t_ns)
+        try:
+            t_ns = int(t_ns)
+        except (TypeError, ValueError, OverflowError):
+            raise EventDataError("not a time stamp", where=f"frame {self.frames}", value=t_ns, accepted="whole nanoseconds") from None
         if self.t_ns is not None and t_ns <= self.t_ns:
             raise EventDataError("time stamps must increase", where=f"frame {self.frames}", value=f"{t_ns} ns",
                                  accepted=f"more than {self.t_ns} ns")

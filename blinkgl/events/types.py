@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from blinkgl.errors import EventDataError
+
 
 @dataclass(frozen=True, eq=False)
 class Events:
@@ -14,6 +16,8 @@ class Events:
     x, y : (N,) uint16 pixel column and row, (0, 0) the top-left pixel.
     t    : (N,) int64 microseconds, non-decreasing inside a chunk and across the chunks of one emulator.
     p    : (N,) uint8, 1 brighter (ON), 0 darker (OFF).
+
+    Raises EventDataError: a column of another type or length.
     """
 
     x: np.ndarray
@@ -22,11 +26,12 @@ class Events:
     p: np.ndarray
 
     def __post_init__(self) -> None:
-        for name, dtype in (("x", np.uint16), ("y", np.uint16), ("t", np.int64), ("p", np.uint8)):
+        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.uint8)):
             column = getattr(self, name)
-            if column.dtype != dtype or column.ndim != 1 or len(column) != len(self.t):
-                raise TypeError(f"Events.{name}: expected 1-D {np.dtype(dtype)} of length {len(self.t)}, "
-                                f"got {column.dtype} {column.shape}")
+            if not isinstance(column, np.ndarray) or column.dtype != dtype or column.ndim != 1 or len(column) != len(self.t):
+                got = f"{column.dtype} {column.shape}" if isinstance(column, np.ndarray) else column
+                many = f" of {len(self.t)}" if isinstance(self.t, np.ndarray) and self.t.ndim == 1 else ""
+                raise EventDataError("not a column of events", where=f"Events.{name}", value=got, accepted=f"a one-dimensional {np.dtype(dtype)} array{many}")
 
     def __len__(self) -> int:
         return len(self.t)

@@ -36,6 +36,7 @@ from blinkgl.io import images
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
 from blinkgl.io.flo import encode_flo
+from blinkgl.io.flow import encode_flow_npy
 from blinkgl.io.flow_png import encode_flow_png
 from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
@@ -151,8 +152,7 @@ class SequenceWriter:
 
         self._write(f"flow/{direction}/{index:06d}.png", png)
         if "npy" in self.float_flow:
-            self._write(f"flow/{direction}_npy/{index:06d}.npy",
-                        lambda: images.encode_npy(np.dstack([np.where(valid[..., None], flow, 0), valid]).astype(np.float32)))
+            self._write(f"flow/{direction}_npy/{index:06d}.npy", lambda: encode_flow_npy(flow, valid))
         if "flo" in self.float_flow:
             self._write(f"flow/{direction}_flo/{index:06d}.flo", lambda: encode_flo(flow, valid))
         if "h5" in self.float_flow:

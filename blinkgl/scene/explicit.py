@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,21 +30,30 @@ _PROCEDURAL_SIZE = 1024
 _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 
 
-def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path) -> Scene:
+@dataclass(frozen=True)
+class InMemory:
+    """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand instead of what the
+    configuration says there."""
+
+    meshes: dict[str, Mesh] = field(default_factory=dict)
+    textures: dict[str, Texture] = field(default_factory=dict)
+
+
+def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()) -> Scene:
     """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
 
     Raises ConfigError (missing file, bad parameter; with ``collisions``,
     bodies that touch at the start) and AssetError."""
     log: list[str] = []
     omissions: dict[str, None] = {}
-    materials = {name: _material(m, base, f"scene.materials.{name}") for name, m in config.materials.items()}
+    materials = {name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name)) for name, m in config.materials.items()}
     assets: dict[tuple[str, bool], Asset] = {}
     objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
     for k, item in enumerate(config.objects):
         where = f"scene.objects.{k}"
         own = item.material is None
         if (item.mesh, own) not in assets:
-            assets[item.mesh, own] = _asset(config.meshes[item.mesh], item.mesh, own, base, config.max_faces)
+            assets[item.mesh, own] = _asset(config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes)
             log += [line for line in assets[item.mesh, own].log if line not in log]
             omissions.update(dict.fromkeys(assets[item.mesh, own].omissions))
         matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
@@ -104,9 +114,9 @@ def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
                           accepted=error.accepted) from None
 
 
-def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int) -> Asset:
-    if config.primitive is not None:
-        mesh = primitive_mesh(config, name)
+def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int, memory: Mapping[str, Mesh]) -> Asset:
+    if name in memory or config.primitive is not None:
+        mesh = memory[name] if name in memory else primitive_mesh(config, name)
         return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
     where = f"scene.meshes.{name}"
     path = resolve(config.file, base)
@@ -116,8 +126,7 @@ def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_f
                       uv_size=config.uv_size, up=config.up)
 
 
-def _material(config: MaterialConfig, base: Path, where: str) -> Material:
-    texture = None
+def _material(config: MaterialConfig, base: Path, where: str, texture: Texture | None = None) -> Material:
     if config.texture is not None:
         texture = _texture(resolve(config.texture, base), config.max_size, f"{where}.texture", config.texture)
     elif config.procedural is not None:

@@ -1,0 +1,79 @@
+"""Arguments of a person's call: what is wrong with one is said in a line that begins with its name."""
+
+from __future__ import annotations
+
+import math
+import numbers
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.errors import ConfigError
+
+
+def plain(value: Any) -> Any:
+    """Lists and numbers of arrays, tuples and NumPy scalars, as a YAML file would have given them."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, Mapping):
+        return {plain(k): plain(v) for k, v in value.items()}
+    return os.fspath(value) if isinstance(value, os.PathLike) else value
+
+
+def given(**arguments: Any) -> dict[str, Any]:
+    """The arguments that are not None, as plain data."""
+    return {name: plain(value) for name, value in arguments.items() if value is not None}
+
+
+def path(value: Any, where: str) -> Path:
+    """Raises ConfigError: no path."""
+    if not isinstance(value, (str, os.PathLike)) or not str(value):
+        raise ConfigError("not a path", where=where, value=value, accepted="text or a pathlib.Path")
+    return Path(value)
+
+
+def number(value: Any, where: str, *, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> float:
+    """A finite number in [least, most] and greater than ``above``. Raises ConfigError."""
+    bounds = [f"greater than {above:g}"] * (above > -math.inf) + [f"at least {least:g}"] * (least > -math.inf) + [f"at most {most:g}"] * (most < math.inf)
+    real = isinstance(value, (numbers.Real, np.number)) and not isinstance(value, bool) and math.isfinite(value)
+    if not real or not least <= value <= most or not value > above:
+        raise ConfigError("out of range" if real else "not a finite number", where=where, value=value, accepted=" ".join(["a number", " and ".join(bounds)]).strip())
+    return float(value)
+
+
+def whole(value: Any, where: str, least: int, most: int) -> int:
+    """A whole number in [least, most]. Raises ConfigError."""
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not least <= value <= most:
+        raise ConfigError("not a whole number in range", where=where, value=value, accepted=f"{least} to {most}")
+    return int(value)
+
+
+def seed(value: Any, where: str = "seed") -> int:
+    return whole(value, where, 0, 2**63 - 1)
+
+
+def one_of(value: Any, where: str, kinds: type | tuple[type, ...], accepted: str) -> Any:
+    """``value`` where it is of one of the classes. Raises ConfigError."""
+    if not isinstance(value, kinds):
+        raise ConfigError(f"not {accepted}", where=where, value=value, accepted=accepted)
+    return value
+
+
+def array(value: Any, where: str, shape: tuple[int | None, ...], accepted: str) -> np.ndarray:
+    """A numeric array of the shape (None: any length). Raises ConfigError."""
+    try:
+        made = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        made = np.empty(0, object)
+    fits = made.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, made.shape))
+    if not fits or made.dtype.kind not in "fiub":
+        got = f"{made.dtype} {made.shape}" if isinstance(value, np.ndarray) else value
+        raise ConfigError("not such an array", where=where, value=got, accepted=accepted)
+    return made

@@ -1,0 +1,169 @@
+"""Events and flow in files, frames to events, two recordings side by side."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from blinkgl.errors import ConfigError, EventDataError
+from blinkgl.events.types import Events
+from blinkgl.front import arguments as check
+from blinkgl.front.runs import Emulator, events_tree
+from blinkgl.io import flow as flow_files
+from blinkgl.io import formats
+from blinkgl.io.formats import EventFile
+
+if TYPE_CHECKING:
+    from blinkgl.comparison import Comparison
+    from blinkgl.simulation import SimulationReport
+
+_SIDE = 65535
+
+
+def open_events(path: str | os.PathLike) -> EventFile:
+    """An event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``; ``height``, ``width`` in px, None
+    where the file does not say (``file.sized()`` finds out), times in µs. Endings: .h5 .hdf5 .raw .aedat4 .txt .csv .npz .npy.
+
+    Raises AssetError: missing, unknown ending, or not what the ending says."""
+    return formats.open_events(check.path(path, "path"))
+
+
+def read_events(path: str | os.PathLike) -> Events:
+    """All :class:`Events` of a file, t in µs, in memory. Raises AssetError and EventDataError (times that run backwards …)."""
+    with open_events(path) as file:
+        return file.read()
+
+
+def write_events(path: str | os.PathLike, events: Events | Iterable[Events], height: int, width: int, *, format: str | None = None,
+                 t_offset_us: int = 0, time_unit: str = "s", overwrite: bool = True) -> int:
+    """Writes events, or chunks in order, of a sensor of height x width px; the file appears whole or not at all. Returns how many.
+
+    path : its ending names the format, or ``format``: dsec, evt3, evt2, aedat4, text, csv, npz, npy.   t_offset_us : DSEC's, µs.
+    time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
+    path, height, width = check.path(path, "path"), check.whole(height, "height", 1, _SIDE), check.whole(width, "width", 1, _SIDE)
+    offset = check.whole(t_offset_us, "t_offset_us", 0, 2**62)
+    return formats.write_events(path, _chunks(events), height, width, format=format, t_offset_us=offset, time_unit=time_unit, overwrite=overwrite)
+
+
+def _chunks(events: Any) -> Iterator[Events]:
+    if isinstance(events, Events):
+        events = (events,)
+    if not isinstance(events, Iterable):
+        raise ConfigError("not events", where="events", value=events, accepted="Events, or chunks of them")
+
+    def checked() -> Iterator[Events]:
+        for chunk in events:
+            yield check.one_of(chunk, "events", Events, "Events, or chunks of them")
+
+    return checked()
+
+
+def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str | None = None, size: tuple[int, int] | None = None,
+            zero_time: bool = False, time_unit: str = "s", overwrite: bool = True) -> int:
+    """Copies events from one file format to another, in pieces. Returns how many events.
+
+    size : (height, width), px, where ``source`` does not say.   format, time_unit : as of :func:`write_events`.
+    zero_time : count times from the first event. Raises AssetError, OutputError, EventDataError, ConfigError."""
+    if size is not None:
+        pair = check.one_of(size, "size", (list, tuple), "(height, width)")
+        if len(pair) != 2:
+            raise ConfigError("not two numbers", where="size", value=size, accepted="(height, width)")
+        size = (check.whole(pair[0], "size", 1, _SIDE), check.whole(pair[1], "size", 1, _SIDE))
+    return formats.convert(check.path(source, "source"), check.path(target, "target"), format=format, size=size, zero_time=bool(zero_time),
+                           time_unit=time_unit, overwrite=overwrite)[1]
+
+
+def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool, of a .png (DSEC), .flo or .npy file.
+
+    Raises AssetError: missing, damaged, or no flow."""
+    return flow_files.read_flow(check.path(path, "path"))
+
+
+def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> int:
+    """Writes flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16 bit), .flo or .npy, by the ending.
+
+    Returns how many valid pixels the format could not hold; they are stored as invalid. Raises OutputError, ConfigError."""
+    field = check.array(flow, "flow", (None, None, 2), "an array (H, W, 2), px")
+    mask = np.ones(field.shape[:2], bool) if valid is None else check.array(valid, "valid", field.shape[:2], f"an array {field.shape[:2]} of bool")
+    if not field.size:
+        raise ConfigError("no pixels", where="flow", value=field.shape, accepted="an array (H, W, 2), px")
+    return flow_files.write_flow(check.path(path, "path"), field.astype(np.float32), mask.astype(bool))
+
+
+def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames: str | os.PathLike | None = None, fps: float | None = None,
+            interval_ms: float = 20.0, zero_time: bool = False) -> "Comparison":
+    """How alike two event files are, over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
+
+    b : event file; None: ``a`` is described.   frames : video or folder of images both are compared with.   fps : of the frames, Hz.
+    interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
+    Raises AssetError, EventDataError, ConfigError."""
+    from blinkgl import comparison
+
+    return comparison.compare(check.path(a, "a"), None if b is None else check.path(b, "b"), frames=None if frames is None else check.path(frames, "frames"),
+                              fps=_fps(fps), interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7), zero_time=bool(zero_time))
+
+
+def simulate(frames: Iterable, *, fps: float | None = None, emulator: Emulator = "esim", gamma: str | float | None = None,
+             interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, sensor: str | None = None,
+             report: "SimulationReport | None" = None) -> Iterator[Events]:
+    """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
+
+    frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array, t_ns). uint8, uint16, or
+    float (1.0 is white).   emulator : as of :func:`record`.   sensor : the read-out limit of that camera, and with an emulator's name its values.
+    gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
+    interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense flow, at most ``max_px`` px a step.
+    report : a SimulationReport to be filled.   Raises ConfigError at once; EventDataError as frames come, naming the frame."""
+    from blinkgl import simulation
+
+    if not isinstance(frames, Iterable):
+        raise ConfigError("not frames", where="frames", value=frames, accepted="an iterable of arrays")
+    return simulation.simulate(_frames(frames), fps=_fps(fps), gamma=gamma, interpolate=interpolate, report=report, **_options(emulator, sensor, factor, max_px, seed))
+
+
+def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None, emulator: Emulator = "esim",
+                  gamma: str | float | None = None, interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
+                  sensor: str | None = None, timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None,
+                  overwrite: bool = True) -> "SimulationReport":
+    """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as ``blinkgl simulate``; files appear whole or not at all.
+
+    timestamps : file of times, one a frame.   preview : a video of frames and events to write.   The rest: as of :func:`simulate`.
+    Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
+    from blinkgl import simulation
+
+    return simulation.simulate_file(check.path(source, "source"), check.path(target, "target"), fps=_fps(fps), gamma=gamma, interpolate=interpolate,
+                                    timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+                                    preview=None if preview is None else check.path(preview, "preview"), overwrite=overwrite,
+                                    **_options(emulator, sensor, factor, max_px, seed))
+
+
+def _options(emulator: Emulator, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
+    from blinkgl import simulation
+    from blinkgl.config.sensor import load_sensor
+
+    tree = events_tree(emulator)
+    camera = None if sensor is None else load_sensor(sensor)
+    if camera is not None:
+        tree = {**camera.values(tree.get("emulator", "esim")), **tree}
+    return dict(emulator=simulation.emulator_config(tree), factor=check.whole(factor, "factor", 1, 1000), seed=check.seed(seed),
+                max_px=check.number(max_px, "max_px", above=0, most=1e4), readout=None if camera is None else camera.readout)
+
+
+def _fps(fps: float | None) -> float | None:
+    return None if fps is None else check.number(fps, "fps", above=0, most=1e9)
+
+
+def _frames(frames: Iterable) -> Iterator:
+    """The items, those that are no frames named by their number."""
+    for k, item in enumerate(frames):
+        try:
+            array, *rest = item if isinstance(item, tuple) else (item,)
+            array = np.asarray(array)
+            if not 0 <= len(rest) <= 2 or (rest and int(rest[0]) != rest[0]):
+                raise ValueError
+        except (TypeError, ValueError, OverflowError):
+            raise EventDataError("not a frame", where=f"frames[{k}]", value=item, accepted="an array, or (array, whole ns)") from None
+        yield (array, *rest) if rest else array

@@ -1,0 +1,297 @@
+"""Scenes in Python: the pieces of ``scene: {kind: explicit}``, checked by the same models, drawn from the same data classes.
+
+    scene = Scene(Camera(320, 240, pose=Keyframes({0: look_at((-3, 0, 1), (0, 0, 0)), 1: look_at((-3, 1, 1), (0, 0, 0))})))
+    scene += Primitive("cuboid", material=Material(procedural="bricks"))
+
+World: right-handed, z up. Lengths in metres, angles in degrees, times in seconds on the scene's clock. All pieces are values: nothing
+changes them, ``scene + body`` is another scene. Whatever cannot be used raises ConfigError when the piece is made, and names the argument.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Union
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from blinkgl.config.base import Config, validate
+from blinkgl.config.scene import ExplicitSceneConfig, KeyedMotionConfig, LightConfig, MaterialConfig, MeshConfig, ObjectConfig, PoseConfig
+from blinkgl.config.sequence import CameraConfig, RunTemplate, SequenceConfig
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.front import arguments as check
+from blinkgl.scene import types as data
+from blinkgl.scene.explicit import InMemory, explicit_scene, primitive_mesh
+from blinkgl.scene.images import content_hash
+from blinkgl.scene.meshes import make_mesh
+
+Vector = Union[Sequence[float], np.ndarray]
+
+
+class _Piece:
+    """A value that is checked when it is made. ``tree``: itself as plain data, as the YAML has it."""
+
+    tree: dict[str, Any]
+
+    def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
+        """``tree`` as it is, when the model takes it. renamed : what keys of the model are called as arguments; "": by their own keys."""
+        try:
+            validate(model, tree)
+        except ConfigError as error:
+            first, *rest = (error.where or "config").split(".")
+            at = [step for step in (renamed.get(first, first), *rest) if step not in ("", "config")]
+            raise ConfigError(error.problem, where=".".join([type(self).__name__, *at]), value=error.value,
+                              accepted=error.accepted) from None
+        return tree
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in self.tree.items())})"
+
+
+class Pose(_Piece):
+    """Where a body or a camera is, and at most one way to say how it is turned.
+
+    position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
+    look_at : (3,) m, the point that a camera's z axis, or a body's x axis, is turned to. At rest a camera looks along +x with z up.
+    Raises ConfigError."""
+
+    def __init__(self, position: Vector = (0.0, 0.0, 0.0), *, euler: Vector | None = None, quaternion: Vector | None = None,
+                 look_at: Vector | None = None):
+        self.tree = self._checked(PoseConfig, check.given(position=position, euler=euler, quaternion=quaternion, look_at=look_at))
+
+
+def look_at(position: Vector, target: Vector) -> Pose:
+    """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's horizon is level. Raises ConfigError."""
+    return Pose(position, look_at=target)
+
+
+class Keyframes(_Piece):
+    """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before the first time and after the last.
+
+    poses : time in s -> :class:`Pose`, two or more; from one to the next less than half a turn.
+    interpolation : "spline" (twice continuously differentiable) or "linear" (straight lines and slerp).
+    Raises ConfigError."""
+
+    def __init__(self, poses: Mapping[float, Pose], interpolation: Literal["spline", "linear"] = "spline"):
+        check.one_of(poses, "Keyframes.poses", Mapping, "a table of times and poses")
+        for time, pose in poses.items():
+            check.number(time, "Keyframes.poses")
+            check.one_of(pose, f"Keyframes.poses[{time}]", Pose, "a Pose, as look_at makes one")
+        frames = [{"time": check.plain(time), **poses[time].tree} for time in sorted(poses)]
+        if not frames:
+            raise ConfigError("too few entries", where="Keyframes.poses", value=poses, accepted="two or more poses")
+        self.tree = self._checked(KeyedMotionConfig, {"keyframes": frames, "interpolation": check.plain(interpolation)}, keyframes="poses")
+
+
+def _motion(pose: Pose | Keyframes | Vector, where: str) -> dict[str, Any]:
+    """A position alone is a pose."""
+    if isinstance(pose, (Pose, Keyframes)):
+        return pose.tree
+    check.one_of(pose, where, (list, tuple, np.ndarray), "a Pose, Keyframes or a position of three numbers")
+    return Pose(pose).tree
+
+
+class Camera(_Piece):
+    """A pin-hole camera and its motion.
+
+    width, height : px.   fov : horizontal field of view, degrees (default 60), or focal : focal length, px.
+    cx, cy : principal point, px; (0, 0) is the centre of the top-left pixel; default: the image's centre.   near : m, nothing nearer is drawn.
+    pose : :class:`Pose`, :class:`Keyframes` or a position (3,); OpenCV axes (x right, y down, z forward).
+    Raises ConfigError."""
+
+    def __init__(self, width: int = 346, height: int = 260, *, fov: float | None = None, focal: float | None = None, cx: float | None = None,
+                 cy: float | None = None, near: float = 0.05, pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0)):
+        self.tree = self._checked(CameraConfig, check.given(width=width, height=height, fov=fov, focal=focal, cx=cx, cy=cy, near=near))
+        self.motion = _motion(pose, "Camera.pose")
+
+
+class Light(_Piece):
+    """One white sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z).
+
+    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60, 40).   unlit : radiance = albedo everywhere.
+    Raises ConfigError."""
+
+    def __init__(self, sun: float = 0.9, sky: float = 0.6, *, elevation: float | None = None, azimuth: float | None = None, unlit: bool = False):
+        tree = check.given(sun=sun, sky=sky, sun_elevation=elevation, sun_azimuth=azimuth, unlit=unlit)
+        self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
+
+
+class Material(_Piece):
+    """A Lambert surface: ``color`` times at most one texture.
+
+    image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or float, linear light; row 0 is the top.
+    color : (3,) linear factor.   procedural, seed : kind and number of a made-up texture, such as "bricks".
+    photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.   max_size : px, longer sides of a file are reduced.
+    unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
+    Raises ConfigError; a missing file is found when the scene is built."""
+
+    def __init__(self, image: str | os.PathLike | np.ndarray | None = None, *, color: Vector = (1.0, 1.0, 1.0), procedural: str | None = None,
+                 seed: int = 0, photograph: str | None = None, uv_scale: Vector = (1.0, 1.0), max_size: int = 2048, unlit: bool = False,
+                 double_sided: bool = False):
+        self.image: data.Texture | None = None
+        if image is not None and not isinstance(image, (str, os.PathLike)):
+            self.image, image = _texture(image), None
+            if procedural is not None or photograph is not None:
+                raise ConfigError("only one of image, procedural, photograph may be given", where="Material.image")
+        tree = check.given(texture=image, procedural=procedural, seed=seed, photograph=photograph, max_size=max_size, color=color,
+                           uv_scale=uv_scale, unlit=unlit, double_sided=double_sided)
+        self.tree = self._checked(MaterialConfig, tree, texture="image")
+
+
+def _texture(image: Any) -> data.Texture:
+    accepted = "a file, or an array (h, w, 3), uint8 sRGB or float linear light >= 0"
+    pixels = check.array(image, "Material.image", (None, None, 3), accepted)
+    if not pixels.size or max(pixels.shape) > 16384:
+        raise ConfigError("size out of range", where="Material.image", value=pixels.shape, accepted="1 to 16384 rows and columns")
+    if pixels.dtype != np.uint8:
+        if pixels.dtype.kind != "f" or not (np.isfinite(pixels).all() and pixels.min() >= 0):
+            raise ConfigError("pixels cannot be used", where="Material.image", value=str(pixels.dtype), accepted=accepted)
+        pixels = pixels.astype(np.float32)
+    pixels = np.array(pixels, order="C")  # a copy: the scene is a value
+    return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))
+
+
+class _Body(_Piece):
+    """What primitives and meshes share: an object of the scene, its mesh and its material."""
+
+    mesh: dict[str, Any]
+    triangles: data.Mesh | None = None
+
+    def _placed(self, name: str | None, material: Material | None, pose: Pose | Keyframes | Vector, scale: float | Vector,
+                category: str) -> dict[str, Any]:
+        kind = type(self).__name__
+        self.material = None if material is None else check.one_of(material, f"{kind}.material", Material, "a Material")
+        tree = {"mesh": "mesh", **check.given(name=name, scale=scale, category=category), **_motion(pose, f"{kind}.pose")}
+        return self._checked(ObjectConfig, tree)
+
+
+class Primitive(_Body):
+    """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid.
+
+    parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)`` (docs/configuration.md, "primitives").
+    material : :class:`Material`, default white.   pose : :class:`Pose`, :class:`Keyframes` or a position (3,).   scale : one factor, or (3,).
+    name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
+    Raises ConfigError."""
+
+    def __init__(self, kind: str, *, material: Material | None = None, pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
+                 scale: float | Vector = 1.0, name: str | None = None, category: Literal["object", "ground", "wall", "sky"] = "object",
+                 **parameters: float | Vector):
+        check.one_of(kind, "Primitive.kind", str, "the name of a shape")
+        self.mesh = {"primitive": kind, "parameters": check.plain(parameters)}
+        try:
+            self._checked(MeshConfig, self.mesh, primitive="kind")
+            primitive_mesh(validate(MeshConfig, self.mesh), "mesh")
+        except ConfigError as error:
+            before, said, key = (error.where or "").rpartition("parameters")
+            raise ConfigError(error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted) from None
+        self.tree = self._placed(name, material if material is not None else Material(), pose, scale, category)
+        self.tree.setdefault("name", kind)
+
+
+class Mesh(_Body):
+    """A body from a file, ``Mesh("chair.glb")``, or from triangles, ``Mesh(vertices=v, faces=f)``.
+
+    file : obj, ply, stl, glb or gltf.   up : the file's axis that points up, "auto", "y" or "z".
+    vertices : (V, 3) m, body axes.   faces : (F, 3) indices, counter-clockwise seen from outside.
+    uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
+    material : :class:`Material`; default: the file's own, or white.   pose, scale, name, category : as of :class:`Primitive`.
+    Raises ConfigError; a missing or damaged file raises when the scene is built."""
+
+    def __init__(self, file: str | os.PathLike | None = None, *, vertices: ArrayLike | None = None, faces: ArrayLike | None = None,
+                 uvs: ArrayLike | None = None, up: Literal["auto", "y", "z"] = "auto", material: Material | None = None,
+                 pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0), scale: float | Vector = 1.0, name: str | None = None,
+                 category: Literal["object", "ground", "wall", "sky"] = "object"):
+        if (file is None) == (vertices is None) or (vertices is None) != (faces is None):
+            raise ConfigError("give a file, or vertices and faces", where="Mesh.file", value=file)
+        if file is not None:
+            self.mesh = self._checked(MeshConfig, check.given(file=str(check.path(file, "Mesh.file")), up=up))
+        else:
+            # The model wants a shape or a file; explicit_scene is given these triangles under the mesh's name.
+            self.mesh, self.triangles = {"primitive": "grid"}, _triangles(vertices, faces, uvs)
+            material = material if material is not None else Material()
+        self.tree = self._placed(name, material, pose, scale, category)
+        self.tree.setdefault("name", "mesh" if file is None else Path(file).stem)
+
+
+def _triangles(vertices: ArrayLike, faces: ArrayLike, uvs: ArrayLike | None) -> data.Mesh:
+    v = check.array(vertices, "Mesh.vertices", (None, 3), "an array (V, 3) of finite numbers, m").astype(np.float64)
+    f = check.array(faces, "Mesh.faces", (None, 3), "an array (F, 3) of whole numbers below V")
+    if not len(v) or not np.isfinite(v).all():
+        raise ConfigError("not finite, or none", where="Mesh.vertices", value=v.shape, accepted="an array (V, 3) of finite numbers, m")
+    if f.dtype.kind not in "iu" or not len(f) or f.min() < 0 or f.max() >= len(v):
+        raise ConfigError("not indices of vertices", where="Mesh.faces", value=f"{f.dtype} {f.shape}", accepted=f"whole numbers, 0 to {len(v) - 1}")
+    t = None if uvs is None else check.array(uvs, "Mesh.uvs", (len(v), 2), f"an array ({len(v)}, 2)").astype(np.float32)
+    digest = content_hash(v.tobytes(), f.astype(np.int64).tobytes(), b"" if t is None else t.tobytes())
+    try:
+        return make_mesh(v, f, uvs=t, name="mesh", source_hash=digest, where="Mesh")
+    except AssetError as error:
+        raise ConfigError(error.problem, where="Mesh.vertices", value=error.value, accepted=error.accepted) from None
+
+
+class Scene(_Piece):
+    """Bodies before a camera, for a time. ``scene + body`` is a scene with one more.
+
+    camera : :class:`Camera`.   objects : :class:`Primitive` and :class:`Mesh`; ids count from 1 in this order.
+    light : :class:`Light`.   background : linear radiance where nothing is hit.
+    duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label interval after ``start``, so that
+    a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
+    collisions : stop what collides where it does.   seed : of the sensor's noise.
+    Raises ConfigError."""
+
+    def __init__(self, camera: Camera | None = None, objects: Sequence[Primitive | Mesh] = (), *, light: Light | None = None,
+                 background: float = 0.2, duration: float = 1.0, label_rate: float = 10.0, start: float = 0.0, collisions: bool = False,
+                 seed: int = 0):
+        self.camera = Camera() if camera is None else check.one_of(camera, "Scene.camera", Camera, "a Camera")
+        self.light = Light() if light is None else check.one_of(light, "Scene.light", Light, "a Light")
+        self.objects = tuple(check.one_of(objects, "Scene.objects", (list, tuple), "a list of Primitive and Mesh"))
+        for k, body in enumerate(self.objects):
+            check.one_of(body, f"Scene.objects[{k}]", _Body, "a Primitive or a Mesh")
+        self._plain = {"background": check.plain(background), "collisions": check.plain(collisions)}
+        self._run = {"seed": check.plain(seed), "time": {"duration": check.plain(duration), "label_rate": check.plain(label_rate),
+                                                         "start": check.plain(start)}}
+        self._checked(SequenceConfig, self._run, time="")
+        # A scene without bodies is refused where it is used: `scene + body` begins with one.
+        named, meshes, materials = [], {}, {}
+        self._memory = InMemory()
+        taken: set[str] = set()
+        for k, body in enumerate(self.objects):
+            item = {**body.tree, "mesh": f"mesh{k}"}
+            item["name"] = item["name"] if item["name"] not in taken else f"{item['name']}#{k}"
+            taken.add(item["name"])
+            meshes[f"mesh{k}"] = body.mesh
+            if body.triangles is not None:
+                self._memory.meshes[f"mesh{k}"] = body.triangles
+            if body.material is not None:
+                item["material"] = f"material{k}"
+                materials[f"material{k}"] = body.material.tree
+                if body.material.image is not None:
+                    self._memory.textures[f"material{k}"] = body.material.image
+            named.append(item)
+        self.tree = {"kind": "explicit", "meshes": meshes, "materials": materials, "objects": named, "camera": self.camera.motion,
+                     "light": self.light.tree, **self._plain}
+        if named:
+            self._checked(ExplicitSceneConfig, self.tree)
+
+    def __add__(self, body: Primitive | Mesh) -> "Scene":
+        check.one_of(body, "Scene + …", _Body, "a Primitive or a Mesh")
+        return Scene(self.camera, (*self.objects, body), light=self.light, seed=self._run["seed"], **self._plain, **self._run["time"])
+
+    def __repr__(self) -> str:
+        return f"<Scene of {len(self.objects)} objects>"
+
+    def template(self) -> RunTemplate:
+        """The scene as the run that a YAML file would be, relative paths from the working folder. Raises ConfigError: no objects."""
+        if not self.objects:
+            raise ConfigError("a scene without objects", where="Scene.objects", accepted="at least one: scene + Primitive(…)")
+        return RunTemplate({**self._run, "camera": self.camera.tree, "scene": self.tree}, Path.cwd())
+
+    @property
+    def on_disk(self) -> bool:
+        """Whether a YAML file could say it: nothing is made of arrays."""
+        return not (self._memory.meshes or self._memory.textures)
+
+    def build(self, config: SequenceConfig) -> data.Scene:
+        """What the renderer draws. Raises ConfigError and AssetError: files."""
+        return explicit_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, Path.cwd(), self._memory)

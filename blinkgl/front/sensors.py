@@ -1,0 +1,54 @@
+"""Event cameras: emulators to feed frames to, and the shipped sensors' values."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from blinkgl.config.sensor import SensorConfig
+from blinkgl.config.sensor import load_sensor as _load_sensor
+from blinkgl.events import Emulator, make_emulator
+from blinkgl.events.emulator import MAX_SIDE
+from blinkgl.front import arguments as check
+from blinkgl.simulation import emulator_config
+
+_STEP = """
+
+    height, width : px.   seed : of its noise.   sensor : a camera whose values are the defaults, such as "davis346".
+    reconstruction : log intensity between frames, "linear", or for Esim "pchip" and "hermite".   values : keys of ``events:``
+    (docs/configuration.md).
+
+    Returns an emulator: ``emulator.step(luminance, t_ns)`` takes (H, W) float32 linear luminance, or uint8, at increasing int ns, and gives
+    :class:`Events` since the step before, t in µs; the first step sets the reference.
+    Raises ConfigError and, from ``step``, EventDataError."""
+
+
+def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, reconstruction: str, values: dict[str, Any]) -> Emulator:
+    height, width = check.whole(height, "height", 1, MAX_SIDE - 1), check.whole(width, "width", 1, MAX_SIDE - 1)
+    defaults = load_sensor(sensor).values(kind) if sensor is not None else {}
+    config = emulator_config({"emulator": kind, **defaults, **check.plain(values)})
+    return make_emulator(config, height, width, check.seed(seed), reconstruction)
+
+
+def Esim(height: int, width: int, *, seed: int = 0, sensor: str | None = None, reconstruction: str = "linear", **values: Any) -> Emulator:
+    return _made("esim", height, width, seed, sensor, reconstruction, values)
+
+
+def V2e(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
+    return _made("v2e", height, width, seed, sensor, "linear", values)
+
+
+def DvsVoltmeter(height: int, width: int, *, seed: int = 0, sensor: str | None = None, **values: Any) -> Emulator:
+    return _made("voltmeter", height, width, seed, sensor, "linear", values)
+
+
+Esim.__doc__ = "ESIM (Rebecq et al., CoRL 2018): an event at every crossing of a contrast threshold of the log intensity." + _STEP
+V2e.__doc__ = "V2E (Hu et al., CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period." + _STEP
+DvsVoltmeter.__doc__ = "DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion with drift between two thresholds." + _STEP
+
+
+def load_sensor(name: str) -> SensorConfig:
+    """The values of a shipped camera: davis240c, davis346, dvxplorer, gen31_vga, imx636 (case and punctuation do not matter).
+
+    ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …; ``values("v2e")`` is what they say of
+    an emulator's keys. Raises ConfigError."""
+    return _load_sensor(name)

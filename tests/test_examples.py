@@ -1,0 +1,71 @@
+"""Every example runs, ends well by its own check, and is what its page shows."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from blinkgl.tools import example_docs
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+EXAMPLES = REPOSITORY / "examples"
+PAGE = (REPOSITORY / "docs/examples.md").read_text(encoding="utf-8")
+NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+
+
+def test_all_are_on_the_page():
+    assert set(NAMES) == set(example_docs.ORDER)
+    assert PAGE.startswith(example_docs.HEADER)
+    assert re.findall(r"^## (\w+)$", PAGE, re.M) == list(example_docs.ORDER)
+    for _, picture, _ in example_docs.PICTURES.values():
+        assert (REPOSITORY / "docs/images" / picture).is_file()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_example(name, tmp_path):
+    if "eflow.data" in (EXAMPLES / f"{name}.py").read_text():
+        pytest.importorskip("torch")
+    output = example_docs.run(name, tmp_path / "made here", EXAMPLES)
+    assert 1 <= len(output.splitlines()) <= 8
+    shown = example_docs.section(name, output, EXAMPLES)
+    text = PAGE[PAGE.index(f"## {name}\n"):]
+    text = text[: text.find("\n## ", 1) + 1 or None]
+    assert shown.partition("It prints:")[0] == text.partition("It prints:")[0], "run: python -m blinkgl.tools.example_docs"
+    assert example_docs.without_numbers(shown) == example_docs.without_numbers(text), "run: python -m blinkgl.tools.example_docs"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_length(name):
+    source = (EXAMPLES / f"{name}.py").read_text()
+    assert 10 <= len(source.splitlines()) <= 65 and max(map(len, source.splitlines())) <= 150
+    assert source.count("assert ") >= 1, "an example that checks nothing"
+
+
+def test_notebook(monkeypatch, capsys):
+    import matplotlib
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    path = EXAMPLES / "demo.ipynb"
+    book = json.loads(path.read_text(encoding="utf-8"))
+    assert book["nbformat"] == 4 and all({"cell_type", "metadata", "source"} <= set(cell) for cell in book["cells"])
+    assert all(cell["outputs"] == [] for cell in book["cells"] if cell["cell_type"] == "code"), "saved with outputs"
+    monkeypatch.chdir(REPOSITORY)
+    names: dict = {}
+    for number, cell in enumerate(example_docs.cells(path)):
+        exec(compile(cell, f"demo.ipynb, code cell {number}", "exec"), names)  # noqa: S102 - our own notebook
+    plt.close("all")
+    assert "events per pixel" in capsys.readouterr().out
+
+
+def test_readme_hello_world(tmp_path, monkeypatch):
+    """The first Python of the README runs as it stands, in ten lines."""
+    block = re.search(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(encoding="utf-8"), re.S)[1]
+    assert len(block.strip().splitlines()) <= 10
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile(block, "README.md", "exec"), names)  # noqa: S102
+    assert len(names["events"]) > 1000 and names["flow"].shape[-1] == 2

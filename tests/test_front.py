@@ -1,0 +1,281 @@
+"""The front door: names, documentation, one path each; scenes in Python are scenes of YAML; wrong calls say which argument."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import blinkgl
+from blinkgl.config.sequence import RunTemplate
+from blinkgl.dataset.run import run_dataset
+from blinkgl.errors import BlinkGLError
+from blinkgl.io.dsec import DsecEventReader
+from blinkgl.scene.build import build_scene
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+FRONT = ("arguments", "drawing", "files", "runs", "scenes", "sensors")
+
+
+def box_scene(**more) -> blinkgl.Scene:
+    """A box passes the camera: 32 x 24 px, two labels at 20 Hz."""
+    path = blinkgl.Keyframes({0: blinkgl.look_at((-2, -0.3, 0.8), (0, 0, 0)), 0.2: blinkgl.look_at((-2, 0.3, 0.8), (0, 0, 0))})
+    settings = {"duration": 0.1, "label_rate": 20, "seed": 3, **more}
+    return blinkgl.Scene(blinkgl.Camera(32, 24, pose=path), **settings) + blinkgl.Primitive("cuboid", material=blinkgl.Material(procedural="bricks", seed=2))
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+def test_import_brings_nothing_with_it():
+    code = "import sys, blinkgl; blinkgl.__version__; dir(blinkgl); print([m for m in sys.modules if m.startswith('blinkgl.') or m in ('numpy', 'numba', 'moderngl', 'pydantic')])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+
+
+def test_table_list_and_type_checker_agree():
+    assert sorted(blinkgl._HOME) == sorted(blinkgl.__all__) and 30 <= len(blinkgl.__all__) <= 40
+    typed = re.findall(r"^    from (\S+) import (.+)$", (REPOSITORY / "blinkgl/__init__.py").read_text(), re.M)
+    assert {name: module for module, names in typed for name in names.split(", ")} == blinkgl._HOME
+    assert set(blinkgl.__all__) <= set(dir(blinkgl))
+    with pytest.raises(AttributeError, match="no_such_name"):
+        blinkgl.no_such_name  # noqa: B018
+
+
+@pytest.mark.parametrize("name", sorted(blinkgl._HOME))
+def test_every_name_exists_and_says_what_it_takes(name):
+    value = getattr(blinkgl, name)
+    text = inspect.getdoc(value)
+    assert text and len(text) > 20
+    for place in [value, *(vars(value).values() if inspect.isclass(value) and value.__module__.startswith("blinkgl.front") else ())]:
+        if not inspect.isfunction(place) or place.__name__.startswith("_") and place.__name__ != "__init__":
+            continue
+        signature = inspect.signature(place)
+        bare = [p for p in signature.parameters.values() if p.annotation is p.empty and p.name != "self"]
+        assert not bare, f"{name}.{place.__name__}: {bare} without annotation"
+        if place.__name__ != "__init__":
+            assert signature.return_annotation is not signature.empty, f"{name}.{place.__name__} returns what?"
+            assert inspect.getdoc(place), f"{name}.{place.__name__} has no docstring"
+        if "ndarray" in str(signature) + str(signature.return_annotation):
+            said = (inspect.getdoc(place) or "") + text
+            assert re.search(r"\((?:[A-Z]|3|h)\b[^)]*\)", said), f"{name}.{place.__name__}: arrays without a shape"
+            assert re.search(r"\b(px|m|µs|ns|s|sRGB|linear)\b", said), f"{name}.{place.__name__}: arrays without a unit"
+
+
+def test_pages_use_no_other_path():
+    """Whoever reads a page finds `from blinkgl import name`, never the room the name lives in."""
+    wrong = []
+    for page in [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "examples").glob("*")]:
+        if page.suffix not in (".md", ".py", ".ipynb"):
+            continue
+        for module, names in re.findall(r"from (blinkgl\.[\w.]+) import ([\w, ]+)", page.read_text(encoding="utf-8")):
+            wrong += [f"{page.name}: from {module} import {name}" for name in names.replace(" ", "").split(",") if name in blinkgl._HOME]
+        wrong += [f"{page.name}: {found}" for found in re.findall(r"blinkgl\.front\.\w+", page.read_text(encoding="utf-8")) if page.name != "architecture.md"]
+    assert wrong == []
+
+
+def test_nothing_shadows_a_room():
+    """A name that is also a sub-package would change its meaning when something imports that."""
+    rooms = {p.stem for p in (REPOSITORY / "blinkgl").iterdir() if p.is_dir() or p.suffix == ".py"}
+    assert rooms & set(blinkgl.__all__) == set()
+
+
+# --- scenes -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_scene_in_python_is_the_scene_of_its_yaml():
+    scene = box_scene(background=0.4) + blinkgl.Primitive("sphere", radius=0.2, pose=blinkgl.Pose((0, 1, 0), euler=(0, 0, 30)), scale=2.0)
+    template = scene.template()
+    template = RunTemplate(yaml.safe_load(yaml.safe_dump(template.tree)), template.base)
+    config = template.sequence(0)
+    ours = scene.build(config)
+    theirs = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns)
+    assert [o.name for o in ours.objects] == [o.name for o in theirs.objects] == ["cuboid", "sphere"]
+    for a, b in zip(ours.objects, theirs.objects):
+        assert np.array_equal(a.parts[0].mesh.vertices, b.parts[0].mesh.vertices) and np.array_equal(a.path.pose(0), b.path.pose(0))
+        assert a.parts[0].material.texture is b.parts[0].material.texture is None or np.array_equal(a.parts[0].material.texture.image, b.parts[0].material.texture.image)
+    assert np.array_equal(ours.camera.K, theirs.camera.K) and ours.light == theirs.light and ours.background == 0.4
+
+
+def test_record_is_what_generate_writes(tmp_path):
+    scene = box_scene()
+    labels = ("images", "flow", "flow_backward", "occlusion", "depth")
+    recording = blinkgl.record(scene, emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels)
+    outcome = blinkgl.generate(scene, tmp_path / "out", emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels)
+    assert outcome.made.events == len(recording.events) > 100
+    folder = tmp_path / "out/train/sequence_000000"
+    with DsecEventReader(folder / "events.h5") as file:
+        written = file.slice(0, 10**6)
+    for column in "xytp":
+        assert np.array_equal(getattr(written, column), getattr(recording.events, column))
+    for k in range(2):
+        flow, valid = blinkgl.read_flow(folder / f"flow/forward/{k:06d}.png")
+        assert np.array_equal(valid, recording.valid[k]) and np.abs(flow - recording.flow[k]).max() <= 1 / 256
+        assert np.array_equal(np.load(folder / f"depth/{k:06d}.npy"), recording.labels[k].depth)
+        import cv2
+        assert np.array_equal(cv2.imread(str(folder / f"images/{k:06d}.png"))[..., ::-1], recording.images[k])
+    assert recording.t_us.tolist() == [50_000, 100_000] and recording.image_t_us.tolist() == [50_000, 100_000, 150_000]
+    assert len(recording.window(0)) == np.count_nonzero((written.t >= 50_000) & (written.t < 100_000))
+    assert blinkgl.verify(tmp_path / "out").clean
+
+
+def test_record_of_a_yaml_is_what_generate_writes(tmp_path):
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump({"seed": 5, "camera": {"width": 32, "height": 24}, "time": {"duration": 0.1, "label_rate": 20},
+                                    "scene": {"kind": "random", "objects": {"count": 2}, "pool": {"urdfs": False}, "textures": {"photographs": False}},
+                                    "preview": {"enabled": False}}))
+    run = blinkgl.load(path, ["output.sequences=2"])
+    recording = blinkgl.record(run, index=1)
+    run_dataset(run, tmp_path / "out")
+    assert len(blinkgl.read_events(tmp_path / "out/train/sequence_000001/events.h5")) == len(recording.events) > 0
+
+
+def test_arrays_as_mesh_and_image():
+    image = np.zeros((8, 8, 3), np.uint8)
+    image[:, 4:] = 255
+    square = dict(vertices=[[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]], faces=[[0, 2, 1], [0, 3, 2]], uvs=[[0, 1], [1, 1], [1, 0], [0, 0]])
+    camera = blinkgl.Camera(32, 32, fov=53.13, pose=(-2, 0, 0))
+    scene = blinkgl.Scene(camera, light=blinkgl.Light(unlit=True), background=0.5) + blinkgl.Mesh(**square, material=blinkgl.Material(image, double_sided=True))
+    frame = blinkgl.render_frame(scene, 0.0, ["images", "depth", "ids"])
+    # The camera looks along +x, so that +y, where u is 1, is on its left.
+    assert np.allclose(frame.depth[8:24, 8:24], 2, atol=1e-4) and (frame.ids[8:24, 8:24] == 1).all()
+    assert frame.colour[16, 6].max() > 0.9 and frame.colour[16, 26].max() < 0.1
+    assert not scene.on_disk
+    with pytest.raises(blinkgl.ConfigError, match="^source: the scene holds arrays"):
+        blinkgl.generate(scene, "nowhere")
+
+
+def test_renderer_draws_what_record_records():
+    scene = box_scene()
+    recording = blinkgl.record(scene, labels=("images", "flow", "ids"))
+    with blinkgl.Renderer(scene) as renderer:
+        assert np.array_equal(renderer.image(0.05), recording.images[0])
+        frame = renderer.frame(0.05, ["flow", "ids"])
+        assert np.array_equal(frame.forward.flow, recording.flow[0]) and np.array_equal(frame.ids, recording.labels[0].ids)
+        half = renderer.frame(0.05, ["flow"], to=0.075)
+        assert np.median(half.forward.flow[..., 0][half.forward.valid]) == pytest.approx(np.median(recording.flow[0][..., 0][recording.valid[0]]) / 2, rel=0.1)
+        emulator = blinkgl.Esim(24, 32, contrast_threshold=0.2)
+        assert len(emulator.step(renderer.luminance(0.0), 0)) == 0 < len(emulator.step(renderer.luminance(0.1), 10**8))
+
+
+def test_emulators_take_a_sensor():
+    assert blinkgl.V2e(4, 4, sensor="davis346").config.refractory_us == blinkgl.load_sensor("davis346").refractory_us
+    assert blinkgl.Esim(4, 4, sensor="davis346", contrast_threshold=0.5).config.contrast_threshold == 0.5
+    assert blinkgl.DvsVoltmeter(4, 4, preset="DVS240").config.k1 == pytest.approx(4.424)
+
+
+# --- wrong calls ------------------------------------------------------------------------------------------------------
+
+b, C, P, S, K, M = blinkgl, blinkgl.Camera, blinkgl.Primitive, blinkgl.Scene, blinkgl.Keyframes, blinkgl.Material
+triangle = dict(vertices=[[0, 0, 0], [1, 0, 0], [0, 1, 0]], faces=[[0, 1, 2]])
+events = blinkgl.Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.zeros(1, np.int64), np.zeros(1, np.uint8))
+grey = np.zeros((4, 4), np.uint8)
+WRONG = [
+    ("Camera.width", lambda d: C("wide")),
+    ("Camera.width", lambda d: C(0)),
+    ("Camera.fov", lambda d: C(32, 24, fov=200)),
+    ("Camera", lambda d: C(32, 24, fov=60, focal=100)),
+    ("Camera.pose", lambda d: C(pose=3)),
+    ("Pose.position", lambda d: b.Pose((1, 2))),
+    ("Pose.position.1", lambda d: C(pose=(1, float("nan"), 2))),
+    ("Pose", lambda d: b.Pose(euler=(0, 0, 1), look_at=(1, 0, 0))),
+    ("Pose.look_at", lambda d: b.look_at((1, 1, 1), (1, 1, 1))),
+    ("Pose.quaternion", lambda d: b.Pose(quaternion="x")),
+    ("Keyframes.poses", lambda d: K({})),
+    ("Keyframes.poses", lambda d: K({0: b.Pose()})),
+    ("Keyframes.poses[1]", lambda d: K({0: b.Pose(), 1: (0, 0, 1)})),
+    ("Keyframes.poses", lambda d: K({"now": b.Pose(), "then": b.Pose()})),
+    ("Keyframes.interpolation", lambda d: K({0: b.Pose(), 1: b.Pose((1, 0, 0))}, "cubic")),
+    ("Primitive.kind", lambda d: P("teapot")),
+    ("Primitive.kind", lambda d: P(None)),
+    ("Primitive.colour", lambda d: P("cuboid", colour="red")),
+    ("Primitive.radius", lambda d: P("sphere", radius=-1)),
+    ("Primitive.material", lambda d: P("cuboid", material="red")),
+    ("Primitive.scale", lambda d: P("cuboid", scale=0)),
+    ("Primitive.category", lambda d: P("cuboid", category="thing")),
+    ("Mesh.file", lambda d: b.Mesh()),
+    ("Mesh.faces", lambda d: b.Mesh(vertices=triangle["vertices"], faces=[[0, 1, 7]])),
+    ("Mesh.vertices", lambda d: b.Mesh(vertices=[[0, 1], [2]], faces=[[0, 1, 2]])),
+    ("Mesh.uvs", lambda d: b.Mesh(**triangle, uvs=[[0, 0]])),
+    ("scene.meshes.mesh0.file", lambda d: b.record(S() + b.Mesh(d / "none.obj"))),
+    ("Material.image", lambda d: M(np.zeros((4, 4)))),
+    ("Material.image", lambda d: M(np.full((4, 4, 3), -1.0))),
+    ("Material.color", lambda d: M(color="red")),
+    ("Material", lambda d: M("a.png", procedural="bricks")),
+    ("Light.elevation", lambda d: b.Light(elevation=100)),
+    ("Scene.camera", lambda d: S("camera")),
+    ("Scene.objects[0]", lambda d: S(objects=["box"])),
+    ("Scene.duration", lambda d: S(duration=-1)),
+    ("Scene.label_rate", lambda d: S(label_rate="often")),
+    ("Scene.seed", lambda d: S(seed=-1)),
+    ("labels", lambda d: b.record(box_scene(), labels=[["flow"]])),
+    ("Scene.background", lambda d: S(background="x") + P("cuboid")),
+    ("Scene + …", lambda d: S() + 3),
+    ("Scene.objects", lambda d: b.record(S())),
+    ("Timeline.max_px", lambda d: b.Timeline("displacement", max_px=-1)),
+    ("Timeline.kind", lambda d: b.Timeline("sometimes")),
+    ("source", lambda d: b.record("demo.yaml")),
+    ("labels", lambda d: b.record(box_scene(), labels=["depht"])),
+    ("labels", lambda d: b.render_frame(box_scene(), 0, "depth")),
+    ("t", lambda d: b.render_frame(box_scene(), "soon")),
+    ("index", lambda d: b.record(box_scene(), index=-1)),
+    ("emulator", lambda d: b.record(box_scene(), emulator="dvs")),
+    ("emulator", lambda d: b.record(box_scene(), emulator=3)),
+    ("esim.contrast_threshold", lambda d: b.record(box_scene(), emulator={"emulator": "esim", "contrast_threshold": "low"})),
+    ("sensor", lambda d: b.record(box_scene(), sensor="eye")),
+    ("quality", lambda d: b.record(box_scene(), quality="best")),
+    ("timeline", lambda d: b.record(box_scene(), timeline="uniform")),
+    ("num", lambda d: b.generate(box_scene(), d / "out", num=0)),
+    ("workers", lambda d: b.generate(box_scene(), d / "out", workers="two")),
+    ("out", lambda d: b.generate(box_scene(), None)),
+    ("height", lambda d: b.Esim(0, 10)),
+    ("width", lambda d: b.V2e(10, 10.5)),
+    ("esim.contrast_treshold", lambda d: b.Esim(4, 4, contrast_treshold=0.2)),
+    ("seed", lambda d: b.DvsVoltmeter(4, 4, seed=-1)),
+    ("frame 0", lambda d: b.Esim(4, 4).step([["a"] * 4] * 4, 0)),
+    ("frame 0", lambda d: b.Esim(4, 4).step(np.zeros((4, 5), np.float32), 0)),
+    ("frame 0", lambda d: b.Esim(4, 4).step(np.zeros((4, 4), np.float32), "now")),
+    ("sensor", lambda d: b.load_sensor(3)),
+    ("Events.x", lambda d: b.Events([1], events.y, events.t, events.p)),
+    ("frames", lambda d: b.simulate(5)),
+    ("fps", lambda d: b.simulate([grey], fps="fast")),
+    ("factor", lambda d: b.simulate([grey], fps=10, interpolate="cubic", factor=0)),
+    ("frames[1]", lambda d: list(b.simulate([grey, ["a", [1]]], fps=10))),
+    ("frames[0]", lambda d: list(b.simulate([(grey, "noon"), (grey, "one")]))),
+    ("gamma", lambda d: b.simulate([grey], fps=10, gamma=[])),
+    ("interpolate", lambda d: b.simulate([grey], fps=10, interpolate=["linear"])),
+    ("source", lambda d: b.simulate_file(None, d / "a.h5")),
+    ("{d}/none.mp4", lambda d: b.simulate_file(d / "none.mp4", d / "a.h5")),
+    ("path", lambda d: b.read_events(3)),
+    ("{d}/none.h5", lambda d: b.read_events(d / "none.h5")),
+    ("events", lambda d: b.write_events(d / "a.npz", [1, 2], 4, 4)),
+    ("events", lambda d: b.write_events(d / "a.npz", None, 4, 4)),
+    ("height", lambda d: b.write_events(d / "a.npz", events, "4", 4)),
+    ("{d}/a.xyz", lambda d: b.write_events(d / "a.xyz", events, 4, 4)),
+    ("size", lambda d: b.convert(d / "a.h5", d / "b.h5", size=3)),
+    ("{d}/a.gif", lambda d: b.read_flow(d / "a.gif")),
+    ("flow", lambda d: b.write_flow(d / "a.flo", np.zeros((4, 4)))),
+    ("valid", lambda d: b.write_flow(d / "a.flo", np.zeros((4, 4, 2)), np.zeros((3, 3), bool))),
+    ("interval_ms", lambda d: b.compare(d / "a.h5", interval_ms=0)),
+    ("a", lambda d: b.compare(None)),
+    ("path", lambda d: b.load(None)),
+    ("overrides", lambda d: b.load(d / "a.yaml", "camera.width=3")),
+    ("seed", lambda d: b.load(d / "a.yaml", seed="x")),
+    ("{d}/none", lambda d: b.verify(d / "none")),
+    ("deep", lambda d: b.verify(d, deep=-1)),
+]
+
+
+@pytest.mark.parametrize("where, call", WRONG, ids=[f"{k}-{where}" for k, (where, _) in enumerate(WRONG)])
+def test_wrong_calls_name_the_argument(where, call, tmp_path):
+    with pytest.raises(BlinkGLError) as caught:
+        call(tmp_path)
+    line = str(caught.value)
+    assert line.startswith(where.format(d=tmp_path) + ": ") and "\n" not in line, line
+    assert len(line) < 400 and "pydantic" not in line
+    assert [p for p in tmp_path.iterdir()] == [], "half-written"

@@ -1,0 +1,97 @@
+"""Writes docs/examples.md: every script of examples/ with what it printed, and the pictures it made.
+
+    python -m blinkgl.tools.example_docs
+
+A test runs the examples and fails when the page shows another program, or another output apart from numbers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import json
+import re
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+from PIL import Image
+
+ROOT = Path("examples")
+PAGE = Path("docs/examples.md")
+PICTURES = {
+    "scene_in_python": ("scene.png", "example_scene.png", "a checked ball, a red ring and a box with a photograph on a brick floor"),
+    "frame_with_labels": ("labels.png", "example_labels.png", "image, depth, instance ids and flow of one frame"),
+    "events_over_frame": ("events.png", "example_events.png", "a frame, and the events that follow it drawn over it"),
+    "event_tensors": ("tensors.png", "example_tensors.png", "a time surface and the five bins of a voxel grid"),
+}
+"""Of an example: the picture it makes, its name in docs/images, and what it shows."""
+ORDER = ("scene_in_python", "frame_with_labels", "own_trajectory", "video_to_events", "events_over_frame", "event_tensors", "dataset_from_yaml",
+         "torch_dataloader", "compare_recordings", "convert_formats", "sensors")
+
+HEADER = """# Examples
+
+Each is a program of its own in `examples/`, does one thing, and ends with a check (`test_final`) that the tests run. Copy one and change it:
+
+```
+.venv/bin/python examples/scene_in_python.py        # writes below out/examples/
+```
+
+This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit. [demo.ipynb](../examples/demo.ipynb) is a notebook that
+walks through the demo. All names come from `import blinkgl`; what they take is in their docstrings (`help(blinkgl.Scene)`).
+"""
+
+
+def load(name: str, root: Path = ROOT) -> ModuleType:
+    """The example as a module."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", root / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def run(name: str, out: Path, root: Path = ROOT) -> str:
+    """Runs an example and its check; returns what it printed."""
+    module = load(name, root)
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        module.main(out)
+    module.test_final(out)
+    return printed.getvalue()
+
+
+def cells(notebook: Path) -> list[str]:
+    """The code cells of a notebook, in order."""
+    return ["".join(cell["source"]) for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+
+
+def section(name: str, output: str, root: Path = ROOT) -> str:
+    """The example's part of the page."""
+    source = (root / f"{name}.py").read_text(encoding="utf-8")
+    title = re.match(r'"""(.*?)"""', source, re.S)[1].strip()
+    body = source.partition('"""\n\n')[2].partition("\n\nif __name__")[0].rstrip()
+    picture = f"\n![{PICTURES[name][2]}](images/{PICTURES[name][1]})\n" if name in PICTURES else ""
+    return f"## {name}\n\n{title}\n\n```python\n{body}\n```\n\nIt prints:\n\n```\n{output.rstrip()}\n```\n{picture}"
+
+
+def without_numbers(text: str) -> str:
+    """Text in which numbers, and the spaces that line them up, do not count: they may differ between machines."""
+    return re.sub(r"[ \t]+", " ", re.sub(r"[-+−]?\d[\d,.]*", "#", text)).strip()
+
+
+def main() -> int:
+    parts = [HEADER]
+    with tempfile.TemporaryDirectory() as folder:
+        for name in ORDER:
+            out = Path(folder) / name
+            parts.append(section(name, run(name, out)))
+            if name in PICTURES:
+                with Image.open(out / PICTURES[name][0]) as picture:  # 256 colours: half the bytes, and nobody sees it
+                    picture.convert("RGB").quantize(256).save(PAGE.parent / "images" / PICTURES[name][1], optimize=True)
+    PAGE.write_text("\n".join(parts), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -66,7 +66,7 @@ setup: .venv/.installed-dev opengl
 	@touch $@
 
 # Once per machine instead of in somebody's first run; where it fails, the first run compiles.
-.venv/.kernels: .venv/.installed-core $(wildcard blinkgl/events/*.py)
+.venv/.kernels: .venv/.installed-core $(wildcard blinkgl/events/*.py) | opengl
 	-@.venv/bin/python -m blinkgl.compiling
 	@touch $@
 

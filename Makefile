@@ -75,5 +75,5 @@ opengl: .venv/.installed-core
 	@tools/setup.sh opengl
 
 clean:
-	rm -rf build dist *.egg-info .pytest_cache .hypothesis
+	rm -rf build dist *.egg-info .pytest_cache .hypothesis .venv/.kernels
 	find blinkgl eflow shaders configs tools tests -name __pycache__ -type d -prune -exec rm -rf {} +

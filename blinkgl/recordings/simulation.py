@@ -172,8 +172,9 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
 
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us if kind == "dsec" else 0, overwrite=overwrite))
-        on_frame = None
-        if preview is not None:
+        if preview is None:
+            on_frame = None
+        else:
             rate = min(1e9 / gap_ns, 100.0)
             video = stack.enter_context(PreviewWriter(stack.enter_context(atomic_file(preview, overwrite=overwrite)), height, width,
                                                       t0_us=start_us, flow=False, rate_hz=rate, fps=min(rate, 25.0)))

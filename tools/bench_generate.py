@@ -29,8 +29,7 @@ from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.report import Totals
-from blinkgl.show.generate import STAGES, summary
+from blinkgl.dataset.report import STAGES, Totals
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
 from blinkgl.render.renderer import LabelRequest, Renderer
@@ -127,7 +126,7 @@ def sequence(name: str, quick: bool) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         list(generate_run(load_run(path, ["time.duration=0.1"]), f"{folder}/warm", 1))
         report = list(generate_run(load_run(path, overrides), f"{folder}/timed", 1))[0]
-    return {"config": name, "triangles": report.triangles, **summary(Totals().add(report))}
+    return {"config": name, "triangles": report.triangles, **Totals().add(report).summary()}
 
 
 def peer(gl, quick: bool) -> dict:

@@ -31,7 +31,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl import bench
+from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import BlinkGLError

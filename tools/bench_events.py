@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from skimage import data
 
-from blinkgl import bench
+from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import make_emulator
 

@@ -21,7 +21,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl import bench
+from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.events import Events, make_emulator

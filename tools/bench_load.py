@@ -26,7 +26,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl import bench
+from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import make_emulator
 from blinkgl.tools.bench_events import FPS, HEIGHT, WIDTH, clip

@@ -21,7 +21,7 @@ import trimesh
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl import bench
+from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate

@@ -20,7 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.bench import machine_line
+from blinkgl.machine.bench import machine_line
 from blinkgl.config.sequence import RunTemplate, load_run
 from blinkgl.dataset.executor import Local
 from blinkgl.dataset.run import run_dataset

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from blinkgl.bench import machine_line
+from blinkgl.machine.bench import machine_line
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.errors import ConfigError

@@ -19,7 +19,7 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.work import report_of
-from blinkgl.explain import explain
+from blinkgl.dataset.explain import explain
 from features import (ELSEWHERE, FEATURES, REFUSED, RUN_LEVEL, all_pairs, configuration, covering_rows, fits, merged, options_of_the_schema,
                       options_of_the_table, pairs)
 

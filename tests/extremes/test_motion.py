@@ -16,7 +16,7 @@ from tests.render.render_scenes import LEVEL, SECOND, camera, cube, curve, drift
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
-from blinkgl.scene.paths import KeyframePath
+from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.timeline import displacement_times, uniform_times
 
 MS = 1_000_000

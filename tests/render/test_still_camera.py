@@ -11,7 +11,7 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Esim
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.still import Rectangle, merged, screen_rectangle
-from blinkgl.scene.paths import KeyframePath
+from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.scene.types import Camera, Part, SceneObject
 from blinkgl.tools import bench_still
 

@@ -24,7 +24,7 @@ from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
 from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
-from blinkgl.trade.show import show
+from blinkgl.show.trade import show
 
 CONFIG = {
     "seed": 3, "camera": {"width": 64, "height": 48}, "time": {"duration": 0.1, "label_rate": 20},

@@ -20,6 +20,21 @@ class LabelRequest:
         asked = {label_of(name).name for name in names}
         self.names = tuple(name for name in LABELS if name in asked)
 
+    @property
+    def buffers(self) -> tuple[str, ...]:
+        """Labels whose shader outputs have to be drawn for it, in the order of the table."""
+        drawn = {other for name in self.names for other in (name, *LABELS[name].needs)}
+        return tuple(name for name, label in LABELS.items() if name in drawn and label.buffer)
+
+    @property
+    def there(self) -> tuple[str, ...]:
+        """Labels whose shader outputs have to be drawn at the other times."""
+        drawn = {other for name in self.names for other in LABELS[name].there}
+        return tuple(name for name in LABELS if name in drawn)
+
+    def without(self, *names: str) -> LabelRequest:
+        return LabelRequest(*(name for name in self.names if name not in names))
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.names)
 

@@ -7,7 +7,7 @@ files, the reference. docs/extending.md has the whole of one; :func:`blinkgl.lab
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -39,6 +39,7 @@ class Buffer(NamedTuple):
 BUFFERS = {"R32F": Buffer("float", 1, np.dtype(np.float32)), "RG32F": Buffer("vec2", 2, np.dtype(np.float32)),
            "RGBA32F": Buffer("vec4", 4, np.dtype(np.float32)), "R32UI": Buffer("uint", 1, np.dtype(np.uint32))}
 VARYINGS = ("local", "normal")
+_NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
 KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
 
 
@@ -164,6 +165,10 @@ class Label:
     judged_in: str = ""
     error = staticmethod(grading.absolute)
 
+    @property
+    def heading(self) -> str:
+        return self.title or self.name
+
     # ---- configuration -------------------------------------------------------------------------------------------
 
     @property
@@ -199,10 +204,11 @@ class Label:
         """A copy of a value. Raises TypeError for one of another shape or kind of number."""
         array = np.array(value)
         shapes = [(height, width), (height, width, 3)] if self.channels is None else [(height, width, self.channels) if self.channels else (height, width)]
-        if array.shape not in shapes or (self.dtype is not None and not np.can_cast(array.dtype, self.dtype, "same_kind")):
-            kind = "" if self.dtype is None else f" {np.dtype(self.dtype)}"
-            raise TypeError(f"label '{self.name}': {array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{kind}")
-        return array if self.dtype is None else array.astype(self.dtype, copy=False)
+        kind = "" if self.dtype is None else np.dtype(self.dtype).kind
+        if array.shape not in shapes or kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]:
+            said = f" {np.dtype(self.dtype)}" if kind else ""
+            raise TypeError(f"label '{self.name}': {array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{said}")
+        return array.astype(self.dtype, copy=False) if kind == "f" else array
 
     # ---- files ---------------------------------------------------------------------------------------------------
 
@@ -231,5 +237,5 @@ class Label:
     @property
     def views(self) -> tuple[View, ...]:
         """What the shader debugger shows and judges."""
-        return (View(self.name, self.title or self.name, self.unit, self.kind, lambda value: value, self.reference, self.judged_in or self.unit,
+        return (View(self.name, self.heading, self.unit, self.kind, lambda value: value, self.reference, self.judged_in or self.unit,
                      self.tolerance, self.error),)

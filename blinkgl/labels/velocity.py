@@ -12,7 +12,7 @@ class Velocity(Label):
     """(H, W, 2) float32 px/s at the label's time; 0 where nothing is hit."""
 
     name, about = "velocity", "instantaneous image velocity, px/s, float32 .npy"
-    unit, kind = "px/s", "motion"
+    title, unit, kind = "velocity label", "px/s", "motion"
     buffer, varyings, channels = "RG32F", ("local",), 2
     judged_in, tolerance, error = "px per label interval", 1e-2, staticmethod(grading.motion_per_interval)
 

@@ -30,7 +30,6 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
     if sensor is None:
         return {"emulator": data, "readout": None}
     from blinkgl.config.sensor import load_sensor
-
     from blinkgl.simulation import emulator_config
 
     camera = load_sensor(sensor)
@@ -54,7 +53,7 @@ def simulate(source: str, target: str, quiet: bool = False, **options) -> None:
 
         report = simulate_file(source, target, progress=progress, **options)
     rate = report.events / report.duration_s if report.duration_s else 0.0
-    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
+    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)
     say(f"{target}: {report.events:,} events in {report.duration_s:.6g} s ({rate / 1e6:.3g} M/s, "
         f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator steps")
     if report.displacement is not None:

@@ -22,6 +22,7 @@ from blinkgl.cpu import bf16_instructions
 from blinkgl.errors import BlinkGLError
 from blinkgl.extras import EXTRAS, install, python
 
+
 @dataclass(frozen=True)
 class Check:
     """One line. status: "ok", "missing" (required), "absent" (optional) or "info"."""

@@ -31,7 +31,7 @@ class TrainProgress:
         self._where = where
         self._console = plain_console(file=sys.stderr)
 
-    def __enter__(self) -> "TrainProgress":
+    def __enter__(self) -> TrainProgress:
         self._live = None
         if self.enabled:
             limit = "" if self._deadline is None else f", {_hms(self._deadline - self._clock())} at most"

@@ -8,8 +8,7 @@ import sys
 import pytest
 
 from blinkgl import cli, doctor
-from blinkgl.gl import context as context_module
-from blinkgl.gl import osmesa
+from blinkgl.gl import context as context_module, osmesa
 
 
 @pytest.fixture(scope="module")

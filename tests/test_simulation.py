@@ -18,9 +18,9 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
-from blinkgl.srgb import DECODE_8BIT
 from blinkgl.io.video import VideoReader, VideoWriter
 from blinkgl.simulation import Decoder, SimulationReport, simulate, simulate_file
+from blinkgl.srgb import DECODE_8BIT
 from tests.shared_data import shared
 
 H, W = 30, 40
@@ -70,8 +70,8 @@ def test_input_types_agree():
 
 def test_luminance_of_colour_and_gamma():
     codes = np.random.default_rng(0).integers(0, 256, (5, 6, 3)).astype(np.uint8)
-    exact = lambda curve: curve(codes / 255.0) @ np.array([0.2126, 0.7152, 0.0722])  # noqa: E731
-    srgb = lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)  # noqa: E731
+    exact = lambda curve: curve(codes / 255.0) @ np.array([0.2126, 0.7152, 0.0722])
+    srgb = lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
     assert np.allclose(Decoder(None)(codes, ""), exact(srgb), atol=1e-6)
     assert np.allclose(Decoder("linear")(codes, ""), exact(lambda x: x), atol=1e-6)
     assert np.allclose(Decoder(2.2)(codes, ""), exact(lambda x: x**2.2), atol=1e-6)

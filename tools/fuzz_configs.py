@@ -139,7 +139,7 @@ class Maker:
         return made
 
     def _drawn(self, name: str, annotation: Any, metadata: Any, made: Any) -> Any:
-        again = lambda: self._plain(name, self.rng.choice(members(annotation)), [*metadata, *_metadata(annotation)])  # noqa: E731
+        again = lambda: self._plain(name, self.rng.choice(members(annotation)), [*metadata, *_metadata(annotation)])
         other = again()
         if isinstance(made, int) and isinstance(other, int) and not isinstance(made, bool):
             return {"integer": sorted((made, other))}
@@ -295,12 +295,12 @@ def _shrink(rng: random.Random, tree: dict[str, Any]) -> None:
                 tree["camera"].pop(key, None)
     for path, value in SMALL.items():
         top = path.split(".")[0]
-        if "." not in path or top == "camera" or isinstance(tree.get(top), dict) and not _has_distribution(tree[top]):
+        if "." not in path or top == "camera" or (isinstance(tree.get(top), dict) and not _has_distribution(tree[top])):
             _put(tree, path, value(rng) if callable(value) else value)
         elif top in tree:
             del tree[top]
     timeline = tree.get("timeline")
-    if not isinstance(timeline, dict) or _has_distribution({"x": timeline.get("kind")}) or len(timeline) == 1 and _has_distribution(timeline):
+    if not isinstance(timeline, dict) or _has_distribution({"x": timeline.get("kind")}) or (len(timeline) == 1 and _has_distribution(timeline)):
         timeline = tree["timeline"] = {"kind": rng.choice(["uniform", "displacement", "brightness"])}
     quality = tree.get("quality") is not None
     for key, value in SMALL_TIMELINE["uniform" if timeline.get("kind", "displacement") == "uniform" else None].items():

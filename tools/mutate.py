@@ -70,7 +70,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        shorten = lambda text: " ".join(text.split())[:60]  # noqa: E731
+        shorten = lambda text: " ".join(text.split())[:60]
         return f"{self.path}:{self.line}:{self.column}: {shorten(self.before)} -> {shorten(self.after) or '(nothing)'}"
 
     def apply(self, source: str) -> str:
@@ -146,7 +146,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_BinOp(self, node) -> None:
         symbol = ARITHMETIC.get(type(node.op))
-        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))  # noqa: E731
+        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
         if symbol and not literal(node.left) and not literal(node.right):
             self.between(node.left, node.right, symbol, "arithmetic")
         self.generic_visit(node)
@@ -166,7 +166,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node) -> None:
-        start, end = self.span(node)
+        start, _end = self.span(node)
         inner = self.span(node.operand)[0]
         if isinstance(node.op, (ast.Not, ast.USub)):
             self.add(start, inner, "", "negation left out")
@@ -200,7 +200,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_Attribute(self, node) -> None:
         if node.attr in NAMES:
-            start, end = self.span(node)
+            _start, end = self.span(node)
             self.add(end - len(node.attr), end, NAMES[node.attr], "function")
         self.visit(node.value)
 

@@ -133,7 +133,7 @@ def _run(scene: Scene, times_ns, near, repeat: int) -> dict[str, np.ndarray]:
 
 
 def _main(job_path: str, answer_path: str) -> None:
-    np.infty = np.inf
+    np.inf = np.inf
     import pyrender
 
     with np.load(job_path, allow_pickle=False) as stored:

@@ -12,7 +12,7 @@ _MOST_LINES = 20
 def verify_and_show(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -> bool:
     """:func:`~blinkgl.dataset.verify.verify_dataset` in words; True when nothing was found."""
     console = plain_console()
-    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
+    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)
     with console.status("looking") as status:
         result = verify_dataset(folder, deep=deep, seed=seed, base=base, progress=lambda number, name: status.update(f"{number}: {name}"))
     for name, lines in sorted(result.problems.items()):

@@ -263,7 +263,7 @@ def _work(job: dict[str, Any], task: int, attempt: int, expected: tuple[dict[str
                 return {"kind": "refused", "error": f"node {socket.gethostname()} sees other meshes or textures"}
     except BlinkGLError as error:
         return {"kind": "refused", "error": str(error)}
-    return _maker.make(task, attempt, lambda message: board.put.remote(message))
+    return _maker.make(task, attempt, board.put.remote)
 
 
 def _failure(task: int, error: str, lost: bool = False) -> Message:

@@ -170,7 +170,7 @@ class Local:
         self._selector.register(process.channel, selectors.EVENT_READ, process)
         process.send({"job": self._job.to_dict(), "device": device})
 
-    def _bury(self, process: "_Process") -> list[Message]:
+    def _bury(self, process: _Process) -> list[Message]:
         """The process ended by itself: its task failed, and another takes its place."""
         self._selector.unregister(process.channel)
         self._processes.remove(process)

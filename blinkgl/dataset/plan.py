@@ -112,7 +112,7 @@ class Plan:
     """How many sequences of each group that has any."""
 
     @classmethod
-    def of(cls, template: RunTemplate, num: int | None = None) -> "Plan":
+    def of(cls, template: RunTemplate, num: int | None = None) -> Plan:
         """``num``: at most so many of each group (a configuration without groups: exactly so many).
 
         Raises ConfigError: any bad value of the recipe, or every group switched off."""

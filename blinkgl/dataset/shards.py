@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.io.index import sequence_folders
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.index import sequence_folders
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
 from blinkgl.terminal import plain_console
 

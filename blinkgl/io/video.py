@@ -99,7 +99,7 @@ class VideoReader:
             probe = imageio_ffmpeg.read_frames(os.fspath(path))
             meta = next(probe)
             probe.close()
-        except Exception as error:  # noqa: BLE001 - it raises IOError, RuntimeError, IndexError, StopIteration …
+        except Exception as error:  # IOError, RuntimeError, IndexError, StopIteration …
             raise AssetError(f"cannot read video: {_gist(str(error))}", where=str(path)) from error
         self.width, self.height = meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]  # ffmpeg turns frames upright
         self.fps = float(meta.get("fps") or 0)

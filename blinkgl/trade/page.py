@@ -67,7 +67,7 @@ def _all(result: dict) -> str:
             "extra", "events, relative", "voxel grid", "flow px, median", "max")
     body = []
     for r in sorted(result["settings"], key=lambda r: (r["size"], r[result["cost"]])):
-        percent = lambda v: "–" if v is None else f"{100 * v:.1f} %"  # noqa: E731
+        percent = lambda v: "–" if v is None else f"{100 * v:.1f} %"
         cells = [escape(r["name"]), f"{r['wall_s']:.2f}", f"{r['cpu_s']:.2f}", f"{r['frames_per_s']:.0f}", f"{r['triangles']:,.0f}", f"{r['time_median_us']:.0f}",
                  f"{r['time_p95_us']:.0f}", f"{r['shift_median_px']:.3f}", f"{r['shift_p95_px']:.3f}", percent(r["missed"]), percent(r["extra"]),
                  f"{100 * r['count']:+.1f} %", percent(r["voxel"]), f"{r['flow_median_px']:.1e}", f"{r['flow_max_px']:.1e}"]

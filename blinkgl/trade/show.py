@@ -34,7 +34,7 @@ def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, 
     if minutes is not None:
         changes |= {"rounds_s": minutes * 30, "reference_s": minutes * 30}
     console = plain_console()
-    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
+    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)
     result = trade(template, quick=quick, only=only, skip=skip, options=replace(options, **changes), cost=f"{cost}_s", say=say)
     show(result, console)
     paths = write(result, out)
@@ -57,7 +57,7 @@ def show(result: dict, console: Console) -> None:
         last = size["levels"][-1]
         if last["frame_wall_s"] is not None:
             mine = [r for r in result["settings"] if (r["size"] or "full") == name]
-            span = lambda key: " to ".join(f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max))  # noqa: E731
+            span = lambda key: " to ".join(f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max))
             console.print(f"seconds per frame of {size['width']}x{size['height']}, wall (processor): Cycles {last['frame_wall_s']:.2f} ({last['frame_cpu_s']:.2f}), "
                           f"the settings {span('wall_s')} ({span('cpu_s')})", highlight=False, soft_wrap=True)
         line = convergence_line(result, name)

@@ -221,7 +221,7 @@ def find_blinkflow(root: Path) -> list[Sequence]:
         fps = _fps(folder / "config.yaml")
         files = sorted((folder / "forward_flow").glob("*.npy"))
         backward = {int(f.stem): f for f in (folder / "backward_flow").glob("*.npy")}
-        at = lambda i: round(i * 1e6 / fps)  # noqa: E731
+        at = lambda i: round(i * 1e6 / fps)
         # backward_flow/k belongs to frames k+1 -> k in the published sets, so the one that starts at label i is file i - 1.
         entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in ((int(f.stem), f) for f in files) if i > 0)
         parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)

@@ -64,7 +64,7 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
     monkeypatch.setattr(base, "_translate", spy)
     messages = 0
     for root in ROOTS:
-        spots = sorted({p for p in places(root)}, key=str) + [()]
+        spots = sorted(set(places(root)), key=str) + [()]
         for tree in SEEDS[root]:
             for path in spots if tree is SEEDS[root][0] else [p for p in spots if p and p[0] in {*tree} - {"data"}]:
                 for value in BAD:

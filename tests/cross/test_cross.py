@@ -20,8 +20,20 @@ from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.work import report_of
 from blinkgl.explain import explain
-from features import (ELSEWHERE, FEATURES, REFUSED, RUN_LEVEL, all_pairs, configuration, covering_rows, fits, merged, options_of_the_schema,
-                      options_of_the_table, pairs)
+from features import (
+    ELSEWHERE,
+    FEATURES,
+    REFUSED,
+    RUN_LEVEL,
+    all_pairs,
+    configuration,
+    covering_rows,
+    fits,
+    merged,
+    options_of_the_schema,
+    options_of_the_table,
+    pairs,
+)
 
 ROWS = covering_rows()
 BATCHES = 8

@@ -13,8 +13,7 @@ import pytest
 from blinkgl.config.base import validate
 from blinkgl.config.gl import GLConfig
 from blinkgl.errors import ConfigError, GLError
-from blinkgl.gl import context as context_module
-from blinkgl.gl import create_context, egl_devices, osmesa
+from blinkgl.gl import context as context_module, create_context, egl_devices, osmesa
 
 VERTEX = """#version 430 core
 in vec3 position;

@@ -58,7 +58,7 @@ class Reader(HTMLParser):
     def handle_endtag(self, tag):
         if tag in self.VOID:
             return
-        while self.open and self.open[-1] != tag and self.open[-1] in ("p",):
+        while self.open and self.open[-1] != tag and self.open[-1] == "p":
             self.open.pop()
         assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-3:]}"
         self.open.pop()

@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 
 from blinkgl.config.base import validate
-from blinkgl.config.scene import ExplicitSceneConfig, LightConfig, ObjectsConfig, PoolConfig, RandomSceneConfig, RegionConfig, SkyConfig, TexturesConfig, WallsConfig
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    LightConfig,
+    ObjectsConfig,
+    PoolConfig,
+    RandomSceneConfig,
+    RegionConfig,
+    SkyConfig,
+    TexturesConfig,
+    WallsConfig,
+)
 from blinkgl.config.sequence import CameraConfig, near_corner
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets

@@ -251,7 +251,7 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:  # `blinkgl … | head`: nobody reads any more, which is no error of ours
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - nothing leaves without a line for the user
         line = _user_line(error)
         if debug or line is None:
             traceback.print_exc()

@@ -105,4 +105,4 @@ def convert(source: str, target: str, *, size: str | None = None, **options) -> 
             raise ConfigError("not a size", where="--size", value=size, accepted="WIDTHxHEIGHT, e.g. 640x480")
         known = (int(height), int(width))
     file, count = run(source, target, size=known, **options)
-    print(f"{target}: {count:,} events, {file.width}x{file.height}, from {file.format}")
+    print(f"{target}: {count:,} events, {file.width}x{file.height}, from {file.format}")  # noqa: T201

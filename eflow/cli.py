@@ -286,7 +286,7 @@ def run(arguments: list[str]) -> int:
             raise
         print(f"error: {error.name} is not installed; run {install(*EXTRAS['learn'][0])}", file=sys.stderr)
         return BlinkGLError.exit_status
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - nothing leaves without a line for the user
         line = _user_line(error)
         if debug or line is None:
             traceback.print_exc()

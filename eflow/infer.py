@@ -93,7 +93,7 @@ def whole_file(file: EventFile) -> tuple[StreamWindow, float]:
         raise EventDataError("no events", where=str(file.path))
     t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
     t = (t0 + t1) // 2
-    cut = lambda a, b: Window(*(getattr(w := events.window(a, b), k) for k in "xytp"), a, b)
+    cut = lambda a, b: Window(*(getattr(events.window(a, b), k) for k in "xytp"), a, b)
     return StreamWindow(t, cut(t0, t), cut(t, t1)), (t1 - t0) / (t1 - t)
 
 

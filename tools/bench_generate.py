@@ -105,7 +105,7 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     events = {}
     for name in ("full redraw", "what moves"):
         with Renderer(gl, scene, PLAIN) as renderer:
-            renderer._still = name == "what moves"
+            renderer._still = name == "what moves"  # noqa: SLF001 - what is measured cannot be switched from outside
             emulator, out, moment = make_emulator(EsimConfig(), 480, 640, seed=1), np.empty((480, 640), np.float32), iter(range(1 << 30))
             made = events[name] = []
 

@@ -55,7 +55,7 @@ class Way:
 
     def __init__(self, gl, scene: Scene, still: bool):
         self.renderer = Renderer(gl, scene, PLAIN)
-        self.renderer._still = still
+        self.renderer._still = still  # noqa: SLF001 - what is measured cannot be switched from outside
         self.emulator = make_emulator(EsimConfig(), HEIGHT, WIDTH, seed=1)
         self.frame = np.empty((HEIGHT, WIDTH), np.float32)
         self.events: list[Events] = []

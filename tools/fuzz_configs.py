@@ -450,7 +450,7 @@ class Worker:
     def __init__(self, seed: int, memory_mb: int, cpu_s: float):
         self.arguments = [sys.executable, "-m", "blinkgl.tools.fuzz_configs", "--worker", "--seed", str(seed), "--memory", str(memory_mb)]
         self.cpu_s, self.process = cpu_s, None
-        self.said = tempfile.TemporaryFile("w+")
+        self.said = tempfile.TemporaryFile("w+")  # noqa: SIM115 - lives as long as the worker
 
     def try_one(self, what: str, number: int) -> Outcome:
         if self.process is None:

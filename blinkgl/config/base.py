@@ -118,7 +118,7 @@ class Config(BaseModel):
 def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
     """Annotation of a field that is one of ``models``, told apart by the value of the key ``tag``; where that key is not given
     it is ``default``, so that a table may say only what it changes."""
-    union = typing.Union[models]
+    union = typing.Union[models]  # noqa: UP007 - of as many as there are
     if default is None:
         return Annotated[union, Discriminator(tag)]
     return Annotated[union, Discriminator(tag), BeforeValidator(partial(_with_tag, tag, default))]

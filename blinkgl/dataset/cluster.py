@@ -139,7 +139,7 @@ class RayCluster:
                 ray.init(address=address, log_to_driver=False, logging_level="ERROR", configure_logging=True)
         except BlinkGLError:
             raise
-        except Exception as error:  # Ray raises ConnectionError, RuntimeError, ValueError, grpc's own
+        except Exception as error:  # noqa: BLE001 - Ray raises ConnectionError, RuntimeError, ValueError, grpc's own
             text = " ".join(str(error).split())[:200]
             what = "Ray's or Python's version differs from the cluster's" if "ersion mismatch" in text else "cannot connect to Ray"
             raise ConfigError(f"{what}: {text}", where="--address", value=address if address != "local" else "a local cluster",

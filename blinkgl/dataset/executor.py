@@ -199,9 +199,9 @@ class _Process:
         self.channel, write_end = os.pipe()
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
-            output = open(log, "ab")
+            output = open(log, "ab")  # noqa: SIM115 - either of the two is closed below
         except OSError:
-            output = open(os.devnull, "ab")
+            output = open(os.devnull, "ab")  # noqa: SIM115
         with output:
             self.popen = subprocess.Popen([sys.executable, "-m", "blinkgl.dataset.worker", str(write_end)], stdin=subprocess.PIPE,
                                           stdout=output, stderr=output, pass_fds=(write_end,), env=environment, start_new_session=True)

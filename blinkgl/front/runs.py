@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import Config, validate_field
 from blinkgl.config.recipe import merge
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 LABELS = ("images", "flow", "flow_backward", "occlusion", "depth", "ids", "normals", "velocity")
 
-Source = Union[Scene, RunTemplate]
-Emulator = Union[str, Mapping[str, Any], Config]
+Source = Scene | RunTemplate
+Emulator = str | Mapping[str, Any] | Config
 
 
 class Timeline:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,7 +35,7 @@ from blinkgl.scene.explicit import InMemory, explicit_scene, primitive_mesh
 from blinkgl.scene.images import content_hash
 from blinkgl.scene.meshes import make_mesh
 
-Vector = Union[Sequence[float], np.ndarray]
+Vector = Sequence[float] | np.ndarray
 
 
 class _Piece:

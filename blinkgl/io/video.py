@@ -27,7 +27,7 @@ class VideoWriter:
         if height % 2 or width % 2:
             raise ValueError(f"yuv420p needs even sizes, got {width}x{height}")
         self.path, self._shape = Path(path), (height, width, 3)
-        self._log = tempfile.TemporaryFile()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the writer
         command = [_ffmpeg(OutputError, path), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
                    "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-", "-an", "-c:v", "libx264", "-preset", preset, "-crf", str(crf),
                    "-pix_fmt", "yuv420p", "-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",

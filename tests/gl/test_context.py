@@ -186,7 +186,7 @@ def test_glcontext_errors_are_translated(monkeypatch, raw, translated):
     from glcontext import egl
 
     def fail(**_):
-        raise Exception(raw)  # what glcontext raises
+        raise Exception(raw)  # noqa: TRY002 - what glcontext raises
 
     monkeypatch.setattr(egl, "create_context", fail)
     with pytest.raises(GLError, match=translated):

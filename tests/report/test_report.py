@@ -40,7 +40,7 @@ def data(tmp_path_factory) -> Path:
 class Reader(HTMLParser):
     """Tags balanced, no reference to anything outside."""
 
-    VOID = {"meta", "img", "rect", "line"}
+    VOID = frozenset({"meta", "img", "rect", "line"})
 
     def __init__(self):
         super().__init__()

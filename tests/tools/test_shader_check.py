@@ -277,8 +277,8 @@ _expressions = st.recursive(
 def test_conditions_against_the_driver(gl, expression):
     """The driver's preprocessor is the oracle."""
     vertex = "#version 430 core\nvoid main() { gl_Position = vec4(0.0); }\n"
-    text = f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform float no;\n#endif\n" \
-           "out vec4 c;\nvoid main() { c = vec4(\n#if " + expression + "\nyes\n#else\nno\n#endif\n); }\n"
+    text = (f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform float no;\n#endif\n"
+            "out vec4 c;\nvoid main() { c = vec4(\n#if " + expression + "\nyes\n#else\nno\n#endif\n); }\n")
     program = gl.ctx.program(vertex_shader=vertex, fragment_shader=text)
     says = "yes" in program
     program.release()

@@ -357,8 +357,8 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         assert page.run("return document.querySelector('#pane-a img').naturalWidth") == WIDTH
         assert page.run("return document.querySelectorAll('#a option').length") == 2 * len(PASSES)
 
-        picture = "const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = i.naturalWidth; c.height = i.naturalHeight;" \
-                  "const g = c.getContext('2d'); g.drawImage(i, 0, 0); return c.toDataURL()"
+        picture = ("const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = i.naturalWidth; c.height = i.naturalHeight;"
+                   "const g = c.getContext('2d'); g.drawImage(i, 0, 0); return c.toDataURL()")
         first = page.run(picture, "#pane-a img")
         page.choose("#time", "0.3")  # scrub
         page.wait("return document.body.dataset.shown === '0.3'")

@@ -17,7 +17,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
-from blinkgl.terminal import never_fail_to_print
+from blinkgl.show.terminal import never_fail_to_print
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
 app = typer.Typer(name="blinkgl", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -48,7 +48,7 @@ def doctor(
     device: Annotated[int, typer.Option(min=0, help="EGL device to examine.")] = 0,
 ) -> None:
     """Say what this machine offers, what is missing, and the command that mends it. Exit status 2 if something required is missing."""
-    from blinkgl import doctor as examination
+    from blinkgl.machine import doctor as examination
 
     report = examination.examine(backend, device)
     if as_json:
@@ -78,7 +78,7 @@ def generate(
 ) -> None:
     """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but some sequences were set aside."""
     from blinkgl.dataset.choose import choose_executor
-    from blinkgl.dataset.show import SET_ASIDE, generate_with_progress
+    from blinkgl.show.generate import SET_ASIDE, generate_with_progress
 
     chosen = choose_executor(executor, workers, address=address, gpus=gpus, devices=devices)
     outcome = generate_with_progress(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet, executor=chosen, resume=resume,
@@ -100,7 +100,7 @@ def verify(
 ) -> None:
     """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is wrong; what could not be compared
     is noted, and said in the last line."""
-    from blinkgl.dataset.check import verify_and_show
+    from blinkgl.show.verify import verify_and_show
 
     if not verify_and_show(folder, deep=sample if deep else 0, seed=seed, base=base):
         raise typer.Exit(BlinkGLError.exit_status)
@@ -114,8 +114,8 @@ def explain(
     overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
 ) -> None:
     """Say what a run will model, what it leaves out and why, and what it will cost. Writes nothing."""
-    from blinkgl import explain as explanation
     from blinkgl.config.sequence import load_run
+    from blinkgl.dataset import explain as explanation
 
     explanation.show(explanation.explain(load_run(config, overrides or [], seed=seed), sequence))
 
@@ -139,7 +139,7 @@ def trade(
                                            "small camera and a short --clip).")] = "raster",
 ) -> None:
     """Measure what accuracy costs: settings timed and judged against a converged reference, as a table, a plot and a page."""
-    from blinkgl.trade.show import trade_and_show
+    from blinkgl.show.trade import trade_and_show
 
     trade_and_show(config, out, overrides=overrides or [], quick=quick, only=only or [], skip=skip or [], sequence=sequence, clip=clip, limit_ms=limit_ms, rounds=rounds,
                    minutes=minutes, cost=cost, reference=reference, seed=seed)
@@ -190,9 +190,9 @@ def simulate(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> None:
     """Turn any video into events."""
-    from blinkgl import commands
+    from blinkgl.show import recordings
 
-    commands.simulate(source, out, quiet, **commands.emulator_options(emulator, config, overrides or [], sensor), fps=fps,
+    recordings.simulate(source, out, quiet, **recordings.emulator_options(emulator, config, overrides or [], sensor), fps=fps,
                       timestamps=timestamps, gamma=gamma, interpolate=interpolate, max_px=max_px, factor=factor, seed=seed,
                       preview=preview, overwrite=overwrite)
 
@@ -211,9 +211,9 @@ def compare(
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
 ) -> None:
     """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against brightness."""
-    from blinkgl import commands
+    from blinkgl.show import recordings
 
-    commands.compare(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
+    recordings.compare(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
                      interval_ms=interval_ms, zero_time=zero_time)
 
 
@@ -228,9 +228,9 @@ def convert(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> None:
     """Convert an event file from one format to another."""
-    from blinkgl import commands
+    from blinkgl.show import recordings
 
-    commands.convert(source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
+    recordings.convert(source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------

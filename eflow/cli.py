@@ -12,8 +12,8 @@ import typer
 from blinkgl import __version__
 from blinkgl.cli import _user_line
 from blinkgl.errors import BlinkGLError, ConfigError
-from blinkgl.extras import EXTRAS, install
-from blinkgl.terminal import never_fail_to_print
+from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.show.terminal import never_fail_to_print
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -69,7 +69,7 @@ def evaluate(
     device: Device = "auto",
 ) -> None:
     """Score a network on a data set, beside zero flow and constant flow."""
-    from blinkgl.terminal import plain_console
+    from blinkgl.show.terminal import plain_console
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
@@ -171,7 +171,7 @@ def submit(
     device: Device = "auto",
 ) -> None:
     """Write a benchmark's submission file; it is checked before it gets its name."""
-    from blinkgl.terminal import plain_console
+    from blinkgl.show.terminal import plain_console
     from eflow.submit import submit_blinkflow, submit_dsec
 
     _one_of("--benchmark", benchmark, ("dsec", "blinkflow"))
@@ -196,7 +196,7 @@ def bench(
     """Milliseconds, GMACs and peak memory per model and resolution; each measured in a process of its own."""
     from rich.table import Table
 
-    from blinkgl.terminal import plain_console
+    from blinkgl.show.terminal import plain_console
     from eflow import bench as benchmark
     from eflow.evaluate import write_json
 

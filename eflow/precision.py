@@ -6,7 +6,7 @@ import sys
 
 import torch
 
-from blinkgl.cpu import bf16_instructions
+from blinkgl.machine.cpu import bf16_instructions
 
 
 def lacks_bf16(device: torch.device) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from rich.progress import BarColumn, Progress
 
-from blinkgl.terminal import plain_column, plain_console
+from blinkgl.show.terminal import plain_column, plain_console
 
 _QUIET_S = 10.0
 """Seconds between lines where there is no terminal."""

@@ -22,7 +22,7 @@ from blinkgl.events import Emulator, Esim, Events, emulator_of, make_emulator, r
 from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.io.formats import open_events
-from blinkgl.simulation import simulate
+from blinkgl.recordings.simulation import simulate
 from blinkgl.tools import fuzz_configs
 from blinkgl.tools.config_docs import page
 from blinkgl.trade.measure import Options
@@ -127,7 +127,7 @@ def test_a_toy_emulator_simulates(toy, tmp_path, capsys):
     assert "events in 0.05 s" in capsys.readouterr().out
     assert run(["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "n.h5"), "-e", "toi"]) == 2
     assert "esim, v2e, voltmeter, toy" in capsys.readouterr().err
-    from blinkgl.commands import emulator_options
+    from blinkgl.show.recordings import emulator_options
 
     assert emulator_options("toy", None, [], "davis346")["emulator"] == Toy.Config(contrast_threshold=0.2, dead_us=500)
     frames = [np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)]

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl import bench
+from blinkgl.machine import bench
 from eflow.ops.voxel import voxel_grid
 
 BINS = 15

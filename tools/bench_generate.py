@@ -25,20 +25,20 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from blinkgl import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.report import Totals
-from blinkgl.dataset.show import STAGES, summary
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene import primitives
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.paths import SplinePath, StaticPath
-from blinkgl.scene.textures import procedural_texture
+from blinkgl.scene.geometry import primitives
+from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Camera, Material, Mesh, Part, Scene, SceneObject
+from blinkgl.show.generate import STAGES, summary
 
 SECOND = 1_000_000_000
 

@@ -21,12 +21,12 @@ import trimesh
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene

@@ -20,7 +20,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl import bench
 from blinkgl.config.base import validate
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
@@ -28,6 +27,7 @@ from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, Displace
 from blinkgl.dataset.event_pass import EventPass
 from blinkgl.events import Events
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene

@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from blinkgl import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events, make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.types import Scene
 from blinkgl.tools.bench_generate import PLAIN, SECOND, probe_scene
 

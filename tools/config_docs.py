@@ -20,7 +20,7 @@ from pydantic_core import PydanticUndefined
 
 from blinkgl.config.base import is_model, members, tag_of
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.scene.primitives import BUILDERS, PARAMETERS, parameters
+from blinkgl.scene.geometry.primitives import BUILDERS, PARAMETERS, parameters
 from eflow.config import TrainConfig
 
 HEADER = """# Every key of the YAML

@@ -44,7 +44,6 @@ import annotated_types
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.bench import machine_line
 from blinkgl.config.base import is_model, members, tag_of
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.quality import QUALITIES
@@ -52,7 +51,8 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import SequenceConfig, load_run
 from blinkgl.errors import BlinkGLError, ConfigError
-from blinkgl.terminal import plain_console
+from blinkgl.machine.bench import machine_line
+from blinkgl.show.terminal import plain_console
 
 DRAWS = 12
 """Sequences drawn of every accepted configuration."""

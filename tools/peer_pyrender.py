@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from blinkgl.extras import install
+from blinkgl.machine.extras import install
 
 if TYPE_CHECKING:
     from blinkgl.scene.types import Scene

@@ -18,7 +18,7 @@ from typing import Any
 from blinkgl.dataset.sockets import listening
 from blinkgl.dataset.work import Job, Maker, Message, environment_differences, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
-from blinkgl.extras import install
+from blinkgl.machine.extras import install
 
 _HELLO_S = 600.0
 _STOP_S = 15.0

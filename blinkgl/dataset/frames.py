@@ -28,9 +28,9 @@ from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
 from blinkgl.io.preview import PreviewWriter
 from blinkgl.io.sequence_dir import SequenceWriter
+from blinkgl.recordings.simulation import Decoder, SimulationReport, simulate
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.pool import resolve
-from blinkgl.simulation import Decoder, SimulationReport, simulate
+from blinkgl.scene.worlds.pool import resolve
 
 _FLOW = (".npy", ".flo", ".png")
 

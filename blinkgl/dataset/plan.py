@@ -21,10 +21,10 @@ from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
 from blinkgl.dataset.frames import matching_folders, used_images
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
-from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash
-from blinkgl.scene.mesh_files import dependencies
-from blinkgl.scene.pool import files_below, resolve
-from blinkgl.scene.world import pools
+from blinkgl.scene.importing.mesh_files import dependencies
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
+from blinkgl.scene.worlds.pool import files_below, resolve
+from blinkgl.scene.worlds.random_world import pools
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class Outcome:
 
 
 class Listener(Protocol):
-    """What a display has to offer; see :mod:`blinkgl.dataset.show`."""
+    """What a display has to offer; see :mod:`blinkgl.show.generate`."""
 
     def begin(self, plan: Plan, outcome: Outcome) -> None: ...
     def message(self, name: str, message: Message) -> None: ...

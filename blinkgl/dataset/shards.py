@@ -27,7 +27,7 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.index import sequence_folders
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
-from blinkgl.terminal import plain_console
+from blinkgl.show.terminal import plain_console
 
 _EXTRAS = {"back.png": "flow/backward", "image.png": "images", "occlusion.png": "occlusion/forward"}
 

@@ -16,8 +16,8 @@ from blinkgl.io import flow as flow_files, formats
 from blinkgl.io.formats import EventFile
 
 if TYPE_CHECKING:
-    from blinkgl.comparison import Comparison
-    from blinkgl.simulation import SimulationReport
+    from blinkgl.recordings.comparison import Comparison
+    from blinkgl.recordings.simulation import SimulationReport
 
 _SIDE = 65535
 
@@ -100,7 +100,7 @@ def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames:
     b : event file; None: ``a`` is described.   frames : video or folder of images both are compared with.   fps : of the frames, Hz.
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
     Raises AssetError, EventDataError, ConfigError."""
-    from blinkgl import comparison
+    from blinkgl.recordings import comparison
 
     return comparison.compare(check.path(a, "a"), None if b is None else check.path(b, "b"), frames=None if frames is None else check.path(frames, "frames"),
                               fps=_fps(fps), interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7), zero_time=bool(zero_time))
@@ -116,7 +116,7 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: Emulator =
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
     interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense flow, at most ``max_px`` px a step.
     report : a SimulationReport to be filled.   Raises ConfigError at once; EventDataError as frames come, naming the frame."""
-    from blinkgl import simulation
+    from blinkgl.recordings import simulation
 
     if not isinstance(frames, Iterable):
         raise ConfigError("not frames", where="frames", value=frames, accepted="an iterable of arrays")
@@ -131,7 +131,7 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
 
     timestamps : file of times, one a frame.   preview : a video of frames and events to write.   The rest: as of :func:`simulate`.
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
-    from blinkgl import simulation
+    from blinkgl.recordings import simulation
 
     return simulation.simulate_file(check.path(source, "source"), check.path(target, "target"), fps=_fps(fps), gamma=gamma, interpolate=interpolate,
                                     timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
@@ -140,8 +140,8 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
 
 
 def _options(emulator: Emulator, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
-    from blinkgl import simulation
     from blinkgl.config.sensor import load_sensor
+    from blinkgl.recordings import simulation
 
     tree = events_tree(emulator)
     camera = None if sensor is None else load_sensor(sensor)

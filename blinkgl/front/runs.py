@@ -105,7 +105,7 @@ def configured(source: Source, *, emulator: Emulator | None = None, sensor: str 
 
 def events_tree(emulator: Emulator) -> dict[str, Any]:
     """``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
-    from blinkgl.simulation import emulator_config
+    from blinkgl.recordings.simulation import emulator_config
 
     if not isinstance(emulator, (str, Mapping, Config)):
         raise ConfigError("not an emulator", where="emulator", value=emulator, accepted="a name, or a table such as {'emulator': 'v2e', 'cutoff_hz': 200}")

@@ -31,9 +31,9 @@ from blinkgl.config.sequence import CameraConfig, RunTemplate, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.scene import types as data
-from blinkgl.scene.explicit import InMemory, explicit_scene, primitive_mesh
-from blinkgl.scene.images import content_hash
-from blinkgl.scene.meshes import make_mesh
+from blinkgl.scene.geometry.meshes import make_mesh
+from blinkgl.scene.surfaces.images import content_hash
+from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_mesh
 
 Vector = Sequence[float] | np.ndarray
 

@@ -8,7 +8,7 @@ from blinkgl.config.sensor import SensorConfig, load_sensor as _load_sensor
 from blinkgl.events import Emulator, make_emulator
 from blinkgl.events.emulator import MAX_SIDE
 from blinkgl.front import arguments as check
-from blinkgl.simulation import emulator_config
+from blinkgl.recordings.simulation import emulator_config
 
 _STEP = """
 

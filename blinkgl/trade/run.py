@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from blinkgl.bench import machine_line
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.events import emulator_of
 from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.machine.bench import machine_line
 from blinkgl.trade.front import front
 from blinkgl.trade.measure import ENOUGH, QUICK, Bench, Options
 from blinkgl.trade.settings import SIZES, Setting, design

@@ -13,10 +13,10 @@ import numpy as np
 import yaml
 
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.dataset.explain import Explanation
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.explain import Explanation
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png

@@ -8,8 +8,8 @@ from rich.console import Console
 
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Local
-from blinkgl.dataset.show import MAX_NOTES, Display, generate_with_progress
-from blinkgl.explain import explain
+from blinkgl.dataset.explain import explain
+from blinkgl.show.generate import MAX_NOTES, Display, generate_with_progress
 from tests.scene.gltf_files import GltfBuilder, triangle
 
 LINE = "card.glb asks for what is not drawn: alpha BLEND (drawn opaque); metal and roughness (drawn matt)"

@@ -18,7 +18,8 @@ from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.work import thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.io.index import read_index
-from blinkgl.scene import primitives, world
+from blinkgl.scene.geometry import primitives
+from blinkgl.scene.worlds import random_world
 from runs import NAMES, alive, children, recipe_file, start, temporaries, tree, wait_for
 
 
@@ -188,8 +189,8 @@ def test_full_disk_stops_the_run_and_a_larger_one_goes_on(reference, small_disk,
 
 def forget_pools() -> None:
     """A process keeps its pools; a driver started on another day would not have them."""
-    world._object_pool.cache_clear()
-    world._texture_pool.cache_clear()
+    random_world._object_pool.cache_clear()
+    random_world._texture_pool.cache_clear()
 
 
 def mesh_recipe(tmp_path: Path) -> tuple[Path, list[Path]]:

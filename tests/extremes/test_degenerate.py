@@ -16,8 +16,8 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.sequence_dir import verify_sequence
 from blinkgl.render import renderer as module
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene import primitives
-from blinkgl.scene.meshes import faces_in_float32
+from blinkgl.scene.geometry import primitives
+from blinkgl.scene.geometry.meshes import faces_in_float32
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, camera, cube, drift, mesh, quad, scene, smooth_texture, still, thing

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, frustum_planes, invert_rigid, projection
-from blinkgl.scene.paths import StaticPath
+from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Camera
 
 CAMERA = Camera(64, 40, 50.0, 70.0, 20.0, 28.0, StaticPath(np.eye(4)))  # nothing about it is symmetric

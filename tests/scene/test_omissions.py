@@ -10,10 +10,10 @@ from PIL import Image
 from blinkgl.config.scene import PoolConfig
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError
-from blinkgl.scene.importers import from_gltf, from_trimesh
-from blinkgl.scene.mesh_files import load_asset
-from blinkgl.scene.paths import StaticPath
-from blinkgl.scene.pool import object_pool
+from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.worlds.from_file import from_gltf, from_trimesh
+from blinkgl.scene.worlds.pool import object_pool
 from tests.scene.gltf_files import GltfBuilder, triangle
 
 CAMERA = CameraConfig(width=64, height=48)

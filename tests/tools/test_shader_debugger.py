@@ -18,8 +18,8 @@ from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.resources import SceneResources
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.paths import KeyframePath, StaticPath
-from blinkgl.scene.primitives import grid
+from blinkgl.scene.geometry.primitives import grid
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject, Texture
 from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session
 from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject

@@ -127,7 +127,7 @@ def test_a_toy_emulator_simulates(toy, tmp_path, capsys):
     assert "events in 0.05 s" in capsys.readouterr().out
     assert run(["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "n.h5"), "-e", "toi"]) == 2
     assert "esim, v2e, voltmeter, toy" in capsys.readouterr().err
-    from blinkgl.show.recordings import emulator_options
+    from blinkgl.show.simulate import emulator_options
 
     assert emulator_options("toy", None, [], "davis346")["emulator"] == Toy.Config(contrast_threshold=0.2, dead_us=500)
     frames = [np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)]

@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.report import Totals
+from blinkgl.dataset.report import STAGES, Totals
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
@@ -38,7 +38,6 @@ from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Camera, Material, Mesh, Part, Scene, SceneObject
-from blinkgl.show.generate import STAGES, summary
 
 SECOND = 1_000_000_000
 
@@ -127,7 +126,7 @@ def sequence(name: str, quick: bool) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         list(generate_run(load_run(path, ["time.duration=0.1"]), f"{folder}/warm", 1))
         report = list(generate_run(load_run(path, overrides), f"{folder}/timed", 1))[0]
-    return {"config": name, "triangles": report.triangles, **summary(Totals().add(report))}
+    return {"config": name, "triangles": report.triangles, **Totals().add(report).summary()}
 
 
 def peer(gl, quick: bool) -> dict:

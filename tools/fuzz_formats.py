@@ -641,7 +641,7 @@ def _make_emulator_yaml(folder: Path) -> list[str]:
 
 def _judge_emulator_yaml(folder: Path) -> str | None:
     from blinkgl.recordings.simulation import emulator_config
-    from blinkgl.show.recordings import emulator_options
+    from blinkgl.show.simulate import emulator_options
 
     emulator_config(emulator_options("esim", str(folder / "e.yaml"), [])["emulator"])
     return None

@@ -253,7 +253,7 @@ def test_real_frames_against_the_real_recording():
 def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
     """The DAVIS346's bus carries 12 M events/s: a strobing clip makes more, and what does not fit is lost and counted."""
     from blinkgl.config.sensor import load_sensor
-    from blinkgl.show.recordings import emulator_options
+    from blinkgl.show.simulate import emulator_options
 
     options = emulator_options("v2e", None, ["contrast_threshold=0.3"], "davis346")
     assert options["emulator"].refractory_us == 500 and options["emulator"].contrast_threshold == 0.3
@@ -281,7 +281,7 @@ def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
 @pytest.mark.parametrize("sensor", [None, "davis346"])
 def test_emulator_parameters_that_cannot_be_used(tmp_path, text, overrides, message, sensor):
     from blinkgl.recordings.simulation import emulator_config
-    from blinkgl.show.recordings import emulator_options
+    from blinkgl.show.simulate import emulator_options
 
     (tmp_path / "e.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):

@@ -418,7 +418,7 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         page.choose("#time", "0.3")
         page.wait("return document.body.dataset.shown === '0.3'")
         assert page.text("#probe [data-gpu=depth]")
-        print(f"error shown {noticed:.2f} s after the edit")
+        print(f"error shown {noticed:.2f} s after the edit")  # noqa: T201
 
         (folder / "include/motion.glsl").write_text(good)
         page.wait("return document.querySelector('#errors').hidden", timeout=20)

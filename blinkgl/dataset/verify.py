@@ -431,7 +431,7 @@ def _deep(root: Path, chosen: dict[str, _Known], result: Verification, base: str
                 if progress:
                     progress(result.sequences, "again: " + shown(name))
 
-                def again() -> list[str]:
+                def again(name: str = name, one: _Known = one) -> list[str]:
                     nonlocal gl
                     if one.config.frames is None and gl is None:
                         gl = create_context(one.config.gl.backend, one.config.gl.device)

@@ -89,7 +89,7 @@ class SequenceWriter:
         self._row_files: dict[str, h5py.File] = {}
         self._failure: list[BaseException] = []
 
-    def __enter__(self) -> "SequenceWriter":
+    def __enter__(self) -> SequenceWriter:
         refuse_existing(self.final)
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)

@@ -13,7 +13,6 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObject, Texture
-
 from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")

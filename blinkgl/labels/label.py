@@ -205,7 +205,7 @@ class Label:
         array = np.array(value)
         shapes = [(height, width), (height, width, 3)] if self.channels is None else [(height, width, self.channels) if self.channels else (height, width)]
         kind = "" if self.dtype is None else np.dtype(self.dtype).kind
-        if array.shape not in shapes or kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]:
+        if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):
             said = f" {np.dtype(self.dtype)}" if kind else ""
             raise TypeError(f"label '{self.name}': {array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{said}")
         return array.astype(self.dtype, copy=False) if kind == "f" else array

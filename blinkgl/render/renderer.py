@@ -15,12 +15,18 @@ from dataclasses import dataclass, replace
 import moderngl
 import numpy as np
 
+from blinkgl.labels import Flow, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import Samples, samples_of
-from blinkgl.labels import Flow, LabelFrame, LabelRequest
 from blinkgl.render.frames import RenderStats
 from blinkgl.render.matrices import (
-    cam_from_obj, cam_from_obj_rate, frustum_planes, inverse_depth_bits, mat4_bytes, projection, rows_xyw_bytes,
+    cam_from_obj,
+    cam_from_obj_rate,
+    frustum_planes,
+    inverse_depth_bits,
+    mat4_bytes,
+    projection,
+    rows_xyw_bytes,
 )
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
@@ -82,7 +88,7 @@ class Renderer:
         self._frustum = frustum_planes(scene.camera)
         self._whole = Rectangle(0, 0, self.width, self.height)
 
-    def __enter__(self) -> "Renderer":
+    def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_) -> None:

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 
 from blinkgl import srgb
+from blinkgl.config.sequence import LabelsConfig
 from blinkgl.errors import BlinkGLError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io import flo, images
 from blinkgl.io.atomic import atomic_file, machine_token, remove_stale
-from blinkgl.config.sequence import LabelsConfig
-from blinkgl.labels import Flow
 from blinkgl.io.sequence_dir import SequenceWriter, read_manifest, verify_sequence
+from blinkgl.labels import Flow
 
 H, W = 24, 32
 

@@ -5,10 +5,10 @@ import pytest
 
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import renderer as module
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid, projection
 from blinkgl.render.occlusion import occlusion_mask
-from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.geometry import primitives

@@ -24,8 +24,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from blinkgl.render.antialiasing import samples_of
 from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.render.antialiasing import samples_of
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.session import DebugRenderer, Subject, When, open_renderer
 
@@ -51,7 +51,7 @@ class Draws:
     draws: int = 0
     triangles: int = 0
     fragments: int = 0
-    variants: dict[str, "Draws"] = field(default_factory=dict)
+    variants: dict[str, Draws] = field(default_factory=dict)
 
 
 class Stopwatch:

@@ -11,13 +11,13 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
-from blinkgl.machine.compiling import compiling_line
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Executor
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
+from blinkgl.machine.compiling import compiling_line
 from blinkgl.show.terminal import plain_column, plain_console, say
 
 MAX_NOTES = 20

@@ -12,7 +12,7 @@ import errno
 import os
 import sys
 import traceback
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -28,7 +28,7 @@ app.add_typer(shader_app)
 def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"blinkgl {__version__}")
-        raise typer.Exit()
+        raise typer.Exit
 
 
 @app.callback()
@@ -58,15 +58,15 @@ def doctor(
 def generate(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")],
-    num: Annotated[Optional[int], typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")] = None,
-    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    num: Annotated[int | None, typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
-    workers: Annotated[Optional[int], typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
     executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
-    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
+    address: Annotated[str | None, typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
     gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
-    devices: Annotated[Optional[str], typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
+    devices: Annotated[str | None, typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,
     mixed: Annotated[bool, typer.Option("--mixed", help="Go on although recipe, assets or software have changed since the run began.")] = False,
     time_limit: Annotated[float, typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers.")] = 3600.0,
@@ -86,7 +86,7 @@ def verify(
     deep: Annotated[bool, typer.Option("--deep", help="Also generate a sample of sequences again and compare bit by bit.")] = False,
     sample: Annotated[int, typer.Option(min=1, help="How many sequences --deep makes again.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
-    base: Annotated[Optional[str], typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
+    base: Annotated[str | None, typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
 ) -> int:
     """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is wrong; what could not be compared
     is noted, and said in the last line."""
@@ -98,9 +98,9 @@ def verify(
 @app.command()
 def explain(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
-    sequence: Annotated[Optional[int], typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
-    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    sequence: Annotated[int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
 ) -> int:
     """Say what a run will model, what it leaves out and why, and what it will cost. Writes nothing."""
     from blinkgl.show import explain as command
@@ -113,15 +113,15 @@ def trade(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")] = "trade",
     quick: Annotated[bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")] = False,
-    only: Annotated[Optional[list[str]], typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated.")] = None,
-    skip: Annotated[Optional[list[str]], typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated.")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
-    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    sequence: Annotated[Optional[int], typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
-    clip: Annotated[Optional[float], typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated.")] = None,
+    skip: Annotated[list[str] | None, typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated.")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    sequence: Annotated[int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
+    clip: Annotated[float | None, typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")] = None,
     limit_ms: Annotated[float, typer.Option(min=0.001, help="Events further apart than this are not the same event.")] = 10.0,
-    rounds: Annotated[Optional[int], typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
-    minutes: Annotated[Optional[float], typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long.")] = None,
+    rounds: Annotated[int | None, typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long.")] = None,
     cost: Annotated[str, typer.Option(help="What the front is drawn over: wall, or cpu on a busy machine.")] = "wall",
     reference: Annotated[str, typer.Option(help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
                                            "small camera and a short --clip).")] = "raster",
@@ -136,7 +136,7 @@ def trade(
 @app.command()
 def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
-    out: Annotated[Optional[str], typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
     examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
 ) -> int:
     """Write one self-contained HTML page about a data set, and its index.jsonl."""
@@ -163,17 +163,17 @@ def simulate(
     source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")],
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
-    sensor: Annotated[Optional[str], typer.Option("--sensor", help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.")] = None,
-    config: Annotated[Optional[str], typer.Option("--config", help="YAML file of emulator parameters.")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")] = None,
-    fps: Annotated[Optional[float], typer.Option(help="Frames per second (default: the video's, or the time stamps).")] = None,
-    timestamps: Annotated[Optional[str], typer.Option(help="File of frame times: µs as integers, or seconds with a point.")] = None,
-    gamma: Annotated[Optional[str], typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats).")] = None,
+    sensor: Annotated[str | None, typer.Option("--sensor", help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.")] = None,
+    config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second (default: the video's, or the time stamps).")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="File of frame times: µs as integers, or seconds with a point.")] = None,
+    gamma: Annotated[str | None, typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats).")] = None,
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, cubic, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     factor: Annotated[int, typer.Option(min=1, max=1000, help="cubic: steps per given frame.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
-    preview: Annotated[Optional[str], typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
+    preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
 ) -> int:
@@ -188,11 +188,11 @@ def simulate(
 @app.command()
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
-    b: Annotated[Optional[str], typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")] = None,
-    frames: Annotated[Optional[str], typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
-    out: Annotated[Optional[str], typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
-    fps: Annotated[Optional[float], typer.Option(help="Frame rate of the frames.")] = None,
-    timestamps: Annotated[Optional[str], typer.Option(help="Frame times.")] = None,
+    b: Annotated[str | None, typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")] = None,
+    frames: Annotated[str | None, typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
     gamma: Annotated[str, typer.Option(help="Of the frames: linear, srgb or an exponent.")] = "linear",
     frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
@@ -209,8 +209,8 @@ def compare(
 def convert(
     source: Annotated[str, typer.Argument(metavar="IN", help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .txt, .csv, .npz, .npy.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
-    format: Annotated[Optional[str], typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
-    size: Annotated[Optional[str], typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
+    format: Annotated[str | None, typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")] = False,
     time_unit: Annotated[str, typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's).")] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
@@ -239,7 +239,7 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:  # `blinkgl … | head`: nobody reads any more, which is no error of ours
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - nothing leaves without a line for the user
         line = _user_line(error)
         if debug or line is None:
             traceback.print_exc()

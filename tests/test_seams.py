@@ -29,7 +29,6 @@ from blinkgl.trade.measure import Options
 from blinkgl.trade.run import trade, write
 from blinkgl.trade.settings import Setting
 
-
 # --- an emulator (docs/extending.md shows this class) ---------------------------------------------------------------
 
 
@@ -228,7 +227,7 @@ def toy_with(part, line=None):
     body, name = tree.body[0].body, part
     if part.startswith("Config."):
         body, name = next(n for n in body if isinstance(n, ast.ClassDef)).body, part.removeprefix("Config.")
-    named = lambda node: getattr(node, "name", None) or getattr(getattr(node, "target", None) or getattr(node, "targets", [None])[0], "id", None)  # noqa: E731
+    named = lambda node: getattr(node, "name", None) or getattr(getattr(node, "target", None) or getattr(node, "targets", [None])[0], "id", None)
     (at,) = (k for k, node in enumerate(body) if named(node) == name)
     body[at:at + 1] = ast.parse(line).body if line else []
     made = {}

@@ -18,9 +18,10 @@ from importlib import metadata
 import numpy as np
 
 from blinkgl import __version__
-from blinkgl.machine.cpu import bf16_instructions
 from blinkgl.errors import BlinkGLError
+from blinkgl.machine.cpu import bf16_instructions
 from blinkgl.machine.extras import EXTRAS, install, python
+
 
 @dataclass(frozen=True)
 class Check:
@@ -55,7 +56,7 @@ def _try(section: str, name: str, action: Callable[[], str], remedy: str) -> Che
     """``action`` returns the text of success and raises anything on failure."""
     try:
         return Check(section, name, "ok", action())
-    except Exception as error:  # whatever a broken installation throws, the line has to appear
+    except Exception as error:  # noqa: BLE001 - whatever a broken installation throws, the line has to appear
         return Check(section, name, "missing", " ".join(f"{type(error).__name__}: {error}".split())[:200], remedy)
 
 

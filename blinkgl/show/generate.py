@@ -11,13 +11,13 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
-from blinkgl.machine.compiling import compiling_line
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Executor
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
+from blinkgl.machine.compiling import compiling_line
 from blinkgl.show.terminal import plain_column, plain_console, say
 
 MAX_NOTES = 20
@@ -56,7 +56,7 @@ class Display:
         self._notes: set[str] = set()
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
-        self._todo, self._outcome, self._started = len(plan.tasks) - outcome.found, outcome, time.monotonic()
+        self._todo, self._started = len(plan.tasks) - outcome.found, time.monotonic()
         if outcome.found:
             self._say(f"{outcome.found} of {len(plan.tasks)} sequences are whole already")
         for name, problem in outcome.damaged.items():

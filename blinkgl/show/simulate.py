@@ -27,7 +27,6 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
     if sensor is None:
         return {"emulator": data, "readout": None}
     from blinkgl.config.sensor import load_sensor
-
     from blinkgl.recordings.simulation import emulator_config
 
     camera = load_sensor(sensor)

@@ -8,8 +8,7 @@ import sys
 import pytest
 
 from blinkgl import cli
-from blinkgl.gl import context as context_module
-from blinkgl.gl import osmesa
+from blinkgl.gl import context as context_module, osmesa
 from blinkgl.machine import doctor
 from blinkgl.show.doctor import show
 

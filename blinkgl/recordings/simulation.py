@@ -1,0 +1,285 @@
+"""Any video to events: frames in, events out.
+
+    for events in simulate(frames, fps=1000, emulator="v2e"):
+        ...
+
+``frames`` is any iterable, a generator included; nothing but the current frames is kept. :func:`simulate_file` is the
+same from file to file (``blinkgl simulate``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from blinkgl.config.base import validate
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.errors import ConfigError, EventDataError, OutputError
+from blinkgl.events import Events, make_emulator
+from blinkgl.events.readout import Readout
+from blinkgl.io.frames import open_frames
+from blinkgl.srgb import linear_from_srgb
+from blinkgl.timeline import interpolate as between
+
+INTERPOLATIONS = ("linear", "cubic", "motion")
+_LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
+"""ITU-R BT.709, on linear light."""
+
+
+@dataclass
+class SimulationReport:
+    """What a simulation did; complete when the generator is exhausted."""
+
+    frames: int = 0
+    """given"""
+    steps: int = 0
+    """frames that the emulator saw, interpolated ones included"""
+    first_ns: int = 0
+    last_ns: int = 0
+    events: int = 0
+    on: int = 0
+    saturated: int = 0
+    """events cut by the emulator's max_events_per_step"""
+    lost: int = 0
+    """events that found the queue of the sensor's read-out full"""
+    late: int = 0
+    """events that were still on the read-out's bus when the last frame came"""
+    displacement: between.Displacement | None = None
+    """for interpolate="motion" """
+
+    @property
+    def duration_s(self) -> float:
+        return (self.last_ns - self.first_ns) * 1e-9
+
+
+def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | EmulatorConfig = EmulatorConfig.members.default, gamma: str | float | None = None,
+             interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, readout: ReadoutConfig | None = None,
+             report: SimulationReport | None = None, on_frame: Callable[[np.ndarray, int, Events], None] | None = None) -> Iterator[Events]:
+    """Events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
+
+    Parameters
+    ----------
+    frames : iterable of (H, W) or (H, W, 3) RGB arrays with ``fps``, of (array, t_ns) pairs or (array, t_ns, name)
+        triples (a :class:`~blinkgl.io.frames.FrameSource` is that). uint8, uint16 (full scale 1.0) or float (1.0 is white, more is fine).
+    emulator : name of one ("esim", "v2e", "voltmeter"), or a config of one.
+    gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: srgb for integers, linear for floats.
+    interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1`` frames in between
+        by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
+    seed : of the emulator. readout : the sensor's bus (``load_sensor(name).readout``); None: no limit. report : filled as it goes. on_frame : called with (luminance or uint8 frame, t_ns, events) per step.
+
+    Raises
+    ------
+    EventDataError : NaN, infinite or negative intensities, non-increasing times, a changed size, fewer than two frames; names the frame.
+    ConfigError : unknown emulator, gamma or interpolation.
+    """
+    config = emulator_config(emulator)
+    if interpolate not in INTERPOLATIONS:
+        raise ConfigError("unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS))
+    report = report if report is not None else SimulationReport()
+    return _run(_timed(frames, fps), config, _checked_gamma(gamma), interpolate, factor, max_px, seed, readout, report, on_frame)
+
+
+def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, report, on_frame) -> Iterator[Events]:
+    first = next(frames, None)
+    if first is None:
+        raise EventDataError("events need at least two frames", value="0 frames")
+    height, width = first[0].shape[:2]
+    model = make_emulator(config, height, width, seed)
+    bus = Readout(readout) if readout is not None else None
+    decode = Decoder(gamma)
+    table = interpolate == "linear" and first[0].dtype == np.uint8 and first[0].ndim == 2
+    if table:
+        model.set_decode(decode.table(np.uint8))
+
+    def luminances() -> Iterator[tuple[np.ndarray, int]]:
+        shape = first[0].shape
+        frame, t_ns, name = first
+        last = None
+        while True:
+            if frame.shape != shape:
+                raise EventDataError("frame size changed", where=name, value=frame.shape, accepted=f"{shape} as the first frame")
+            if last is not None and t_ns <= last:
+                raise EventDataError("time stamps must increase", where=name, value=f"{t_ns} ns", accepted=f"more than {last} ns")
+            last = t_ns
+            report.frames += 1
+            yield (frame if table and frame.dtype == np.uint8 else decode(frame, name)), t_ns
+            following = next(frames, None)
+            if following is None:
+                break
+            frame, t_ns, name = following
+        if report.frames < 2:
+            raise EventDataError("events need at least two frames", where=name, value="1 frame")
+
+    stream = luminances()
+    if interpolate == "cubic":
+        stream = between.cubic(stream, factor)
+    elif interpolate == "motion":
+        report.displacement = between.Displacement()
+        stream = between.motion(stream, max_px, displacement=report.displacement)
+    for luminance, t_ns in stream:
+        if report.steps == 0:
+            report.first_ns = t_ns
+        events = model.step(luminance, t_ns)
+        if bus is not None:
+            events = bus.step(events, t_ns // 1000)
+            report.lost, report.late = bus.dropped, bus.late
+        report.steps += 1
+        report.last_ns = t_ns
+        report.events += len(events)
+        report.on += int(np.count_nonzero(events.p))
+        report.saturated = getattr(model, "saturated", 0)
+        if on_frame is not None:
+            on_frame(luminance, t_ns, events)
+        if len(events):
+            yield events
+
+
+def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None,
+                  timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None, overwrite: bool = True,
+                  progress: Callable[[SimulationReport, float | None], None] | None = None, **options) -> SimulationReport:
+    """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format (.h5 .raw .aedat4
+    .txt .csv .npz .npy); options as :func:`simulate`. The files appear whole or not at all.
+
+    preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
+    """
+    from blinkgl.io.atomic import atomic_file
+    from blinkgl.io.formats import event_writer, output_format
+    from blinkgl.io.preview import PreviewWriter
+
+    kind = output_format(target)
+    if preview is not None and Path(preview).resolve() == Path(target).resolve():
+        raise OutputError("preview and events in the same file", where=str(preview))
+    frames = open_frames(source, fps=fps, timestamps=timestamps)
+    height, width = frames.height, frames.width
+    report = SimulationReport()
+    iterator = iter(frames)
+    first = next(iterator)
+    second = next(iterator, None)
+    start_us = first[1] // 1000
+    gap_ns = (second[1] - first[1]) if second else 10**9
+
+    def given() -> Iterator:
+        for i, (frame, t_ns, name) in enumerate(itertools.chain([first], [second] if second else [], iterator)):
+            yield frame, t_ns, f"{source}: frame {i} ({name})"
+
+    with contextlib.ExitStack() as stack:
+        out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us if kind == "dsec" else 0, overwrite=overwrite))
+        if preview is None:
+            on_frame = None
+        else:
+            rate = min(1e9 / gap_ns, 100.0)
+            video = stack.enter_context(PreviewWriter(stack.enter_context(atomic_file(preview, overwrite=overwrite)), height, width,
+                                                      t0_us=start_us, flow=False, rate_hz=rate, fps=min(rate, 25.0)))
+            decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
+
+            def on_frame(luminance, t_ns, events) -> None:
+                video.add_events(events)
+                if video.due(t_ns // 1000):
+                    video.frame(t_ns // 1000, decode(luminance, "") if luminance.dtype == np.uint8 else luminance)
+
+        done = 0
+        for events in simulate(given(), report=report, on_frame=on_frame, **options):
+            out.append(events)
+            if progress is not None and report.frames > done:
+                done = report.frames
+                progress(report, min(done / frames.count, 1.0) if frames.count else None)
+        out.t_end_us = report.last_ns // 1000
+    return report
+
+
+class Decoder:
+    """Frames as stored to linear luminance (H, W) float32. gamma as :func:`simulate`."""
+
+    def __init__(self, gamma: str | float | None):
+        self._gamma = gamma
+        self._tables: dict[np.dtype, np.ndarray] = {}
+
+    def table(self, dtype) -> np.ndarray:
+        """Luminance of each code of an unsigned integer type, float32."""
+        dtype = np.dtype(dtype)
+        if dtype not in self._tables:
+            most = np.iinfo(dtype).max
+            self._tables[dtype] = self._curve(np.arange(most + 1, dtype=np.float64) / most, "srgb").astype(np.float32)
+        return self._tables[dtype]
+
+    def __call__(self, frame: np.ndarray, name: str) -> np.ndarray:
+        """Raises EventDataError with ``name``, pixel and value for NaN, infinite or negative intensities."""
+        if frame.dtype in (np.uint8, np.uint16):
+            table = self.table(frame.dtype)
+            if frame.ndim == 2:
+                return table[frame]
+            out = np.empty(frame.shape[:2], np.float32)
+            _luma_by_table(np.ascontiguousarray(frame), table, _LUMA, out)
+            return out
+        if frame.dtype.kind != "f":
+            raise EventDataError("unsupported pixel type", where=name, value=str(frame.dtype), accepted="uint8, uint16 or float")
+        frame = np.asarray(frame, np.float32)
+        low, high = frame.min(), frame.max()
+        if not (low >= 0 and high < np.inf):  # NaN fails both
+            where = np.argwhere(~((frame >= 0) & (frame < np.inf)))[0]
+            raise EventDataError(f"intensity at pixel x={where[1]}, y={where[0]} cannot be used", where=name,
+                                 value=float(frame[tuple(where)]), accepted="a finite value >= 0")
+        linear = self._curve(frame, "linear")
+        return np.ascontiguousarray(linear if linear.ndim == 2 else linear @ _LUMA, np.float32)
+
+    def _curve(self, code: np.ndarray, default: str) -> np.ndarray:
+        gamma = default if self._gamma is None else self._gamma
+        if gamma == "linear":
+            return code
+        return linear_from_srgb(code) if gamma == "srgb" else code ** code.dtype.type(gamma)
+
+
+@numba.njit(cache=True, nogil=True)
+def _luma_by_table(frame, table, weights, out):
+    for y in range(out.shape[0]):
+        for x in range(out.shape[1]):
+            out[y, x] = weights[0] * table[frame[y, x, 0]] + weights[1] * table[frame[y, x, 1]] + weights[2] * table[frame[y, x, 2]]
+
+
+def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
+    """A validated emulator config from a name, a plain mapping with ``emulator``, or a config."""
+    if isinstance(emulator, EmulatorConfig):
+        return emulator
+    data = {"emulator": emulator} if isinstance(emulator, str) else dict(emulator)
+    members = EmulatorConfig.members
+    kind = data.get("emulator", members.default)
+    if not isinstance(kind, str) or kind not in members.models:
+        raise ConfigError("unknown emulator", where="emulator", value=kind, accepted=", ".join(members.models))
+    return validate(members.models[kind], data, where=kind)
+
+
+def _checked_gamma(gamma: str | float | None) -> str | float | None:
+    if gamma in (None, "srgb", "linear"):
+        return gamma
+    try:
+        value = float(gamma)
+        if 0 < value <= 10:
+            return value
+    except (TypeError, ValueError):
+        pass
+    raise ConfigError("unknown transfer curve", where="gamma", value=gamma, accepted="srgb, linear or an exponent up to 10")
+
+
+def _timed(frames: Iterable, fps: float | None) -> Iterator[tuple[np.ndarray, int, str]]:
+    """(frame, t_ns, name) from the three kinds of iterables :func:`simulate` takes."""
+    for i, item in enumerate(frames):
+        if isinstance(item, tuple):
+            frame, t_ns = np.asarray(item[0]), int(item[1])
+            name = item[2] if len(item) > 2 else f"frame {i}"
+        elif fps:
+            frame, t_ns, name = np.asarray(item), round(i * 1e9 / fps), f"frame {i}"
+        else:
+            raise EventDataError("frames without times", where=f"frame {i}", accepted="fps, or (frame, t_ns) pairs")
+        if frame.ndim == 3 and frame.shape[2] == 1:
+            frame = frame[..., 0]
+        if frame.ndim not in (2, 3) or (frame.ndim == 3 and frame.shape[2] != 3):
+            raise EventDataError("not a frame", where=name, value=frame.shape, accepted="(H, W) or (H, W, 3)")
+        yield frame, t_ns, name

@@ -424,7 +424,7 @@ class Reach:
         if mutant.path.endswith(".glsl"):
             contexts = [t for t in self.seconds if t.startswith(("tests/render/", "tests/extremes/")) and "pyrender" not in t and "cycles" not in t]
         else:
-            room = f"tests/{Path(mutant.path).parent.name}/"
+            room = f"tests/{Path(mutant.path).parts[1]}/"
             reached = self.anywhere(mutant.path)
             if not reached:  # compiled as a whole, or run in a process of its own
                 contexts = [t for t in self.seconds if t.startswith(room)]
@@ -452,7 +452,7 @@ class Reach:
         path, file = Path(mutant.path), Path(test.split("::")[0])
         if file.stem == f"test_{path.stem}":
             return 0
-        return 1 if file.parent.name == ("render" if path.suffix == ".glsl" else path.parent.name) else 2
+        return 1 if file.parts[1] == ("render" if path.suffix == ".glsl" else path.parts[1]) else 2
 
     def _around(self, mutant: Mutant) -> list[str]:
         """Coverage names the first line of a statement only. What runs when a module is imported (a default, a constant) concerns all
@@ -630,6 +630,8 @@ class Copy:
             path.write_bytes(source)
         if outcome == "failed" and failed in tests and not self.passes(failed):
             return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
+        if outcome == "failed" and not failed and self.run(tests, 600)[0] != "passed":
+            return {**result, "outcome": "broken"}  # the process died, and does so without the mutant
         return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed,
                 "seconds": round(time.monotonic() - started, 1)}
 
@@ -717,6 +719,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.out:
             options.out.write_text(json.dumps(results, indent=1))
     survivors = [r for r in results if r["outcome"] in ("survived", "no test")]
+    results = [r for r in results if r["outcome"] != "broken"]
     share = 1 - len(survivors) / max(len(results), 1)
     print(f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as equivalent")
     print(*(f"survived: {r['name']}  ({r['outcome']}, {r['tests']} tests)" for r in sorted(survivors, key=lambda r: r["name"])), sep="\n")

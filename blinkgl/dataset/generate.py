@@ -124,7 +124,7 @@ def _write_labels(config: SequenceConfig, renderer: Renderer, writer: SequenceWr
     interval = config.time.interval_ns
     for k, t_ns in enumerate(times):
         if labels.images:
-            colour = renderer.colour(t_ns)
+            colour = renderer.colour(t_ns).read()
             with clock("write"):
                 writer.image(k, t_ns // 1000, colour)
         if k == len(times) - 1:

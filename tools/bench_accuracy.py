@@ -17,14 +17,14 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine import bench
 from blinkgl.config.sequence import load_run
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.build import build_scene
 
-REQUEST = LabelRequest(depth=True, ids=True, velocity=True, flow_forward=True, flow_backward=True, occlusion=True)
+REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
 
 
 def compare(gl, template, index: int) -> dict[str, float]:

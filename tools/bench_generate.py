@@ -25,17 +25,16 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.report import Totals
-from blinkgl.show.generate import STAGES, summary
+from blinkgl.dataset.report import STAGES, Totals
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene.geometry import primitives
 from blinkgl.scene.build import build_scene
+from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Camera, Material, Mesh, Part, Scene, SceneObject
@@ -109,7 +108,7 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
 
             def frame():
                 t = next(moment) * 2_000_000
-                image = renderer.luminance(t)
+                image = renderer.luminance(t).read()
                 made.append(len(emulator.step(image.view(), t, image.rows_changed_since(last[0]))))
                 last[0] = image
 
@@ -126,7 +125,7 @@ def sequence(name: str, quick: bool) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         list(generate_run(load_run(path, ["time.duration=0.1"]), f"{folder}/warm", 1))
         report = list(generate_run(load_run(path, overrides), f"{folder}/timed", 1))[0]
-    return {"config": name, "triangles": report.triangles, **summary(Totals().add(report))}
+    return {"config": name, "triangles": report.triangles, **Totals().add(report).summary()}
 
 
 def peer(gl, quick: bool) -> dict:
@@ -144,7 +143,7 @@ def peer(gl, quick: bool) -> dict:
 
         def both():
             t = next(moments)
-            renderer.labels(t, LabelRequest(colour=True, depth=True))
+            renderer.labels(t, LabelRequest("images", "depth"))
 
         ours = bench.seconds(both, 10 if quick else 40)["median"]
         luminance = bench.seconds(lambda: renderer.luminance(next(moments)).read(), 10 if quick else 40)["median"]

@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events, make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.types import Scene
@@ -44,7 +44,7 @@ def one_mover(kind: str, coverage: float) -> Scene:
     radius = float(np.linalg.norm(mover.parts[0].mesh.vertices, axis=1).max())
     distance = 2 * radius * camera.fx / np.sqrt(coverage * WIDTH * HEIGHT)
     speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / camera.fx  # units per second, across the image
-    seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]  # noqa: E731
+    seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]
     path = KeyframePath([0, 2 * SECOND], [seen(-speed / 4), seen(speed * 7 / 4)], [Rotation.identity().as_quat()] * 2, interpolation="linear")
     objects = tuple(replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
     return replace(scene, objects=objects, camera=replace(camera, path=StaticPath(at)))
@@ -65,7 +65,7 @@ class Way:
         stats = self.renderer.stats
         drawn, read = stats.render_s, stats.readback_s
         wall, cpu = time.perf_counter(), time.process_time()
-        before, self.frame = self.frame, self.renderer.luminance(t_ns)
+        before, self.frame = self.frame, self.renderer.luminance(t_ns).read()
         luminance = self.frame.view()
         done = time.perf_counter()
         self.events.append(self.emulator.step(luminance, t_ns, self.frame.rows_changed_since(before)))

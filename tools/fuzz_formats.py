@@ -100,7 +100,7 @@ def _as_stored(folder: Path, name: str) -> dict[str, np.ndarray] | None:
         return {"x": data["x"], "y": data["y"], "t": np.rint(t.astype(float) * 1e6) if t.dtype.kind == "f" else t, "p": (data["p"] > 0) * 1}
     if path.suffix in (".txt", ".csv"):
         lines = [line for line in path.read_bytes().split(b"\n") if line.strip() and line.strip()[:1] not in b"#%"]
-        events = [f for line in lines if len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit() or f[0][:1] in b"."]
+        events = [f for line in lines if (len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit()) or f[0][:1] in b"."]
         return {"x": np.array([float(f[1]) for f in events])}
     return None
 
@@ -468,12 +468,12 @@ _RECIPE = {
 def _make_data_set(folder: Path) -> None:
     """One sequence, its index and the run's record; nothing of it was rendered."""
     from blinkgl.config.reader import to_yaml
-
     from blinkgl.config.sequence import load_run
     from blinkgl.dataset.plan import Plan
     from blinkgl.dataset.run_folder import RunFolder
     from blinkgl.io.index import write_index
     from blinkgl.io.sequence_dir import SequenceWriter
+    from blinkgl.labels import Flow
 
     (folder / "recipe.yaml").write_text(to_yaml(_RECIPE))
     out = folder / "out"
@@ -483,8 +483,8 @@ def _make_data_set(folder: Path) -> None:
         writer.append_events(_events())
         for k in range(2):
             t = 20_000 * (k + 1)
-            writer.flow("forward", k, flow, valid, t, t + 20_000)
-            writer.depth(k, flow[..., 0] + 9)
+            writer.label("flow_forward", k, Flow(flow, valid), t, t + 20_000)
+            writer.label("depth", k, flow[..., 0] + 9, t)
         writer.poses(T_world_cam=np.tile(np.eye(4), (2, 1, 1)))
         writer.info.update(blinkgl="0", seed=11, sequence=0, split="train", labels=2, duration_us=60_000, emulator="esim", frames=30, group="a")
         writer.t_end_us = 60_000
@@ -641,8 +641,8 @@ def _make_emulator_yaml(folder: Path) -> list[str]:
 
 
 def _judge_emulator_yaml(folder: Path) -> str | None:
-    from blinkgl.show.recordings import emulator_options
     from blinkgl.recordings.simulation import emulator_config
+    from blinkgl.show.simulate import emulator_options
 
     emulator_config(emulator_options("esim", str(folder / "e.yaml"), [])["emulator"])
     return None

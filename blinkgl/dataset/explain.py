@@ -14,20 +14,19 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import flow_files, folder_of, read_frame, used_images
+from blinkgl.dataset.frames import RECORDED, flow_files, folder_of, read_frame, used_images
 from blinkgl.events import emulator_of, make_emulator
 from blinkgl.gl import GLContext, create_context
+from blinkgl.labels import LABELS, asked_for
+from blinkgl.labels.label import BUFFERS
+from blinkgl.recordings.simulation import SimulationReport, simulate
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.recordings.simulation import SimulationReport, simulate
-from blinkgl.show.terminal import plain_console
 from blinkgl.timeline import make_timeline
 
 PROBES = 12
@@ -105,14 +104,17 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     rate = report.events / ((len(probed) - 1) / frames.fps)
     result.passes.append(Pass("frames and event kernel", f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
                               (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
-    labels = config.labels
-    for name, on, why in (("images", labels.images, "labels.images: false"), ("forward flow", flows and "forward" in labels.flow, "frames.flow: null, or not in "
-                          "labels.flow"), ("occlusion masks", masks and labels.occlusion and "forward" in labels.flow, "no mask files, labels.occlusion: false, or no forward flow"),
+    request = asked_for(config.labels)
+    for name, on, why in (("images", "images" in request, "labels.images: false"),
+                          ("forward flow", flows and "flow_forward" in request, "frames.flow: null, or not in labels.flow"),
+                          ("occlusion masks", masks and "occlusion_forward" in request, "no mask files, labels.occlusion: false, or no forward flow"),
                           ("preview", config.preview.enabled, "preview.enabled: false"),
                           ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             result.left_out.append((name, why))
-    result.left_out.append(("backward flow, depth, ids, normals, velocity", "recorded frames bring none"))
+    brought = {LABELS[name].heading for name in RECORDED}
+    others = dict.fromkeys(label.heading for label in LABELS.values() if label.heading not in brought)
+    result.left_out.append((", ".join(others), "recorded frames bring none"))
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / duration
     return result
@@ -183,18 +185,17 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         name = "brightness" if timeline.kind == "brightness" else "velocity"
         result.passes.append(Pass(name, f"decides the step; every {timeline.sample_every}. pixel", (name,),
                                   pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, small_s * count))
-    if config.labels.images:
+    if "images" in asked_for(config.labels):
         result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
                                   ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
                                   _timed(lambda t: renderer.colour(t).read(), times[:3]) * (labels + 1)))
-    request = _request(config)
-    wanted = [name for name in ("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward") if getattr(request, name)]
-    if wanted:
+    request = asked_for(config.labels)
+    request = request.without(*(name for name in request if LABELS[name].anti_aliased))
+    if request:
         interval = config.time.interval_ns
         each = _timed(lambda t: renderer.labels(t, request, t + interval, t - interval), config.time.label_times_ns[:3])
-        sizes = {"depth": 4, "ids": 4, "normals": 16, "velocity": 8, "flow_forward": 16, "flow_backward": 16}
-        result.passes.append(Pass("labels", ", ".join(wanted) + (", occlusion" if request.occlusion else ""), ("geometry",),
-                                  pixels * (sum(sizes[w] for w in wanted) + DEPTH_BYTES), labels, each * labels))
+        result.passes.append(Pass("labels", ", ".join(request), ("geometry",),
+                                  pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES), labels, each * labels))
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
         each = _timed(lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times[:3])
@@ -216,22 +217,12 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
                               (config.events.emulator,), 0, result.frames, each * result.frames))
 
 
-def _request(config: SequenceConfig) -> LabelRequest:
-    labels = config.labels
-    return LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
-                        flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=labels.occlusion)
-
-
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
     add = lambda what, why: result.left_out.append((what, why))
-    labels = config.labels
-    for name, on, key in (("images", labels.images, "labels.images: false"), ("depth", labels.depth, "labels.depth: false"),
-                          ("instance ids", labels.ids, "labels.ids: false"), ("normals", labels.normals, "labels.normals: false"),
-                          ("velocity label", labels.velocity, "labels.velocity: false"),
-                          ("forward flow", "forward" in labels.flow, "not in labels.flow"),
-                          ("backward flow", "backward" in labels.flow, "not in labels.flow"),
-                          ("occlusion masks", labels.occlusion and labels.flow, "labels.occlusion: false, or no flow"),
-                          ("preview", config.preview.enabled, "preview.enabled: false"),
+    request = asked_for(config.labels)
+    there = {LABELS[name].heading for name in request}
+    labels = {label.heading: label.off or f"labels.{label.name}: false" for label in LABELS.values()}
+    for name, on, key in (*((heading, heading in there, why) for heading, why in labels.items()), ("preview", config.preview.enabled, "preview.enabled: false"),
                           ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             add(name, key)
@@ -255,24 +246,3 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         if value in (0, 0.0, False) and name not in ("seed",):
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
     add("shadows, inter-reflection, motion blur, depth of field", "BlinkGL does not model them")
-
-
-def show(result: Explanation, console: Console | None = None) -> None:
-    """Prints an explanation as three tables."""
-    console = console or plain_console()
-    scene = Table(title="what is modelled", title_justify="left", show_header=False)
-    for key, value in result.scene.items():
-        scene.add_row(key, value)
-    console.print(scene)
-    passes = Table(title=f"what is computed (timed on {result.machine})", title_justify="left")
-    for column, side in (("pass", "left"), ("why", "left"), ("variants", "left"), ("MB/frame", "right"), ("times", "right"), ("seconds", "right")):
-        passes.add_column(column, justify=side)
-    for p in result.passes:
-        passes.add_row(p.name, p.why, ", ".join(p.variants), f"{p.bytes / 1e6:.2f}" if p.bytes else "–", f"{p.count:,}", f"{p.seconds:.2f}")
-    console.print(passes)
-    left = Table(title="what is left out", title_justify="left", show_header=False)
-    for what, why in result.left_out:
-        left.add_row(what, why)
-    console.print(left)
-    console.print(f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
-                  f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video", highlight=False, soft_wrap=True)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import Config, validate_field
 from blinkgl.config.recipe import merge
@@ -13,15 +12,14 @@ from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.scenes import Scene
+from blinkgl.labels import LABELS
 
 if TYPE_CHECKING:
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
 
-LABELS = ("images", "flow", "flow_backward", "occlusion", "depth", "ids", "normals", "velocity")
-
-Source = Union[Scene, RunTemplate]
-Emulator = Union[str, Mapping[str, Any], Config]
+Source = Scene | RunTemplate
+Emulator = str | Mapping[str, Any] | Config
 
 
 class Timeline:
@@ -57,7 +55,7 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 
 def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, workers: int = 1, resume: bool = False,
              emulator: Emulator | None = None, sensor: str | None = None, timeline: Timeline | None = None, quality: str | None = None,
-             labels: Sequence[str] | None = None) -> "Outcome":
+             labels: Sequence[str] | None = None) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at most).   workers : processes; 1: this one.
@@ -77,7 +75,7 @@ def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, 
     return run_dataset(template, check.path(out, "out"), executor, num=num, resume=bool(resume))
 
 
-def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> "Verification":
+def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verification:
     """Looks through a data set; ``.clean`` says whether all is well, ``.problems`` what is not, by sequence.
 
     deep : so many sequences are made again and compared.   seed : draws which. Raises AssetError: no data set there."""
@@ -97,7 +95,7 @@ def configured(source: Source, *, emulator: Emulator | None = None, sensor: str 
     if timeline is not None:
         own["timeline"] = check.one_of(timeline, "timeline", Timeline, "a Timeline").tree
     if labels is not None:
-        own["labels"] = _labels_tree(labels)
+        own["labels"] = labels_tree(labels)
     for key in ("sensor", "quality"):
         if key in own:
             validate_field(SequenceConfig, key, own[key])
@@ -116,15 +114,22 @@ def events_tree(emulator: Emulator) -> dict[str, Any]:
 
 
 def label_names(labels: Sequence[str]) -> set[str]:
-    """Raises ConfigError: not of :data:`LABELS`."""
+    """Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
+    known = list(dict.fromkeys(label.said for label in LABELS.values()))
     wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
     for name in wanted:
-        if name not in LABELS:
-            raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(LABELS))
+        if name not in known:
+            raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(known))
     return set(wanted)
 
 
-def _labels_tree(labels: Sequence[str]) -> dict[str, Any]:
+def labels_tree(labels: Sequence[str]) -> dict[str, Any]:
+    """``labels:`` that asks for these and no others. Raises ConfigError as :func:`label_names`."""
     wanted = label_names(labels)
-    flow = [direction for name, direction in (("flow", "forward"), ("flow_backward", "backward")) if name in wanted]
-    return {"flow": flow, **{name: name in wanted for name in LABELS if not name.startswith("flow")}}
+    everything: dict[str, Any] = {}
+    asked: dict[str, Any] = {}
+    for label in LABELS.values():
+        label.ask(everything)
+        if label.said in wanted:
+            label.ask(asked)
+    return {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}

@@ -52,6 +52,14 @@ def encode_ids(ids: np.ndarray) -> bytes:
     return encode_png(ids.astype(np.uint16))
 
 
+def read_ids(path: str | os.PathLike) -> np.ndarray:
+    """(H, W) integers as stored. Raises AssetError."""
+    image = read_png(path)
+    if image.ndim != 2:
+        raise AssetError("not a picture of ids", where=str(path), value=image.shape, accepted="one channel")
+    return image
+
+
 def encode_npy(array: np.ndarray) -> bytes:
     """.npy bytes; object arrays are refused (they would be pickled)."""
     buffer = io.BytesIO()
@@ -98,7 +106,7 @@ class NpzReader:
         self.path, self._archive = path, zipfile.ZipFile(path)
         self.names = [n.removesuffix(".npy") for n in self._archive.namelist()]
 
-    def __enter__(self) -> "NpzReader":
+    def __enter__(self) -> NpzReader:
         return self
 
     def __exit__(self, *_) -> None:
@@ -134,5 +142,5 @@ def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
         yield
     except AssetError:
         raise
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         raise AssetError(f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)) from error

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from blinkgl.labels import Flow, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
-from blinkgl.render.frames import Flow, LabelFrame, LabelRequest
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.passes import Geometry
 
@@ -18,12 +18,13 @@ SURFACES = 3
 """Times whose surfaces are kept: neighbouring labels look at the same moments."""
 
 
+OUTPUTS = {"depth": "DEPTH", "ids": "ID", "normals": "NORMAL", "velocity": "VELOCITY", "flow_forward": "FLOW_FORWARD", "flow_backward": "FLOW_BACKWARD"}
+"""Name of a label -> its output of the label pass."""
+
+
 def buffers_of(request: LabelRequest) -> tuple[str, ...]:
     """Outputs of the label pass that a request takes, in their order."""
-    occlusion = request.occlusion and (request.flow_forward or request.flow_backward)
-    wanted = {"DEPTH": request.depth, "ID": request.ids or occlusion, "NORMAL": request.normals, "VELOCITY": request.velocity,
-              "FLOW_FORWARD": request.flow_forward, "FLOW_BACKWARD": request.flow_backward}
-    return tuple(name for name, on in wanted.items() if on)
+    return tuple(OUTPUTS[name] for name in request.buffers)
 
 
 class Labels:
@@ -36,24 +37,27 @@ class Labels:
     def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
         """See :meth:`Renderer.labels`."""
         draw, result = self._renderer, {}
-        if request.colour:
-            result["colour"] = draw.colour(t_ns).read()
+        if "images" in request:
+            result["images"] = draw.colour(t_ns).read()
         if names := buffers_of(request):
-            ends = {"forward": forward_ns} if request.flow_forward else {}
-            ends |= {"backward": backward_ns} if request.flow_backward else {}
+            ends = {"forward": forward_ns} if "FLOW_FORWARD" in names else {}
+            ends |= {"backward": backward_ns} if "FLOW_BACKWARD" in names else {}
             frame = draw.draw(Geometry(names), t_ns, ends)
             buffers = {name: frame.read(name) for name in names}
-            if request.depth:
+            if "depth" in request:
                 result["depth"] = np.where(buffers["DEPTH"] > 0, buffers["DEPTH"], np.float32(np.inf))
-            if request.ids:
+            if "ids" in request:
                 result["ids"] = buffers["ID"]
-            if request.normals:
+            if "normals" in request:
                 result["normals"] = np.ascontiguousarray(buffers["NORMAL"][..., :3])
-            if request.velocity:
+            if "velocity" in request:
                 result["velocity"] = buffers["VELOCITY"]
             for way, other_ns in ends.items():
-                result[way] = self._flow(buffers[f"FLOW_{way.upper()}"], buffers.get("ID"), other_ns, request.occlusion)
-        return LabelFrame(t_ns, **result)
+                flow = self._flow(buffers[f"FLOW_{way.upper()}"], buffers.get("ID"), other_ns, f"occlusion_{way}" in request)
+                result[f"flow_{way}"] = Flow(flow.flow, flow.valid)
+                if flow.occluded is not None:
+                    result[f"occlusion_{way}"] = flow.occluded
+        return LabelFrame(t_ns, result)
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """See :meth:`Renderer.shown_at`."""

@@ -2,7 +2,7 @@
 
     with create_context() as gl, Renderer(gl, scene, RenderConfig()) as renderer:
         luminance = renderer.luminance(t_ns).read()            # (H, W) float32, linear light
-        labels = renderer.labels(t_ns, LabelRequest(flow_forward=True, depth=True), t_forward_ns=t1_ns)
+        labels = renderer.labels(t_ns, LabelRequest("flow_forward", "depth"), t_forward_ns=t1_ns)
         edges = renderer.draw(MyPass(), t_ns)                  # a Frame: on the card until it is read
 
 A pass (``passes/``) says what is drawn; a :class:`~blinkgl.render.moment.Moment` where everything is; a
@@ -16,10 +16,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from blinkgl.labels import Flow, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, Frame
-from blinkgl.render.frames import LabelFrame, LabelRequest, RenderStats
+from blinkgl.render.frames import RenderStats
 from blinkgl.render.labels import Labels
 from blinkgl.render.moment import Moment, Moments
 from blinkgl.render.painter import Painter

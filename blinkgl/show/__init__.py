@@ -1,5 +1,6 @@
-"""What the commands print.
+"""What the commands print. Nothing here makes a result, and no other room prints.
 
-In: a command's arguments. Out: a library call behind a display, then words, tables and files for people; no result is made here.
-Start in generate.py; one module per command, and terminal.py, which makes every console of the project.
+In:    a command's options.
+Out:   one call into the library behind a display, words and tables for people, the command's exit status.
+Start: generate.py; one module per command, of its name, with ``run``. terminal.py makes every console of the project.
 """

@@ -93,7 +93,6 @@ class Budget(Timeline):
         self.error = TimeError(config.reconstruction, config.max_time_error_px if in_px else config.max_time_error_us * 1e-6, in_px,
                                config.percentile)
         self._speeds: dict[int, np.ndarray] = {}
-        self._probing = False
 
     def __iter__(self) -> Iterator[int]:
         last = None
@@ -115,7 +114,7 @@ class Budget(Timeline):
         speed = self._speeds[nearest]
         # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of the stride or smaller than the stride.
         rows, columns = (((np.arange(few) + 0.5) * many / few).astype(np.intp) for few, many in zip(speed.shape, luminance.shape))
-        pick = lambda a: a[np.ix_(rows, columns)]  # noqa: E731
+        pick = lambda a: a[np.ix_(rows, columns)]
         small = pick(luminance)
         slope = self.response.change(small, pick(rate)) if rate is not None else None
         self.error.observe(t_ns, self.response.signal(small), slope, speed)

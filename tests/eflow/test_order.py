@@ -53,7 +53,7 @@ def equal(a: dict, b: dict) -> bool:
 
 
 def test_a_sample_is_a_function_of_its_key(source):
-    make = lambda seed=0: FlowDataset([source], VoxelGrid(), seed=seed, augment=STRONG, crop=(96, 112))  # noqa: E731
+    make = lambda seed=0: FlowDataset([source], VoxelGrid(), seed=seed, augment=STRONG, crop=(96, 112))
     key = Key(2, 5, 0, 3)
     a = make()[key]
     assert a["new"].shape == (15, 96, 112) and a["flow"].shape == (2, 96, 112) and a["valid"].dtype == torch.bool
@@ -137,12 +137,13 @@ def test_unlabelled_data_cannot_be_trained_on(tmp_path):
 
 def test_windows_without_events(tmp_path):
     from blinkgl.io.sequence_dir import SequenceWriter
+    from blinkgl.labels import Flow
     from flow_data import SPAN, constant_flow, moving_events
 
     with SequenceWriter(tmp_path / "still", 128, 128, config_yaml="") as writer:
         writer.append_events(moving_events(128, 128, 0, 2 * SPAN))
         for k in range(3):
-            writer.flow("forward", k, constant_flow(128, 128), np.ones((128, 128), bool), SPAN * (k + 1), SPAN * (k + 2))
+            writer.label("flow_forward", k, Flow(constant_flow(128, 128), np.ones((128, 128), bool)), SPAN * (k + 1), SPAN * (k + 2))
         writer.t_end_us = 4 * SPAN
     source = open_source(tmp_path)
     with pytest.raises(BlinkGLError, match=r"still/000001: no events in the new window \[200000, 300000\) µs"):
@@ -156,7 +157,7 @@ def test_flow_from_400_px_on_is_not_supervised(source):
 
     class Fast:
         has_backward = True
-        __len__ = lambda self: 1  # noqa: E731
+        __len__ = lambda self: 1
 
         def __getitem__(self, i):
             flow = source[0].flow.copy()

@@ -17,9 +17,8 @@ from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath
-from blinkgl.scene.types import Camera, Part, SceneObject
+from blinkgl.scene.types import Camera
 from blinkgl.tools import bench_still
-
 from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -138,7 +137,7 @@ def test_another_camera_takes_nothing_from_the_first(gl):
     """look_through: luminance, what has changed in it, and the surfaces that hide points at t' are the other camera's."""
     world = mixed_scene(48, 36, camera_moves=False)
     other = replace(world.camera, cx=world.camera.cx - 20, fx=world.camera.fx * 1.3)
-    request = LabelRequest(flow_forward=True, occlusion=True)
+    request = LabelRequest("flow_forward", "occlusion_forward")
     with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, replace(world, camera=other), PLAIN) as fresh:
         first = renderer.luminance(0)
         last = renderer.luminance(SECOND // 9)

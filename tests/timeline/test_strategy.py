@@ -56,7 +56,7 @@ def test_displacement_over_whole_intervals(gl, world, config, inside):
         for a, b in zip(times[:-1:3].tolist(), times[1::3].tolist()):
             if b - a <= config.min_step_us * 1000:
                 continue
-            flow = renderer.labels(a, LabelRequest(flow_forward=True), b).forward
+            flow = renderer.labels(a, LabelRequest("flow_forward"), b).forward
             moved = np.linalg.norm(flow.flow, axis=-1)[flow.valid]
             for percent, bound in inside:
                 assert np.percentile(moved[moved > 0], percent) <= bound * 1.05
@@ -81,7 +81,7 @@ def test_brightness_bound_holds_between_frames(gl, world, fraction, percent):
         times = times_of(config, renderer).tolist()
         worst = 0.0
         for a, b in zip(times[:-1:4], times[1::4]):
-            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t).read() + 1e-3), renderer.labels(t, LabelRequest(ids=True)).ids) for t in (a, b)))
+            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t).read() + 1e-3), renderer.labels(t, LabelRequest("ids")).ids) for t in (a, b)))
             change = np.abs(lb - la)[(ia == ib)]
             worst = max(worst, np.percentile(change[change > 0], percent))
         assert 0.4 * fraction * 0.2 < worst <= 1.1 * fraction * 0.2
@@ -135,7 +135,7 @@ def test_budget_finds_the_order_and_the_step_of_a_smooth_signal():
     x = np.linspace(0, 2 * np.pi, 4000, endpoint=False)[None]
     speed_px, wavelength = 50.0, 40.0
     rate = speed_px / wavelength * 2 * np.pi
-    signal = lambda t: np.sin(x - rate * t).astype(np.float32)  # noqa: E731
+    signal = lambda t: np.sin(x - rate * t).astype(np.float32)
     error, t = TimeError("linear", 0.5e-3, in_px=False, percentile=50.0), 0.0
     steps = []
     for k in range(80):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from importlib import resources
 
@@ -10,7 +11,6 @@ import yaml
 
 from blinkgl.config.quality import QUALITIES, load_quality
 from blinkgl.config.sequence import RunTemplate, apply_overrides, load_run
-from blinkgl.trade.front import dominating
 from blinkgl.trade.measure import Bench, Options
 from blinkgl.trade.settings import Setting
 
@@ -28,6 +28,11 @@ def tables(overrides) -> dict:
     return {"timeline": config.timeline.model_dump(), "render": config.render.model_dump()}
 
 
+def dominating(row: dict, rows: list[dict], cost: str, error: str, margin: float = 0.0) -> list[dict]:
+    """Rows that beat ``row`` in cost and in error, in both by more than the relative ``margin``."""
+    return [r for r in rows if r[cost] < row[cost] * (1 - margin) and r[error] < row[error] * (1 - margin)]
+
+
 def row_of(name: str, rows: list[dict]) -> dict:
     wanted = tables([f"quality={name}"])
     (row,) = [r for r in rows if not r["size"] and "textures" not in r["other"] and tables(r["overrides"]) == wanted]
@@ -39,7 +44,7 @@ def test_presets_are_on_the_measured_front(recorded):
     presets = [row_of(name, rows) for name in QUALITIES]
     for preset in presets:
         assert preset["on_front"] and not dominating(preset, rows, recorded["cost"], "voxel"), preset["name"]
-    for cheap, dear in zip(presets, presets[1:]):
+    for cheap, dear in itertools.pairwise(presets):
         assert cheap[recorded["cost"]] < dear[recorded["cost"]] and cheap["voxel"] > dear["voxel"]
 
 

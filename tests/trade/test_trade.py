@@ -18,13 +18,13 @@ from blinkgl.config.sequence import load_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.rectangles import Rectangle
+from blinkgl.show.trade import show
 from blinkgl.tools import peer_cycles
-from blinkgl.trade.front import dominating, front
+from blinkgl.trade.front import front
 from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
 from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
-from blinkgl.show.trade import show
 
 CONFIG = {
     "seed": 3, "camera": {"width": 64, "height": 48}, "time": {"duration": 0.1, "label_rate": 20},
@@ -46,8 +46,6 @@ def test_front_by_hand():
     rows = [dict(n=n, c=c, e=e) for n, c, e in (("a", 1, 9), ("b", 2, 5), ("worse than b", 3, 5), ("c", 4, 1), ("slow", 9, 2), ("equal to c", 4, 1),
                                                ("unknown", 0, float("nan")))]
     assert [r["n"] for r in front(rows, "c", "e")] == ["a", "b", "c"]
-    assert [r["n"] for r in dominating(rows[4], rows, "c", "e")] == ["c", "equal to c"]
-    assert dominating(rows[4], rows, "c", "e", margin=0.6) == []
 
 
 def test_lattice_covers_what_it_says():

@@ -24,8 +24,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.frames import LabelRequest
 from blinkgl.render.labels import buffers_of
 from blinkgl.render.passes import Geometry, Pass
 from blinkgl.scene.types import Scene
@@ -53,7 +53,7 @@ class Draws:
     draws: int = 0
     triangles: int = 0
     fragments: int = 0
-    variants: dict[str, "Draws"] = field(default_factory=dict)
+    variants: dict[str, Draws] = field(default_factory=dict)
 
 
 class Stopwatch:
@@ -165,7 +165,7 @@ class TimedRenderer(DebugRenderer):
 def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
     """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that generation runs for this configuration."""
     config = subject.config
-    labels, render = config.labels, config.render
+    asked, render = asked_for(config.labels), config.render
     rate = config.timeline.reconstruction == "hermite"
     out = {"luminance" + (" and rate" if rate else ""): (lambda r: r.luminance(when.t_ns, rate), samples_of(render.antialiasing).grid)}
     if config.timeline.kind != "uniform":
@@ -174,18 +174,15 @@ def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
             out["brightness (timeline)"] = (lambda r: r.brightness(when.t_ns, every), 1 / every)
         else:
             out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, every), 1 / every)
-    if labels.images or config.preview.enabled:
+    if "images" in asked or config.preview.enabled:
         out["colour"] = (lambda r: r.colour(when.t_ns), samples_of(render.image_antialiasing).grid)
-    request = LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
-                           flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=False)
-    occlusion = labels.occlusion and (request.flow_forward or request.flow_backward)
-    if occlusion:
-        request = replace(request, ids=True)
-    names, ends = buffers_of(request), {"forward": when.forward_ns, "backward": when.backward_ns}
+    names, ends = buffers_of(asked), {"forward": when.forward_ns, "backward": when.backward_ns}
     if names:
         out["labels"] = (lambda r: r.draw(Geometry(names), when.t_ns, ends), 1)
-    if occlusion:
-        out["occlusion, per direction"] = (lambda r: r.draw(Geometry(("DEPTH", "ID")), when.forward_ns), 1)
+    if asked.there:
+        there = buffers_of(LabelRequest(*asked.there))
+        who = ", ".join(dict.fromkeys(LABELS[name].said for name in asked if LABELS[name].there))
+        out[f"{who}, per direction"] = (lambda r: r.draw(Geometry(there), when.forward_ns), 1)
     return out
 
 

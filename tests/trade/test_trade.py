@@ -62,7 +62,7 @@ def test_fine_tiles_are_the_image_itself_and_then_its_mean(gl, config):
     for scale, antialiasing in ((1, "none"), (2, "ssaa2"), (4, "ssaa4")):
         render = bench.config([f"render.antialiasing={antialiasing}"]).render
         with Renderer(gl, bench.scene, render) as whole, FineTiles(gl, bench.scene, bench.tiles, scale) as tiles:
-            image = whole.luminance(t)
+            image = whole.luminance(t).read()
             (mine,) = tiles([t])
             inside = np.abs(mine - image)[bench.mask]
             # The tiles' projection rounds differently: a sample on an edge may fall on its other side.

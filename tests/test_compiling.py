@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from blinkgl import compiling
-from blinkgl.dataset.clock import StageClock
+from blinkgl.sequence.clock import StageClock
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run import Outcome
 from blinkgl.dataset.show import show_outcome

@@ -18,7 +18,7 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import matching_folders, used_images
+from blinkgl.sequence.recorded import matching_folders, used_images
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
 from blinkgl.scene.images import IMAGE_SUFFIXES, content_hash

@@ -17,7 +17,7 @@ from rich.table import Table
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
-from blinkgl.terminal import plain_console
+from blinkgl.show.terminal import plain_console
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
 from eflow.infer import predict

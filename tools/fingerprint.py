@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.bench import machine_line
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
+from blinkgl.machine.bench import machine_line
 
 BASE = {
     "seed": 5,
@@ -76,7 +76,7 @@ def frames(scratch: Path) -> dict[str, str]:
     """A folder of frames, converted by ``generate`` and by ``simulate`` with each emulator."""
     import cv2
 
-    from blinkgl.simulation import simulate_file
+    from blinkgl.recordings.simulation import simulate_file
 
     folder = scratch / "clip" / "image_left"
     folder.mkdir(parents=True)

@@ -100,7 +100,7 @@ def _as_stored(folder: Path, name: str) -> dict[str, np.ndarray] | None:
         return {"x": data["x"], "y": data["y"], "t": np.rint(t.astype(float) * 1e6) if t.dtype.kind == "f" else t, "p": (data["p"] > 0) * 1}
     if path.suffix in (".txt", ".csv"):
         lines = [line for line in path.read_bytes().split(b"\n") if line.strip() and line.strip()[:1] not in b"#%"]
-        events = [f for line in lines if len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit() or f[0][:1] in b"."]
+        events = [f for line in lines if (len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit()) or f[0][:1] in b"."]
         return {"x": np.array([float(f[1]) for f in events])}
     return None
 
@@ -242,7 +242,7 @@ def _write_exr(path: Path, image: np.ndarray) -> None:
 def _judge_frames(name: str = "frames", fps: float | None = None) -> Callable[[Path], str | None]:
     def judge(folder: Path) -> str | None:
         from blinkgl.io.frames import open_frames
-        from blinkgl.simulation import Decoder
+        from blinkgl.recordings.simulation import Decoder
 
         source = open_frames(folder / name, fps=fps)
         decode, last = Decoder(None), None
@@ -328,7 +328,7 @@ def _make_mesh(ending: str) -> Callable[[Path], list[str]]:
 
 def _judge_asset(name: str) -> Callable[[Path], str | None]:
     def judge(folder: Path) -> str | None:
-        from blinkgl.scene.mesh_files import load_asset
+        from blinkgl.scene.importing.mesh_files import load_asset
 
         asset = load_asset(folder / name, max_texture=256).normalised()
         return _sound_parts(asset.parts)
@@ -416,7 +416,7 @@ def _judge_scene(name: str) -> Callable[[Path], str | None]:
     def judge(folder: Path) -> str | None:
         from blinkgl.config.sequence import CameraConfig
         from blinkgl.errors import BlinkGLError
-        from blinkgl.scene.importers import from_gltf
+        from blinkgl.scene.worlds.from_file import from_gltf
 
         try:
             problem = _judge_asset(name)(folder)
@@ -447,7 +447,7 @@ def _make_texture(ending: str, dtype=np.uint8) -> Callable[[Path], list[str]]:
 
 def _judge_texture(name: str) -> Callable[[Path], str | None]:
     def judge(folder: Path) -> str | None:
-        from blinkgl.scene.images import load_image
+        from blinkgl.scene.surfaces.images import load_image
 
         return _sound_texture(load_image(folder / name, 256))
     return judge
@@ -468,7 +468,6 @@ _RECIPE = {
 def _make_data_set(folder: Path) -> None:
     """One sequence, its index and the run's record; nothing of it was rendered."""
     from blinkgl.config.reader import to_yaml
-
     from blinkgl.config.sequence import load_run
     from blinkgl.dataset.plan import Plan
     from blinkgl.dataset.run_folder import RunFolder
@@ -641,8 +640,8 @@ def _make_emulator_yaml(folder: Path) -> list[str]:
 
 
 def _judge_emulator_yaml(folder: Path) -> str | None:
-    from blinkgl.commands import emulator_options
-    from blinkgl.simulation import emulator_config
+    from blinkgl.recordings.simulation import emulator_config
+    from blinkgl.show.simulate import emulator_options
 
     emulator_config(emulator_options("esim", str(folder / "e.yaml"), [])["emulator"])
     return None

@@ -36,7 +36,7 @@ class PreviewRecorder:
                 self._video.set_flow(picture.velocity * self._interval_s)
             self._video.frame(picture.t_ns // 1000, picture.image)
 
-    def __enter__(self) -> "PreviewRecorder":
+    def __enter__(self) -> PreviewRecorder:
         return self
 
     def __exit__(self, kind, *_) -> None:

@@ -20,8 +20,7 @@ from blinkgl.render.frames import LabelFrame, LabelRequest
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.scene import types as data
 from blinkgl.scene.build import build_scene
-from blinkgl.sequence import EventChunk
-from blinkgl.sequence import simulate as core
+from blinkgl.sequence import EventChunk, simulate as core
 from blinkgl.srgb import to_srgb8
 
 _LATEST_S = 1e7
@@ -119,7 +118,7 @@ class Renderer:
             self._renderer = stack.enter_context(SceneRenderer(gl, self.scene, self.config.render))
             self._stack = stack.pop_all()
 
-    def __enter__(self) -> "Renderer":
+    def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:

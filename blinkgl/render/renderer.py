@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import moderngl
 import numpy as np
 
-from blinkgl.compiling import working_clock
+from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.frames import Flow, LabelFrame, LabelRequest, RenderStats
 from blinkgl.render.matrices import (
@@ -25,8 +25,8 @@ from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
 from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import Backdrop, Rectangle, screen_rectangle
-from blinkgl.scene.lod import at_level_of_detail
-from blinkgl.scene.meshes import without_collapsed_faces
+from blinkgl.scene.geometry.lod import at_level_of_detail
+from blinkgl.scene.geometry.meshes import without_collapsed_faces
 from blinkgl.scene.types import PosePath, Scene
 
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.errors import ConfigError
-from blinkgl.scene.explicit import explicit_scene, primitive_mesh
-from blinkgl.scene.importers import scene_from_file
-from blinkgl.scene.pool import SPLITS, resolve
 from blinkgl.scene.types import Scene
-from blinkgl.scene.world import pools, random_world
+from blinkgl.scene.worlds.explicit import explicit_scene, primitive_mesh
+from blinkgl.scene.worlds.from_file import scene_from_file
+from blinkgl.scene.worlds.pool import SPLITS, resolve
+from blinkgl.scene.worlds.random_world import pools, random_world
 
 
 def build_scene(config: SceneConfig, camera, t0_ns: int, t1_ns: int, *, split: str = "train", seed: int = 0, sequence: int = 0,

@@ -1,7 +1,7 @@
-"""One sequence as it happens: a configuration comes in, events, ground truth and pictures go out in the order of time.
+"""One sequence as it happens.
 
-``simulate.py`` is the door (:func:`~blinkgl.sequence.simulate.simulate_sequence`) and what both sources share; ``rendered.py`` draws a
-scene, ``recorded.py`` reads folders of frames. Files, arrays, measurements and training are consumers of it and live in other rooms.
+In: the configuration of one sequence, and OpenGL where a scene is drawn. Out: its events, ground truth and pictures, in the order of time;
+whoever writes, keeps, judges or counts them lives in another room. Start in simulate.py; rendered.py and recorded.py are its two sources.
 """
 
 from blinkgl.sequence.items import EventChunk, GroundTruth, Item, Picture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-from blinkgl.compiling import compiled_s, working_clock
+from blinkgl.machine.compiling import compiled_s, working_clock
 
 
 class StageClock:

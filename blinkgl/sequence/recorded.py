@@ -24,13 +24,13 @@ from blinkgl.events.types import Events
 from blinkgl.io.flow import read_flow
 from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
+from blinkgl.recordings.simulation import Decoder, stepped, timed
 from blinkgl.render.frames import Flow, LabelFrame
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.pool import resolve
+from blinkgl.scene.worlds.pool import resolve
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.items import GroundTruth, Picture
 from blinkgl.sequence.simulate import Simulation
-from blinkgl.simulation import Decoder, stepped, timed
 
 _FLOW = (".npy", ".flo", ".png")
 

@@ -35,7 +35,7 @@ from blinkgl.timeline import Ticks, Timeline
 
 def simulate_sequence(config: SequenceConfig, index: int = 0, gl: GLContext | None = None, *, base: Path = Path("."), events: bool = True,
                       labels: bool = True, pictures_hz: float | None = None, scene: Scene | None = None, renderer: Renderer | None = None,
-                      window_ns: tuple[int, int] | None = None) -> "Simulation":
+                      window_ns: tuple[int, int] | None = None) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth` and :class:`Picture` in time order.
 
     gl : context to draw with; None: one of its own, where something is drawn at all.
@@ -81,7 +81,7 @@ class Simulation(ABC):
         self.pictures_hz, self.events, self.labels = pictures_hz, 0, 0
         self._labels, self._stack, self._begun = labels, stack or ExitStack(), False
 
-    def __enter__(self) -> "Simulation":
+    def __enter__(self) -> Simulation:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -58,7 +58,7 @@ class FineTiles:
         self._renderer = Renderer(gl, replace(scene, camera=self._cameras[0]), RenderConfig())
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
-    def __enter__(self) -> "FineTiles":
+    def __enter__(self) -> FineTiles:
         return self
 
     def __exit__(self, *_) -> None:
@@ -99,6 +99,6 @@ def reference_events(source: FrameSource, times: Iterable[int], config: Emulator
 
 def _zoomed(camera: Camera, tile: Rectangle, scale: int) -> Camera:
     """The camera of one rectangle, ``scale`` times finer. Pixel centres are at integers: pixel x is [x - 0.5, x + 0.5)."""
-    place = lambda c, start: (c - start + 0.5) * scale - 0.5  # noqa: E731
+    place = lambda c, start: (c - start + 0.5) * scale - 0.5
     return replace(camera, width=(tile.x1 - tile.x0) * scale, height=(tile.y1 - tile.y0) * scale, fx=camera.fx * scale, fy=camera.fy * scale,
                    cx=place(camera.cx, tile.x0), cy=place(camera.cy, tile.y0))

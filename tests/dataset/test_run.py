@@ -13,12 +13,13 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset import run as run_module
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
-from blinkgl.io.index import read_index
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.work import thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
-from blinkgl.scene import primitives, world
+from blinkgl.io.index import read_index
+from blinkgl.scene.geometry import primitives
+from blinkgl.scene.worlds import random_world
 from runs import NAMES, alive, children, recipe_file, start, temporaries, tree, wait_for
 
 
@@ -128,7 +129,7 @@ def test_driver_killed_then_terminated_then_resumed(reference, tmp_path, capfd):
     assert 1 <= len(half) < 6 and all((p / "manifest.json").is_file() for p in half)
 
     driver = start(recipe, "--out", out, "--resume")  # in one process this time
-    wait_for(lambda: temporaries(out) and "fly" in temporaries(out)[0].name or driver.poll() is not None)
+    wait_for(lambda: (temporaries(out) and "fly" in temporaries(out)[0].name) or driver.poll() is not None)
     driver.send_signal(signal.SIGTERM)
     said, _ = driver.communicate()
     assert driver.returncode in (0, 130) and "Traceback" not in said
@@ -188,8 +189,8 @@ def test_full_disk_stops_the_run_and_a_larger_one_goes_on(reference, small_disk,
 
 def forget_pools() -> None:
     """A process keeps its pools; a driver started on another day would not have them."""
-    world._object_pool.cache_clear()
-    world._texture_pool.cache_clear()
+    random_world._object_pool.cache_clear()
+    random_world._texture_pool.cache_clear()
 
 
 def mesh_recipe(tmp_path: Path) -> tuple[Path, list[Path]]:

@@ -8,9 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.extremes.measures import FACING
-from tests.render.render_scenes import LEVEL, camera, cube, drift, mesh, quad, scene, smooth_texture, still, thing
-from tests.shared_data import shared
 
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate
@@ -19,9 +16,12 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.sequence_dir import verify_sequence
 from blinkgl.render import renderer as module
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene import primitives
-from blinkgl.scene.meshes import faces_in_float32
+from blinkgl.scene.geometry import primitives
+from blinkgl.scene.geometry.meshes import faces_in_float32
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
+from tests.extremes.measures import FACING
+from tests.render.render_scenes import LEVEL, camera, cube, drift, mesh, quad, scene, smooth_texture, still, thing
+from tests.shared_data import shared
 
 MS = 1_000_000
 RAW = [("DEPTH", "R32F"), ("ID", "R32UI"), ("NORMAL", "RGBA32F"), ("VELOCITY", "RG32F"), ("FLOW_FORWARD", "RGBA32F"), ("FLOW_BACKWARD", "RGBA32F")]

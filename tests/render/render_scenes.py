@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from blinkgl.scene.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
 
 SECOND = 1_000_000_000

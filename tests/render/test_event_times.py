@@ -12,7 +12,6 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Esim, Events
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Camera, Material, Texture
-
 from render_scenes import LEVEL, SECOND, drift, mixed_scene, quad, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")

@@ -6,14 +6,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from render_scenes import (
-    LEVEL, SECOND, camera, cube, curve, drift, mesh, mixed_scene, moved_scene, pose, quad, scene, sphere, still, thing,
-)  # fmt: skip
 from scipy.spatial.transform import Rotation
 
 from blinkgl.render import reference
 from blinkgl.render.probe import probe
 from blinkgl.scene.types import Camera, Light, Material, Part, SceneObject, Texture
+from render_scenes import (
+    LEVEL,
+    SECOND,
+    camera,
+    cube,
+    curve,
+    drift,
+    mesh,
+    mixed_scene,
+    moved_scene,
+    quad,
+    scene,
+    sphere,
+    still,
+    thing,
+)  # fmt: skip
 
 MS = 1_000_000
 

@@ -10,9 +10,8 @@ from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigi
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
-from blinkgl.scene import primitives
+from blinkgl.scene.geometry import primitives
 from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObject, Texture
-
 from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")

@@ -91,7 +91,7 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
     assert not events_of(made["labels"]).t.size
     for a, b in zip((i for i in made["everything"] if isinstance(i, GroundTruth)), made["labels"], strict=True):
         np.testing.assert_array_equal(a.image, b.image)
-        assert a.frame is b.frame is None or np.array_equal(a.frame.depth, b.frame.depth) and np.array_equal(a.frame.backward.flow, b.frame.backward.flow)
+        assert a.frame is b.frame is None or (np.array_equal(a.frame.depth, b.frame.depth) and np.array_equal(a.frame.backward.flow, b.frame.backward.flow))
 
 
 # --- its consumers see one and the same -------------------------------------------------------------------------------
@@ -129,7 +129,7 @@ def test_opengl_is_let_go_however_it_ends(tmp_path, how, monkeypatch):
             with simulate_sequence(config, 0) as sequence:
                 return sequence
         sequence = simulate_sequence(config, 0)
-        for k, item in enumerate(sequence):
+        for k, _ in enumerate(sequence):
             if how == "break" and k == 5:
                 break
             if how == "error" and k == 5:
@@ -168,7 +168,7 @@ def test_two_at_once_are_as_one_after_the_other(tmp_path):
     other = create_context()
     with other, simulate_sequence(config, 0) as a, simulate_sequence(config, 0) as b:
         together = []
-        for x, y in zip(a, b, strict=True):
+        for x, _ in zip(a, b, strict=True):
             together += [x]
             other.make_current()
         truths = [(x, y) for x, y in zip(together, alone, strict=True) if isinstance(x, GroundTruth)]

@@ -19,7 +19,7 @@ from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import ShaderError, expand, shader_folder
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene, check_assets
-from blinkgl.scene.lod import at_level_of_detail
+from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.types import Scene
 
 DEBUG_PROGRAM = "debug.glsl"

@@ -51,7 +51,7 @@ class Draws:
     draws: int = 0
     triangles: int = 0
     fragments: int = 0
-    variants: dict[str, "Draws"] = field(default_factory=dict)
+    variants: dict[str, Draws] = field(default_factory=dict)
 
 
 class Stopwatch:

@@ -1,0 +1,228 @@
+"""``blinkgl explain CONFIG``: what a run will model, what it leaves out and why, and what it is likely to cost.
+
+The scene of one sequence is built and a handful of its frames are drawn and timed (or, of recorded frames, converted); nothing
+is written.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.config.sequence import RunTemplate, SequenceConfig
+from blinkgl.gl import GLContext, create_context
+from blinkgl.render.antialiasing import samples_of
+from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.scene.build import build_scene
+from blinkgl.scene.types import Scene
+from blinkgl.sequence import simulate_sequence
+
+PROBES = 12
+DEPTH_BYTES = 4
+
+
+@dataclass(frozen=True)
+class Pass:
+    """One kind of drawing. ``bytes`` per frame of its targets, depth included; ``count`` in the whole sequence."""
+
+    name: str
+    why: str
+    variants: tuple[str, ...]
+    bytes: int
+    count: int
+    seconds: float
+
+
+@dataclass
+class Explanation:
+    scene: dict[str, str] = field(default_factory=dict)
+    passes: list[Pass] = field(default_factory=list)
+    left_out: list[tuple[str, str]] = field(default_factory=list)
+    frames: int = 0
+    seconds: float = 0.0
+    seconds_per_simulated_second: float = 0.0
+    machine: str = ""
+
+
+def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
+    """Explains one sequence (default: the first). Raises what generating it would raise."""
+    config = template.sequence(template.sequence(0).output.first_index if sequence is None else sequence)
+    index = config.output.first_index if sequence is None else sequence
+    if config.frames is not None:
+        return _explain_frames(config, index, template.base)
+    with create_context(config.gl.backend, config.gl.device) as gl:
+        scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
+                            seed=config.seed, sequence=index, base=template.base)
+        with Renderer(gl, scene, config.render) as renderer:
+            result = Explanation(machine=gl.renderer)
+            result.scene = _describe(renderer.scene, renderer)
+            _passes(config, index, scene, renderer, gl, result)
+            _left_out(config, scene, result)
+    simulated = (scene.t1_ns - scene.t0_ns) * 1e-9
+    result.seconds = sum(p.seconds for p in result.passes)
+    result.seconds_per_simulated_second = result.seconds / simulated
+    return result
+
+
+def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
+    """A sequence that is converted from recorded frames: nothing is rendered; the first few frames are converted and timed."""
+    frames = config.frames
+    probe = simulate_sequence(config, index, base=base, labels=False)
+    files, flows, masks = probe.files, probe.flows, probe.masks
+    duration = (len(files) - 1) / frames.fps
+    result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
+    between = {"linear": "no frames in between", "cubic": f"{frames.factor - 1} frames in between, monotone cubics",
+               "motion": f"at most {frames.max_px:g} px per step, dense-flow warp"}[frames.interpolate]
+    result.scene = {
+        "frames": f"{len(files)} of {probe.folder}, {probe.width}x{probe.height}, {frames.fps:g} Hz: {duration:.6g} s", "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
+        "flow": f"{len(flows)} files, {len(masks)} masks of occluded pixels" if flows else "none: no flow labels",
+        "not used": "camera, time, timeline, scene and render: nothing is rendered"}
+    count = min(PROBES, len(files)) - 1
+    until_ns, started, steps = round(count * 1e9 / frames.fps), time.perf_counter(), 0
+    for chunk in probe:
+        steps += 1
+        if chunk.t_ns >= until_ns:
+            break
+    each, rate = (time.perf_counter() - started) / count, probe.events / (1e-9 * until_ns)
+    result.frames = 1 + round((steps - 1) * (len(files) - 1) / count)
+    result.passes.append(Pass("frames and event kernel", f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
+                              (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
+    labels = config.labels
+    for name, on, why in (("images", labels.images, "labels.images: false"), ("forward flow", flows and "forward" in labels.flow, "frames.flow: null, or not in "
+                          "labels.flow"), ("occlusion masks", masks and labels.occlusion and "forward" in labels.flow, "no mask files, labels.occlusion: false, or no forward flow"),
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
+        if not on:
+            result.left_out.append((name, why))
+    result.left_out.append(("backward flow, depth, ids, normals, velocity", "recorded frames bring none"))
+    result.seconds = sum(p.seconds for p in result.passes)
+    result.seconds_per_simulated_second = result.seconds / duration
+    return result
+
+
+def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
+    moving = sum(not o.path.is_static for o in scene.objects)
+    parts = [p for o in scene.objects for p in o.parts]
+    textures = {id(p.material.texture): p.material.texture for p in parts if p.material.texture is not None}
+    pixels = sum(t.image.shape[0] * t.image.shape[1] for t in textures.values())
+    kinds = {category: sum(o.category == category for o in scene.objects) for category in ("object", "ground", "wall", "sky")}
+    lit = sum(not p.material.unlit for p in parts)
+    return {
+        "bodies": ", ".join(f"{n} {k}{'s' if n > 1 and k != 'sky' else ''}" for k, n in kinds.items() if n) + f"; {moving} move",
+        "camera": f"{scene.camera.width}x{scene.camera.height}, fx {scene.camera.fx:.0f} px, "
+                  + ("still" if scene.camera.path.is_static else "moving"),
+        "triangles": f"{renderer.triangles:,}" + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
+        "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
+        "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit" if lit else "none: every surface is unlit",
+        "notes": "; ".join(scene.log) or "–",
+        **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
+    }
+
+
+def _timed(run, times) -> float:
+    run(times[0])
+    started = time.perf_counter()
+    for t in times:
+        run(t)
+    return (time.perf_counter() - started) / len(times)
+
+
+def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, gl: GLContext, result: Explanation) -> None:
+    t0, t1 = scene.t0_ns, scene.t1_ns
+    duration = (t1 - t0) * 1e-9
+    pixels = renderer.width * renderer.height
+    times = [int(t) for t in np.linspace(t0, t1, PROBES)]
+    labels = config.time.label_count
+
+    def variants(name: str) -> tuple[str, ...]:
+        return tuple(sorted({"+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
+                             for program, defines in gl.shaders._programs if program == name}))
+
+    timeline, rejected = config.timeline, 1.0
+    luminance = np.empty((renderer.height, renderer.width), np.float32)
+    rate = np.empty_like(luminance) if timeline.reconstruction == "hermite" else None
+    event_s = _timed(lambda t: renderer.luminance(t, out=luminance, rate=rate), times)
+    fine = samples_of(config.render.antialiasing).stored
+    probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
+    seen = [chunk.t_ns for chunk in islice(probe, 2 * PROBES)]  # a short stretch of it, as it will be
+    if timeline.kind == "uniform":
+        result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
+    else:
+        steps = np.clip([1 / max(probe.timeline.pace(t), 1e-12) for t in times], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
+        result.frames = int(duration * np.mean(1 / steps)) + 1
+        rejected = 1.1  # a step is cut again now and then
+    result.passes.append(Pass("event frames" + (" with rates" if rate is not None else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
+                              variants("luminance.glsl"), pixels * fine * ((4 if rate is None else 8) + DEPTH_BYTES), result.frames,
+                              event_s * result.frames))
+    if timeline.kind != "uniform":
+        small_s, count = _timed(probe.timeline.pace, times), int(result.frames * rejected)
+        name = "brightness" if timeline.kind == "brightness" else "velocity"
+        result.passes.append(Pass(name, f"decides the step; every {timeline.sample_every}. pixel", (name,),
+                                  pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, small_s * count))
+    if config.labels.images:
+        result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
+                                  ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
+                                  _timed(renderer.colour, times[:3]) * (labels + 1)))
+    request = _request(config)
+    wanted = [name for name in ("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward") if getattr(request, name)]
+    if wanted:
+        interval = config.time.interval_ns
+        each = _timed(lambda t: renderer.labels(t, request, t + interval, t - interval), config.time.label_times_ns[:3])
+        sizes = {"depth": 4, "ids": 4, "normals": 16, "velocity": 8, "flow_forward": 16, "flow_backward": 16}
+        result.passes.append(Pass("labels", ", ".join(wanted) + (", occlusion" if request.occlusion else ""), ("geometry",),
+                                  pixels * (sum(sizes[w] for w in wanted) + DEPTH_BYTES), labels, each * labels))
+    if config.preview.enabled:
+        pictures = int(duration * config.preview.rate) + 1
+        each = _timed(lambda t: (renderer.colour(t, antialiasing="none"), renderer.velocity(t)), times[:3])
+        result.passes.append(Pass("preview", f"{config.preview.rate:g} pictures per simulated second", ("colour", "velocity"),
+                                  pixels * (16 + 8 + DEPTH_BYTES), pictures, each * pictures))
+    each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - t0), 1e-9)
+    result.passes.append(Pass("event kernel", f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
+                              (config.events.emulator,), 0, result.frames, each * result.frames))
+
+
+def _request(config: SequenceConfig) -> LabelRequest:
+    labels = config.labels
+    return LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
+                        flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=labels.occlusion)
+
+
+def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
+    add = lambda what, why: result.left_out.append((what, why))
+    labels = config.labels
+    for name, on, key in (("images", labels.images, "labels.images: false"), ("depth", labels.depth, "labels.depth: false"),
+                          ("instance ids", labels.ids, "labels.ids: false"), ("normals", labels.normals, "labels.normals: false"),
+                          ("velocity label", labels.velocity, "labels.velocity: false"),
+                          ("forward flow", "forward" in labels.flow, "not in labels.flow"),
+                          ("backward flow", "backward" in labels.flow, "not in labels.flow"),
+                          ("occlusion masks", labels.occlusion and labels.flow, "labels.occlusion: false, or no flow"),
+                          ("preview", config.preview.enabled, "preview.enabled: false"),
+                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
+        if not on:
+            add(name, key)
+    if config.render.antialiasing == "none":
+        add("anti-aliasing of event frames", "render.antialiasing: none (mip-maps filter textures; edges are not filtered)")
+    elif config.render.antialiasing == "msaa4":
+        add("super-sampling of event frames", "render.antialiasing: msaa4 (edges are filtered; textures by mip-maps alone)")
+    if not config.render.lod.enabled:
+        add("level of detail", "render.lod.enabled: false (every mesh as it is)")
+    if config.render.antialiasing == "taps4":
+        add("anti-aliasing of silhouettes", "render.antialiasing: taps4 (textures are super-sampled; edges are not filtered)")
+    if config.render.anisotropy == 1:
+        add("anisotropic filtering", "render.anisotropy: 1")
+    if all(p.material.unlit for o in scene.objects for p in o.parts):
+        add("light", "every material is unlit: no normals in the vertex stream, no light in the shader")
+    if config.timeline.kind == "uniform":
+        add("velocity pass", "timeline: uniform does not look at motion")
+    if config.timeline.reconstruction != "hermite":
+        add("rates of change in the event frames", f"timeline.reconstruction: {config.timeline.reconstruction}")
+    for name, value in config.events.model_dump().items():
+        if value in (0, 0.0, False) and name not in ("seed",):
+            add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
+    add("shadows, inter-reflection, motion blur, depth of field", "BlinkGL does not model them")

@@ -1,0 +1,380 @@
+"""Event recordings side by side, against the frames of their scene, or one by itself: how real does a simulation look?
+
+Everything streams interval by interval; memory is a handful of sensor-sized maps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.formats import ENDINGS, EventFile, open_events
+from blinkgl.io.images import NpzReader, npy_header, numpy_errors
+
+IEI_EDGES_US = np.logspace(0, 7, 71)
+"""Bins of the inter-event interval of a pixel: 1 µs to 10 s, ten per decade."""
+LOG_OFFSET = 10.0
+"""Added to the 8-bit code before the logarithm: keeps the dark noise of real frames from dominating."""
+BLUR_PX = 1.0
+"""Sigma of the Gaussian on both maps before a correlation: single-event quantisation and sub-pixel shifts are not what it asks about."""
+
+
+@dataclass
+class Side:
+    """One recording inside the compared time span. Maps are (H, W), times µs."""
+
+    name: str
+    count: int = 0
+    on: int = 0
+    rate_hz: np.ndarray = field(default=None, repr=False)
+    """(K,) events per second in each interval"""
+    counts: np.ndarray = field(default=None, repr=False)
+    iei: np.ndarray = field(default=None, repr=False)
+    """(70,) inter-event intervals per bin of IEI_EDGES_US"""
+    frame_correlation: np.ndarray | None = field(default=None, repr=False)
+    """(K,) Pearson correlation over the pixels of the polarity sum with the change of ln(I + 10), both blurred by BLUR_PX"""
+    implied_threshold: np.ndarray | None = field(default=None, repr=False)
+    """(K,) change of ln(I + 10) per event: slope through 0 of change on polarity sum"""
+
+    @property
+    def size(self) -> str:
+        """"640x480", width first."""
+        return f"{self.counts.shape[1]}x{self.counts.shape[0]}"
+
+    @property
+    def on_off_ratio(self) -> float:
+        off = self.count - self.on
+        return self.on / off if off else float("inf")
+
+    @property
+    def median_iei_us(self) -> float:
+        if not self.iei.sum():
+            return float("nan")
+        i = int(np.searchsorted(np.cumsum(self.iei), self.iei.sum() / 2))
+        return float(np.sqrt(IEI_EDGES_US[i] * IEI_EDGES_US[i + 1]))
+
+
+@dataclass
+class Comparison:
+    """Result of :func:`compare`. ``b`` is None when there was one recording. What is told pixel by pixel is None where the two differ in size."""
+
+    edges_us: np.ndarray
+    a: Side
+    b: Side | None
+    pixel_correlation: float | None = None
+    """Pearson correlation over the pixels of the event counts of a and b"""
+    polarity_correlation: np.ndarray | None = None
+    """(K,) Pearson correlation over the pixels of the blurred polarity sums of a and b in each interval"""
+
+    @property
+    def same_size(self) -> bool:
+        """Whether the pixels of two recordings can be compared one by one."""
+        return self.b is not None and self.a.counts.shape == self.b.counts.shape
+
+    @property
+    def duration_s(self) -> float:
+        return (self.edges_us[-1] - self.edges_us[0]) * 1e-6
+
+    @property
+    def rate_ratio(self) -> np.ndarray:
+        """(K,) events of b per event of a; NaN where a has none."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.a.rate_hz > 0, self.b.rate_hz / self.a.rate_hz, np.nan)
+
+    @property
+    def iei_distance(self) -> float:
+        """Largest difference of the two cumulative distributions of the inter-event interval (Kolmogorov–Smirnov distance)."""
+        cdf = [np.cumsum(s.iei) / max(s.iei.sum(), 1) for s in (self.a, self.b)]
+        return float(np.abs(cdf[0] - cdf[1]).max())
+
+    def rows(self) -> list[tuple[str, str, str]]:
+        """(quantity, a, b) as text, for a table; quantities of the pair stand in the last column."""
+        sides = [self.a] + ([self.b] if self.b else [])
+        each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))
+        rows = [("sensor", *each(lambda s: s.size)),
+                ("events", *each(lambda s: f"{s.count:,}")),
+                ("rate", *each(lambda s: f"{s.count / self.duration_s / 1e6:.4g} M/s")),
+                ("rate of a pixel", *each(lambda s: f"{s.count / self.duration_s / s.counts.size:.4g} Hz")),
+                ("ON / OFF", *each(lambda s: f"{s.on_off_ratio:.3f}")),
+                ("active pixels", *each(lambda s: f"{100 * np.mean(s.counts > 0):.1f} %")),
+                ("median interval of a pixel", *each(lambda s: f"{s.median_iei_us / 1000:.3g} ms"))]
+        if self.a.frame_correlation is not None:
+            rows += [("polarity sum : Δ ln(I+10), correlation", *each(lambda s: _spread(s.frame_correlation))),
+                     ("implied contrast threshold", *each(lambda s: _spread(s.implied_threshold)))]
+        if self.b:
+            rows += [("event-rate ratio B / A per interval", "", _spread(self.rate_ratio))]
+            if self.same_size:
+                rows += [("polarity sums A : B per interval, correlation", "", _spread(self.polarity_correlation)),
+                         ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}")]
+            rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
+        return rows
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists (maps left out), for JSON."""
+        def side(s: Side) -> dict:
+            return {k: _plain(v) for k, v in asdict(s).items() if k != "counts"} | {
+                "size": s.size, "on_off_ratio": _plain(s.on_off_ratio), "median_iei_us": _plain(s.median_iei_us)}
+        pair = {} if self.b is None else {
+            "b": side(self.b), "rate_ratio": _plain(self.rate_ratio), "pixel_correlation": _plain(self.pixel_correlation),
+            "polarity_correlation": _plain(self.polarity_correlation), "iei_distance": _plain(self.iei_distance)}
+        return {"edges_us": _plain(self.edges_us), "duration_s": self.duration_s, "iei_edges_us": _plain(IEI_EDGES_US), "a": side(self.a), **pair}
+
+
+def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames: str | os.PathLike | None = None, fps: float | None = None,
+            timestamps: str | os.PathLike | None = None, gamma: str | float = "linear", frame_delay_ms: float = 0.0,
+            interval_ms: float = 20.0, zero_time: bool = False) -> Comparison:
+    """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the time they share; alone, ``a`` is described.
+
+    Recordings of different sensor sizes are described side by side; what needs the same pixels in both is then None.
+
+    Intervals are those between frames where frames are given, else ``interval_ms``. ``b`` may itself be frames (a folder, video, .npy of
+    frames): anything that is no event file. gamma : of the frames; "linear" takes the codes as intensities, as fits a DAVIS's frames.
+    frame_delay_ms : added to the frames' times; a stamp of the exposure's start lags its centre. zero_time : count both recordings from their first event.
+
+    Raises EventDataError: frames of another size than a recording, no common time. AssetError: unreadable.
+    """
+    if b is not None and frames is None and not _is_event_file(b):
+        b, frames = None, b
+    files = [open_events(p).sized() for p in ((a,) if b is None else (a, b))]
+    spans = [_span(f) for f in files]
+    shifts = [s[0] if zero_time else 0 for s in spans]
+    start, stop = max(s[0] - d for s, d in zip(spans, shifts)), min(s[1] - d for s, d in zip(spans, shifts))
+    changes: Iterator[np.ndarray | None]
+    if frames is not None:
+        edges, changes = _frame_intervals(frames, fps, timestamps, gamma, round(frame_delay_ms * 1000), start, stop, files)
+    else:
+        count = int(np.ceil(max(stop - start, 0) / (interval_ms * 1000)))
+        edges = start + np.arange(count + 1) * round(interval_ms * 1000)
+        changes = iter([None] * count)
+    if len(edges) < 2:
+        raise EventDataError("no common time", where=", ".join(str(f.path) for f in files),
+                             value=[tuple(round((t - d) / 1e6, 6) for t in s) for s, d in zip(spans, shifts)],
+                             accepted="recordings that overlap (seconds shown), or --zero-time")
+    return _accumulate(files, shifts, edges, changes)
+
+
+def _accumulate(files: list[EventFile], shifts: list[int], edges: np.ndarray, changes: Iterator[np.ndarray | None]) -> Comparison:
+    shapes, intervals = [(f.height, f.width) for f in files], len(edges) - 1
+    same = len(files) == 2 and shapes[0] == shapes[1]
+    sides = [Side(str(f.path), counts=np.zeros(shape, np.int64), rate_hz=np.zeros(intervals), iei=np.zeros(len(IEI_EDGES_US) - 1, np.int64))
+             for f, shape in zip(files, shapes)]
+    last = [np.full(shape, -1, np.int64) for shape in shapes]
+    bins = IEI_EDGES_US
+    polarity = np.full(intervals, np.nan)
+    frame_correlation = np.full((len(files), intervals), np.nan)
+    threshold = np.full((len(files), intervals), np.nan)
+    with_frames = False
+    streams = [_windows(f, edges + d, d) for f, d in zip(files, shifts)]
+    for k, (change, *events) in enumerate(zip(changes, *streams)):
+        sums = [np.zeros(shape, np.int32) for shape in shapes]
+        for i, e in enumerate(events):
+            sides[i].count += len(e)
+            sides[i].on += int(np.count_nonzero(e.p))
+            sides[i].rate_hz[k] = len(e) / ((edges[k + 1] - edges[k]) * 1e-6)
+            _collect(e.x, e.y, e.t, e.p, edges[0], sides[i].counts, sums[i], last[i], sides[i].iei, len(bins) - 1)
+        smooth = [_blurred(s) for s in sums] if same or change is not None else []
+        if change is not None:
+            with_frames = True
+            change = _blurred(change)
+            for i, s in enumerate(smooth):
+                frame_correlation[i, k] = _correlation(s, change)
+                square = float(np.sum(s * s))
+                threshold[i, k] = float(np.sum(s * change)) / square if square else np.nan
+        if same:
+            polarity[k] = _correlation(*smooth)
+    if with_frames:
+        for i, side in enumerate(sides):
+            side.frame_correlation, side.implied_threshold = frame_correlation[i], threshold[i]
+    if len(files) == 1:
+        return Comparison(edges, sides[0], None)
+    if not same:
+        return Comparison(edges, *sides)
+    return Comparison(edges, *sides, pixel_correlation=_correlation(sides[0].counts, sides[1].counts), polarity_correlation=polarity)
+
+
+@numba.njit(cache=True, nogil=True)
+def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
+    """Adds events to the count and polarity maps and to the histogram of inter-event intervals (ten bins per decade of µs)."""
+    for i in range(len(t)):
+        r, c = y[i], x[i]
+        counts[r, c] += 1
+        sums[r, c] += 2 * np.int32(p[i]) - 1
+        now = t[i] - origin
+        if last[r, c] >= 0:
+            k = int(10 * np.log10(max(now - last[r, c], 1)) + 1e-9)
+            iei[min(k, bins - 1)] += 1
+        last[r, c] = now
+
+
+def _windows(file: EventFile, edges: np.ndarray, shift: int) -> Iterator[Events]:
+    """Events of each [edges[k], edges[k+1]), times minus ``shift``; every interval yields, empty ones too."""
+    parts: list[Events] = []
+    k = 0
+    for chunk in file.chunks():
+        while k < len(edges) - 1:
+            parts.append(chunk.window(int(edges[k]), int(edges[k + 1])))
+            if chunk.t[-1] < edges[k + 1]:
+                break  # the interval may go on in the next chunk
+            yield _joined(parts, shift)
+            parts, k = [], k + 1
+        if k == len(edges) - 1:
+            return
+    while k < len(edges) - 1:
+        yield _joined(parts, shift)
+        parts, k = [], k + 1
+
+
+def _joined(parts: list[Events], shift: int) -> Events:
+    events = Events.concatenate(parts)
+    return Events(events.x, events.y, events.t - shift, events.p) if shift else events
+
+
+def _span(file: EventFile) -> tuple[int, int]:
+    """First event's time and one past the last's."""
+    first = last = None
+    for chunk in file.chunks():
+        first = int(chunk.t[0]) if first is None else first
+        last = int(chunk.t[-1])
+    if first is None:
+        raise EventDataError("no events", where=str(file.path))
+    return first, last + 1
+
+
+def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, stop: int, files: list[EventFile]):
+    """Edges (µs) of the frame intervals inside [start, stop) and, lazily, the change of ln(I + 10) over each."""
+    from blinkgl.io.frames import open_frames
+    from blinkgl.recordings.simulation import Decoder
+    source = open_frames(path, fps=fps, timestamps=timestamps)
+    if any((f.height, f.width) != (source.height, source.width) for f in files):
+        sizes = "; ".join(f"{name}: {width}x{height}" for name, width, height in [(path, source.width, source.height), *((f.path, f.width, f.height) for f in files)])
+        raise EventDataError(f"frames and recordings differ in size ({sizes})", where="compare", accepted="frames of the recordings' size")
+    # The first interval may begin a little before the first event, the last end a little after the last one.
+    slack = lambda a, b: (b - a) // 4
+    times = np.array([t // 1000 + delay_us for _, t, _ in source], np.int64)
+    inside = [k for k in range(len(times) - 1) if times[k] >= start - slack(times[k], times[k + 1]) and times[k + 1] <= stop + slack(times[k], times[k + 1])]
+    if not inside:
+        return np.empty(0, np.int64), iter(())
+    lo, hi = inside[0], inside[-1] + 1
+    decode = Decoder(gamma)
+
+    def changes() -> Iterator[np.ndarray]:
+        before = None
+        for k, (frame, _, name) in enumerate(source):
+            if lo <= k <= hi:
+                log = np.log(decode(frame, name).astype(np.float64) * 255 + LOG_OFFSET)
+                if before is not None:
+                    yield log - before
+                before = log
+
+    return times[lo:hi + 1], changes()
+
+
+def _blurred(values: np.ndarray) -> np.ndarray:
+    return cv2.GaussianBlur(values.astype(np.float64), (0, 0), BLUR_PX)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson's over the pixels; NaN where one is constant."""
+    a, b = a.ravel() - a.mean(), b.ravel() - b.mean()
+    norm = np.sqrt((a @ a) * (b @ b))
+    return float(a @ b / norm) if norm > 0 else float("nan")
+
+
+def _is_event_file(path) -> bool:
+    path = Path(path)
+    if path.suffix.lower() in (".npy", ".npz") and path.is_file():
+        with contextlib.suppress(AssetError), numpy_errors(path):  # damaged: the reader will say so
+            if path.suffix.lower() == ".npz":
+                with NpzReader(path) as arrays:
+                    return "x" in arrays
+            with open(path, "rb") as file:
+                return "x" in (npy_header(file, path.stat().st_size, str(path))[2].names or ())
+    return path.suffix.lower() in ENDINGS and not path.is_dir()
+
+
+def _spread(values: np.ndarray) -> str:
+    values = values[np.isfinite(values)]
+    return f"{np.mean(values):.3f} ({np.min(values):.3f} … {np.max(values):.3f})" if len(values) else "–"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return [_plain(v) for v in value.tolist()]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def plot(result: Comparison, path: str | os.PathLike) -> None:
+    """One PNG: rates over time, counts per pixel, inter-event intervals, correlations per interval. OutputError when it cannot be written."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from blinkgl.io.atomic import atomic_file, output_errors
+
+    sides = [(result.a, "A", "#1764ab")] + ([(result.b, "B", "#d1495b")] if result.b else [])
+    middle = (result.edges_us[:-1] + result.edges_us[1:]) / 2e6
+    figure = Figure(figsize=(13, 7.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 3)
+    figure.suptitle("   ".join(f"{tag}: {Path(s.name).name}, {s.count:,} events" for s, tag, _ in sides), fontsize=11)
+
+    ax = axes[0, 0]
+    for side, tag, colour in sides:
+        ax.step(result.edges_us / 1e6, np.append(side.rate_hz, side.rate_hz[-1:]) / 1e6, where="post", color=colour, label=tag)
+    ax.set(title="event rate", xlabel="time [s]", ylabel="M events/s", ylim=(0, None))
+    ax.legend(frameon=False)
+
+    top = max(1.0, *(float(np.percentile(s.counts, 99.5)) for s, _, _ in sides))
+    for ax, (side, tag, _) in zip((axes[0, 1], axes[0, 2]), sides):
+        image = ax.imshow(side.counts, cmap="magma", vmin=0, vmax=top)
+        ax.set(title=f"{tag}: events per pixel", xticks=[], yticks=[])
+        figure.colorbar(image, ax=ax, shrink=0.7)
+
+    ax = axes[1, 0]
+    for side, tag, colour in sides:
+        density = side.iei / max(side.iei.sum(), 1)
+        ax.step(IEI_EDGES_US / 1000, np.append(density, density[-1:]), where="post", color=colour, label=tag)
+    ax.set(title="interval between a pixel's events", xlabel="ms", ylabel="share per bin", xscale="log", ylim=(0, None))
+    if len(used := np.flatnonzero(sum(s.iei for s, _, _ in sides))):
+        ax.set_xlim(IEI_EDGES_US[used[0]] / 1000, IEI_EDGES_US[used[-1] + 1] / 1000)
+
+    ax = axes[1, 1]
+    for side, tag, colour in sides:
+        if side.frame_correlation is not None:
+            ax.plot(middle, side.frame_correlation, "o-", ms=3, color=colour, label=f"{tag} : frames, Δ ln(I+10)")
+    if result.polarity_correlation is not None:
+        ax.plot(middle, result.polarity_correlation, "s--", ms=3, color="0.35", label="A : B")
+    ax.set(title="polarity sum per interval, correlation", xlabel="time [s]", ylim=(min(0, *ax.get_ylim()), 1))
+    if ax.get_lines():
+        ax.legend(frameon=False, fontsize=9)
+    else:
+        ax.axis("off")
+
+    ax = axes[1, 2]
+    if result.same_size:
+        limit = int(top) + 1
+        joint = np.histogram2d(np.minimum(result.a.counts, limit).ravel(), np.minimum(result.b.counts, limit).ravel(),
+                               bins=min(limit + 1, 60), range=[[0, limit + 1]] * 2)[0]
+        ax.imshow(np.log10(joint.T + 1), origin="lower", extent=(0, limit + 1, 0, limit + 1), cmap="Greys", aspect="equal")
+        ax.plot([0, limit + 1], [0, limit + 1], ":", color="#d1495b", lw=1)
+        ax.set(title=f"events per pixel, r = {result.pixel_correlation:.3f}", xlabel="A", ylabel="B")
+    else:
+        ax.axis("off")
+    if result.b is None:
+        axes[0, 2].axis("off")
+    for ax in (axes[0, 0], axes[1, 0], axes[1, 1]):
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(alpha=0.25)
+    with atomic_file(path) as temporary, output_errors(path):
+        figure.savefig(temporary, dpi=110, metadata={"Software": None})

@@ -1,0 +1,296 @@
+"""Primitive solids with analytic normals and proper texture coordinates, centred on the origin, z up.
+
+All but :func:`grid` are closed. Every function takes keyword parameters in the user's units and returns a
+:class:`~blinkgl.scene.types.Mesh` whose ``source_hash`` is a hash of the parameters. Texture coordinates run once round
+a body and from its top (v = 0) to its bottom; caps carry the texture's inscribed disc.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import itertools
+import math
+from dataclasses import replace
+from functools import wraps
+
+import numpy as np
+
+from blinkgl.config.scene import PRIMITIVE_KINDS
+from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.meshes import closedness, make_mesh, transform_mesh, weld
+from blinkgl.scene.types import Mesh
+
+PARAMETERS = {
+    "extents": "edge lengths in x, y, z, m",
+    "width": "edge in x, m",
+    "depth": "edge in y, m",
+    "radius": "m; prism, pyramid: of the circle through the polygon's corners; torus: from the axis to the middle of the tube",
+    "tube": "radius of the tube, m, less than radius",
+    "height": "along z, m; capsule: of the cylinder between the two half spheres",
+    "segments": "faces round the z axis",
+    "tube_segments": "faces round the tube",
+    "rings": "rows of faces along z; cylinder, cone: rows of vertices",
+    "sides": "corners of the polygon",
+    "subdivisions": "cells per edge; icosphere: how often each of 20 triangles is cut into four, 0 to 7",
+}
+"""What the builders' parameters mean, for the documentation. Metres are world units, before the object's scale."""
+
+_LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1}
+_MAX_SEGMENTS = 4096
+
+
+def parameter_hash(*parts) -> str:
+    """32 hex digits, stable across platforms and load order."""
+    return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
+
+
+def _primitive(build):
+    """Checks the parameters, builds, and stamps name, hash and closedness."""
+    signature = inspect.signature(build)
+
+    @wraps(build)
+    def made(**parameters) -> Mesh:
+        where = build.__name__
+        unknown = set(parameters) - set(signature.parameters)
+        if unknown:
+            raise AssetError("unknown parameter", where=where, value=min(unknown),
+                             accepted="one of " + ", ".join(signature.parameters))
+        bound = signature.bind(**parameters)
+        bound.apply_defaults()
+        for key, value in bound.arguments.items():
+            default = signature.parameters[key].default
+            if isinstance(default, int):
+                low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MAX_SEGMENTS)
+                if float(value) != int(value) or not low <= value <= high:
+                    raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=f"a whole number in {low}..{high}")
+                bound.arguments[key] = int(value)
+            elif np.shape(value) != np.shape(default) or not np.isfinite(value).all() or np.min(value) <= 0:
+                accepted = f"{len(default)} numbers greater than 0" if np.shape(default) else "a number greater than 0"
+                raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
+            else:
+                bound.arguments[key] = tuple(map(float, value)) if np.shape(default) else float(value)
+        positions, normals, uvs, faces = build(**bound.arguments)
+        return Mesh(vertices=np.ascontiguousarray(positions, np.float64), faces=np.ascontiguousarray(faces, np.int32),
+                    normals=np.ascontiguousarray(normals, np.float32), uvs=np.ascontiguousarray(uvs, np.float32),
+                    closed=closedness(*weld(positions, faces))[0], name=where,
+                    source_hash=parameter_hash("primitive", 1, where, tuple(bound.arguments.items())))
+
+    return made
+
+
+def _join(pieces):
+    """One body of several (positions, normals, uvs, faces)."""
+    offsets = np.cumsum([0] + [len(p[0]) for p in pieces[:-1]])
+    return (*(np.concatenate([p[i] for p in pieces]) for i in range(3)), np.concatenate([p[3] + o for p, o in zip(pieces, offsets)]))
+
+
+def _lattice(columns: int, rows: int) -> np.ndarray:
+    """(2*columns*rows, 3) faces of a vertex lattice numbered row by row (row r+1 above row r), counter-clockwise."""
+    c, r = np.meshgrid(np.arange(columns), np.arange(rows))
+    i = (r * (columns + 1) + c).ravel()
+    right, up = i + 1, i + columns + 1
+    return np.stack([np.stack([i, right, up + 1], 1), np.stack([i, up + 1, up], 1)], axis=1).reshape(-1, 3)
+
+
+def square(origin, right, up, columns: int, rows: int):
+    """Flat parallelogram seen counter-clockwise; uv (0, 0) at its top left."""
+    s, t = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)))
+    origin, right, up = (np.asarray(a, float) for a in (origin, right, up))
+    positions = origin + s[:, None] * right + t[:, None] * up
+    normal = np.cross(right, up)
+    normal = normal / np.linalg.norm(normal)
+    return positions, np.broadcast_to(normal, positions.shape), np.stack([s, 1 - t], 1), _lattice(columns, rows)
+
+
+def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: int):
+    """Surface of revolution about z.
+
+    profile : (K, 2) r, z from bottom to top as seen with the outside on the right.   normals : (K, 2) likewise.
+    A row with r = 0 is a pole: the triangles that would collapse there are left out.
+    """
+    angle = 2 * math.pi * np.arange(segments + 1) / segments
+    cos, sin = np.cos(angle), np.sin(angle)
+    cos[-1], sin[-1] = 1.0, 0.0     # the seam's two columns coincide exactly
+    r, z = profile[:, :1], profile[:, 1:]
+    positions = np.stack([r * cos, r * sin, np.broadcast_to(z, (len(profile), segments + 1))], axis=2).reshape(-1, 3)
+    n = np.stack([normals[:, :1] * cos, normals[:, :1] * sin, np.broadcast_to(normals[:, 1:], (len(profile), segments + 1))], axis=2)
+    uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), v[:, None]), axis=2).reshape(-1, 2).copy()
+    faces = _lattice(segments, len(profile) - 1)
+    pole = np.repeat(np.abs(profile[:, 0]) < 1e-12, segments + 1)
+    positions[pole, :2] = 0.0
+    uvs[pole, 0] += 0.5 / segments    # a pole's vertex belongs to one segment: its middle
+    return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
+
+
+def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0):
+    """Flat cap: the texture's inscribed disc, seen from outside."""
+    angle = turn + 2 * math.pi * np.arange(segments) / segments
+    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
+    positions = np.concatenate([[[0.0, 0.0, z]], rim])
+    side = 1.0 if up else -1.0
+    uvs = np.stack([0.5 + 0.5 * side * positions[:, 0] / radius, 0.5 - 0.5 * positions[:, 1] / radius], axis=1)
+    i = np.arange(segments)
+    faces = np.stack([np.zeros(segments, int), 1 + i, 1 + (i + 1) % segments], axis=1)
+    return positions, np.broadcast_to([0.0, 0.0, side], positions.shape), uvs, faces if up else faces[:, ::-1]
+
+
+@_primitive
+def cuboid(extents=(1.0, 1.0, 1.0), subdivisions=1):
+    """Box of edge lengths ``extents``; the texture once on each side."""
+    x, y, z = np.array(extents) / 2
+    n = subdivisions
+    return _join([
+        square((x, -y, -z), (0, 2 * y, 0), (0, 0, 2 * z), n, n), square((-x, y, -z), (0, -2 * y, 0), (0, 0, 2 * z), n, n),
+        square((x, y, -z), (-2 * x, 0, 0), (0, 0, 2 * z), n, n), square((-x, -y, -z), (2 * x, 0, 0), (0, 0, 2 * z), n, n),
+        square((-x, -y, z), (2 * x, 0, 0), (0, 2 * y, 0), n, n), square((x, -y, -z), (-2 * x, 0, 0), (0, 2 * y, 0), n, n)])
+
+
+@_primitive
+def grid(width=1.0, depth=1.0, subdivisions=1):
+    """Rectangle in z = 0 facing +z, ``width`` in x and ``depth`` in y; the texture once on it. Not closed."""
+    return square((-width / 2, -depth / 2, 0), (width, 0, 0), (0, depth, 0), subdivisions, subdivisions)
+
+
+@_primitive
+def sphere(radius=0.5, segments=32, rings=16):
+    """Sphere by longitude and latitude."""
+    latitude = np.linspace(-math.pi / 2, math.pi / 2, rings + 1)
+    direction = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
+    direction[[0, -1]] = [[0, -1], [0, 1]]
+    return _revolve(radius * direction, direction, 1 - np.arange(rings + 1) / rings, segments)
+
+
+@_primitive
+def icosphere(radius=0.5, subdivisions=3):
+    """Sphere of 20 * 4**subdivisions nearly equal triangles, box-projected texture."""
+    g = (1 + math.sqrt(5)) / 2
+    points = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g),
+                       (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)])
+    points /= np.linalg.norm(points[0])
+    faces = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
+                      (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    for _ in range(subdivisions):
+        edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+        unique, index = np.unique(edges, axis=0, return_inverse=True)
+        middle = points[unique].sum(axis=1)
+        mid = len(points) + index.reshape(-1, 3)
+        points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
+        a, b, c = faces.T
+        ab, bc, ca = mid.T
+        faces = np.stack([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))], axis=1).reshape(-1, 3)
+    mesh = make_mesh(points, faces, normals=points, name="icosphere")
+    return radius * mesh.vertices, mesh.normals, mesh.uvs, mesh.faces
+
+
+@_primitive
+def cylinder(radius=0.5, height=1.0, segments=32, rings=2):
+    """Circular cylinder along z."""
+    t = np.linspace(0, 1, rings)
+    profile = np.stack([np.full(rings, radius), (t - 0.5) * height], axis=1)
+    side = _revolve(profile, np.broadcast_to([1.0, 0.0], profile.shape), 1 - t, segments)
+    return _join([side, _disc(radius, height / 2, True, segments), _disc(radius, -height / 2, False, segments)])
+
+
+@_primitive
+def cone(radius=0.5, height=1.0, segments=32, rings=4):
+    """Circular cone with its tip at z = height/2."""
+    t = np.linspace(0, 1, rings)
+    profile = np.stack([radius * (1 - t), (t - 0.5) * height], axis=1)
+    profile[-1, 0] = 0.0
+    slope = np.array([height, radius]) / math.hypot(height, radius)
+    positions, normals, uvs, faces = _revolve(profile, np.broadcast_to(slope, profile.shape), 1 - t, segments)
+    # The normals at the tip belong to the middle of their segment, as the uvs there do.
+    tip = slice(-(segments + 1), None)
+    angle = 2 * math.pi * (np.arange(segments + 1) + 0.5) / segments
+    normals[tip] = np.stack([slope[0] * np.cos(angle), slope[0] * np.sin(angle), np.full(segments + 1, slope[1])], axis=1)
+    return _join([(positions, normals, uvs, faces), _disc(radius, -height / 2, False, segments)])
+
+
+@_primitive
+def torus(radius=0.35, tube=0.15, segments=32, tube_segments=16):
+    """Ring about z: ``radius`` to the middle of a tube of radius ``tube`` (< radius)."""
+    if tube >= radius:
+        raise AssetError("bad parameter", where="torus.tube", value=tube, accepted=f"less than radius {radius:g}")
+    angle = 2 * math.pi * np.arange(tube_segments + 1) / tube_segments
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    direction[-1] = direction[0]
+    return _revolve(np.array([radius, 0.0]) + tube * direction, direction, 1 - np.arange(tube_segments + 1) / tube_segments, segments)
+
+
+@_primitive
+def capsule(radius=0.25, height=0.5, segments=32, rings=16):
+    """Cylinder of ``height`` between two half spheres; ``rings`` rows of the two together."""
+    half = max(rings // 2, 1)
+    latitude = np.linspace(0, math.pi / 2, half + 1)
+    top = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
+    top[-1], top[0] = (0, 1), (1, 0)
+    direction = np.concatenate([top[::-1] * [1, -1], top])
+    profile = radius * direction + np.concatenate([np.full((half + 1, 2), [0, -height / 2]), np.full((half + 1, 2), [0, height / 2])])
+    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
+    return _revolve(profile, direction, 1 - length / length[-1], segments)
+
+
+@_primitive
+def prism(sides=6, radius=0.5, height=1.0):
+    """Upright prism over a regular polygon of circumradius ``radius``, flat-shaded; the texture once on each side."""
+    angle = 2 * math.pi * np.arange(sides + 1) / sides
+    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
+    rim[-1] = rim[0]
+    walls = [square(rim[i], rim[i + 1] - rim[i], (0, 0, height), 1, 1) for i in range(sides)]
+    return _join([*walls, _disc(radius, height / 2, True, sides), _disc(radius, -height / 2, False, sides)])
+
+
+@_primitive
+def pyramid(sides=4, radius=0.5, height=1.0):
+    """Pyramid over a regular polygon, flat-shaded; each side carries the texture's triangle."""
+    angle = 2 * math.pi * np.arange(sides + 1) / sides
+    rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
+    rim[-1] = rim[0]
+    tip = np.array([0, 0, height / 2])
+    walls = []
+    for a, b in itertools.pairwise(rim):
+        normal = np.cross(b - a, tip - a)
+        walls.append((np.stack([a, b, tip]), np.broadcast_to(normal / np.linalg.norm(normal), (3, 3)),
+                      np.array([[0.0, 1.0], [1.0, 1.0], [0.5, 0.0]]), np.array([[0, 1, 2]])))
+    return _join([*walls, _disc(radius, -height / 2, False, sides)])
+
+
+BUILDERS = {f.__name__: f for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid)}
+
+
+def parameters(kind: str) -> dict[str, float | int | tuple[float, ...]]:
+    """Names and defaults of a builder's parameters."""
+    return {name: parameter.default for name, parameter in inspect.signature(BUILDERS[kind]).parameters.items()}
+
+
+def random_primitive(kind: str, index: int) -> Mesh:
+    """The ``index``-th body of a kind, about one unit large. No two have the same proportions, so that bodies of different
+    indices may be told apart by a train/test split; ``source_hash`` is of (kind, index)."""
+    rng = np.random.default_rng([PRIMITIVE_KINDS.index(kind), index])
+
+    def between(low: float, high: float) -> float:
+        # Log-uniform, and rounded: the last bit of exp differs between platforms.
+        return round(math.exp(rng.uniform(math.log(low), math.log(high))), 6)
+
+    if kind == "cuboid":
+        mesh = cuboid(extents=(between(0.25, 1), between(0.25, 1), between(0.25, 1)), subdivisions=2)
+    elif kind in ("cylinder", "cone"):
+        mesh = BUILDERS[kind](radius=0.5, height=between(0.3, 3))
+    elif kind == "sphere":
+        mesh = transform_mesh(sphere(), np.diag([1, between(0.6, 1), between(0.6, 1)]))
+    elif kind == "icosphere":
+        mesh = transform_mesh(icosphere(subdivisions=int(rng.integers(1, 4))), np.diag([1, between(0.6, 1), between(0.6, 1)]))
+    elif kind == "torus":
+        mesh = torus(tube=between(0.06, 0.25))
+    elif kind == "capsule":
+        mesh = capsule(height=between(0.1, 1.2))
+    elif kind == "prism":
+        mesh = prism(sides=int(rng.integers(3, 9)), height=between(0.3, 3))
+    else:
+        mesh = pyramid(sides=int(rng.integers(3, 7)), height=between(0.5, 1.6))
+    return replace(mesh, source_hash=random_primitive_hash(kind, index), name=f"{kind}-{index}")
+
+
+def random_primitive_hash(kind: str, index: int) -> str:
+    return parameter_hash("random primitive", 1, kind, index)

@@ -1,0 +1,563 @@
+"""Reader of glTF 2.0 (.gltf with its buffers and images, .glb): meshes, materials, cameras, node hierarchy, animations.
+
+Its own reader rather than trimesh's, because a scene's cameras, unlit and double-sided materials, node names and
+animations are wanted, and because every count and path a file claims has to be checked before it is believed.
+Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (buffers, accessors), 3.7 (meshes), 3.9 (materials),
+3.10 (cameras), 3.11 (animations); extensions KHR_materials_unlit, KHR_texture_transform.
+
+Coordinates stay as in the file (y up) until whoever asked turns them z up (:data:`Z_UP`). What a file asks for
+and is not drawn is collected in :attr:`Document.omissions`.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import struct
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.importing import gltf_schema
+from blinkgl.scene.omissions import Omissions
+from blinkgl.scene.reading import contents, reading
+from blinkgl.scene.surfaces.images import content_hash, decode_image
+from blinkgl.scene.types import Material, Texture
+from blinkgl.srgb import linear_from_srgb
+
+# Columns: the file's x, y, z axes in a z-up world.
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+_DRAWN = {"KHR_materials_unlit", "KHR_texture_transform", "KHR_mesh_quantization"}
+# Not drawn, and yet no reason to refuse a file that requires them: shape, base colour and motion are what they would
+# be, only light is missing from the surface. Everything else that is required (compressed geometry or images,
+# instances, other material models, what nobody has heard of) would be a scene that is not the file's.
+_LIGHT_ONLY = {"KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_materials_clearcoat",
+               "KHR_materials_sheen",
+               "KHR_materials_specular", "KHR_materials_ior", "KHR_materials_iridescence", "KHR_materials_anisotropy",
+               "KHR_materials_dispersion"}
+# Nothing to be seen in these.
+_INVISIBLE = {"KHR_xmp_json_ld", "KHR_xmp"}
+_DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_MAX_NODES, _MAX_DEPTH = 200_000, 256
+_MAX_ZEROS = 64_000_000     # bytes of an accessor without a buffer behind it (all zeros): nothing in the file bounds them
+_WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
+_NEAREST = 9728
+_MAX_TIME = 1e7             # s, of an animation's keys
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Raw triangles. normals, uvs (v down) and material may be None."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None = None
+    uvs: np.ndarray | None = None
+    material: Material | None = None
+
+
+def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
+    """The piece under an affine (4, 4) map; a mirroring one turns the faces round, so that they keep facing out."""
+    linear = matrix[:3, :3]
+    determinant = float(np.linalg.det(linear))
+    vertices = piece.vertices @ linear.T + matrix[:3, 3]
+    # Cofactors instead of the inverse: also right for a map that flattens the mesh.
+    cofactors = np.stack([np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])])
+    normals = None if piece.normals is None else piece.normals @ cofactors.T * (1.0 if determinant >= 0 else -1.0)
+    return replace(piece, vertices=vertices, normals=normals, faces=piece.faces if determinant >= 0 else piece.faces[:, ::-1])
+
+
+@dataclass(frozen=True)
+class Node:
+    """name, parent (None at the root), mesh and camera index (None without), rest translation, quaternion x y z w, scale
+    or matrix."""
+
+    name: str
+    parent: int | None
+    mesh: int | None
+    camera: int | None
+    translation: tuple
+    rotation: tuple
+    scale: tuple
+    matrix: np.ndarray | None
+
+    def local(self, translation=None, rotation=None, scale=None) -> np.ndarray:
+        """(4, 4) transform to the parent, with animated values in place of the resting ones."""
+        if self.matrix is not None:
+            return self.matrix
+        T = np.eye(4)
+        turn = Rotation.from_quat(self.rotation if rotation is None else rotation).as_matrix()
+        T[:3, :3] = turn * (self.scale if scale is None else scale)
+        T[:3, 3] = self.translation if translation is None else translation
+        return T
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One animated property of a node: path translation | rotation | scale, times (K,) s, values (K, 3 or 4), interpolation
+    LINEAR | STEP | CUBICSPLINE (then values (K, 3, n): in-tangent, value, out-tangent)."""
+
+    node: int
+    path: str
+    times: np.ndarray
+    values: np.ndarray
+    interpolation: str
+
+    def at(self, t: float) -> np.ndarray:
+        """Value at t seconds, held outside the key frames (specification, 3.11 and appendix C)."""
+        times = self.times
+        values = self.values[:, 1] if self.interpolation == "CUBICSPLINE" else self.values
+        i = int(np.searchsorted(times, t, side="right")) - 1
+        if i < 0 or i >= len(times) - 1 or self.interpolation == "STEP":
+            return values[min(max(i, 0), len(times) - 1)]
+        h = times[i + 1] - times[i]
+        s = (t - times[i]) / h
+        if self.interpolation == "CUBICSPLINE":
+            v = ((2 * s**3 - 3 * s**2 + 1) * values[i] + h * (s**3 - 2 * s**2 + s) * self.values[i, 2]
+                 + (3 * s**2 - 2 * s**3) * values[i + 1] + h * (s**3 - s**2) * self.values[i + 1, 0])
+            return v / np.linalg.norm(v) if self.path == "rotation" else v
+        if self.path == "rotation":
+            a, b = Rotation.from_quat(values[i]), Rotation.from_quat(values[i + 1])
+            return (a * Rotation.from_rotvec(s * (a.inv() * b).as_rotvec())).as_quat()
+        return (1 - s) * values[i] + s * values[i + 1]
+
+
+@dataclass
+class Document:
+    """A parsed file. ``nodes`` are those of the default scene, parents before children, by their index in the file.
+
+    tree : its JSON, of the shape that :mod:`blinkgl.scene.importing.gltf_schema` demands.
+    materials : False leaves the file's own materials out, and what they ask for unsaid.
+    log : repairs and decisions.   omissions : what the file asks for and is not drawn.
+    """
+
+    path: Path
+    tree: dict
+    buffers: list[bytes]
+    max_texture: int
+    materials: bool
+    omissions: Omissions
+    nodes: dict[int, Node] = field(default_factory=dict)
+    log: list[str] = field(default_factory=list)
+    _materials: dict = field(default_factory=dict)
+    _textures: dict = field(default_factory=dict)
+
+    @property
+    def where(self) -> str:
+        return str(self.path)
+
+    # ---- geometry
+    def world(self, node: int, overrides: dict[int, dict] | None = None) -> np.ndarray:
+        """(4, 4) transform of a node to the file's world; ``overrides``: node -> animated values."""
+        T = np.eye(4)
+        step: int | None = node
+        while step is not None:
+            T = self.nodes[step].local(**(overrides or {}).get(step, {})) @ T
+            step = self.nodes[step].parent
+        return T
+
+    def mesh_pieces(self, mesh: int) -> list[Piece]:
+        """The triangles of a mesh in its own coordinates, a piece per primitive; points and lines are left out."""
+        pieces = []
+        for primitive in _item(self.tree, "meshes", mesh, self.where)["primitives"]:
+            mode, attributes = primitive.get("mode", 4), primitive["attributes"]
+            if mode not in (4, 5, 6):
+                self.omissions.add("points and lines")
+                continue
+            if "POSITION" not in attributes:
+                continue
+            position = _item(self.tree, "accessors", attributes["POSITION"], self.where)
+            if "KHR_draco_mesh_compression" in primitive.get("extensions", {}) and "bufferView" not in position:
+                raise _needs("KHR_draco_mesh_compression", self.where)
+            vertices = self._attribute(primitive, "POSITION", 3, position["count"])
+            order = np.arange(len(vertices))
+            if "indices" in primitive:
+                order = self.accessor(primitive["indices"])
+                if order.dtype.kind != "u" or order.shape[1] != 1:
+                    raise AssetError(f"the indices of mesh {mesh} are no whole numbers", where=self.where)
+                order = order.astype(np.int64).ravel()
+            if primitive.get("targets"):
+                self.omissions.add("morph targets (the base shape is drawn)")
+            if "JOINTS_0" in attributes:
+                self.omissions.add("skins (the rest shape is drawn)")
+            material, uv_set, uv_matrix = self.material(primitive.get("material"))
+            normals = self._attribute(primitive, "NORMAL", 3, len(vertices))
+            uvs = self._attribute(primitive, f"TEXCOORD_{uv_set}", 2, len(vertices))
+            if uvs is not None and uv_matrix is not None:
+                uvs = uvs @ uv_matrix[:2, :2].T + uv_matrix[:2, 2]
+            if self.materials:
+                self._note_wrapping(primitive.get("material"), uvs)
+                material = self._coloured(primitive, material, len(vertices))
+            pieces.append(Piece(vertices, _triangles(order, mode), normals, uvs, material))
+        return pieces
+
+    def _attribute(self, primitive: dict, name: str, width: int, count: int) -> np.ndarray | None:
+        """(count, width) float64, None without it. Its length is checked before it is read."""
+        if name not in primitive["attributes"]:
+            return None
+        index = primitive["attributes"][name]
+        a = _item(self.tree, "accessors", index, self.where)
+        if a["count"] != count or _WIDTHS[a["type"]] != width:
+            raise AssetError(f"the file is no valid glTF ({name} does not fit the positions)", where=self.where,
+                             value=f"{a['count']} {a['type']}", accepted=f"{count} VEC{width}")
+        return self.accessor(index).astype(np.float64)
+
+    def _coloured(self, primitive: dict, material: Material | None, count: int) -> Material | None:
+        """The material times the vertices' colour (linear) where they all have the same, which is exact."""
+        if "COLOR_0" not in primitive["attributes"]:
+            return material
+        index = primitive["attributes"]["COLOR_0"]
+        width = _WIDTHS[_item(self.tree, "accessors", index, self.where)["type"]]
+        colours = self._attribute(primitive, "COLOR_0", 4 if width == 4 else 3, count)[:, :3]
+        if len(colours) == 0 or not (colours == colours[0]).all():
+            self.omissions.add("vertex colours (left out)")
+            return material
+        material = material or Material()
+        factor = np.clip(colours[0], 0, 1) * material.base_color
+        return replace(material, base_color=tuple(float(c) for c in factor))
+
+    def _note_wrapping(self, material: int | None, uvs: np.ndarray | None) -> None:
+        info = self._base_colour(material).get("baseColorTexture")
+        if info is None or uvs is None or not len(uvs):
+            return
+        sampler = _item(self.tree, "textures", info["index"], self.where).get("sampler")
+        if sampler is None:
+            return
+        settings = _item(self.tree, "samplers", sampler, self.where)
+        for axis, key in enumerate(("wrapS", "wrapT")):
+            # Inside the image all modes show the same, but for the outermost half pixel.
+            outside = uvs[:, axis].min() < -1e-3 or uvs[:, axis].max() > 1 + 1e-3
+            if outside and (name := _WRAPS.get(settings.get(key))):
+                self.omissions.add(f"texture wrap mode {name} (repeated)")
+        if settings.get("magFilter") == _NEAREST:
+            self.omissions.add("unfiltered textures (drawn smooth)")
+
+    def _base_colour(self, material: int | None) -> dict:
+        if material is None:
+            return {}
+        return _item(self.tree, "materials", material, self.where).get("pbrMetallicRoughness", {})
+
+    def pieces(self) -> list[Piece]:
+        """The whole scene at rest as one object, in the file's axes."""
+        return [transformed(p, self.world(i)) for i, node in self.nodes.items() if node.mesh is not None
+                for p in self.mesh_pieces(node.mesh)]
+
+    def accessor(self, index: int) -> np.ndarray:
+        """(count, n) values; normalised integers become floats."""
+        a = _item(self.tree, "accessors", index, self.where)
+        count, width, dtype = a["count"], _WIDTHS[a["type"]], np.dtype(_DTYPES[a["componentType"]]).newbyteorder("<")
+        if "bufferView" in a:
+            values = self._view(a["bufferView"], a.get("byteOffset", 0), count, width, dtype, index)
+        elif count * width * dtype.itemsize > _MAX_ZEROS:
+            raise AssetError(f"accessor {index} has no buffer and too many values", where=self.where, value=count,
+                             accepted=f"at most {_MAX_ZEROS // 10**6} MB of zeros")
+        else:
+            values = np.zeros((count, width), dtype)
+        if "sparse" in a:
+            where, what, n = a["sparse"]["indices"], a["sparse"]["values"], a["sparse"]["count"]
+            kind = np.dtype(_DTYPES[where["componentType"]]).newbyteorder("<")
+            at = self._view(where["bufferView"], where.get("byteOffset", 0), n, 1, kind, index)
+            new = self._view(what["bufferView"], what.get("byteOffset", 0), n, width, dtype, index)
+            if n and int(at.max()) >= count:
+                raise AssetError(f"accessor {index} has a sparse index outside it", where=self.where)
+            values = values.copy()
+            values[at.ravel().astype(np.int64)] = new
+        if a.get("normalized") and values.dtype.kind in "iu":
+            return np.maximum(values / float(np.iinfo(values.dtype).max), -1.0)
+        return values
+
+    def _view(self, view: int, offset: int, count: int, width: int, dtype: np.dtype, accessor: int) -> np.ndarray:
+        v = _item(self.tree, "bufferViews", view, self.where)
+        data = self.buffers[_index(v.get("buffer"), len(self.buffers), "buffer", self.where)]
+        begin = v.get("byteOffset", 0)
+        start, item = begin + offset, width * dtype.itemsize
+        stride = v.get("byteStride", 0) or item
+        needed = start + (stride * (count - 1) + item if count else 0)
+        if stride < item or needed > min(len(data), begin + v.get("byteLength", 0)):
+            raise AssetError(f"the mesh is corrupt: accessor {accessor} reaches outside its buffer", where=self.where)
+        return np.ndarray((count, width), dtype, data, start if count else 0, (stride, dtype.itemsize))
+
+    # ---- materials
+    def material(self, index: int | None) -> tuple[Material | None, int, np.ndarray | None]:
+        """(material, texture coordinate set, 3x3 texture transform or None)."""
+        if index is None:
+            return None, 0, None
+        if index not in self._materials:
+            m, pbr = _item(self.tree, "materials", index, self.where), self._base_colour(index)
+            info = pbr.get("baseColorTexture") or {}
+            transform = info.get("extensions", {}).get("KHR_texture_transform") or {}
+            material = Material(texture=self._texture(info["index"]) if info and self.materials else None,
+                                base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
+                                unlit="KHR_materials_unlit" in m.get("extensions", {}),
+                                double_sided=m.get("doubleSided", False))
+            if self.materials:
+                self._note_material(m, pbr)
+            self._materials[index] = (material, transform.get("texCoord", info.get("texCoord", 0)),
+                                      _texture_transform(transform))
+        return self._materials[index]
+
+    def _note_material(self, m: dict, pbr: dict) -> None:
+        """What a used material asks for beside a matt base colour."""
+        if m.get("alphaMode", "OPAQUE") != "OPAQUE":
+            self.omissions.add(f"alpha {m['alphaMode']} (drawn opaque)")
+        for name in m.get("extensions", {}):
+            if name not in _DRAWN | _INVISIBLE | {"KHR_materials_emissive_strength"}:
+                self.omissions.add(name)
+        if "KHR_materials_unlit" in m.get("extensions", {}):
+            return
+        if any(m.get("emissiveFactor", (0, 0, 0))):
+            self.omissions.add("emissive light")
+        if pbr.get("metallicFactor", 1) > 0 or pbr.get("roughnessFactor", 1) < 1:
+            self.omissions.add("metal and roughness (drawn matt)")
+        for key, name in (("normalTexture", "normal maps"), ("occlusionTexture", "occlusion maps")):
+            if key in m:
+                self.omissions.add(name)
+
+    def _texture(self, index: int) -> Texture | None:
+        source = _item(self.tree, "textures", index, self.where).get("source")
+        if source is None:
+            names = ", ".join(self.tree["textures"][index].get("extensions", {})) or "without an image"
+            self.omissions.add(f"textures of another kind ({names})")
+            return None
+        if source not in self._textures:
+            image = _item(self.tree, "images", source, self.where)
+            if "bufferView" in image:
+                v = _item(self.tree, "bufferViews", image["bufferView"], self.where)
+                buffer = self.buffers[_index(v["buffer"], len(self.buffers), "buffer", self.where)]
+                begin = v.get("byteOffset", 0)
+                data = buffer[begin : begin + v.get("byteLength", 0)]
+            else:
+                data = _fetch(image.get("uri", ""), self.path, "image")
+            name = str(image.get("name") or f"image-{source}")
+            pixels = decode_image(data, self.max_texture, f"{self.where} (image '{name}')")
+            self._textures[source] = Texture(pixels, name, content_hash(data))
+        return self._textures[source]
+
+    # ---- animations
+    def channels(self, animation: int) -> list[Channel]:
+        """Node animations; what else an animation moves (morph weights) is an omission."""
+        a = _item(self.tree, "animations", animation, self.where)
+        samplers, found = a["samplers"], []
+        for channel in a["channels"]:
+            node, path = channel["target"].get("node"), channel["target"]["path"]
+            if path not in ("translation", "rotation", "scale"):
+                self.omissions.add(f"animation of {path if path == 'weights' else 'other properties'}")
+                continue
+            if node not in self.nodes:
+                continue
+            if self.nodes[node].matrix is not None:
+                self.omissions.add("animation of nodes that have a matrix")
+                continue
+            sampler = samplers[_index(channel["sampler"], len(samplers), "animation sampler", self.where)]
+            kind, width = sampler.get("interpolation", "LINEAR"), 4 if path == "rotation" else 3
+            per_key = 3 if kind == "CUBICSPLINE" else 1
+            keys, given = (_item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
+            # Lengths first: the two are as long as the file says, whatever is behind them.
+            fits = (keys["type"] == "SCALAR" and given["count"] == per_key * keys["count"] > 0
+                    and _WIDTHS[given["type"]] == width)
+            times = self.accessor(sampler["input"]).astype(np.float64).ravel() if fits else np.zeros(0)
+            values = self.accessor(sampler["output"]).astype(np.float64) if fits else np.zeros(0)
+            if (not fits or not (np.abs(values) <= 1e12).all() or not (np.abs(times) < _MAX_TIME).all()
+                    or (np.diff(times) <= 0).any()):      # NaN compares false
+                raise AssetError(f"the animation of {path} of node '{self.nodes[node].name}' is corrupt", where=self.where)
+            values = values.reshape(-1, per_key, width)
+            if path == "rotation" and (np.linalg.norm(values[:, per_key // 2], axis=1) < 1e-9).any():
+                raise AssetError(f"the animation of node '{self.nodes[node].name}' has a rotation of zero",
+                                 where=self.where)
+            found.append(Channel(node, path, times, values if per_key == 3 else values[:, 0], kind))
+        return found
+
+
+def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, max_texture: int = 2048,
+         materials: bool = True) -> Document:
+    """Parses a file, checks its shape and its counts. Raises AssetError naming it."""
+    path = Path(path)
+    where = str(path)
+    with reading("scene", where):
+        data = contents(path, "scene") if data is None else data
+        tree, binary = _parse(data, where)
+        for name in tree.get("extensionsRequired", []):
+            if name not in _DRAWN | _LIGHT_ONLY | _INVISIBLE:
+                raise _needs(name, where)
+        document = Document(path, tree, _buffers(tree, binary, path), max_texture, materials, Omissions(path.name))
+        document.nodes = _nodes(tree, where)
+        _check_faces(document, max_faces)
+        for name in tree.get("extensionsUsed", []):
+            # What belongs to materials and textures is said where one is used, and lights by what they are.
+            said_there = name.startswith(("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_"))
+            if name not in _DRAWN | _LIGHT_ONLY | _INVISIBLE and not said_there:
+                document.omissions.add(name)
+        if any("KHR_lights_punctual" in tree["nodes"][i].get("extensions", {}) for i in document.nodes):
+            document.omissions.add("lights (the configuration's sun and sky shine)")
+    return document
+
+
+def _needs(extension: str, where: str) -> AssetError:
+    return AssetError(f"the file needs the extension {extension}, which BlinkGL does not draw", where=where,
+                      accepted="a glTF 2.0 export without it (uncompressed, PNG or JPEG images)")
+
+
+def inside(folder: Path, name: str, where: str) -> Path:
+    """The file ``name`` below ``folder``. AssetError when it is absolute, leads out by ``..`` or by a link, or is missing."""
+    target = Path(folder) / name
+    try:
+        within = (name and "\0" not in name and not Path(name).is_absolute() and "\\" not in name
+                  and target.resolve().is_relative_to(Path(folder).resolve()))
+        found = within and target.is_file()
+    except (OSError, ValueError, RuntimeError):      # a name too long for the file system, a link to itself
+        within, found = True, False
+    if not within:
+        raise AssetError("refers to a file outside its folder", where=where, value=name, accepted="a relative path below it")
+    if not found:
+        raise AssetError("refers to a file that is missing", where=where, value=name)
+    return target
+
+
+def buffer_contents(path: Path, data: bytes) -> list[bytes]:
+    """The external buffers of a .gltf file, in order."""
+    with reading("scene", str(path)):
+        tree, _ = _parse(data, str(path))
+        uris = [b.get("uri") or "" for b in tree.get("buffers", [])]
+        return [_fetch(uri, path, "buffer") for uri in uris if uri and not uri.startswith("data:")]
+
+
+def to_linear(srgb) -> tuple[float, float, float]:
+    return tuple(float(c) for c in linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1)))
+
+
+def _parse(data: bytes, where: str) -> tuple[dict, bytes]:
+    binary = b""
+    if data[:4] == b"glTF":
+        if len(data) < 20:
+            raise AssetError("the file is truncated", where=where, value=f"{len(data)} bytes")
+        version, length = struct.unpack_from("<II", data, 4)
+        if version != 2 or length > len(data):
+            raise AssetError("the file is truncated or not glTF 2", where=where, value=f"version {version}, {len(data)} of {length} bytes")
+        position, chunks = 12, {}
+        while position + 8 <= length:
+            size, kind = struct.unpack_from("<II", data, position)
+            if position + 8 + size > length:
+                raise AssetError("the file is truncated inside a chunk", where=where)
+            chunks.setdefault(kind, data[position + 8 : position + 8 + size])
+            position += 8 + size
+        text, binary = chunks.get(0x4E4F534A, b""), chunks.get(0x004E4942, b"")
+    else:
+        text = data
+    try:
+        tree = json.loads(text.decode("utf-8-sig"))
+    except (ValueError, RecursionError):
+        raise AssetError("the file is no valid glTF (its JSON cannot be read)", where=where) from None
+    gltf_schema.check(tree, where)
+    if not tree["asset"]["version"].startswith("2"):
+        raise AssetError("the file is no glTF 2", where=where, value=tree["asset"]["version"])
+    return tree, binary
+
+
+def _buffers(tree: dict, binary: bytes, path: Path) -> list[bytes]:
+    buffers = []
+    for number, buffer in enumerate(tree.get("buffers", [])):
+        compressed = next((e for e in buffer.get("extensions", {}) if e.endswith("_meshopt_compression")), None)
+        if compressed and "uri" not in buffer:
+            raise _needs(compressed, str(path))
+        data = _fetch(buffer["uri"] or "", path, "buffer") if "uri" in buffer else binary if number == 0 else b""
+        if len(data) < buffer.get("byteLength", 0):
+            raise AssetError(f"buffer {number} is truncated", where=str(path), value=len(data),
+                             accepted=f"{buffer.get('byteLength')} bytes")
+        buffers.append(data)
+    return buffers
+
+
+def _fetch(uri: str, path: Path, what: str) -> bytes:
+    if uri.startswith("data:"):
+        head, _, body = uri.partition(",")
+        try:
+            return base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode("latin-1")
+        except (binascii.Error, ValueError):
+            raise AssetError(f"the embedded {what} is corrupt", where=str(path)) from None
+    if "://" in uri:
+        raise AssetError(f"the {what} is on a network", where=str(path), value=uri, accepted="a file beside it")
+    return contents(inside(path.parent, unquote(uri), str(path)), what, str(path))
+
+
+def _nodes(tree: dict, where: str) -> dict[int, Node]:
+    """Nodes of the default scene (of the file, when it has none), parents first."""
+    raw, scenes = tree.get("nodes", []), tree.get("scenes", [])
+    if len(raw) > _MAX_NODES:
+        raise AssetError("the file has too many nodes", where=where, value=len(raw), accepted=f"at most {_MAX_NODES}")
+    if scenes:
+        roots = scenes[_index(tree.get("scene", 0), len(scenes), "scene", where)].get("nodes", [])
+    else:
+        children = {c for n in raw for c in n.get("children", [])}
+        roots = [i for i in range(len(raw)) if i not in children]
+    nodes: dict[int, Node] = {}
+    stack = [(r, None, 0) for r in reversed(roots)]
+    while stack:
+        i, parent, depth = stack.pop()
+        if i in nodes or depth > _MAX_DEPTH:
+            raise AssetError("the nodes are no tree" if i in nodes
+                             else f"the nodes are nested more than {_MAX_DEPTH} deep", where=where, value=i)
+        n = raw[_index(i, len(raw), "node", where)]
+        matrix = np.array(n["matrix"], float).reshape(4, 4).T if n.get("matrix") else None
+        rest = [tuple(map(float, n.get(k, d))) for k, d in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))]
+        nodes[i] = Node(str(n.get("name") or f"node-{i}"), parent, n.get("mesh"), n.get("camera"), *rest, matrix)
+        stack += [(c, i, depth + 1) for c in reversed(n.get("children", []))]
+    return nodes
+
+
+def _check_faces(document: Document, max_faces: int) -> None:
+    """Triangles the scene would have, from the accessors' counts alone (every node that shows a mesh counts it)."""
+    tree, where = document.tree, document.where
+    per_mesh = {}
+    for node in document.nodes.values():
+        if node.mesh is None:
+            continue
+        if node.mesh not in per_mesh:
+            total = 0
+            for primitive in _item(tree, "meshes", node.mesh, where)["primitives"]:
+                position = primitive["attributes"].get("POSITION")
+                vertices = _item(tree, "accessors", position, where)["count"] if position is not None else 0
+                corners = vertices
+                if "indices" in primitive:
+                    corners = _item(tree, "accessors", primitive["indices"], where)["count"]
+                total += max(corners // (3 if primitive.get("mode", 4) == 4 else 1), vertices // 3)
+            per_mesh[node.mesh] = total
+    total = sum(per_mesh[n.mesh] for n in document.nodes.values() if n.mesh is not None)
+    if total > max_faces:
+        raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
+
+
+def _triangles(order: np.ndarray, mode: int) -> np.ndarray:
+    if mode == 4:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    if len(order) < 3:
+        return np.zeros((0, 3), np.int64)
+    i = np.arange(len(order) - 2)
+    if mode == 6:
+        return np.stack([np.full(len(i), order[0]), order[i + 1], order[i + 2]], axis=1)
+    odd = i % 2
+    return np.stack([order[i], order[i + 1 + odd], order[i + 2 - odd]], axis=1)
+
+
+def _texture_transform(transform: dict | None) -> np.ndarray | None:
+    if not transform:
+        return None
+    (ox, oy), (sx, sy), r = transform.get("offset", (0, 0)), transform.get("scale", (1, 1)), float(transform.get("rotation", 0))
+    c, s = np.cos(r), np.sin(r)
+    return np.array([[1, 0, ox], [0, 1, oy], [0, 0, 1]]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ np.diag([sx, sy, 1.0])
+
+
+def _item(tree: dict, key: str, index, where: str) -> dict:
+    items = tree.get(key, [])
+    return items[_index(index, len(items), key, where)]
+
+
+def _index(index, count: int, what: str, where: str) -> int:
+    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < count:
+        raise AssetError(f"the file is no valid glTF (a reference to {what} that does not exist)", where=where, value=index)
+    return index

@@ -1,0 +1,224 @@
+"""What a glTF 2.0 file's JSON has to look like before it is believed: types, ranges, lengths of all that is read.
+
+The reader (:mod:`blinkgl.scene.importing.gltf`) works on the plain dictionaries; :func:`check` says that they have this shape.
+References from one list into another are checked where they are followed. Names are those of the specification. A
+property that nobody reads is not looked at.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from blinkgl.errors import AssetError
+
+Index = Annotated[int, Field(ge=0, lt=2**31)]
+Size = Annotated[int, Field(ge=0, le=2**53)]
+# Beyond this a unit was mistaken, and products of a few of them overflow.
+Number = Annotated[float, Field(ge=-1e12, le=1e12)]
+Factor = Annotated[float, Field(ge=0, le=1e9)]
+Vector2 = Annotated[list[Number], Field(min_length=2, max_length=2)]
+Vector3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
+Vector4 = Annotated[list[Number], Field(min_length=4, max_length=4)]
+Matrix4 = Annotated[list[Number], Field(min_length=16, max_length=16)]
+Extensions = dict[str, dict[str, Any]]
+
+
+class _Part(BaseModel):
+    # A default of None stands for "not there"; JSON's null is nowhere allowed by the specification, nor here.
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+
+
+class Asset(_Part):
+    version: str
+
+
+class Buffer(_Part):
+    uri: str = None
+    byteLength: Size = 0
+    extensions: Extensions = {}
+
+
+class BufferView(_Part):
+    buffer: Index
+    byteOffset: Size = 0
+    byteLength: Size = 0
+    byteStride: Annotated[int, Field(ge=0, le=65536)] = 0
+
+
+class SparseIndices(_Part):
+    bufferView: Index
+    byteOffset: Size = 0
+    componentType: Literal[5121, 5123, 5125]
+
+
+class SparseValues(_Part):
+    bufferView: Index
+    byteOffset: Size = 0
+
+
+class Sparse(_Part):
+    count: Size
+    indices: SparseIndices
+    values: SparseValues
+
+
+class Accessor(_Part):
+    bufferView: Index = None
+    byteOffset: Size = 0
+    componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    count: Size
+    normalized: bool = False
+    sparse: Sparse = None
+
+
+class Transform(_Part):
+    offset: Vector2 = [0, 0]
+    scale: Vector2 = [1, 1]
+    rotation: Number = 0.0
+    texCoord: Annotated[int, Field(ge=0, le=255)] = None
+
+
+class TextureExtensions(_Part):
+    KHR_texture_transform: Transform = None
+
+
+class TextureInfo(_Part):
+    index: Index
+    texCoord: Annotated[int, Field(ge=0, le=255)] = 0
+    extensions: TextureExtensions = TextureExtensions()
+
+
+class Pbr(_Part):
+    baseColorFactor: Annotated[list[Factor], Field(min_length=4, max_length=4)] = [1, 1, 1, 1]
+    baseColorTexture: TextureInfo = None
+    metallicFactor: Factor = 1.0
+    roughnessFactor: Factor = 1.0
+    metallicRoughnessTexture: TextureInfo = None
+
+
+class Material(_Part):
+    pbrMetallicRoughness: Pbr = Pbr()
+    normalTexture: TextureInfo = None
+    occlusionTexture: TextureInfo = None
+    emissiveTexture: TextureInfo = None
+    emissiveFactor: Annotated[list[Factor], Field(min_length=3, max_length=3)] = [0, 0, 0]
+    alphaMode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
+    doubleSided: bool = False
+    extensions: Extensions = {}
+
+
+class Primitive(_Part):
+    attributes: dict[str, Index]
+    indices: Index = None
+    material: Index = None
+    mode: Annotated[int, Field(ge=0, le=6)] = 4
+    targets: list[dict[str, Index]] = []
+    extensions: Extensions = {}
+
+
+class Mesh(_Part):
+    primitives: list[Primitive]
+
+
+class Node(_Part):
+    children: list[Index] = []
+    mesh: Index = None
+    camera: Index = None
+    skin: Index = None
+    matrix: Matrix4 = None
+    translation: Vector3 = [0, 0, 0]
+    rotation: Vector4 = [0, 0, 0, 1]
+    scale: Vector3 = [1, 1, 1]
+    extensions: Extensions = {}
+
+    @model_validator(mode="after")
+    def _turned(self):
+        if sum(q * q for q in self.rotation) < 1e-18:
+            raise ValueError("a node's rotation is zero")
+        return self
+
+
+class Scene(_Part):
+    nodes: list[Index] = []
+
+
+class Texture(_Part):
+    source: Index = None
+    sampler: Index = None
+    extensions: Extensions = {}
+
+
+class Image(_Part):
+    uri: str = None
+    bufferView: Index = None
+
+
+class Sampler(_Part):
+    magFilter: int = None
+    wrapS: int = 10497
+    wrapT: int = 10497
+
+
+class Perspective(_Part):
+    yfov: Annotated[float, Field(gt=1e-4, lt=3.1415)]
+    znear: Factor = None
+
+
+class Camera(_Part):
+    type: Literal["perspective", "orthographic"]
+    perspective: Perspective = None
+
+
+class Target(_Part):
+    node: Index = None
+    path: str
+
+
+class Channel(_Part):
+    sampler: Index
+    target: Target
+
+
+class AnimationSampler(_Part):
+    input: Index
+    output: Index
+    interpolation: Literal["LINEAR", "STEP", "CUBICSPLINE"] = "LINEAR"
+
+
+class Animation(_Part):
+    channels: list[Channel]
+    samplers: list[AnimationSampler]
+
+
+class File(_Part):
+    asset: Asset
+    extensionsUsed: list[str] = []
+    extensionsRequired: list[str] = []
+    buffers: list[Buffer] = []
+    bufferViews: list[BufferView] = []
+    accessors: list[Accessor] = []
+    images: list[Image] = []
+    samplers: list[Sampler] = []
+    textures: list[Texture] = []
+    materials: list[Material] = []
+    meshes: list[Mesh] = []
+    cameras: list[Camera] = []
+    nodes: list[Node] = []
+    scenes: list[Scene] = []
+    scene: Index = 0
+    animations: list[Animation] = []
+
+
+def check(tree: Any, where: str) -> None:
+    """AssetError naming the first property that is not as the specification has it, and its value."""
+    try:
+        File.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        path = ".".join(str(step) for step in first["loc"]) or "its JSON"
+        message = first["msg"].removeprefix("Value error, ")
+        raise AssetError(f"the file is no valid glTF ({path}: {message[0].lower() + message[1:]})", where=where,
+                         value=... if first["type"] in ("missing", "value_error") else first["input"]) from None

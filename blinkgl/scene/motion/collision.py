@@ -1,0 +1,403 @@
+"""Collisions along trajectories, found continuously; whoever collides stays where it is.
+
+    result = resolve_collisions(objects, camera_path, camera_radius, t0_ns, t1_ns)
+    if result.at_start: ...                         # a placement to be drawn again
+    scene = Scene(result.objects, replace(camera, path=result.camera_path), t0_ns, t1_ns, log=result.log)
+
+Method: conservative advancement (Mirtich 1996; Tang, Kim & Manocha, "C2A", ICRA 2009). At a time t two bodies are a
+distance d apart and over [t, t + dt] no point of theirs is faster than S = sum(|v| + |w| r), with bounds that come from
+the trajectories' polynomials (:meth:`PosePath.speed_bound`), not from samples; so nothing can touch before t + d / S,
+which is the next time looked at. A body that is thinner than its motion per frame therefore cannot be jumped over.
+Whichever pair is next in time is advanced first, so each step sees all earlier cuts.
+
+Distances: bounding spheres and separating faces of convex static bodies while these suffice, otherwise exact
+triangle-triangle distances (fcl). Two bodies collide when they come within ``tol = tolerance * (the smaller's radius)``;
+the cut is at a separation in (0, tol].
+
+Rest: a body that touches the ground (or a wall) at t0 was put there. Where that is flat (or convex: a slab), the body
+may slide on it, lift off and land; only sinking more than ``rest_margin`` of its radius into it counts as a
+collision. Touching other bodies, or ground that is not convex, at t0 is a collision at t0.
+
+A body wholly inside another closed mesh has a positive distance to it: that is tested once, at t0, by winding number
+(later it cannot get in without a collision), and only against objects and their closed meshes: sky, walls and ground
+may enclose.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, replace
+
+import fcl
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from blinkgl.scene.motion.paths import CutPath
+from blinkgl.scene.types import PosePath, SceneObject
+
+CAMERA = "camera"
+_SUPPORTS = ("ground", "wall")
+_MAX_PLANES = 24  # convex static bodies with more faces are left to fcl
+_REQUEST = fcl.DistanceRequest()
+
+
+@dataclass(frozen=True)
+class Collision:
+    """``first`` and ``second`` (names; the camera's is "camera") came within ``separation`` of each other at t_ns.
+
+    kind : "contact", or "inside": one lies within the other's closed mesh (at t0 only; separation 0).
+    cut  : names of those that were moving and have been stopped.
+    """
+
+    t_ns: int
+    first: str
+    second: str
+    kind: str
+    separation: float
+    cut: tuple[str, ...]
+
+    def __str__(self) -> str:
+        verb = "lies inside" if self.kind == "inside" else "touches"
+        stopped = f"; stopped: {', '.join(self.cut)}" if self.cut else ""
+        return f"t={self.t_ns * 1e-9:.6f} s: {self.first} {verb} {self.second}{stopped}"
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionResult:
+    """objects, camera_path : as given, with :class:`CutPath` where something was stopped.
+    events   : in order of time.
+    at_start : those of ``events`` at t0: placements that were no good.
+    distance_queries : how many exact distances it took.
+    """
+
+    objects: tuple[SceneObject, ...]
+    camera_path: PosePath
+    events: tuple[Collision, ...]
+    at_start: tuple[Collision, ...]
+    distance_queries: int = 0
+
+    @property
+    def log(self) -> tuple[str, ...]:
+        return tuple(str(event) for event in self.events)
+
+
+def resolve_collisions(objects: tuple[SceneObject, ...] | list[SceneObject], camera_path: PosePath, camera_radius: float,
+                       t0_ns: int, t1_ns: int, tolerance: float = 1e-3, rest_margin: float = 0.01) -> CollisionResult:
+    """Cuts every moving body's path at its first collision in [t0, t1].
+
+    objects       : moving and static ones, ground, walls and sky included.
+    camera_radius : the camera is a sphere of this radius (at least the near distance, or the image cuts into
+                    surfaces) round its centre, > 0.
+    tolerance     : relative to the smaller body's radius, see the module's docstring; in (0, 0.1].
+    rest_margin   : how deep, relative to its radius, a body may sink into what it rests on at t0; in (0, 0.1].
+    """
+    if not (0 < tolerance <= 0.1 and 0 < rest_margin <= 0.1 and camera_radius > 0 and t0_ns <= t1_ns):
+        raise ValueError("resolve_collisions: tolerance and rest_margin in (0, 0.1], camera_radius > 0, t0_ns <= t1_ns")
+    bodies = [_Body.of_object(o) for o in objects if any(len(p.mesh.faces) for p in o.parts)]
+    bodies.append(_Body.of_camera(camera_path, camera_radius))
+    search = _Search(bodies, int(t0_ns), int(t1_ns), tolerance, rest_margin)
+    events = tuple(search.run())
+    cut = {body.source: body.path for body in bodies if body.cut}
+    return CollisionResult(tuple(replace(o, path=cut[id(o)]) if id(o) in cut else o for o in objects),
+                           cut.get(CAMERA, camera_path), events, tuple(e for e in events if e.t_ns == t0_ns),
+                           search.distance_queries)
+
+
+def overlaps(objects: tuple[SceneObject, ...] | list[SceneObject], t_ns: int, camera_path: PosePath | None = None,
+             camera_radius: float = 0.05, tolerance: float = 1e-3) -> list[Collision]:
+    """Which bodies touch or enclose each other at t_ns, for checking placements: static ones included; resting on the
+    ground, and sky, walls and ground meeting each other, are not reported."""
+    bodies = [_Body.of_object(o) for o in objects if any(len(p.mesh.faces) for p in o.parts)]
+    if camera_path is not None:
+        bodies.append(_Body.of_camera(camera_path, camera_radius))
+    return _Search(bodies, int(t_ns), int(t_ns), tolerance, 0.01).at_start(static_too=True)
+
+
+@dataclass(eq=False)
+class _Body:
+    """What the search knows about a body. vertices (V, 3), faces (F, 3): all parts, local; probes: (K, 3) one vertex
+    of each part; closed: its closed parts' (vertices, faces); pad: thickness added all round. Derived: centre, radius:
+    bounding ball, local; arm: |centre|; reach: largest distance of a vertex from the local origin, which is what
+    turning moves; hull: (H, 3) vertices of the convex hull, local; planes: (P, 4) world (n, o) with n.x <= o inside, of
+    a convex static body, else None."""
+
+    name: str
+    category: str
+    source: int | str
+    path: PosePath
+    vertices: np.ndarray
+    faces: np.ndarray
+    probes: np.ndarray
+    pad: float = 0.0
+    closed: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    cut: bool = False
+
+    @staticmethod
+    def of_object(obj: SceneObject) -> _Body:
+        meshes = [part.mesh for part in obj.parts if len(part.mesh.faces)]
+        first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+        return _Body(obj.name, obj.category, id(obj), obj.path, np.concatenate([mesh.vertices for mesh in meshes]),
+                     np.concatenate([mesh.faces + k for mesh, k in zip(meshes, first)]),
+                     np.array([mesh.vertices[mesh.faces[0, 0]] for mesh in meshes]),
+                     closed=tuple((m.vertices, m.faces) for m in meshes if m.closed) if obj.category == "object" else ())
+
+    @staticmethod
+    def of_camera(path: PosePath, radius: float) -> _Body:
+        # A point is a triangle of three equal corners: the same exact distance routine serves it.
+        return _Body(CAMERA, CAMERA, CAMERA, path, np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((1, 3)), pad=radius)
+
+    def __post_init__(self):
+        self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        used = self.vertices[np.unique(self.faces)]
+        self.low, self.high = used.min(axis=0), used.max(axis=0)
+        self.centre = 0.5 * (self.low + self.high)
+        self.radius = float(np.linalg.norm(used - self.centre, axis=1).max()) + self.pad
+        self.arm = float(np.linalg.norm(self.centre))
+        self.reach = float(np.linalg.norm(used, axis=1).max())
+        self.hull = _hull(used)
+        self.is_static = self.path.is_static
+        self.planes = None
+        if self.is_static and self.category != CAMERA:
+            T = self.path.pose(self.path.t0_ns)
+            self.planes = _face_planes(used @ T[:3, :3].T + T[:3, 3], self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
+        self._shape = None
+
+    def shape(self) -> fcl.CollisionObject:
+        if self._shape is None:
+            model = fcl.BVHModel()
+            model.beginModel(len(self.vertices), len(self.faces))
+            model.addSubModel(self.vertices, self.faces)
+            model.endModel()
+            self._shape = fcl.CollisionObject(model)
+        return self._shape
+
+    def encloses(self, points: np.ndarray, T: np.ndarray) -> bool:
+        """Whether a closed part contains one of the world ``points``."""
+        local = (points - T[:3, 3]) @ T[:3, :3]
+        near = local[(np.linalg.norm(local - self.centre, axis=1) < self.radius)]
+        return any(abs(_winding(point, *part)) > 0.5 for part in self.closed for point in near)
+
+
+class _Search:
+    """Conservative advancement of all pairs, the one that is next in time first."""
+
+    def __init__(self, bodies: list[_Body], t0: int, t1: int, tolerance: float, rest_margin: float):
+        self.bodies, self.t0, self.t1, self.tolerance, self.rest_margin = bodies, t0, t1, tolerance, rest_margin
+        self.distance_queries = 0
+        self.resting: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
+
+    def run(self):
+        yield from self.at_start()
+        queue = [(self.t0, i, j) for i, j in self._pairs()]  # equal times, ordered pairs: a heap already
+        while queue:
+            t, i, j = heapq.heappop(queue)
+            a, b = self.bodies[i], self.bodies[j]
+            if a.is_static and b.is_static:
+                continue
+            later, hit = self._advance(i, j, t)
+            if hit is not None:
+                yield Collision(t, a.name, b.name, "contact", hit, self._stop(t, a, b))
+            elif later < self.t1:
+                heapq.heappush(queue, (later, i, j))
+
+    def at_start(self, static_too: bool = False) -> list[Collision]:
+        """Contacts and containments at t0; notes who rests on what and stops what moves. ``static_too``: among static
+        bodies as well, and nothing is stopped."""
+        found = []
+        for i, j in self._pairs(static_too):
+            a, b = self.bodies[i], self.bodies[j]
+            Ta, Tb = a.path.pose(self.t0), b.path.pose(self.t0)
+            if self._ball_gap(a, b, Ta, Tb) > self._tol(a, b):
+                continue
+            if a.encloses(_moved(b.probes, Tb), Ta):
+                found.append((b, a, "inside", 0.0))
+            elif b.encloses(_moved(a.probes, Ta), Tb):
+                found.append((a, b, "inside", 0.0))
+            elif not self._rests(i, j, Ta, Tb):
+                separation = self._distance(a, b, Ta, Tb)
+                if separation <= self._tol(a, b):
+                    found.append((a, b, "contact", max(separation, 0.0)))
+        # Stopped only now: every pair is judged by the same scene.
+        return [Collision(self.t0, a.name, b.name, kind, separation, () if static_too else self._stop(self.t0, a, b))
+                for a, b, kind, separation in found]
+
+    def _pairs(self, static_too: bool = False):
+        for i, a in enumerate(self.bodies):
+            for j in range(i + 1, len(self.bodies)):
+                b = self.bodies[j]
+                surroundings = a.category in ("sky", *_SUPPORTS) and b.category in ("sky", *_SUPPORTS)
+                watched = static_too or CAMERA in (a.category, b.category)
+                if not surroundings and (watched or not (a.is_static and b.is_static)):
+                    yield i, j
+
+    def _tol(self, a: _Body, b: _Body) -> float:
+        # Floor: float64 distances of bodies this far from the origin are no better.
+        return max(self.tolerance * min(a.radius, b.radius), 1e-12 * max(a.reach, b.reach))
+
+    def _stop(self, t: int, *bodies: _Body) -> tuple[str, ...]:
+        moving = [body for body in bodies if not body.is_static]
+        for body in moving:
+            body.path, body.is_static, body.cut = CutPath(body.path, t), True, True
+        return tuple(body.name for body in moving)
+
+    def _rests(self, i: int, j: int, Ta, Tb) -> bool:
+        a, b = self.bodies[i], self.bodies[j]
+        if a.category in _SUPPORTS:
+            a, b, Ta, Tb = b, a, Tb, Ta
+        if b.category not in _SUPPORTS or b.planes is None or a.category == CAMERA:
+            return False
+        heights = _heights(b.planes, a, Ta)
+        k = int(np.argmax(heights))
+        if not -self.rest_margin * a.radius <= heights[k] <= self._tol(a, b):
+            return False
+        self.resting[i, j] = b.planes[k : k + 1], min(float(heights[k]), 0.0)
+        return True
+
+    def _advance(self, i: int, j: int, t: int) -> tuple[int, float | None]:
+        """(next time up to which the pair is known to be apart, None), or (t, separation) for a collision at t."""
+        a, b = self.bodies[i], self.bodies[j]
+        Ta, Tb = a.path.pose(t), b.path.pose(t)
+        room, nearer = self._room(i, j, a, b, Ta, Tb)
+        separation = room
+        if room <= 0.0:
+            tol = self._tol(a, b)
+            separation = self._distance(a, b, Ta, Tb)
+            if separation <= tol:
+                return t, max(separation, 0.0)
+            room, nearer = separation - 0.5 * tol, _body_speed
+        later = self._later(a, b, t, room, nearer)
+        # A body that crosses the room left within a nanosecond has no later time to be looked at.
+        return (later, None) if later > t else (t, separation)
+
+    def _room(self, i: int, j: int, a: _Body, b: _Body, Ta, Tb):
+        """How much the two may approach before they have to be looked at again, without an exact distance, and the
+        bound on a body's share in the approach. Room 0 when only the exact distance can tell."""
+        if (i, j) in self.resting:
+            plane, lowest = self.resting[i, j]
+            body, T = (b, Tb) if a.category in _SUPPORTS else (a, Ta)
+            margin = self.rest_margin * body.radius
+            room = float(_heights(plane, body, T)[0]) - lowest + 0.975 * margin
+            return (room if room > 0.025 * margin else 0.0), _speed_along(plane[0, :3])
+        tol = self._tol(a, b)
+        gap = self._ball_gap(a, b, Ta, Tb)
+        # Far apart the balls are as good as the triangles; close by an exact distance gains much larger steps.
+        if gap > max(tol, 0.3 * min(a.radius, b.radius)):
+            return gap - 0.5 * tol, _centre_speed
+        for solid, body, T in ((a, b, Tb), (b, a, Ta)):
+            if solid.planes is not None:
+                heights = _heights(solid.planes, body, T)
+                k = int(np.argmax(heights))
+                if heights[k] > tol:
+                    return float(heights[k]) - 0.5 * tol, _speed_along(solid.planes[k, :3])
+        return 0.0, None
+
+    def _later(self, a: _Body, b: _Body, t: int, room: float, speed_bound) -> int:
+        """Latest time for which ``speed_bound`` allows no more than ``room`` of approach since t."""
+        window = self.t1 - t
+        for _ in range(4):
+            speed = sum(speed_bound(body, t, t + window) for body in (a, b) if not body.is_static)
+            if speed * window * 1e-9 <= room:
+                return t + window
+            step = int(room / speed * 1e9)
+            # The bound over a shorter interval is smaller; half the time is where a closer look stops paying.
+            if 2 * step >= window:
+                break
+            window = min(2 * step + 1, window)
+        return t + step
+
+    def _ball_gap(self, a, b, Ta, Tb) -> float:
+        """Lower bound of the distance: between bounding balls, or of a ball and a static body's faces."""
+        ca, cb = Ta[:3, :3] @ a.centre + Ta[:3, 3], Tb[:3, :3] @ b.centre + Tb[:3, 3]
+        gap = float(np.linalg.norm(ca - cb)) - a.radius - b.radius
+        if b.planes is not None:
+            gap = max(gap, float((b.planes[:, :3] @ ca - b.planes[:, 3]).max()) - a.radius)
+        if a.planes is not None:
+            gap = max(gap, float((a.planes[:, :3] @ cb - a.planes[:, 3]).max()) - b.radius)
+        return gap
+
+    def _distance(self, a, b, Ta, Tb) -> float:
+        self.distance_queries += 1
+        shapes = []
+        for body, T in ((a, Ta), (b, Tb)):
+            shape = body.shape()
+            shape.setTransform(fcl.Transform(T[:3, :3], T[:3, 3]))
+            shapes.append(shape)
+        return max(fcl.distance(*shapes, _REQUEST, fcl.DistanceResult()), 0.0) - a.pad - b.pad
+
+
+def _body_speed(body: _Body, ta: int, tb: int) -> float:
+    """Upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round: turning moves it nowhere.)"""
+    v, w = body.path.speed_bound(ta, tb)
+    return v + w * body.reach
+
+
+def _centre_speed(body: _Body, ta: int, tb: int) -> float:
+    v, w = body.path.speed_bound(ta, tb)
+    return v + w * body.arm
+
+
+def _speed_along(normal: np.ndarray):
+    """As :func:`_body_speed`, along one direction only, for paths that can tell."""
+    normal = np.ascontiguousarray(normal)
+
+    def speed(body: _Body, ta: int, tb: int) -> float:
+        bound = getattr(body.path, "approach_bound", None)
+        return _body_speed(body, ta, tb) if bound is None else bound(normal, body.reach, ta, tb)
+
+    return speed
+
+
+def _moved(points: np.ndarray, T: np.ndarray) -> np.ndarray:
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def _heights(planes: np.ndarray, body: _Body, T: np.ndarray) -> np.ndarray:
+    """(P,) height of the body's lowest point over each plane."""
+    local = planes[:, :3] @ T[:3, :3]
+    return (local @ body.hull.T).min(axis=1) + planes[:, :3] @ T[:3, 3] - planes[:, 3] - body.pad
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    try:
+        return points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):  # flat or too few: all of them
+        return np.unique(points, axis=0)
+
+
+def _face_planes(used: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray | None:
+    """(P, 4) face planes of a convex mesh, both sides of a flat one; None when it is neither."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    keep = length > 0
+    if not keep.any():
+        return None
+    normals = normals[keep] / length[keep, None]
+    planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, corners[keep, 0])])
+    extent = float(np.linalg.norm(used.max(axis=0) - used.min(axis=0)))
+    _, first = np.unique(np.round(planes / [1, 1, 1, max(extent, 1e-300)], 6), axis=0, return_index=True)
+    planes = planes[np.sort(first)]
+    if len(planes) > _MAX_PLANES:
+        return None
+    # Outermost vertices on both sides: faces that look inwards (a sky box) fail the first test.
+    offset = used @ planes[:, :3].T - planes[:, 3]
+    slack = 1e-9 * max(extent, float(np.abs(used).max()))
+    if offset.max() > slack:
+        return None
+    planes[:, 3] += np.maximum(offset.max(axis=0), 0.0)
+    if offset.min() >= -slack:
+        opposite = -planes
+        opposite[:, 3] -= offset.min(axis=0)
+        planes = np.vstack([planes, opposite])
+    return planes
+
+
+def _winding(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Generalised winding number of a closed mesh round ``point``: 0 outside, +-1 inside (solid angles of its
+    triangles; Van Oosterom & Strackee 1983)."""
+    a, b, c = (vertices[faces[:, k]] - point for k in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    det = np.einsum("ij,ij->i", a, np.cross(b, c))
+    dot = (la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la
+           + np.einsum("ij,ij->i", c, a) * lb)
+    return float(np.arctan2(det, dot).sum() / (2 * np.pi))

@@ -1,0 +1,372 @@
+"""Random 6-DoF motion: way-points in free space with random rotations, and a C2 spline through them.
+
+    space = FreeSpace(low=(-4, -4, 0), high=(4, 4, 3), ground_z=0.0, centres=centres, radii=radii)
+    rng = generator(seed, sequence, Role.TRAJECTORY)
+    path = random_path(rng, t0_ns, t1_ns, ObjectMotion(speed=(0.5, 1)), space, radius=0.3, start_pose=T_world_obj)
+    sliding = random_path(rng, t0_ns, t1_ns, ObjectMotion(), space, radius=0.3, start_pose=T_world_obj, on_ground=True)
+    camera = random_camera_path(rng, t0_ns, t1_ns, CameraMotion(), space, radius=0.2, target=(0, 0, 0.5))
+    print(statistics(path, t0_ns, t1_ns))          # mean and peak speed and angular rate
+
+How the configured speed is met: way-points are a random walk whose legs have about the right length, so that they
+can be rejected one by one; the spline through them is a fixed curve in space, and the *time* it takes is then
+stretched until the mean speed over [t0, t1] is the drawn one. Way-points therefore stay where free space was found.
+The angular rate is met by scaling the turns between key frames. ``path.t1_ns`` may lie past t1: the walk's last
+leg is rarely used up.
+
+Way-points and the straight legs between them avoid the given obstacles and the ground, the spline between them is
+checked at samples and redrawn a few times. That makes collisions rare, not impossible:
+:func:`blinkgl.scene.motion.collision.resolve_collisions` has the last word.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from blinkgl.config.trajectory import CameraMotion, MotionConfig, ObjectMotion
+from blinkgl.errors import ConfigError
+from blinkgl.scene.motion.paths import SplinePath, StaticPath, body_rate, rigid
+from blinkgl.scene.types import PosePath
+
+_REDRAWS = 6  # whole paths; the one that leaves free space least is kept
+_TRIES = 40  # directions per leg, after which the leg is halved
+_MAX_TURN = 2.0  # rad between key frames: RotationSpline needs less than pi
+_SAMPLES = 16  # per leg, for arc length, mean rate and the check of the curve
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpace:
+    """A box without the inside of obstacles' bounding spheres.
+
+    low, high : (3,) corners; a body's *origin* has to stay inside.
+    ground_z  : bodies have to stay above by their radius (None: no ground).
+    centres, radii : (M, 3), (M,) spheres.
+    """
+
+    low: ArrayLike
+    high: ArrayLike
+    ground_z: float | None = None
+    centres: ArrayLike = field(default_factory=lambda: np.zeros((0, 3)))
+    radii: ArrayLike = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self):
+        for name, shape in (("low", (3,)), ("high", (3,)), ("centres", (-1, 3)), ("radii", (-1,))):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64).reshape(shape))
+        if not (self.low <= self.high).all() or len(self.centres) != len(self.radii):
+            raise ValueError("FreeSpace: low has to be below high, and each centre needs a radius")
+
+    def depth(self, points: np.ndarray, radius: float, skip: np.ndarray | None = None) -> np.ndarray:
+        """(N,) how far a body's sphere at (N, 3) ``points`` is outside free space; 0 inside. ``skip``: (M,) bool
+        obstacles to leave out."""
+        low = self.low.copy()
+        if self.ground_z is not None:
+            low[2] = min(max(low[2], self.ground_z + radius), self.high[2])
+        out = np.maximum(np.maximum(low - points, points - self.high), 0.0).max(axis=1)
+        if len(self.radii):
+            gap = np.linalg.norm(points[:, None] - self.centres, axis=2) - self.radii - radius
+            if skip is not None:
+                gap[:, skip] = 0.0
+            out = np.maximum(out, -gap.min(axis=1))
+        return out
+
+    def leg_is_free(self, a: np.ndarray, b: np.ndarray, radius: float) -> bool:
+        """Whether a body's sphere may go straight from ``a`` to ``b``. Where it starts outside free space (a body
+        placed close to another: bounding spheres overlap), it only has to get out, not deeper in."""
+        if np.any(np.maximum(self.low - b, b - self.high) > np.maximum(np.maximum(self.low - a, a - self.high), 0.0)):
+            return False
+        if self.ground_z is not None and b[2] < self.ground_z + radius and b[2] < a[2]:
+            return False
+        if not len(self.radii):
+            return True
+        limit = self.radii + radius
+        leg = b - a
+        along = np.clip((self.centres - a) @ leg / max(leg @ leg, 1e-300), 0.0, 1.0)
+        nearest = np.linalg.norm(a + along[:, None] * leg - self.centres, axis=1)
+        at_a = np.linalg.norm(a - self.centres, axis=1)
+        return bool(np.all((nearest >= limit) | ((at_a < limit) & (nearest >= at_a * (1 - 1e-12)))))
+
+    def sample(self, rng: np.random.Generator, radius: float, tries: int = 1000) -> np.ndarray:
+        """(3,) uniform random free point. ConfigError when none is found."""
+        points = rng.uniform(self.low, self.high, (tries, 3))
+        free = np.flatnonzero(self.depth(points, radius) <= 0.0)
+        if not len(free):
+            raise ConfigError(f"no free space for a body of radius {radius:.3g} in {tries} tries", where="scene",
+                              accepted="fewer or smaller objects, or a larger world")
+        return points[free[0]]
+
+
+@dataclass(frozen=True)
+class PathStatistics:
+    """mean_speed, peak_speed in units/s; mean_rate, peak_rate in rad/s. The peaks are upper bounds (tight to ~1 %)."""
+
+    mean_speed: float
+    peak_speed: float
+    mean_rate: float
+    peak_rate: float
+
+
+def statistics(path: PosePath, t0_ns: int, t1_ns: int, samples: int = 512) -> PathStatistics:
+    """What a path really does over [t0, t1]: midpoint rule and interval bounds on ``samples`` intervals."""
+    edges = np.linspace(0, t1_ns - t0_ns, samples + 1).astype(np.int64) + t0_ns
+    speed, rate = 0.0, 0.0
+    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist()):
+        mid = (a + b) // 2
+        D = path.derivative(mid)
+        speed += (b - a) * float(np.linalg.norm(D[:3, 3]))
+        rate += (b - a) * float(np.linalg.norm(body_rate(path.pose(mid), D)))
+    bounds = np.array([path.speed_bound(a, b) for a, b in zip(edges[:-1].tolist(), edges[1:].tolist())])
+    length = max(t1_ns - t0_ns, 1)
+    return PathStatistics(speed / length, float(bounds[:, 0].max()), rate / length, float(bounds[:, 1].max()))
+
+
+def random_path(rng: np.random.Generator, t0_ns: int, t1_ns: int, config: ObjectMotion, space: FreeSpace, radius: float,
+                start_pose: ArrayLike | None = None, on_ground: bool = False) -> PosePath:
+    """Motion of one object over [t0, t1].
+
+    radius     : of its bounding sphere, kept clear of ``space``'s obstacles. Leave the object itself out of them.
+    start_pose : (4, 4) T_world_obj at t0; None draws a free position and a uniform rotation.
+    on_ground  : it rests on the ground: its height stays and it turns about the world's vertical only.
+    Returns a StaticPath for ``kind: static``, with probability ``static_share``, and for zero speed and rate.
+    """
+    start = _start(rng, space, radius) if start_pose is None else rigid(start_pose)
+    still = rng.random() < config.static_share
+    speed, rate = rng.uniform(*config.speed), math.radians(rng.uniform(*config.rotation_rate))
+    if config.kind == "static" or still or (speed == 0 and rate == 0):
+        return StaticPath(start, t0_ns, t1_ns)
+    times, positions = _waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=on_ground)
+    times, positions = _refined(times, positions, rate)
+    turns = _random_turns(rng, config, rate, times, start[:3, :3].T[:, 2] if on_ground else None)
+    return SplinePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
+
+
+def random_camera_path(rng: np.random.Generator, t0_ns: int, t1_ns: int, config: CameraMotion, space: FreeSpace, radius: float,
+                       target: PosePath | ArrayLike, start_pose: ArrayLike | None = None) -> PosePath:
+    """Motion of the camera over [t0, t1], OpenCV axes.
+
+    radius     : of the sphere round the camera centre that stays clear of obstacles (at least the near distance).
+    target     : point (3,) to look at, or a path whose origin is followed. The viewing direction stays within
+                 ``view_cone`` of it and the horizon within ``roll`` at the way-points, as far as the drawn angular
+                 rate can follow the target.
+    start_pose : (4, 4) T_world_cam at t0; None draws a free position and looks at the target.
+    """
+    aim = target.pose if isinstance(target, PosePath) else None
+    fixed = None if aim else np.asarray(target, dtype=np.float64).reshape(3)
+
+    def look_at(t_ns: int) -> np.ndarray:
+        return aim(t_ns)[:3, 3] if aim else fixed
+
+    if start_pose is None:
+        position = space.sample(rng, radius)
+        start = np.eye(4)
+        start[:3, 3] = position
+        roll = math.radians(rng.uniform(-0.5, 0.5) * config.roll)
+        start[:3, :3] = look_rotation(look_at(t0_ns) - position) @ Rotation.from_rotvec([0, 0, roll]).as_matrix()
+    else:
+        start = rigid(start_pose)
+    speed, rate = rng.uniform(*config.speed), math.radians(rng.uniform(*config.rotation_rate))
+    if config.kind == "static" or (speed == 0 and rate == 0 and config.shake == 0):
+        return StaticPath(start, t0_ns, t1_ns)
+    times, positions = _waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=False)
+    times, positions = _refined(times, positions, rate)
+    aims = np.array([look_at(int(t)) for t in times]) - positions
+    turns = _camera_turns(rng, config, rate, times, start[:3, :3], aims)
+    rotations = _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate)
+    if config.shake > 0:
+        times, positions, rotations = _shaken(rng, config, times, positions, rotations)
+    return SplinePath(times, positions, rotations)
+
+
+def look_rotation(direction: ArrayLike) -> np.ndarray:
+    """(3, 3) R_world_cam (OpenCV axes) looking along ``direction`` with a level horizon (world z up); straight up or
+    down the image's right is the world's +x."""
+    z = np.asarray(direction, dtype=np.float64)
+    length = np.linalg.norm(z)
+    z = z / length if length > 1e-12 else np.array([0.0, 1.0, 0.0])
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    n = np.linalg.norm(x)
+    x = x / n if n > 1e-9 else np.array([1.0, 0.0, 0.0]) - z[0] * z
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _start(rng, space, radius) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = space.sample(rng, radius)
+    T[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    return T
+
+
+def _unit(rng: np.random.Generator, n: int | None = None) -> np.ndarray:
+    v = rng.normal(size=3 if n is None else (n, 3))
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def _turned(rng, config: MotionConfig, last: np.ndarray | None, flat: bool) -> np.ndarray:
+    """Next direction: the last one and a random one, mixed by smoothness."""
+    v = _unit(rng)
+    if last is not None:
+        v = (1.0 - config.smoothness) * v + config.smoothness * last
+    if flat:
+        v[2] = 0.0
+    n = np.linalg.norm(v)
+    return v / n if n > 1e-9 else np.array([1.0, 0.0, 0.0])
+
+
+def _waypoints(rng, t0_ns, t1_ns, config, space, radius, start, speed, flat):
+    """Times (K,) int64 and positions (K, 3), K >= 2, of a walk whose mean speed over [t0, t1] is ``speed``."""
+    duration = (t1_ns - t0_ns) * 1e-9
+    if duration <= 0:
+        raise ValueError("a path needs t0_ns < t1_ns")
+    if speed == 0.0:
+        times = np.linspace(0, t1_ns - t0_ns, config.waypoints).round().astype(np.int64) + t0_ns
+        return times, np.tile(start, (config.waypoints, 1))
+    if flat:
+        space = FreeSpace(np.r_[space.low[:2], -np.inf], np.r_[space.high[:2], np.inf], None, space.centres, space.radii)
+    entangled = np.linalg.norm(space.centres - start, axis=1) < space.radii + radius
+    best, least = None, math.inf
+    for _ in range(_REDRAWS):
+        points = _walk(rng, config, space, radius, start, speed * duration, flat)
+        times = _timed(points, t0_ns, t1_ns, speed)
+        used = int(np.searchsorted(times, t1_ns)) + 1
+        curve = CubicSpline((times - t0_ns) * 1e-9, points)(np.linspace(0, duration, _SAMPLES * used))
+        outside = space.depth(curve, radius, skip=entangled).max()
+        if outside < least:
+            best, least = (times, points), outside
+        if outside <= 0.0:
+            break
+    return best
+
+
+def _walk(rng, config, space, radius, start, length, flat) -> np.ndarray:
+    """(K, 3) way-points from ``start``, legs of about length / (waypoints - 1), until ``length`` is covered."""
+    leg = length / (config.waypoints - 1)
+    points, covered, direction = [start], 0.0, None
+    while covered < length and len(points) <= 16 * config.waypoints:
+        step = leg * rng.uniform(0.6, 1.4)
+        for attempt in range(4 * _TRIES):
+            # Hemmed in: shorter legs, and no more insisting on the last direction.
+            direction = _turned(rng, config, direction if attempt < _TRIES else None, flat)
+            reach = step * 0.5 ** (attempt // _TRIES)
+            goal = points[-1] + reach * direction
+            if space.leg_is_free(points[-1], goal, radius):
+                points.append(goal)
+                covered += reach
+                break
+        else:
+            points.append(points[-1].copy())
+    return np.array(points)
+
+
+def _timed(points, t0_ns, t1_ns, speed) -> np.ndarray:
+    """(K,) int64 times such that the cubic spline through ``points`` has mean speed ``speed`` over [t0, t1].
+
+    Affine changes of the parameter leave the curve as it is, so only the stretch has to be found. Parameter steps
+    go as the square root of the leg (centripetal parametrisation): no loops and cusps where legs differ.
+    """
+    legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    steps = np.sqrt(np.maximum(legs, 0.05 * max(legs.max(), 1e-12)))
+    parameter = np.r_[0.0, np.cumsum(steps)]
+    middle = (parameter[:-1, None] + steps[:, None] * (np.arange(_SAMPLES) + 0.5) / _SAMPLES).ravel()
+    rate = np.linalg.norm(CubicSpline(parameter, points)(middle, 1), axis=1)
+    arc = np.r_[0.0, np.cumsum(rate * np.repeat(steps, _SAMPLES) / _SAMPLES)]
+    at = np.r_[0.0, np.cumsum(np.repeat(steps, _SAMPLES) / _SAMPLES)]
+    duration = (t1_ns - t0_ns) * 1e-9
+    end = np.interp(speed * duration, arc, at)  # a body that found no way out is slower than configured
+    times = np.rint(parameter * ((t1_ns - t0_ns) / end)).astype(np.int64)
+    order = np.arange(len(times))
+    return np.maximum.accumulate(times - order) + order + t0_ns
+
+
+def _split(times: np.ndarray, parts: int) -> np.ndarray:
+    """Each interval of (K,) int64 times in ``parts`` equal ones."""
+    share = np.arange(parts) / parts
+    inner = times[:-1, None] + np.rint(np.diff(times)[:, None] * share).astype(np.int64)
+    return np.unique(np.r_[inner.ravel(), times[-1]])
+
+
+def _seconds(times: np.ndarray) -> np.ndarray:
+    return (times - times[0]) * 1e-9
+
+
+def _resampled(times, positions, parts):
+    """The same curve with more knots: a spline through samples at a superset of its knots is the spline itself."""
+    finer = _split(times, parts)
+    return finer, CubicSpline(_seconds(times), positions)((finer - times[0]) * 1e-9)
+
+
+def _refined(times, positions, rate):
+    parts = math.ceil(1.4 * rate * np.diff(times).max() * 1e-9 / _MAX_TURN)
+    return _resampled(times, positions, parts) if parts > 1 else (times, positions)
+
+
+def _random_turns(rng, config, rate, times, vertical) -> np.ndarray:
+    """(K-1, 3) body-frame rotation vectors from key frame to key frame, about ``vertical`` (body frame) if given."""
+    angles = rate * np.diff(times) * 1e-9 * rng.uniform(0.6, 1.4, len(times) - 1)
+    if vertical is not None:
+        return angles[:, None] * vertical * rng.choice([-1.0, 1.0])
+    axes, axis = [], None
+    for _ in angles:
+        axis = _turned(rng, config, axis, False)
+        axes.append(axis)
+    return angles[:, None] * np.array(axes)
+
+
+def _camera_turns(rng, config, rate, times, R, aims) -> np.ndarray:
+    """As :func:`_random_turns`; each turn is the first of some random ones that keeps target and horizon in bounds,
+    or else the one (turning straight to the target among them) that comes closest."""
+    cone, roll = math.radians(config.view_cone), math.radians(config.roll)
+    turns, axis = [], None
+    for k, dt in enumerate(np.diff(times) * 1e-9):
+        angle = rate * dt * rng.uniform(0.6, 1.4)
+        tries = [angle * _turned(rng, config, axis, False) for _ in range(16)]
+        home = Rotation.from_matrix(R.T @ look_rotation(aims[k + 1])).as_rotvec()
+        tries.append(home * min(1.0, angle / max(float(np.linalg.norm(home)), 1e-12)))
+        ends = R @ Rotation.from_rotvec(tries).as_matrix()
+        towards = aims[k + 1] / max(float(np.linalg.norm(aims[k + 1])), 1e-12)
+        off_target = np.arccos(np.clip(ends[:, :, 2] @ towards, -1.0, 1.0)) - cone
+        off_level = np.arcsin(np.clip(np.abs(ends[:, 2, 0]), 0.0, 1.0)) - roll
+        excess = np.maximum(off_target, 0.0) + np.maximum(off_level, 0.0)
+        chosen = int(np.argmin(excess))  # the first zero, if there is one
+        turns.append(tries[chosen])
+        size = np.linalg.norm(tries[chosen])
+        axis = tries[chosen] / size if size > 0 else None
+        R = ends[chosen]
+    return np.array(turns)
+
+
+def _chained(R: np.ndarray, turns: np.ndarray) -> Rotation:
+    out = [R]
+    for E in Rotation.from_rotvec(turns).as_matrix():
+        out.append(out[-1] @ E)
+    return Rotation.from_matrix(np.array(out))
+
+
+def _rotations(R, turns, times, t0_ns, t1_ns, rate) -> Rotation:
+    """Key rotations from ``R`` by ``turns``, all scaled so that the spline's mean angular rate over [t0, t1] is
+    ``rate`` (to 0.1 %, unless turns would pass 150 degrees)."""
+    if rate == 0.0 or not turns.any():
+        return _chained(R, 0.0 * turns)
+    most = 2.6 / np.linalg.norm(turns, axis=1).max()
+    middle = (np.arange(_SAMPLES * len(times)) + 0.5) / (_SAMPLES * len(times)) * ((t1_ns - t0_ns) * 1e-9)
+    factor = min(0.9, most)  # a spline winds more than the chain of its keys
+    for _ in range(5):
+        rotations = _chained(R, factor * turns)
+        mean = float(np.linalg.norm(RotationSpline(_seconds(times), rotations)(middle, 1), axis=1).mean())
+        if abs(mean / rate - 1.0) < 1e-3 or mean == 0.0:
+            break
+        factor = min(factor * rate / mean, most)
+    return rotations
+
+
+def _shaken(rng, config, times, positions, rotations):
+    parts = math.ceil(np.diff(times).max() * 1e-9 * config.shake_rate)
+    finer, moved = _resampled(times, positions, parts) if parts > 1 else (times, positions)
+    smooth = RotationSpline(_seconds(times), rotations)((finer - times[0]) * 1e-9)
+    noise = rng.normal(scale=math.radians(config.shake), size=(len(finer), 3))
+    noise[0] = 0.0  # the pose at t0 is the caller's
+    return finer, moved, smooth * Rotation.from_rotvec(noise)

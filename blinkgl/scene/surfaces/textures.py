@@ -1,0 +1,186 @@
+"""Procedural textures: each is one function of a seed, tileable, in colour, never black.
+
+A scalar field in [0, 1] is laid through a palette of random sRGB colours. Fields are built from integer lattices with
+wrap-around, so that a texture repeats without a seam.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.config.scene import TEXTURE_KINDS
+from blinkgl.scene.geometry.primitives import parameter_hash
+from blinkgl.scene.types import Texture
+
+DARKEST, BRIGHTEST = 20, 240      # sRGB: radiance stays within about (0.007, 0.87)
+MIN_CONTRAST = 70                 # least difference in sRGB luma between a palette's darkest and brightest colour
+
+
+def procedural_hash(kind: str, index: int) -> str:
+    """Identity of a procedural texture for splits; independent of its size."""
+    return parameter_hash("procedural", 1, kind, index)
+
+
+def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
+    """The ``index``-th texture of a kind, (size, size, 3) uint8 sRGB; the same on every run."""
+    rng = np.random.default_rng([TEXTURE_KINDS.index(kind), index])
+    field = _FIELDS[kind](rng, size)
+    image = _grade(field, _palette(rng), rng)
+    return Texture(image=image, name=f"{kind}-{index}", source_hash=procedural_hash(kind, index))
+
+
+def _palette(rng: np.random.Generator) -> np.ndarray:
+    """(2..5, 3) sRGB colours in 0..255 with at least MIN_CONTRAST between darkest and brightest."""
+    colours = rng.uniform(DARKEST, BRIGHTEST, (int(rng.integers(2, 6)), 3))
+    luma = colours @ [0.299, 0.587, 0.114]
+    lack = MIN_CONTRAST - (luma.max() - luma.min())
+    if lack > 0:
+        colours[luma.argmax()] += lack / 2 + 10
+        colours[luma.argmin()] -= lack / 2 + 10
+    return np.clip(colours, DARKEST, BRIGHTEST)
+
+
+def _grade(field: np.ndarray, palette: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Field (h, w) in [0, 1], or (h, w) integer labels, to (h, w, 3) uint8."""
+    if field.dtype.kind in "iu":
+        return np.round(palette[field % len(palette)]).astype(np.uint8)
+    stops = np.linspace(0, 1, len(palette))
+    table = np.stack([np.interp(np.linspace(0, 1, 1024), stops, palette[:, c]) for c in range(3)], axis=1)
+    return np.round(table[np.clip(field * 1023, 0, 1023).astype(np.int32)]).astype(np.uint8)
+
+
+def _stretch(field: np.ndarray) -> np.ndarray:
+    low, high = field.min(), field.max()
+    return ((field - low) / max(high - low, 1e-9)).astype(np.float32)
+
+
+def _coordinates(size: int) -> tuple[np.ndarray, np.ndarray]:
+    s = (np.arange(size) + 0.5) / size
+    return np.meshgrid(s, s)
+
+
+def _smooth(t: np.ndarray) -> np.ndarray:
+    return t * t * t * (t * (6 * t - 15) + 10)      # Perlin's quintic: C2 across cells
+
+
+def _lattice(size: int, cells: int):
+    """Per pixel along one axis: cell before, cell after (wrapped), fraction."""
+    x = (np.arange(size) + 0.5) / size * cells
+    low = np.floor(x).astype(int)
+    return low % cells, (low + 1) % cells, x - low
+
+
+def _value_noise(rng, size: int, cells: int) -> np.ndarray:
+    corner = rng.random((cells, cells))
+    i, j, f = _lattice(size, cells)
+    w = _smooth(f)
+    rows = corner[i] * (1 - w)[:, None] + corner[j] * w[:, None]
+    return rows[:, i] * (1 - w) + rows[:, j] * w
+
+
+def _perlin_noise(rng, size: int, cells: int) -> np.ndarray:
+    angle = rng.uniform(0, 2 * np.pi, (cells, cells))
+    gx, gy = np.cos(angle), np.sin(angle)
+    i, j, f = _lattice(size, cells)
+    w = _smooth(f)
+    total = 0.0
+    for rows, dy, wy in ((i, f, 1 - w), (j, f - 1, w)):
+        for columns, dx, wx in ((i, f, 1 - w), (j, f - 1, w)):
+            dot = gx[np.ix_(rows, columns)] * dx + gy[np.ix_(rows, columns)] * dy[:, None]
+            total = total + dot * wy[:, None] * wx
+    return total
+
+
+def _value(rng, size):
+    return _stretch(_value_noise(rng, size, int(rng.integers(6, 40))))
+
+
+def _perlin(rng, size):
+    return _stretch(_perlin_noise(rng, size, int(rng.integers(4, 24))))
+
+
+def _fbm(rng, size):
+    cells, gain = int(rng.integers(2, 7)), rng.uniform(0.45, 0.75)
+    octaves = [gain**k * _perlin_noise(rng, size, cells * 2**k) for k in range(6)]
+    return _stretch(sum(octaves[1:], octaves[0]))
+
+
+def _stripes(rng, size):
+    x, y = _coordinates(size)
+    a, b = int(rng.integers(0, 12)), int(rng.integers(0, 12))
+    a = a or (b == 0) * 5
+    phase = (a * x + b * y) + rng.uniform(0, 0.3) * _perlin_noise(rng, size, 4)
+    if rng.random() < 0.5:
+        return (0.5 + 0.5 * np.sin(2 * np.pi * phase)).astype(np.float32)
+    return np.floor(2 * phase).astype(np.int64) + 1000
+
+
+def _checks(rng, size):
+    x, y = _coordinates(size)
+    n, m = 2 * int(rng.integers(1, 10)), 2 * int(rng.integers(1, 10))
+    if rng.random() < 0.5:
+        return (np.floor(n * x) + np.floor(m * y)).astype(np.int64)
+    cells = rng.integers(0, 5, (m, n))
+    return cells[np.floor(m * y).astype(int), np.floor(n * x).astype(int)]
+
+
+def _glyphs(rng, size):
+    """Lines of words in an invented alphabet of 5x7 strokes."""
+    alphabet = np.zeros((24, 7, 5), bool)
+    for letter in alphabet:
+        for _ in range(int(rng.integers(2, 5))):
+            if rng.random() < 0.5:
+                r, c0 = 3 * int(rng.integers(0, 3)), int(rng.integers(0, 2))
+                letter[r, c0 : c0 + int(rng.integers(3, 6))] = True
+            else:
+                c, r0 = 2 * int(rng.integers(0, 3)), 3 * int(rng.integers(0, 2))
+                letter[r0 : r0 + int(rng.integers(4, 8)), c] = True
+    columns, rows = int(rng.integers(6, 22)), int(rng.integers(4, 16))
+    page = np.zeros((rows * 10, columns * 6), np.int64)
+    for row in range(rows):
+        ink = 1 + int(rng.integers(0, 4))
+        for column in range(columns):
+            if rng.random() > 0.18:
+                page[row * 10 + 2 : row * 10 + 9, column * 6 : column * 6 + 5] = ink * alphabet[rng.integers(0, 24)]
+    y = np.minimum((np.arange(size) + 0.5) / size * page.shape[0], page.shape[0] - 1).astype(int)
+    x = np.minimum((np.arange(size) + 0.5) / size * page.shape[1], page.shape[1] - 1).astype(int)
+    return page[np.ix_(y, x)]
+
+
+def _dots(rng, size):
+    """Discs of random radius and colour, wrapped round the edges."""
+    field = np.zeros((size, size), np.int64)
+    smallest, largest = 0.01, rng.uniform(0.03, 0.12)
+    for colour in range(int(rng.integers(40, 160))):
+        cx, cy = rng.random(2) * size
+        radius = max(rng.uniform(smallest, largest) * size, 1.0)
+        x = np.arange(int(cx - radius), int(cx + radius) + 2)
+        y = np.arange(int(cy - radius), int(cy + radius) + 2)
+        inside = (x[None, :] + 0.5 - cx) ** 2 + (y[:, None] + 0.5 - cy) ** 2 < radius**2
+        patch = np.ix_(y % size, x % size)
+        field[patch] = np.where(inside, colour + 1, field[patch])
+    return field
+
+
+def _gradient(rng, size):
+    """A few smooth waves: low contrast almost everywhere, what event cameras find hardest."""
+    x, y = _coordinates(size)
+    waves = [rng.uniform(0.3, 1) * np.cos(2 * np.pi * (rng.integers(-2, 3) * x + rng.integers(-2, 3) * y + rng.random())) for _ in range(4)]
+    return _stretch(sum(waves) + 0.3 * np.cos(2 * np.pi * (x + rng.random())))
+
+
+def _bricks(rng, size):
+    rows, columns = 2 * int(rng.integers(2, 9)), int(rng.integers(2, 9))
+    x, y = _coordinates(size)
+    row = np.floor(y * rows).astype(int)
+    along = x * columns + 0.5 * (row % 2)
+    brick = np.floor(along).astype(int) % columns
+    tone = 0.35 + 0.6 * rng.random((rows, columns))[row, brick] + 0.25 * _perlin_noise(rng, size, 32)
+    joint = rng.uniform(0.04, 0.1)
+    mortar = (np.minimum(along % 1, 1 - along % 1) * rows / columns < joint) | (np.minimum(y * rows % 1, 1 - y * rows % 1) < joint)
+    return np.where(mortar, 0.0, np.clip(tone, 0.2, 1)).astype(np.float32)
+
+
+_FIELDS = {"value": _value, "perlin": _perlin, "fbm": _fbm, "stripes": _stripes, "checks": _checks, "glyphs": _glyphs,
+           "dots": _dots, "gradient": _gradient, "bricks": _bricks}
+assert tuple(_FIELDS) == TEXTURE_KINDS

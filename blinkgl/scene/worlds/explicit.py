@@ -1,0 +1,154 @@
+"""Custom scenes: named meshes and materials, objects and camera with poses or key frames, as written in the YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    KeyedMotionConfig,
+    MaterialConfig,
+    MeshConfig,
+    PoseConfig,
+    object_names,
+)
+from blinkgl.config.sequence import near_corner
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.importing.mesh_files import Asset, load_asset
+from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.trajectories import look_rotation
+from blinkgl.scene.reading import contents
+from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
+from blinkgl.scene.surfaces.textures import procedural_texture
+from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.worlds.pool import resolve
+from blinkgl.scene.worlds.random_world import make_camera, make_light
+
+_PROCEDURAL_SIZE = 1024
+# A camera (OpenCV axes) that looks along the world's +x with z up.
+_LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+
+
+@dataclass(frozen=True)
+class InMemory:
+    """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand instead of what the
+    configuration says there."""
+
+    meshes: dict[str, Mesh] = field(default_factory=dict)
+    textures: dict[str, Texture] = field(default_factory=dict)
+
+
+def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()) -> Scene:
+    """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
+
+    Raises ConfigError (missing file, bad parameter; with ``collisions``,
+    bodies that touch at the start) and AssetError."""
+    log: list[str] = []
+    omissions: dict[str, None] = {}
+    materials = {name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name)) for name, m in config.materials.items()}
+    assets: dict[tuple[str, bool], Asset] = {}
+    objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
+    for k, item in enumerate(config.objects):
+        where = f"scene.objects.{k}"
+        own = item.material is None
+        if (item.mesh, own) not in assets:
+            assets[item.mesh, own] = _asset(config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes)
+            log += [line for line in assets[item.mesh, own].log if line not in log]
+            omissions.update(dict.fromkeys(assets[item.mesh, own].omissions))
+        matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
+        parts = []
+        for part in assets[item.mesh, own].parts:
+            material = part.material if own else materials[item.material]
+            material = replace(material, unlit=material.unlit or config.light.unlit)
+            parts.append(Part(transform_mesh(part.mesh, matrix), material))
+        objects.append(SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category))
+    path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
+    if config.collisions:
+        result = resolve_collisions(tuple(objects), path, 1.01 * near_corner(camera), t0_ns, t1_ns)
+        if result.at_start:
+            raise ConfigError(f"{result.at_start[0]}, at the start", where="scene.collisions",
+                              accepted="bodies apart at the start, or collisions: false")
+        objects, path, log = result.objects, result.camera_path, log + list(result.log)
+    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background,
+                 tuple(log), tuple(omissions))
+
+
+def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
+    """The configured pose over [t0, t1], or the path through its key frames (whose times are seconds on the sequence's clock)."""
+    if not config.keyframes:
+        return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
+    poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
+    times = [round(k.time * 1e9) for k in config.keyframes]
+    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation, f"{where}.keyframes")
+
+
+def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
+    """(4, 4) T_world_body.
+
+    quaternion : the rotation itself; for a camera that of its OpenCV axes.
+    euler, or nothing : turned about the world's x, then y, then z, from rest; a camera at rest looks along +x with z up.
+    look_at : a camera's z axis (x level), an object's x axis (y level) points there.
+    """
+    T = np.eye(4)
+    T[:3, 3] = config.position
+    if config.look_at is not None:
+        R = look_rotation(np.subtract(config.look_at, config.position))
+        T[:3, :3] = R if camera else np.column_stack([R[:, 2], -R[:, 0], -R[:, 1]])
+    elif config.quaternion is not None:
+        w, x, y, z = config.quaternion
+        T[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    else:
+        turn = Rotation.from_euler("xyz", config.euler or (0, 0, 0), degrees=True)
+        T[:3, :3] = (turn * _LEVEL_CAMERA if camera else turn).as_matrix()
+    return T
+
+
+def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
+    """The primitive that ``scene.meshes.name`` asks for. Raises ConfigError for a bad parameter."""
+    try:
+        return BUILDERS[config.primitive](**config.parameters)
+    except AssetError as error:
+        key = (error.where or "").partition(".")[2]
+        raise ConfigError(error.problem, where=f"scene.meshes.{name}.parameters" + (f".{key}" if key else ""), value=error.value,
+                          accepted=error.accepted) from None
+
+
+def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int, memory: Mapping[str, Mesh]) -> Asset:
+    if name in memory or config.primitive is not None:
+        mesh = memory[name] if name in memory else primitive_mesh(config, name)
+        return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
+    where = f"scene.meshes.{name}"
+    path = resolve(config.file, base)
+    if not path.is_file():
+        raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a mesh file")
+    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs,
+                      uv_size=config.uv_size, up=config.up)
+
+
+def _material(config: MaterialConfig, base: Path, where: str, texture: Texture | None = None) -> Material:
+    if config.texture is not None:
+        texture = _texture(resolve(config.texture, base), config.max_size, f"{where}.texture", config.texture)
+    elif config.procedural is not None:
+        texture = procedural_texture(config.procedural, config.seed, min(config.max_size, _PROCEDURAL_SIZE))
+    elif config.photograph is not None:
+        bundled = photographs()
+        if config.photograph not in bundled:
+            raise ConfigError("no such photograph", where=f"{where}.photograph", value=config.photograph,
+                              accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'")
+        texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
+    return Material(texture, config.color, config.uv_scale, config.unlit, config.double_sided)
+
+
+def _texture(path: Path, max_size: int, where: str, given: str) -> Texture:
+    if not path.is_file():
+        raise ConfigError("no such file", where=where, value=given, accepted="an image file")
+    data = contents(path, "image")
+    return Texture(decode_image(data, max_size, str(path)), path.name, content_hash(data))

@@ -1,0 +1,367 @@
+"""Finished scenes: glTF files, ``trimesh.Scene`` and ``pyrender.Scene`` objects.
+
+    scene = from_gltf("room.glb", camera, t0_ns, t1_ns)
+    scene = from_trimesh(trimesh.load_scene("room.obj"), camera, t0_ns, t1_ns)
+    scene = from_pyrender(pyrender_scene, camera, t0_ns, t1_ns)
+
+``camera`` is anything with width, height, fx, fy, near and principal_point (or cx, cy). Each node that shows a mesh
+becomes one object; a node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along
+-z with y up in all three, get OpenCV axes. glTF's world (y up) is turned z up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.scene import FileSceneConfig
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.geometry.meshes import closed_together, make_mesh
+from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.mesh_files import piece_of_trimesh
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.omissions import Omissions
+from blinkgl.scene.reading import reading
+from blinkgl.scene.surfaces.images import content_hash, shrink
+from blinkgl.scene.types import Camera, Light, Material, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.worlds.explicit import motion_path
+from blinkgl.scene.worlds.pool import resolve
+from blinkgl.scene.worlds.random_world import make_camera, make_light
+
+CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])    # its own inverse
+_ANIMATION_STEP = 1 / 60                         # s between the samples that a spline is laid through
+_MAX_SAMPLES = 20_000
+
+
+def scene_from_file(config: FileSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path) -> Scene:
+    """A ``scene: {kind: file}``."""
+    path = resolve(config.path, base)
+    if not path.is_file():
+        raise ConfigError("no such file", where="scene.path", value=config.path, accepted="a gltf or glb file")
+    if path.suffix.lower() not in (".gltf", ".glb"):
+        raise ConfigError("not a glTF scene", where="scene.path", value=config.path, accepted="a .gltf or .glb file")
+    camera_path = None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", camera=True)
+    scene = from_gltf(path, camera, t0_ns, t1_ns, camera_name=config.camera, camera_path=camera_path, intrinsics=config.intrinsics,
+                      animation=config.animation, light=make_light(config.light), background=config.background,
+                      max_faces=config.max_faces, max_texture=config.max_texture_size)
+    return unlit(scene) if config.light.unlit else scene
+
+
+def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: str | int | None = None,
+              camera_path: PosePath | None = None, intrinsics: str = "config", animation: str | int | None = 0, light: Light = Light(), background: float = 0.2,
+              max_faces: int = 5_000_000, max_texture: int = 2048) -> Scene:
+    """A glTF 2.0 file with its materials, cameras and node animations.
+
+    camera_name : name or index of the file's camera (None: the first), unless ``camera_path`` is given.
+    intrinsics : "config": those of ``camera``; "file": fx = fy = height / 2 / tan(yfov / 2), centred, near = znear.
+    animation : name or index; translations, rotations of nodes are sampled at 60 Hz and joined by a C2 spline. Changing
+        scales keep their first value, which the scene's log says.
+    What the file asks for and is not drawn is in the scene's ``omissions``.
+    Raises AssetError (file), ConfigError (camera or animation that is not there).
+    """
+    with reading("scene", str(path)):
+        document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture)
+        return _from_document(document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light,
+                              background)
+
+
+def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation,
+                   light, background) -> Scene:
+    channels = _channels(document, animation)
+    objects = []
+    for index, node in document.nodes.items():
+        if node.mesh is None:
+            continue
+        pieces = document.mesh_pieces(node.mesh)
+        if not any(len(p.faces) for p in pieces):
+            continue
+        motion, baked = _motion(document, index, channels, t0_ns, t1_ns)
+        objects.append((node.name, _parts(pieces, baked, node.name, document.where, document.log), motion))
+    if not objects:
+        raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
+    changes = {}
+    if camera_path is None or intrinsics == "file":
+        index = _camera_node(document, camera_name)
+        if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
+            document.omissions.add("an orthographic camera (drawn in perspective)")
+        if camera_path is None:
+            camera_path, _ = _motion(document, index, channels, t0_ns, t1_ns, CV_FROM_GL)
+        if intrinsics == "file":
+            changes = _gltf_intrinsics(document, index, camera)
+    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, document.log,
+                  document.omissions)
+
+
+def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
+                 near: float = 0.05, light: Light = Light(), background: float = 0.2, max_faces: int = 5_000_000,
+                 max_texture: int = 2048) -> Scene:
+    """A ``trimesh.Scene``.
+
+    camera : intrinsics; None takes the scene's own camera (resolution, K).
+    camera_path : None takes the scene's camera transform.
+    up : "y" turns the world z up. Normals are made anew (crease angle), because trimesh's round off every edge.
+    """
+    turn = _turn(up)
+    log, omissions = [], Omissions("the trimesh scene")
+    objects = []
+    for name in sorted(scene.graph.nodes_geometry):
+        matrix, geometry = scene.graph[name]
+        mesh = scene.geometry[geometry]
+        if not hasattr(mesh, "faces") or not len(mesh.faces):
+            omissions.add("points and lines")
+            continue
+        where = f"trimesh geometry '{geometry}'"
+        if len(mesh.faces) > max_faces:
+            raise AssetError("the mesh has too many faces", where=where, value=len(mesh.faces), accepted=f"at most {max_faces}")
+        rigid, baked = split_rigid(turn @ matrix)
+        piece = piece_of_trimesh(mesh, max_texture=max_texture, where=where, file_normals=False, omissions=omissions)
+        objects.append((str(name), _parts([piece], baked, str(name), where, log), StaticPath(rigid, t0_ns, t1_ns)))
+    if (camera is None or camera_path is None) and not scene.has_camera:
+        raise ConfigError("the trimesh scene has no camera", where="from_trimesh", accepted="camera and camera_path, or scene.set_camera()")
+    if camera_path is None:
+        camera_path = StaticPath(split_rigid(turn @ scene.camera_transform)[0] @ CV_FROM_GL, t0_ns, t1_ns)
+    if camera is None:
+        (width, height), (fx, fy) = (int(v) for v in scene.camera.resolution), scene.camera.focal
+        scene_camera = Camera(width, height, float(fx), float(fy), (width - 1) / 2, (height - 1) / 2, camera_path, near)
+    else:
+        scene_camera = make_camera(camera, camera_path)
+    if not objects:
+        raise AssetError("the scene has no faces", where="from_trimesh", accepted="a scene with a mesh")
+    return _scene(objects, scene_camera, t0_ns, t1_ns, light, background, log, omissions)
+
+
+def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
+                  intrinsics: str = "file", up: str = "z", light: Light | None = None, background: float | None = None, max_texture: int = 2048) -> Scene:
+    """A ``pyrender.Scene`` (pyrender itself is not imported here).
+
+    camera : width, height and, with intrinsics="config", the rest; "file" takes the main camera's yfov or fx, fy, cx, cy.
+    light : None takes the direction of the first directional light, if there is one; strengths are BlinkGL's.
+    background : None takes the mean of ``scene.bg_color``.
+    """
+    turn = _turn(up)
+    log, omissions = [], Omissions("the pyrender scene")
+    objects = []
+    # pyrender keeps nodes in a set: order them by what they are.
+    order = sorted(scene.mesh_nodes, key=lambda n: (str(n.name or n.mesh.name or ""), np.asarray(scene.get_pose(n)).tobytes(),
+                                                    [np.asarray(p.positions).tobytes() for p in n.mesh.primitives]))
+    for number, node in enumerate(order):
+        name = str(node.name or node.mesh.name or f"mesh-{number}")
+        pieces = [_pyrender_piece(p, max_texture, name) for p in node.mesh.primitives if getattr(p, "mode", 4) == 4]
+        if len(pieces) < len(node.mesh.primitives):
+            omissions.add("points and lines")
+        if not pieces:
+            continue
+        _pyrender_omissions(node.mesh.primitives, omissions)
+        rigid, baked = split_rigid(turn @ scene.get_pose(node))
+        objects.append((name, _parts(pieces, baked, name, f"pyrender mesh '{name}'", log), StaticPath(rigid, t0_ns, t1_ns)))
+    if not objects:
+        raise AssetError("the scene has no faces", where="from_pyrender", accepted="a scene with a mesh")
+    node = scene.main_camera_node
+    if node is None and (camera_path is None or intrinsics == "file"):
+        raise ConfigError("the pyrender scene has no camera", where="from_pyrender",
+                          accepted="a camera node, or camera_path and intrinsics='config'")
+    if camera_path is None:
+        camera_path = StaticPath(split_rigid(turn @ scene.get_pose(node))[0] @ CV_FROM_GL, t0_ns, t1_ns)
+    changes = _pyrender_intrinsics(node.camera, camera) if intrinsics == "file" else {}
+    if light is None:
+        suns = sorted(getattr(scene, "directional_light_nodes", ()), key=lambda n: str(n.name or ""))
+        light = Light()
+        if suns:    # it shines along its -z axis
+            T, _ = split_rigid(turn @ scene.get_pose(suns[0]))
+            light = replace(light, sun_direction=tuple(float(v) for v in T[:3, 2]))
+    if background is None:
+        background = float(np.mean(np.asarray(scene.bg_color, float)[:3]))
+    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, log, omissions)
+
+
+def unlit(scene: Scene) -> Scene:
+    """The scene with radiance = albedo everywhere."""
+    def of(parts):
+        return tuple(Part(p.mesh, replace(p.material, unlit=True)) for p in parts)
+
+    return replace(scene, objects=tuple(replace(o, parts=of(o.parts)) for o in scene.objects))
+
+
+def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T, A), both (4, 4), with matrix = T @ A: T rigid, its rotation the nearest to the linear part (polar decomposition),
+    A what is left: scale, shear, mirroring."""
+    matrix = np.asarray(matrix, np.float64)
+    linear = matrix[:3, :3]
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-300:
+        raise AssetError("a node's transform is singular or not finite", where="scene", value=matrix.tolist())
+    u, _, vt = np.linalg.svd(linear)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    T, A = np.eye(4), np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, matrix[:3, 3]
+    A[:3, :3] = rotation.T @ linear
+    return T, A
+
+
+def _scene(objects: Iterable, camera: Camera, t0_ns, t1_ns, light, background, log, omissions: Omissions) -> Scene:
+    made, names = [], set()
+    for k, (name, parts, path) in enumerate(objects):
+        name = name if name not in names else f"{name}#{k}"
+        names.add(name)
+        made.append(SceneObject(name, k + 1, parts, path))
+    return Scene(tuple(made), camera, t0_ns, t1_ns, light, background, tuple(dict.fromkeys(log)), omissions.lines())
+
+
+def _parts(pieces: list[gltf.Piece], baked: np.ndarray, name: str, where: str, log: list[str]) -> tuple[Part, ...]:
+    parts = []
+    for piece in (gltf.transformed(p, baked) for p in pieces if len(p.faces)):
+        textured = piece.material is not None and piece.material.texture is not None
+        mesh = make_mesh(piece.vertices, piece.faces, normals=piece.normals, uvs=piece.uvs, name=name, where=where,
+                         source_hash=content_hash(piece.vertices.tobytes(), np.ascontiguousarray(piece.faces, np.int64).tobytes()),
+                         project_degenerate=not textured, log=log)
+        parts.append(Part(mesh, piece.material or Material()))
+    if closed_together(tuple(p.mesh for p in parts)):
+        parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]
+    return tuple(parts)
+
+
+def _turn(up: str) -> np.ndarray:
+    if up not in ("y", "z"):
+        raise ConfigError("unknown up axis", value=up, accepted="y or z")
+    return gltf.Z_UP if up == "y" else np.eye(4)
+
+
+# ---- glTF
+def _channels(document: gltf.Document, animation: str | int | None) -> list[gltf.Channel]:
+    listed = document.tree.get("animations", [])
+    if animation is None or (animation == 0 and not listed):
+        return []
+    names = [str(a.get("name", i)) for i, a in enumerate(listed)]
+    if len(listed) > 1 and animation == 0:
+        document.omissions.add(f"animations beside '{names[0]}' (scene.animation chooses one of: {', '.join(names)})")
+    index = names.index(animation) if animation in names else animation
+    if not isinstance(index, int) or not 0 <= index < len(listed):
+        accepted = f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
+        raise ConfigError("no such animation in the file", where="scene.animation", value=animation, accepted=accepted)
+    return document.channels(index)
+
+
+_HERE = np.eye(4)
+
+
+def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0_ns: int, t1_ns: int, local: np.ndarray = _HERE):
+    """(PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
+    chain, step = set(), node
+    while step is not None:
+        chain.add(step)
+        step = document.nodes[step].parent
+    mine = [c for c in channels if c.node in chain]
+    rest, baked = split_rigid(gltf.Z_UP @ document.world(node))
+    if not mine:
+        return StaticPath(rest @ local, t0_ns, t1_ns), baked
+    start, end = min(c.times[0] for c in mine), max(c.times[-1] for c in mine)
+    start, end = max(start, min(t0_ns * 1e-9, end)), min(end, max(t1_ns * 1e-9, start))
+    keys = np.concatenate([c.times for c in mine])
+    regular = np.linspace(start, end, int(min(max((end - start) / _ANIMATION_STEP, 1), _MAX_SAMPLES)) + 1)
+    times = np.unique(np.round(np.concatenate([keys[(keys >= start) & (keys <= end)], regular]) * 1e9).astype(np.int64))
+    times = times[np.concatenate([[True], np.diff(times) > 100_000])]     # a key next to a sample adds nothing but ringing
+    poses, first = [], None
+    for t in times:
+        values: dict[int, dict] = {}
+        for c in mine:
+            values.setdefault(c.node, {})[c.path] = c.at(t * 1e-9)
+        T, A = split_rigid(gltf.Z_UP @ document.world(node, values))
+        first = A if first is None else first
+        if np.abs(A - first).max() > 1e-3 * np.abs(first).max():
+            line = f"{document.path.name}: the changing scale of node '{document.nodes[node].name}' is not supported, its first one is kept"
+            document.log.append(line)
+        poses.append(T @ local)
+    if any(c.interpolation == "STEP" for c in mine):
+        document.log.append(f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed")
+    poses = np.stack(poses)
+    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), "spline", document.where), first
+
+
+def _camera_node(document: gltf.Document, name: str | int | None) -> int:
+    found = {i: n for i, n in document.nodes.items() if n.camera is not None}
+    if not found:
+        raise ConfigError("the file has no camera", where="scene.pose", accepted="a camera pose here, or a file with a camera")
+    names = {}
+    for i, n in found.items():
+        cameras = document.tree.get("cameras", [])
+        if n.camera >= len(cameras):
+            raise AssetError("the file is no valid glTF (a reference to cameras that does not exist)",
+                             where=document.where, value=n.camera)
+        names.setdefault(str(cameras[n.camera].get("name", n.name)), i)
+        names.setdefault(n.name, i)
+    order = list(found)
+    if name is None:
+        if len(order) > 1:
+            document.omissions.add(f"cameras beside '{next(iter(names))}' (scene.camera chooses one of: {', '.join(names)})")
+        return order[0]
+    if isinstance(name, int) and 0 <= name < len(order):
+        return order[name]
+    if name in names:
+        return names[name]
+    raise ConfigError("no such camera in the file", where="scene.camera", value=name,
+                      accepted=f"one of: {', '.join(names)}, or an index below {len(order)}")
+
+
+def _gltf_intrinsics(document: gltf.Document, node: int, camera) -> dict:
+    description = document.tree["cameras"][document.nodes[node].camera]
+    perspective = description.get("perspective", {})
+    yfov = perspective.get("yfov")
+    if description["type"] != "perspective" or yfov is None:
+        raise AssetError("the camera is not a perspective one with a valid yfov", where=document.where, value=yfov,
+                         accepted="intrinsics: config")
+    focal = camera.height / 2 / np.tan(yfov / 2)
+    znear = perspective.get("znear", camera.near)
+    return dict(fx=focal, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2,
+                near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near)
+
+
+# ---- pyrender
+def _pyrender_omissions(primitives, omissions: Omissions) -> None:
+    for primitive in primitives:
+        if getattr(primitive, "color_0", None) is not None:
+            omissions.add("vertex colours (left out)")
+        material = primitive.material
+        if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
+            omissions.add(f"alpha {material.alphaMode} (drawn opaque)")
+        if np.any(getattr(material, "emissiveFactor", None)):
+            omissions.add("emissive light")
+        if getattr(material, "normalTexture", None) is not None:
+            omissions.add("normal maps")
+
+
+def _pyrender_piece(primitive, max_texture: int, name: str) -> gltf.Piece:
+    positions = np.asarray(primitive.positions, np.float64)
+    faces = np.arange(len(positions)).reshape(-1, 3) if primitive.indices is None else np.asarray(primitive.indices).reshape(-1, 3)
+    uvs = None if primitive.texcoord_0 is None else np.asarray(primitive.texcoord_0, np.float64)[:, :2] * [1, -1] + [0, 1]
+    source = primitive.material
+    material = None
+    if source is not None:
+        factor = getattr(source, "baseColorFactor", None)
+        texture = getattr(getattr(source, "baseColorTexture", None), "source", None)
+        if texture is not None:
+            image = np.asarray(texture.convert("RGB") if hasattr(texture, "convert") else texture)
+            image = np.round(image * 255).astype(np.uint8) if image.dtype.kind == "f" else image
+            image = image[..., None] if image.ndim == 2 else image
+            image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
+            texture = Texture(shrink(np.ascontiguousarray(image), max_texture), f"{name} texture", content_hash(image.tobytes()))
+        colour = (1.0, 1.0, 1.0) if factor is None else tuple(float(c) for c in np.asarray(factor, float)[:3])
+        material = Material(texture, colour, double_sided=bool(getattr(source, "doubleSided", False)))
+    normals = None if primitive.normals is None else np.asarray(primitive.normals, np.float64)
+    return gltf.Piece(positions, faces, normals, uvs, material)
+
+
+def _pyrender_intrinsics(source, camera) -> dict:
+    near = float(getattr(source, "znear", None) or camera.near)
+    if hasattr(source, "yfov"):
+        focal = camera.height / 2 / np.tan(source.yfov / 2)
+        # pyrender scales x by the aspect ratio: the viewport's, unless the camera states one.
+        aspect = getattr(source, "aspectRatio", None) or camera.width / camera.height
+        fx = focal * camera.width / camera.height / aspect
+        return dict(fx=fx, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2, near=near)
+    if hasattr(source, "fx"):
+        # pyrender counts from the image's corner, we from the first pixel's centre.
+        return dict(fx=float(source.fx), fy=float(source.fy), cx=float(source.cx) - 0.5, cy=float(source.cy) - 0.5, near=near)
+    raise ConfigError("only perspective and intrinsics cameras are supported", where="from_pyrender", value=type(source).__name__)

@@ -1,0 +1,238 @@
+"""Pools of objects and textures, listed by content hash, split into disjoint train and test parts, loaded lazily.
+
+An entry's split depends only on its content: the same file under two names, on two machines, listed in another order or
+in a pool that has grown, is always on the same side. Entries are drawn by first choosing a source (a folder, the
+primitives, …) with equal chances and then an entry, so that six photographs are not drowned by a thousand patterns.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, PoolConfig, TexturesConfig
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.geometry.primitives import random_primitive, random_primitive_hash
+from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
+from blinkgl.scene.reading import MAX_BYTES, contents
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
+from blinkgl.scene.surfaces.textures import procedural_hash, procedural_texture
+from blinkgl.scene.types import Material, Part, Texture
+
+SPLITS = ("train", "test")
+_MAX_REDRAWS = 50
+_MAX_FILES = 1_000_000
+
+
+def split_of(source_hash: str, test_fraction: float) -> str:
+    """'train' or 'test', from the hash alone. Raising the fraction moves entries to 'test' only."""
+    return "test" if int(source_hash[:13], 16) < test_fraction * 16**13 else "train"
+
+
+class ChangedAsset(AssetError):
+    """A file is not what it was when the pool was listed: which scenes are drawn would depend on when it was looked at."""
+
+    def __init__(self, file: Path):
+        super().__init__("the file has changed while it was in use", where=str(file), accepted="the file as it was, or a new run")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One mesh or texture that can be loaded. ``source`` is the folder or kind of source, ``file`` None for generated ones."""
+
+    source_hash: str
+    name: str
+    source: str
+    file: Path | None = None
+    kind: str = ""
+    index: int = 0
+
+
+@dataclass
+class Pool:
+    """Entries in a deterministic order (by source, then hash), and what is needed to load them.
+
+    bad_assets : "error" lets AssetError through; "skip" logs it and draws again.   what, where : for messages.
+    """
+
+    entries: tuple[Entry, ...]
+    load_entry: Callable[[Entry], object]
+    test_fraction: float
+    where: str
+    what: str
+    bad_assets: str = "error"
+    cache_bytes: int = 256_000_000
+    _cache: OrderedDict = field(default_factory=OrderedDict, repr=False)
+    _cached_bytes: int = 0
+
+    def split(self, split: str) -> dict[str, tuple[Entry, ...]]:
+        """source -> its entries on this side; sources without any are left out. ConfigError when nothing is left."""
+        if split not in SPLITS:
+            raise ConfigError("unknown split", value=split, accepted="train or test")
+        sides: dict[str, list[Entry]] = {}
+        for entry in self.entries:
+            if split_of(entry.source_hash, self.test_fraction) == split:
+                sides.setdefault(entry.source, []).append(entry)
+        if not sides:
+            if not self.entries:
+                raise ConfigError(f"the pool of {self.what} is empty", where=self.where, accepted=f"at least one source of {self.what}")
+            raise ConfigError(f"none of the {len(self.entries)} {self.what} falls to split '{split}'", where=f"{self.where}.test_fraction",
+                              value=self.test_fraction, accepted="another fraction, or a larger pool")
+        return {source: tuple(entries) for source, entries in sides.items()}
+
+    def load(self, entry: Entry):
+        """The entry's content, from a cache of the last ones within ``cache_bytes``."""
+        if entry.source_hash in self._cache:
+            self._cache.move_to_end(entry.source_hash)
+            return self._cache[entry.source_hash]
+        loaded = self.load_entry(entry)
+        self._cache[entry.source_hash] = loaded
+        self._cached_bytes += _bytes_of(loaded)
+        while self._cached_bytes > self.cache_bytes and len(self._cache) > 1:
+            self._cached_bytes -= _bytes_of(self._cache.popitem(last=False)[1])
+        return loaded
+
+    def draw(self, rng: np.random.Generator, split: str, log: list[str] | None = None):
+        """A random entry's content. The number of draws from ``rng`` does not depend on what the cache holds."""
+        sides = self.split(split)
+        sources = list(sides)
+        for _ in range(_MAX_REDRAWS):
+            entries = sides[sources[int(rng.integers(len(sources)))]]
+            entry = entries[int(rng.integers(len(entries)))]
+            try:
+                return self.load(entry)
+            except ChangedAsset:  # skipping it would quietly make another scene
+                raise
+            except AssetError as error:
+                if self.bad_assets == "error":
+                    raise
+                if log is not None:
+                    log.append(f"skipped: {error}")
+        raise AssetError(f"{_MAX_REDRAWS} {self.what} drawn in a row are unusable", where=self.where)
+
+
+def _bytes_of(loaded: Texture | Asset) -> int:
+    if isinstance(loaded, Texture):
+        return loaded.image.nbytes
+    own = sum(a.nbytes for p in loaded.parts for a in (p.mesh.vertices, p.mesh.faces, p.mesh.normals, p.mesh.uvs))
+    return own + sum(t.image.nbytes for t in {id(p.material.texture): p.material.texture for p in loaded.parts}.values() if t is not None)
+
+
+def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
+    """Primitives, mesh folders and pybullet's URDF meshes. Loads :class:`~blinkgl.scene.importing.mesh_files.Asset` objects that
+    are centred on their bounding box and have bounding radius 1. Raises ConfigError for a folder that is missing or holds no mesh."""
+    kinds = PRIMITIVE_KINDS if config.primitives == "all" else config.primitives
+    entries = []
+    for kind in kinds:
+        for index in range(config.variants):
+            entries.append(Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index))
+    folders = [(resolve(folder, base), f"{where}.folders.{i}", folder) for i, folder in enumerate(config.folders)]
+    urdfs = _random_urdfs(config.urdfs, f"{where}.urdfs")
+    if urdfs is not None:
+        folders.append((urdfs, f"{where}.urdfs", "pybullet random_urdfs"))
+    limit = int(config.max_file_mb * 1e6)
+    for folder, at, name in folders:
+        entries += _folder_entries(folder, at, name, MESH_SUFFIXES, limit, "mesh", config.bad_assets)
+
+    def load(entry: Entry) -> Asset:
+        if entry.file is None:
+            return Asset(entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)).normalised()
+        asset = load_asset(entry.file, max_faces=config.max_faces, max_bytes=limit, keep_materials=config.keep_materials,
+                           max_texture=max_texture, source_hash=entry.source_hash, up=config.up)
+        _same_content(entry, content_hash(contents(entry.file, "mesh", max_bytes=limit), *dependencies(entry.file)))
+        return asset.normalised()
+
+    return Pool(_listed(entries), load, config.test_fraction, where, "meshes", config.bad_assets)
+
+
+def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.textures") -> Pool:
+    """Procedural textures, scikit-image's photographs and image folders. Loads :class:`~blinkgl.scene.types.Texture`."""
+    kinds = TEXTURE_KINDS if config.procedural is True else config.procedural or ()
+    entries = [Entry(procedural_hash(kind, index), f"{kind}-{index}", "procedural", kind=kind, index=index)
+               for kind in kinds for index in range(config.variants)]
+    if config.photographs:
+        bundled = photographs()
+        if not bundled:
+            raise ConfigError("scikit-image's photographs are not installed", where=f"{where}.photographs", value=True,
+                              accepted="run 'pip install scikit-image', or set it to false")
+        entries += [Entry(content_hash(file.read_bytes()), name, "photographs", file) for name, file in bundled.items()]
+    for i, folder in enumerate(config.folders):
+        entries += _folder_entries(resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, MAX_BYTES,
+                                   "image", config.bad_assets)
+
+    def load(entry: Entry) -> Texture:
+        if entry.file is None:
+            return procedural_texture(entry.kind, entry.index, config.max_size)
+        data = contents(entry.file, "image")
+        _same_content(entry, content_hash(data))
+        return Texture(decode_image(data, config.max_size, str(entry.file)), entry.name, entry.source_hash)
+
+    return Pool(_listed(entries), load, config.test_fraction, where, "textures", config.bad_assets)
+
+
+def _same_content(entry: Entry, found: str) -> None:
+    if found != entry.source_hash:
+        raise ChangedAsset(entry.file)
+
+
+def resolve(path: str, base: Path) -> Path:
+    """A path of the YAML: ``~`` expanded, relative to the YAML file's folder."""
+    path = Path(path).expanduser()
+    return path if path.is_absolute() else base / path
+
+
+def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...], what: str) -> list[Path]:
+    """Files with these suffixes, recursively, sorted by name. ConfigError when the folder is missing or holds none."""
+    if not folder.is_dir():
+        raise ConfigError("is not a folder" if folder.exists() else "no such folder", where=where, value=given,
+                          accepted=f"a folder of {what}")
+    try:
+        files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
+    except OSError as error:
+        raise ConfigError(f"cannot read the folder: {error.strerror or error}", where=where, value=given) from None
+    if not files:
+        raise ConfigError(f"the folder holds no {what}", where=where, value=given, accepted="files of " + " ".join(suffixes))
+    if len(files) > _MAX_FILES:
+        raise ConfigError(f"the folder holds more than {_MAX_FILES} {what}", where=where, value=given)
+    return files
+
+
+def _folder_entries(folder: Path, where: str, given: str, suffixes, limit: int, what: str,
+                    bad_assets: str) -> Iterable[Entry]:
+    entries = []
+    for file in files_below(folder, where, given, suffixes, "meshes" if what == "mesh" else "images"):
+        try:
+            data = contents(file, what, max_bytes=limit)
+            digest = content_hash(data, *dependencies(file, data))
+        except AssetError:
+            if bad_assets == "error":
+                raise
+            continue
+        entries.append(Entry(digest, str(file.relative_to(folder)), given, file))
+    return entries
+
+
+def _listed(entries: Iterable[Entry]) -> tuple[Entry, ...]:
+    """Without repeated content inside a source, sources in the order of the YAML, each sorted by hash."""
+    sources: dict[str, dict[str, Entry]] = {}
+    for entry in entries:
+        sources.setdefault(entry.source, {}).setdefault(entry.source_hash, entry)
+    return tuple(entry for listed in sources.values() for _, entry in sorted(listed.items()))
+
+
+def _random_urdfs(setting, where: str) -> Path | None:
+    if setting is False:
+        return None
+    spec = find_spec("pybullet_data")
+    folder = Path(spec.submodule_search_locations[0]) / "random_urdfs" if spec and spec.submodule_search_locations else None
+    if folder is not None and folder.is_dir():
+        return folder
+    if setting is True:
+        raise ConfigError("pybullet's random_urdfs are not installed", where=where, value=True,
+                          accepted="run 'pip install pybullet', or set it to auto or false")
+    return None

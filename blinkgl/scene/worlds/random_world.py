@@ -1,0 +1,273 @@
+"""Random worlds: a textured sky box, ground, walls, and objects from a pool, resting or flying, mostly in view.
+
+After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; way-points in free space joined by
+splines; whoever collides stops. The world is z up, in metres, ground at ``ground.height``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
+from blinkgl.config.sequence import camera_radius
+from blinkgl.errors import ConfigError
+from blinkgl.rng import Role, generator
+from blinkgl.scene.geometry.meshes import scale_mesh
+from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
+from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
+from blinkgl.scene.reading import contents
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
+from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
+
+_PLACEMENTS = 300      # positions tried for an object before it is left out
+_CAMERA_PATHS = 6      # camera paths tried for one that runs into nothing; the last is cut where it does
+_GAP = 0.05            # m between bounding spheres at t0
+_STAND_OFF = 0.8       # m beyond the clearance that way-points keep from the camera: nothing should fill the view
+_PANORAMA_MARGIN = 1 / 16
+
+
+def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, split: str, seed: int, sequence: int, base: Path) -> Scene:
+    """The ``sequence``-th random scene of a run; arguments as :func:`blinkgl.scene.build.build_scene`."""
+    rng, rng_motion, rng_texture = (generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE))
+    objects, textures = pools(config, base)
+    log: list[str] = []
+    omissions: dict[str, None] = {}
+    floor = config.ground.height if config.ground else 0.0
+    unlit = config.light.unlit
+
+    T_cam, target = _viewpoint(config, rng, floor)
+    clearance = camera_radius(camera, config.camera_clearance)
+    if clearance > config.region.height:
+        raise ConfigError("the region is too low for a camera that keeps this far from everything", where="scene.region.height",
+                          value=config.region.height, accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
+                          "distance of the near plane's corners: camera.near and camera.fov)")
+    backdrop = []
+    if config.sky:
+        parts = _sky(config.sky, textures, rng_texture, split, base, log)
+        backdrop.append(("sky", "sky", parts, StaticPath(_shift(floor), t0_ns, t1_ns)))
+    if config.ground:
+        size = config.ground.size or (config.sky.size if config.sky else 4 * config.region.width)
+        mesh = grid(width=size, depth=size, subdivisions=config.ground.subdivisions)
+        repeats = size / _log_uniform(rng_texture, config.ground.tile)
+        material = Material(textures.draw(rng_texture, split, log), uv_scale=(repeats, repeats), unlit=unlit)
+        backdrop.append(("ground", "ground", (Part(mesh, material),), StaticPath(_shift(floor), t0_ns, t1_ns)))
+    backdrop += [(f"wall-{k}", "wall", parts, StaticPath(T, t0_ns, t1_ns))
+                 for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))]
+
+    placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log, omissions)
+    centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
+    radii = np.array([radius for *_, radius, _ in placed])
+    half = config.region.width / 2
+    low, high = np.array([-half, -half, floor]), np.array([half, half, floor + config.region.height])
+    ground_z = floor if config.ground else None
+
+    items = list(backdrop)
+    for k, (name, parts, T, radius, resting) in enumerate(placed):
+        others = np.arange(len(placed)) != k
+        space = FreeSpace(low, high, ground_z, np.vstack([centres[others], T_cam[:3, 3]]), np.append(radii[others], clearance + _STAND_OFF))
+        path = random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=resting)
+        items.append((name, "object", parts, path))
+    scene_objects = tuple(SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items))
+    space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
+    for _ in range(_CAMERA_PATHS):  # a camera that was stopped would see a still world from then on: another path is better
+        path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
+        result = resolve_collisions(scene_objects, path, clearance, t0_ns, t1_ns)
+        if not any("camera" in event.cut for event in result.events):
+            break
+    # Bounding spheres were apart, so only one that sinks into ground or wall can touch at t0: leave it out.
+    ours = {o.name for o in scene_objects if o.category == "object"}
+    bad = ours & {name for c in result.at_start for name in (c.first, c.second)}
+    if bad:
+        result = resolve_collisions(tuple(o for o in scene_objects if o.name not in bad), path, clearance, t0_ns, t1_ns)
+        log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
+    log += result.log
+    return Scene(objects=result.objects, camera=make_camera(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
+                 light=make_light(config.light, rng), background=config.background, log=tuple(log),
+                 omissions=tuple(omissions))
+
+
+def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
+    """(object pool, texture pool); the same pools, with their caches, for the same configuration in one process."""
+    return _object_pool(config.pool, base.resolve(), config.textures.max_size), _texture_pool(config.textures, base.resolve())
+
+
+_object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
+_texture_pool = lru_cache(maxsize=4)(texture_pool)
+
+
+def make_camera(camera, path, **changes) -> Camera:
+    """Scene camera from anything with width, height, fx, fy, near and principal_point or cx, cy."""
+    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
+    made = Camera(camera.width, camera.height, float(camera.fx), float(camera.fy), float(cx), float(cy), path, camera.near)
+    return replace(made, **changes)
+
+
+def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:
+    """Sun direction drawn where the configuration leaves it open and ``rng`` is given."""
+    drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
+    return Light(config.sun_direction(*drawn), config.sun, config.sky)
+
+
+def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray, np.ndarray]:
+    """(T_world_cam at t0, point looked at): near the edge of the region, looking across its middle."""
+    half = config.region.width / 2
+    around = rng.uniform(0, 2 * math.pi)
+    low, high = config.region.camera_height
+    position = np.array([0, 0, floor]) + [*(rng.uniform(0.4, 0.85) * half * np.array([math.cos(around), math.sin(around)])),
+                                          rng.uniform(low, min(high, config.region.height))]
+    target = np.array([*rng.uniform(-0.2, 0.2, 2) * half, floor + rng.uniform(0.05, 0.3) * config.region.height])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = look_rotation(target - position), position
+    return T, target
+
+
+def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log,
+           omissions):
+    """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
+    settings, region = config.objects, config.region
+    placed: list[tuple] = []
+    if settings.count == 0:
+        return placed
+    centres, radii = [T_cam[:3, 3]], [clearance]
+    for k in range(settings.count):
+        asset = objects.draw(rng, split, log)
+        radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
+        resting = config.ground is not None and rng.random() >= settings.flying
+        rotation = _rotation(rng, resting)
+        parts = _dress(config, asset, radius, textures, rng_texture, split, log)
+        lowest = min(float((p.mesh.vertices @ rotation[2]).min()) for p in parts)
+        in_view = rng.random() < settings.in_view
+        for _ in range(_PLACEMENTS):
+            position = _candidate(config, camera, rng, T_cam, floor, in_view, resting)
+            if resting:
+                position[2] = floor - lowest
+            elif not floor + (radius if config.ground else 0) + _GAP <= position[2] <= floor + region.height:
+                continue
+            gap = np.linalg.norm(np.array(centres) - position, axis=1) - radii - radius
+            if (np.abs(position[:2]) <= region.width / 2).all() and gap.min() > _GAP and gap[0] > max(radius, _STAND_OFF):
+                break
+        else:
+            log.append(f"object {k} ({asset.name}, radius {radius:.2f} m) left out: no free place in {_PLACEMENTS} tries")
+            continue
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = rotation, position
+        centres.append(position)
+        radii.append(radius)
+        placed.append((f"{asset.name}#{k}", parts, T, radius, resting))
+        log.extend(line for line in asset.log if line not in log)
+        omissions.update(dict.fromkeys(asset.omissions))
+    return placed
+
+
+def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarray:
+    """A position to try: along a pixel's ray at a log-uniform distance, or anywhere in the region."""
+    region = config.region
+    if not in_view:
+        half = region.width / 2
+        return rng.uniform([-half, -half, floor], [half, half, floor + region.height])
+    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
+    pixel = rng.uniform([-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5])
+    ray = T_cam[:3, :3] @ [(pixel[0] - cx) / camera.fx, (pixel[1] - cy) / camera.fy, 1.0]
+    if resting:
+        ray[2] = 0.0
+    return T_cam[:3, 3] + ray / np.linalg.norm(ray) * _log_uniform(rng, config.objects.distance)
+
+
+def _rotation(rng, resting: bool) -> np.ndarray:
+    """(3, 3). Flying: uniform over rotations. Resting: any heading, upright or, for half of them, lying on its side."""
+    if not resting:
+        return Rotation.random(rng=rng).as_matrix()
+    heading, tipped, axis = rng.uniform(0, 2 * math.pi), rng.random() < 0.3, int(rng.integers(2))
+    tip = Rotation.from_rotvec(np.eye(3)[axis] * (math.pi / 2 if tipped else 0.0))
+    return (Rotation.from_rotvec([0, 0, heading]) * tip).as_matrix()
+
+
+def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]:
+    """The asset at its size, with its own materials or a random texture and tint."""
+    tint = 1 - config.objects.tint * rng.random(3)
+    repeats = _log_uniform(rng, config.objects.texture_scale)
+    parts = []
+    texture = None if asset.has_materials else textures.draw(rng, split, log)
+    for part in asset.parts:
+        mesh = scale_mesh(part.mesh, radius)
+        if asset.has_materials:
+            material = replace(part.material, unlit=part.material.unlit or config.light.unlit,
+                               double_sided=part.material.double_sided or not mesh.closed)
+        else:
+            material = Material(texture, tuple(float(c) for c in tint), (repeats, repeats), config.light.unlit, not mesh.closed)
+        parts.append(Part(mesh, material))
+    return tuple(parts)
+
+
+def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[Part, ...]:
+    """Six inward squares around the origin."""
+    half, n = config.size / 2, config.subdivisions
+    brightness = float(rng.uniform(*config.brightness))
+    repeats, inset = _log_uniform(rng, config.repeat), 1.0
+    if config.panoramas:
+        images, repeats, inset = _panorama_faces(config, rng, split, textures.test_fraction, base), 1.0, 1 / (1 + _PANORAMA_MARGIN)
+    elif config.per_face:
+        images = [textures.draw(rng, split, log) for _ in SKY_SIDES]
+    else:
+        images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
+    parts = []
+    for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
+        positions, normals, uvs, faces = square(half * (forward - right + down), 2 * half * right, -2 * half * down, n, n)
+        uvs = 0.5 + (uvs - 0.5) * inset
+        mesh = Mesh(positions, faces.astype(np.int32), np.ascontiguousarray(normals, np.float32), uvs.astype(np.float32),
+                    name=f"sky {side}", source_hash=parameter_hash("sky", config.size, n, side, inset))
+        parts.append(Part(mesh, Material(texture, (brightness,) * 3, (repeats, repeats), unlit=True)))
+    return tuple(parts)
+
+
+def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[Texture]:
+    """Six textures of one panorama of this split, turned to a random heading."""
+    files = []
+    for i, given in enumerate(config.panoramas):
+        path, where = resolve(given, base), f"scene.sky.panoramas.{i}"
+        if not path.exists():
+            raise ConfigError("no such file or folder", where=where, value=given, accepted="an equirectangular image or a folder of them")
+        files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
+    hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
+    mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
+    if not mine:
+        raise ConfigError(f"none of the {len(hashed)} panoramas falls to split '{split}'", where="scene.sky.panoramas",
+                          accepted="more panoramas, or another scene.textures.test_fraction")
+    digest, file = mine[int(rng.integers(len(mine)))]
+    image = shrink(load_image(file), 4096)
+    image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
+    sides = cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN)
+    return [Texture(side, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)]
+
+
+def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_texture, split, floor, log):
+    """(parts, T_world_wall) of slabs outside the region, far enough for any object whose origin stays inside."""
+    out = config.region.width / 2 + config.objects.size[1] / 2 + walls.thickness / 2 + _GAP
+    for side in rng.permutation(4)[: walls.count]:
+        height, length = float(rng.uniform(*walls.height)), 2 * out
+        mesh = cuboid(extents=(walls.thickness, length, height), subdivisions=8)
+        tile = _log_uniform(rng_texture, walls.tile)
+        material = Material(textures.draw(rng_texture, split, log), uv_scale=(length / tile, height / tile), unlit=config.light.unlit)
+        turn = Rotation.from_rotvec([0, 0, math.pi / 2 * side])
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.round(turn.as_matrix()), turn.apply([out, 0, 0]) + [0, 0, floor + height / 2]
+        yield (Part(mesh, material),), T
+
+
+def _shift(z: float) -> np.ndarray:
+    T = np.eye(4)
+    T[2, 3] = z
+    return T
+
+
+def _log_uniform(rng: np.random.Generator, bounds: tuple[float, float]) -> float:
+    return float(np.exp(rng.uniform(math.log(bounds[0]), math.log(bounds[1]))))

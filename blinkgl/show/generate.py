@@ -1,0 +1,183 @@
+"""``blinkgl generate``: one display over all workers while it runs, a table when it is done."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
+from rich.table import Table
+
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.executor import Executor
+from blinkgl.dataset.plan import Plan
+from blinkgl.dataset.report import STAGES, SequenceReport, Totals
+from blinkgl.dataset.run import Outcome, run_dataset
+from blinkgl.dataset.work import Message, report_of
+from blinkgl.machine.compiling import compiling_line
+from blinkgl.show.terminal import plain_column, plain_console, say
+
+MAX_NOTES = 20
+"""Files of which it is said what is not drawn; beyond, that there are more."""
+SET_ASIDE = 3
+"""Exit status of a run that is over but lacks sequences."""
+
+
+def run(config: str, out: str, *, num: int | None = None, seed: int | None = None, overrides: list[str] = (), quiet: bool = False,
+        executor: Executor | None = None, resume: bool = False, mixed: bool = False, time_limit_s: float = 0.0) -> int:
+    """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing, whose names and reasons
+    are said even when ``quiet``. Raises what it raises."""
+    template = load_run(config, overrides, seed=seed)
+    console = plain_console(quiet=quiet)
+    outcome = run_dataset(template, out, executor, num=num, resume=resume, mixed=mixed, time_limit_s=time_limit_s,
+                          listener=None if quiet else Display(console, Path(out)))
+    show_outcome(console, outcome, Path(out))
+    if quiet:
+        for name, reason in sorted(outcome.set_aside.items()):
+            say(plain_console(stderr=True), f"set aside: {name}: {reason}")
+    return SET_ASIDE if outcome.set_aside else 0
+
+
+class Display:
+    """Sequences, events, frames/s, what is left, disk used and expected: a bar per sequence at work on a terminal, a line per
+    finished sequence elsewhere."""
+
+    def __init__(self, console: Console, out: Path):
+        self._console, self._out = console, out
+        self._bars = Progress(plain_column("{task.description}"), BarColumn(bar_width=30), plain_column("{task.percentage:>3.0f}%"),
+                              plain_column("{task.fields[detail]}"), TimeElapsedColumn(), console=console, transient=True,
+                              disable=not console.is_terminal)
+        self._tasks: dict[str, TaskID] = {}
+        self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames, events of what is being made
+        self._done = self._frames = self._events = self._bytes = self._given_up = 0
+        self._notes: set[str] = set()
+
+    def begin(self, plan: Plan, outcome: Outcome) -> None:
+        self._todo, self._outcome, self._started = len(plan.tasks) - outcome.found, outcome, time.monotonic()
+        if outcome.found:
+            self._say(f"{outcome.found} of {len(plan.tasks)} sequences are whole already")
+        for name, problem in outcome.damaged.items():
+            self._say(f"{name} was damaged ({problem}); moved to .run/damaged, will be made again")
+        self._bars.start()
+        self._total = self._bars.add_task("all", total=max(self._todo, 1), detail="", visible=self._todo > 1)
+
+    def message(self, name: str, message: Message) -> None:
+        kind = message["kind"]
+        self._note(message.get("omissions") or message.get("report", {}).get("omissions") or ())
+        if kind == "progress":
+            self._at_work[name] = (message["fraction"], message["frames"], message["events"])
+            if name not in self._tasks:
+                self._tasks[name] = self._bars.add_task(name, total=1.0, detail="")
+            detail = f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {_shares(message['seconds'])}" if message["fraction"] < 1 else "labels, files"
+            self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
+        elif kind != "silent":
+            self._at_work.pop(name, None)
+            if name in self._tasks:
+                self._bars.remove_task(self._tasks.pop(name))
+        if kind == "done":
+            report = report_of(message)
+            self._done, self._frames, self._events = self._done + 1, self._frames + report.frames, self._events + report.events
+            self._bytes += message["bytes"]
+            if not self._console.is_terminal or self._todo > 1:
+                self._say(_line(report) + (f"; {self.summary()}" if self._todo > 1 else ""))
+        elif kind == "silent":
+            self._say(f"{name}: {message['error']}")
+        elif kind == "failed":
+            self._given_up += bool(message.get("given_up"))
+            self._say(f"{name} failed, {'set aside' if message.get('given_up') else 'will be tried again'}: {message['error']}")
+        self._bars.update(self._total, completed=self._done + sum(f for f, _, _ in self._at_work.values()), detail=self.summary())
+
+    def end(self, outcome: Outcome) -> None:
+        self._bars.stop()
+
+    def summary(self) -> str:
+        """"12/20, 85 frames/s, 1.2 M events/s, 0:03:10 left, 0.21 GB of about 0.35 GB"."""
+        elapsed = max(time.monotonic() - self._started, 1e-3)
+        frames = self._frames + sum(f for _, f, _ in self._at_work.values())
+        events = self._events + sum(e for _, _, e in self._at_work.values())
+        parts = [f"{self._done}/{self._todo}", f"{frames / elapsed:.0f} frames/s", f"{events / elapsed / 1e6:.2f} M events/s"]
+        if made := self._done + sum(f for f, _, _ in self._at_work.values()):
+            left = (self._todo - self._given_up - made) * elapsed / made
+            parts.append(f"{int(left // 3600)}:{int(left // 60) % 60:02d}:{int(left) % 60:02d} left")
+        if self._done:
+            expected = self._bytes / self._done * self._todo
+            room = shutil.disk_usage(self._out).free
+            parts.append(f"{_size(self._bytes)} of about {_size(expected)}")
+            if expected - self._bytes > room:
+                parts.append(f"DISK: only {_size(room)} free")
+        return ", ".join(parts)
+
+    def _note(self, lines: Iterable[str]) -> None:
+        """Says what is not drawn, once, however many sequences and workers use the file."""
+        for line in lines:
+            if line in self._notes:
+                continue
+            self._notes.add(line)
+            if len(self._notes) <= MAX_NOTES:
+                self._say(f"note: {line}")
+            elif len(self._notes) == MAX_NOTES + 1:
+                self._say("note: more files ask for what is not drawn; the manifests name them under not_drawn")
+
+    def _say(self, text: str) -> None:
+        say(self._console, text)
+
+
+def _shares(seconds: dict[str, float]) -> str:
+    """"render 63 %, events 12 %": where most of the time has gone so far."""
+    total = sum(seconds.values()) or 1.0
+    largest = sorted(STAGES, key=lambda name: -seconds.get(name, 0.0))[:2]
+    return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
+
+
+def _size(size: float) -> str:
+    return f"{size / 1e9:.2f} GB" if size >= 1e8 else f"{size / 1e6:.1f} MB"
+
+
+def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
+    """The final table, and what was set aside."""
+    if line := compiling_line(outcome.made.compile_s):
+        say(console, line)
+    if outcome.made:
+        show_table(console, outcome.made, outcome.elapsed_s)
+    else:
+        say(console, f"nothing to make: all {outcome.found} sequences are whole" if not outcome.set_aside else "no sequence was made")
+    if outcome.set_aside:
+        say(console, f"{len(outcome.set_aside)} of {outcome.planned} sequences are set aside; run again with --resume to try them again "
+                     f"(logs: {out}/.run/logs)")
+        for name, reason in sorted(outcome.set_aside.items()):
+            say(console, f"  {name}: {reason}")
+
+
+def _line(report: SequenceReport) -> str:
+    return (f"{report.path}: {report.frames} frames, {report.events / 1e6:.2f} M events, {report.labels} labels, "
+            f"{report.total_s:.1f} s ({report.total_s / report.simulated_s:.1f} s per simulated second)")
+
+
+def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -> None:
+    """The final table: what was made, how fast, and where the time went. ``elapsed_s``: of the run, where several workers
+    each spent wall time at once."""
+    s = made.summary()
+    table = Table(title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",
+                  title_justify="left", show_header=False)
+    table.add_row("event frames", f"{s['frames']:,}")
+    table.add_row("events", f"{s['events'] / 1e6:.2f} M")
+    table.add_row("labels", f"{s['labels']:,}")
+    if elapsed_s is not None and len(made) > 1:
+        table.add_row("elapsed", f"{elapsed_s:.1f} s  ({s['total_s'] / elapsed_s:.2f} sequences at a time)")
+    table.add_row("wall time of all sequences" if len(made) > 1 else "wall time", f"{s['total_s']:.1f} s")
+    table.add_row("per simulated second", f"{s['seconds_per_simulated_second']:.2f} s")
+    table.add_row("rate", f"{s['events_per_second'] / 1e6:.2f} M events/s")
+    if (error := made.first.timeline.get("time_error")) is not None:
+        name = f"p{error['percentile']:g}"
+        table.add_row("time error, estimated", f"median {error['median_us']} µs, {name} {error[name + '_us']} µs"
+                      + (" (first sequence)" if len(made) > 1 else ""))
+    table.add_section()
+    for name in (*STAGES, "other"):
+        seconds = s[f"{name}_s"]
+        table.add_row(name, f"{seconds:.2f} s  {100 * seconds / s['total_s']:4.0f} %")
+    console.print(table)
+    folder = made.first.path
+    say(console, f"look at {folder / 'preview.mp4'}" if (folder / "preview.mp4").exists() else f"written to {folder}")

@@ -1,0 +1,119 @@
+"""blinkgl explain: what it says is what a run does."""
+
+import os
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.explain import explain
+from blinkgl.dataset.generate import generate_run
+from blinkgl.errors import ConfigError
+
+SMALL = {
+    "camera": {"width": 64, "height": 48}, "time": {"duration": 0.2, "label_rate": 20},
+    "timeline": {"kind": "displacement", "max_px": 0.5},
+    "scene": {"kind": "random", "objects": {"count": 4}, "textures": {"photographs": False, "max_size": 64, "variants": 2},
+              "pool": {"primitives": ["cuboid"], "variants": 2}},
+    "labels": {"flow": ["forward"]}, "preview": {"enabled": False},
+}
+
+
+def template(tmp_path, **changes):
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump({**SMALL, **changes}))
+    return load_run(path)
+
+
+def test_expected_frames_and_passes_are_those_of_the_run(tmp_path):
+    run = template(tmp_path)
+    told = explain(run)
+    made = list(generate_run(run, tmp_path / "out"))[0]
+    assert abs(told.frames - made.frames) < 0.25 * made.frames
+    assert [p.name for p in told.passes] == ["event frames", "velocity", "colour", "labels", "event kernel"]
+    assert f"{made.triangles:,}" == told.scene["triangles"] and "4 objects" in told.scene["bodies"]
+    assert all(p.seconds > 0 and p.count > 0 for p in told.passes)
+
+
+def test_what_is_left_out_follows_the_configuration(tmp_path):
+    out = dict(explain(template(tmp_path)).left_out)
+    assert "depth" in out and "backward flow" in out and "preview" in out and "esim: refractory_us" in out
+    more = explain(template(tmp_path, timeline={"kind": "uniform", "fps": 100}, labels={"images": False, "depth": True, "flow": []},
+                            events={"emulator": "esim", "refractory_us": 50}, render={"antialiasing": "ssaa2"}))
+    out = dict(more.left_out)
+    assert "depth" not in out and "images" in out and "velocity pass" in out and "esim: refractory_us" not in out
+    assert "anti-aliasing of event frames" not in out
+    assert [p.name for p in more.passes] == ["event frames", "labels", "event kernel"]
+    assert more.frames == 26, "0.25 s at 100 frames/s, both ends included"
+
+
+def test_an_unlit_world_needs_no_normals(tmp_path):
+    scene = {**SMALL["scene"], "light": {"unlit": True}}
+    told = explain(template(tmp_path, scene=scene))
+    assert "light" in dict(told.left_out)
+    assert not any("LIT" in v.split("+") for p in told.passes for v in p.variants)
+
+
+def test_passes_of_the_other_timelines(tmp_path):
+    result = explain(template(tmp_path, timeline={"kind": "brightness", "reconstruction": "hermite", "max_fraction_of_threshold": 2.0}))
+    passes = {p.name: p for p in result.passes}
+    assert {"event frames with rates", "brightness"} <= set(passes) and "velocity" not in passes
+    assert any("RATE" in v for v in passes["event frames with rates"].variants)
+    assert "hermite in between" in passes["event frames with rates"].why
+    budget = explain(template(tmp_path, timeline={"kind": "budget", "max_time_error_us": 500}))
+    assert {"event frames", "velocity"} <= {p.name for p in budget.passes} and budget.frames > 2
+    assert ("rates of change in the event frames", "timeline.reconstruction: linear") in budget.left_out
+
+
+def test_recorded_frames_are_what_is_explained(tmp_path):
+    """Nothing is rendered, so no scene is described, no OpenGL is opened and no pass is a drawing."""
+    (tmp_path / "P0/image_left").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (24, 40), dtype=np.uint8)
+    for k in range(20):
+        cv2.imwrite(str(tmp_path / f"P0/image_left/{k:03d}.png"), np.roll(image, k, axis=1))
+    path = tmp_path / "run.yaml"
+    tree = {"frames": {"folders": ["P0"], "fps": 10, "flow": None, "interpolate": "linear", "first": 1}, "preview": {"enabled": False},
+            "camera": {"width": 99, "height": 99}, "gl": {"backend": "egl", "device": 4000}}
+    path.write_text(yaml.safe_dump(tree))
+    run = load_run(path)
+    told = explain(run)
+    assert set(told.scene) == {"frames", "images", "flow", "not used"} and "40x24" in told.scene["frames"] and "19 of" in told.scene["frames"]
+    made = list(generate_run(run, tmp_path / "out"))[0]
+    assert told.frames == made.frames == 19 and [p.name for p in told.passes] == ["frames and event kernel"]
+    assert told.seconds > 0 and "forward flow" in dict(told.left_out)
+    path.write_text(yaml.safe_dump({**tree, "frames": {**tree["frames"], "fps": 0.002}}))
+    for refused in (lambda: explain(load_run(path)), lambda: list(generate_run(load_run(path), tmp_path / "out2"))):
+        with pytest.raises(ConfigError, match="frames.fps: 19 frames at this rate last 9000 s"):
+            refused()
+    assert not (tmp_path / "out2").exists()
+
+
+ENVIRONMENTS = [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}, {"PYTHONIOENCODING": "latin-1"}]
+
+
+def command(arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess:
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("LC_", "LANG", "PYTHONIO", "PYTHONUTF8"))}
+    return subprocess.run([sys.executable, *arguments], env={**clean, **environment}, capture_output=True, timeout=300)
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_output_that_cannot_show_every_character(environment):
+    """In the one place that all commands go through; and an error's line that holds what the user typed."""
+    code = "import sys; from blinkgl import cli; status = cli.run(['explain', '\\u00b5\\u2603.yaml']); print('1 \\u00b5s \\u2026 2 px\\u00b2 \\u2603'); sys.exit(status)"
+    done = command(["-c", code], environment)
+    assert done.returncode == 2 and done.stderr.startswith(b"error: ") and done.stderr.count(b"\n") == 1
+    assert done.stdout in (b"1 us ... 2 px^2 ?\n", b"1 \xb5s ... 2 px\xb2 ?\n")
+
+
+def test_explain_in_plain_ascii(tmp_path):
+    (tmp_path / "P0/images").mkdir(parents=True)
+    for k in range(3):
+        cv2.imwrite(str(tmp_path / f"P0/images/µ{k}.png"), np.zeros((16, 16), np.uint8))
+    (tmp_path / "run.yaml").write_text("frames: {folders: [P0], images: images, flow: null}")
+    done = command(["-m", "blinkgl.cli", "explain", str(tmp_path / "run.yaml")], ENVIRONMENTS[0])
+    assert done.returncode == 0 and done.stderr == b"" and b"u0.png ... u2.png" in done.stdout

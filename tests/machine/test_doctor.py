@@ -1,0 +1,100 @@
+"""``blinkgl doctor`` tells the truth: what works here, and what a broken machine lacks."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+from blinkgl import cli
+from blinkgl.gl import context as context_module, osmesa
+from blinkgl.machine import doctor
+from blinkgl.show.doctor import show
+
+
+@pytest.fixture(scope="module")
+def report():
+    return doctor.examine()
+
+
+def by_name(report) -> dict[str, doctor.Check]:
+    return {f"{check.section}/{check.name}": check for check in report.checks}
+
+
+def test_this_machine_passes_every_required_check(report):
+    assert report.ok, [check for check in report.checks if check.status == "missing"]
+    checks = by_name(report)
+    for name in ("OpenGL/context", "OpenGL/version", "OpenGL/32F depth, reversed-Z", "OpenGL/R32F target", "OpenGL/RG32F target",
+                 "OpenGL/RGBA32F target", "Kernels/numba", "Kernels/threads", "Kernels/SIMD", "Codecs/HDF5 blosc-zstd",
+                 "Codecs/libx264 video", "Codecs/16-bit RGB PNG"):
+        assert checks[name].status == "ok", checks[name]
+
+
+def test_what_is_absent_has_a_command(report):
+    for check in report.checks:
+        if check.status == "missing" or (check.status == "absent" and check.section == "Optional extras"):
+            assert check.remedy, check
+
+
+def test_extras_are_those_of_the_package():
+    from importlib import metadata
+
+    assert set(doctor.EXTRAS) == set(metadata.metadata("blinkgl").get_all("Provides-Extra"))
+
+
+def test_no_opengl_is_reported_with_the_remedy_and_status_2(monkeypatch, capsys):
+    monkeypatch.setattr(context_module, "_EGL_LIBRARIES", ("libmissing.so",))
+    monkeypatch.setattr(osmesa, "LIBRARIES", ("libmissing.so",))
+    monkeypatch.setattr(doctor, "_numba", lambda: iter(()))  # compiled in another test; slow
+    assert cli.run(["doctor", "--json"]) == 2
+    result = json.loads(capsys.readouterr().out)
+    context = next(check for check in result["checks"] if check["name"] == "context")
+    assert not result["ok"] and context["status"] == "missing"
+    assert "apt-get install" in context["remedy"] and "libegl1" in context["remedy"]
+    assert cli.run(["doctor"]) == 2
+    shown = capsys.readouterr().out
+    assert "MISSING" in shown and "Something required is missing" in shown and "sudo apt-get install" in shown
+
+
+def test_a_codec_that_lies_is_found(monkeypatch):
+    cv2 = pytest.importorskip("cv2")
+    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: (data.astype("uint16")))
+    check = next(check for check in doctor._codecs() if check.name == "16-bit RGB PNG")
+    assert check.status == "missing" and "opencv-python-headless" in check.remedy
+
+
+def test_a_missing_package_is_found(monkeypatch):
+    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
+    check = next(check for check in doctor._codecs() if check.name == "HDF5 blosc-zstd")
+    assert check.status == "missing" and "hdf5plugin" in check.value and "pip install" in check.remedy
+
+
+def test_a_target_that_rounds_is_found(gl, monkeypatch):
+    from blinkgl.gl import framebuffer
+
+    half = framebuffer.FORMATS["RGBA16F"]._replace(gl="f2")
+    monkeypatch.setitem(framebuffer.FORMATS, "RGBA32F", half)
+    with pytest.raises(ValueError, match="drew"):
+        doctor._draw_exactly(gl, "RGBA32F")
+
+
+def test_clip_space_that_is_not_zero_to_one_is_found(gl):
+    import ctypes
+
+    clip_control = gl.function("glClipControl", None, ctypes.c_uint, ctypes.c_uint)
+    clip_control(0x8CA1, 0x935E)  # GL_NEGATIVE_ONE_TO_ONE
+    try:
+        with pytest.raises(ValueError):
+            doctor._draw_depth(gl)
+    finally:
+        clip_control(0x8CA1, 0x935F)
+
+
+def test_shown_text_is_plain_when_piped(report, capsys):
+    show(report)
+    shown = capsys.readouterr().out
+    assert "\x1b" not in shown
+    for check in report.checks:  # one check, one line
+        assert any(check.name in line and check.value[:60] in line for line in shown.splitlines()), check
+    assert "All required parts are there." in shown

@@ -1,0 +1,131 @@
+"""compare: against recordings whose statistics are known, and against the numbers on the data's own page."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from blinkgl.cli import run
+from blinkgl.errors import EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.formats import write_events
+from blinkgl.recordings.comparison import IEI_EDGES_US, compare, plot
+from tests.shared_data import shared
+
+H, W = 40, 50
+
+
+def poisson(rate_hz: float, on_share: float, seconds=4.0, seed=0, t0=0, pixels=None) -> Events:
+    """Independent pixels with Poisson events; ``pixels`` (H, W) weights the rate."""
+    rng = np.random.default_rng(seed)
+    weights = np.ones((H, W)) if pixels is None else pixels
+    n = rng.poisson(rate_hz * seconds * weights.sum())
+    where = rng.choice(H * W, n, p=(weights / weights.sum()).ravel())
+    return Events((where % W).astype(np.uint16), (where // W).astype(np.uint16),
+                  t0 + np.sort(rng.integers(0, round(seconds * 1e6), n)), (rng.random(n) < on_share).astype(np.uint8))
+
+
+def test_counts_rates_and_intervals(tmp_path):
+    a, b = poisson(20, 0.5), poisson(40, 0.8, seed=1)
+    write_events(tmp_path / "a.h5", a, H, W)
+    write_events(tmp_path / "b.raw", b, H, W)
+    result = compare(tmp_path / "a.h5", tmp_path / "b.raw", interval_ms=500)
+    inside = lambda e: e.window(int(result.edges_us[0]), int(result.edges_us[-1]))
+    assert len(result.edges_us) == 9 and result.a.count == len(inside(a)) and result.b.count == len(inside(b))
+    assert result.a.count == pytest.approx(len(a), abs=3)
+    assert np.allclose(result.a.rate_hz, 20 * H * W, rtol=0.05) and np.nanmean(result.rate_ratio) == pytest.approx(2, rel=0.03)
+    assert result.a.on_off_ratio == pytest.approx(1, rel=0.03) and result.b.on_off_ratio == pytest.approx(4, rel=0.05)
+    assert abs(result.pixel_correlation) < 0.1, "independent"
+    # The interval of a Poisson process is exponential: median ln 2 / rate (bins of a tenth of a decade).
+    assert result.a.median_iei_us == pytest.approx(np.log(2) / 20 * 1e6, rel=0.2)
+    cdf = lambda rate: 1 - np.exp(-rate * IEI_EDGES_US * 1e-6)
+    assert result.iei_distance == pytest.approx(np.abs(cdf(20) - cdf(40)).max(), abs=0.05)
+    measured = np.cumsum(result.a.iei) / result.a.iei.sum()
+    assert np.abs(measured - cdf(20)[1:]).max() < 0.05
+    assert len(json.dumps(result.to_dict())) > 100 and "NaN" not in json.dumps(result.to_dict())
+
+
+def test_recording_with_itself_and_shifted(tmp_path):
+    pixels = np.random.default_rng(3).random((H, W)) ** 4
+    a = poisson(50, 0.4, pixels=pixels)
+    write_events(tmp_path / "a.npz", a, H, W)
+    write_events(tmp_path / "b.npz", Events(a.x, a.y, a.t + 10**9, a.p), H, W)
+    result = compare(tmp_path / "a.npz", tmp_path / "a.npz")
+    assert result.pixel_correlation == pytest.approx(1) and np.allclose(result.polarity_correlation, 1) and result.iei_distance == 0
+    with pytest.raises(EventDataError, match=r"no common time .*--zero-time"):
+        compare(tmp_path / "a.npz", tmp_path / "b.npz")
+    result = compare(tmp_path / "a.npz", tmp_path / "b.npz", zero_time=True)
+    assert result.pixel_correlation == pytest.approx(1) and np.allclose(result.polarity_correlation, 1)
+
+
+def test_polarity_sum_against_frames(tmp_path):
+    """Events made by counting thresholds of the frames' log change: correlation near 1 and the threshold comes back."""
+    rng = np.random.default_rng(0)
+    codes = np.stack([cv2.GaussianBlur(rng.random((H, W)) * 255, (0, 0), 3) for _ in range(5)])
+    codes = (codes - codes.min()) / np.ptp(codes) * 255
+    threshold, events = 0.1, []
+    base = np.log(codes[0] + 10)
+    for k in range(4):
+        n = np.rint((np.log(codes[k + 1] + 10) - base) / threshold).astype(int)
+        base += n * threshold
+        y, x = np.nonzero(n)
+        y, x, p = (np.repeat(v, np.abs(n[y, x])) for v in (y, x, n[y, x] > 0))
+        t = np.sort(rng.integers(k * 10_000, (k + 1) * 10_000, len(x)))
+        events.append(Events(x.astype(np.uint16), y.astype(np.uint16), t, p.astype(np.uint8)))
+    write_events(tmp_path / "e.h5", events, H, W)
+    np.savez(tmp_path / "f.npz", frames=(codes / 255), timestamps_us=np.arange(5) * 10_000)
+    for result in (compare(tmp_path / "e.h5", tmp_path / "f.npz"), compare(tmp_path / "e.h5", frames=tmp_path / "f.npz")):
+        assert result.b is None and len(result.a.frame_correlation) == 4
+        assert result.a.frame_correlation.min() > 0.97
+        assert np.allclose(result.a.implied_threshold, threshold, rtol=0.1)
+    plot(result, tmp_path / "p.png")
+    assert (tmp_path / "p.png").stat().st_size > 10_000
+
+
+def test_slider_depth_gives_the_figures_on_its_page():
+    """MANIFEST.md: summed polarity against log(I+10) change per interval correlates 0.82-0.88; implied threshold ~0.5-0.6."""
+    root = shared("data/events/slider_depth")
+    result = compare(root / "events_chunk.txt", root)
+    assert len(result.a.frame_correlation) == 4
+    assert result.a.frame_correlation.min() > 0.80 and result.a.frame_correlation.max() < 0.90
+    assert np.all((result.a.implied_threshold > 0.48) & (result.a.implied_threshold < 0.62))
+
+
+def test_recordings_of_different_sizes_stand_side_by_side(tmp_path, capsys):
+    """What needs the same pixels in both is left out; all else is what each says of itself."""
+    a, b = poisson(20, 0.5), poisson(20, 0.8, seed=1)
+    write_events(tmp_path / "a.h5", a, H, W)
+    write_events(tmp_path / "b.h5", Events(b.x * 3, b.y * 2, b.t, b.p), 2 * H, 3 * W)
+    result = compare(tmp_path / "a.h5", tmp_path / "b.h5", interval_ms=500)
+    assert (result.a.size, result.b.size) == ("50x40", "150x80") and not result.same_size
+    assert result.pixel_correlation is None and result.polarity_correlation is None
+    assert result.b.counts.shape == (2 * H, 3 * W) and result.b.on_off_ratio == pytest.approx(4, rel=0.05)
+    assert np.nanmean(result.rate_ratio) == pytest.approx(1, rel=0.05) and result.iei_distance < 0.05
+    assert json.loads(json.dumps(result.to_dict()))["pixel_correlation"] is None
+    assert run(["compare", str(tmp_path / "a.h5"), str(tmp_path / "b.h5"), "-o", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "150x80" in out and "KS distance" in out and "polarity sums A : B" not in out
+    assert (tmp_path / "out/compare.png").stat().st_size > 10_000
+
+
+def test_one_recording_is_described(tmp_path, capsys):
+    events = poisson(20, 0.8)
+    write_events(tmp_path / "a.h5", events, H, W)
+    result = compare(tmp_path / "a.h5")
+    assert result.b is None and result.a.count == len(events) and result.a.on_off_ratio == pytest.approx(4, rel=0.05)
+    assert run(["compare", str(tmp_path / "a.h5"), "-o", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert "50x40" in out and f"{len(events):,}" in out and (tmp_path / "out/compare.png").stat().st_size > 10_000
+
+
+def test_bad_input(tmp_path):
+    write_events(tmp_path / "a.h5", poisson(5, 0.5), H, W)
+    write_events(tmp_path / "b.h5", Events.empty(), H, W)
+    with pytest.raises(EventDataError, match="b.h5: no events"):
+        compare(tmp_path / "a.h5", tmp_path / "b.h5")
+    np.savez(tmp_path / "f.npz", frames=np.ones((3, H, W + 2)), timestamps_us=[0, 1, 2])
+    with pytest.raises(EventDataError, match=r"f\.npz: 52x40; .*a\.h5: 50x40"):
+        compare(tmp_path / "a.h5", tmp_path / "f.npz")

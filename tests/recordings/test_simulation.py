@@ -1,0 +1,288 @@
+"""Video to events: the generator, the files, the command; and everything that can be wrong with the input."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tracemalloc
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+
+import blinkgl
+from blinkgl.cli import run
+from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
+from blinkgl.events import Events, make_emulator
+from blinkgl.io.formats import open_events
+from blinkgl.io.video import VideoReader, VideoWriter
+from blinkgl.recordings.simulation import Decoder, SimulationReport, simulate, simulate_file
+from blinkgl.srgb import DECODE_8BIT
+from tests.shared_data import shared
+
+H, W = 30, 40
+
+
+def frames8(count=8, height=H, width=W, channels=()) -> np.ndarray:
+    """A bright bar wandering over a gradient, uint8."""
+    out = np.empty((count, height, width, *channels), np.uint8)
+    ramp = np.linspace(30, 120, width)
+    for i in range(count):
+        row = ramp.copy()
+        row[3 * i:3 * i + 6] = 230
+        out[i] = row.reshape(1, width, *(1,) * len(channels))
+    return out
+
+
+def same(a: Events, b: Events) -> bool:
+    return all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")
+
+
+def all_of(*args, **kw) -> Events:
+    return Events.concatenate(list(simulate(*args, **kw)))
+
+
+def test_generator_equals_the_emulator_by_hand():
+    frames = frames8()
+    config = EsimConfig(contrast_threshold=0.3)
+    emulator = make_emulator(config, H, W, 5)
+    by_hand = Events.concatenate([emulator.step(DECODE_8BIT[f], i * 10_000_000) for i, f in enumerate(frames)])
+    assert len(by_hand) > 1000
+    report = SimulationReport()
+    ours = all_of((f for f in frames), fps=100, emulator=config, seed=5, report=report)
+    assert same(ours, by_hand)
+    assert (report.frames, report.steps, report.events, report.on) == (8, 8, len(ours), int(ours.p.sum())) and report.duration_s == pytest.approx(0.07)
+    assert same(all_of([(f, i * 10_000_000) for i, f in enumerate(frames)], emulator=config, seed=5), by_hand)
+    assert same(all_of(frames[..., None], fps=100, emulator=config, seed=5), by_hand)
+    assert same(Events.concatenate(list(blinkgl.simulate(frames, fps=100, emulator=config, seed=5))), by_hand)
+
+
+def test_input_types_agree():
+    frames = frames8()
+    reference = all_of(frames, fps=100, emulator=EsimConfig(threshold_sigma=0), gamma="srgb")
+    for other in (np.repeat(frames[..., None], 3, axis=-1), frames.astype(np.uint16) * 257, frames / np.float32(255), frames / 255.0):
+        events = all_of(other, fps=100, emulator=EsimConfig(threshold_sigma=0), gamma="srgb")
+        assert abs(len(events) - len(reference)) <= 0.01 * len(reference)
+
+
+def test_luminance_of_colour_and_gamma():
+    codes = np.random.default_rng(0).integers(0, 256, (5, 6, 3)).astype(np.uint8)
+    exact = lambda curve: curve(codes / 255.0) @ np.array([0.2126, 0.7152, 0.0722])
+    srgb = lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    assert np.allclose(Decoder(None)(codes, ""), exact(srgb), atol=1e-6)
+    assert np.allclose(Decoder("linear")(codes, ""), exact(lambda x: x), atol=1e-6)
+    assert np.allclose(Decoder(2.2)(codes, ""), exact(lambda x: x**2.2), atol=1e-6)
+    real = np.random.default_rng(0).random((5, 6, 3)) * 10
+    assert np.allclose(Decoder(None)(real, ""), real @ np.array([0.2126, 0.7152, 0.0722]), rtol=1e-6), "floats are linear"
+
+
+@pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
+@pytest.mark.parametrize("interpolate", ["linear", "cubic", "motion"])
+def test_interpolations_run_and_order_events(emulator, interpolate):
+    report = SimulationReport()
+    texture = cv2.GaussianBlur(np.random.default_rng(0).random((80, 160)) * 255, (0, 0), 3)
+    frames = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    frames = np.stack([frames[:, 4 * i:4 * i + 100] for i in range(5)])
+    events = all_of(frames, fps=100, emulator=emulator, interpolate=interpolate, report=report)
+    assert len(events) and np.all(np.diff(events.t) >= 0) and events.t[-1] <= 40_000
+    assert report.frames == 5 and (report.steps == 5 if interpolate == "linear" else report.steps > 5)
+    assert (report.displacement is not None) == (interpolate == "motion")
+
+
+@pytest.mark.parametrize("frame, message", [
+    (np.full((H, W), np.nan, np.float32), r"frame 2: intensity at pixel x=0, y=0 cannot be used \(got nan\)"),
+    (np.full((H, W), -1, np.float32), "frame 2: intensity.*got -1"), (np.full((H, W), np.inf, np.float32), "frame 2: intensity.*inf"),
+    (np.ones((H, W + 1), np.float32), "frame 2: frame size changed"), (np.ones((H, W, 4), np.float32), "frame 2: not a frame"),
+    (np.ones((H, W), np.int32), "unsupported pixel type|unsupported frame type"),
+])
+@pytest.mark.parametrize("interpolate", ["linear", "cubic", "motion"])
+def test_bad_frames_are_named(frame, message, interpolate):
+    good = np.ones((H, W), np.float32)
+    with pytest.raises(EventDataError, match=message):
+        all_of([good, good * 2, frame, good], fps=10, interpolate=interpolate)
+
+
+def test_bad_streams():
+    good = np.ones((H, W), np.float32)
+    with pytest.raises(EventDataError, match="at least two frames.*0 frames"):
+        all_of([], fps=10)
+    with pytest.raises(EventDataError, match="at least two frames.*1 frame"):
+        all_of([good], fps=10)
+    with pytest.raises(EventDataError, match="frame 2: time stamps must increase"):
+        all_of([(good, 0), (good, 10), (good, 10)])
+    with pytest.raises(EventDataError, match="frames without times"):
+        all_of([good, good])
+    with pytest.raises(ConfigError, match="unknown emulator.*esim, v2e, voltmeter"):
+        simulate([good], fps=1, emulator="iebcs")
+    with pytest.raises(ConfigError, match="unknown interpolation"):
+        simulate([good], fps=1, interpolate="spline")
+    with pytest.raises(ConfigError, match="unknown transfer curve"):
+        simulate([good], fps=1, gamma="rec709")
+    with pytest.raises(ConfigError, match="esim.contrast_threshold"):
+        simulate([good], fps=1, emulator={"emulator": "esim", "contrast_threshold": 0})
+
+
+def test_zero_intensity_is_fine():
+    black = np.zeros((H, W), np.float32)
+    events = all_of([black, black + 1, black], fps=10)
+    assert np.isfinite(events.t).all() and len(events) > 2 * H * W
+
+
+def write_video(path, frames, fps=100):
+    with VideoWriter(path, *frames.shape[1:3], fps) as video:
+        for f in frames:
+            video.write(np.repeat(f[..., None], 3, axis=-1))
+
+
+@pytest.mark.parametrize("ending", [".h5", ".raw", ".txt", ".csv", ".npz", ".npy", ".aedat4"])
+def test_video_to_every_format(tmp_path, ending):
+    if ending == ".aedat4":
+        pytest.importorskip("dv_processing", reason="optional extra [formats]")
+    write_video(tmp_path / "v.mp4", frames8(10))
+    expected = Events.concatenate(list(simulate(VideoReader(tmp_path / "v.mp4"), fps=100)))
+    report = simulate_file(tmp_path / "v.mp4", tmp_path / f"e{ending}", preview=tmp_path / "p.mp4")
+    assert report.events == len(expected) > 1000 and report.frames == 10
+    assert same(open_events(tmp_path / f"e{ending}").read(), expected)
+    assert len(list(VideoReader(tmp_path / "p.mp4"))) >= 9
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["v.mp4", f"e{ending}", "p.mp4"])
+
+
+def test_dsec_output_covers_the_video(tmp_path):
+    folder = tmp_path / "f"
+    folder.mkdir()
+    for i, f in enumerate([*frames8(4), *[frames8(4)[-1]] * 3]):
+        cv2.imwrite(str(folder / f"{i}.png"), f)
+    start = 1_600_000_000_000_000
+    (folder / "timestamps.txt").write_text("\n".join(str(start + 10_000 * i) for i in range(7)))
+    simulate_file(folder, tmp_path / "e.h5")
+    with h5py.File(tmp_path / "e.h5") as file:
+        assert file["t_offset"][()] == start and len(file["ms_to_idx"]) == 61, "the still end is covered, too"
+
+
+def truncated_video(tmp_path):
+    rng = np.random.default_rng(0)
+    write_video(tmp_path / "v.mp4", rng.integers(0, 255, (30, 96, 128)).astype(np.uint8))
+    data = (tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "v.mp4").write_bytes(data[: len(data) // 2])
+
+
+def test_bad_input_leaves_no_output(tmp_path):
+    truncated_video(tmp_path)
+    with pytest.raises(AssetError, match="v.mp4: video truncated or corrupt after frame"):
+        simulate_file(tmp_path / "v.mp4", tmp_path / "e.h5", preview=tmp_path / "p.mp4")
+    np.save(tmp_path / "f.npy", np.array([np.ones((H, W)), np.full((H, W), np.nan)]))
+    with pytest.raises(EventDataError, match=r"f.npy: frame 1 \(#1\): intensity"):
+        simulate_file(tmp_path / "f.npy", tmp_path / "e.h5", fps=10)
+    with pytest.raises(OutputError, match="unknown event file ending"):
+        simulate_file(tmp_path / "f.npy", tmp_path / "e.xyz", fps=10)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["f.npy", "v.mp4"]
+
+
+def test_full_disk_leaves_no_output(tmp_path):
+    if os.geteuid() != 0 or not shutil.which("mount"):
+        pytest.skip("needs root and mount(8) for a size-limited tmpfs")
+    small = tmp_path / "small"
+    small.mkdir()
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", small], capture_output=True).returncode:
+        pytest.skip("this container does not allow mounting a tmpfs")
+    try:
+        noise = np.random.default_rng(0).random((12, 240, 320), dtype=np.float32)
+        np.save(tmp_path / "f.npy", noise)
+        for name in ("e.h5", "e.raw", "e.txt", "e.npy"):
+            with pytest.raises(OutputError, match=f"{name}: cannot write: no space left on the device"):
+                simulate_file(tmp_path / "f.npy", small / name, fps=100)
+            assert list(small.iterdir()) == []
+    finally:
+        subprocess.run(["umount", "-l", small], check=True)
+
+
+def test_memory_does_not_grow_with_the_clip():
+    def peak(count: int) -> int:
+        frames = frames8(12)
+        tracemalloc.start()
+        for _ in simulate((frames[i % 12] for i in range(count)), fps=100):
+            pass
+        size = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return size
+    peak(20)
+    assert peak(400) < 1.2 * peak(40) + 100_000
+
+
+def test_commands(tmp_path, capsys):
+    write_video(tmp_path / "v.mp4", frames8(10))
+    out = str(tmp_path / "e.h5")
+    assert run(["simulate", str(tmp_path / "v.mp4"), "--out", out, "-e", "v2e", "--set", "preset=clean", "--interpolate", "motion"]) == 0
+    said = capsys.readouterr().out
+    assert "from 10 frames" in said and "interpolated by dense-flow warp, not recorded" in said
+    assert run(["simulate", str(tmp_path / "v.mp4"), "--out", out]) == 2
+    assert "output file exists; expected a new name, or --overwrite" in capsys.readouterr().err
+    (tmp_path / "c.yaml").write_text("emulator: v2e\ncontrast_threshold: 1e-1\n")
+    assert run(["simulate", str(tmp_path / "v.mp4"), "--out", out, "--config", str(tmp_path / "c.yaml"), "--overwrite", "-q"]) == 0
+    expected = Events.concatenate(list(simulate(VideoReader(tmp_path / "v.mp4"), fps=100, emulator=V2eConfig(contrast_threshold=0.1))))
+    assert capsys.readouterr().out == "" and same(open_events(out).read(), expected)
+    assert run(["convert", out, str(tmp_path / "e.raw"), "--format", "evt2"]) == 0
+    assert "40x30, from dsec" in capsys.readouterr().out
+    assert run(["compare", out, str(tmp_path / "e.raw"), "--interval-ms", "10", "-o", str(tmp_path / "c")]) == 0
+    said = capsys.readouterr().out
+    assert "event counts per pixel" in said and (tmp_path / "c" / "compare.png").stat().st_size > 10_000
+    for arguments in (["--set", "contrast"], ["--config", str(tmp_path / "none.yaml")], ["--set", "contrast_treshold=1"], ["--gamma", "x"]):
+        assert run(["simulate", str(tmp_path / "v.mp4"), "--out", str(tmp_path / "n.h5"), *arguments]) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: ") and error.count("\n") == 1
+    assert run(["convert", out, str(tmp_path / "n.raw"), "--size", "3by4"]) == 2
+    assert not (tmp_path / "n.h5").exists() and not (tmp_path / "n.raw").exists()
+
+
+def test_real_frames_against_the_real_recording():
+    """The signs and places of the simulated events are the recording's: correlation of polarity sums, per frame interval."""
+    from blinkgl.recordings.comparison import compare
+    root = shared("data/events/slider_depth")
+    import tempfile
+    with tempfile.TemporaryDirectory() as folder:
+        simulate_file(root, f"{folder}/e.h5", gamma="linear", interpolate="motion",
+                      emulator=EsimConfig(contrast_threshold=0.5, log_eps=10 / 255))
+        result = compare(root / "events_chunk.txt", f"{folder}/e.h5", frames=root)
+    assert len(result.edges_us) == 5 and result.polarity_correlation.min() > 0.8
+    assert 0.7 < np.nanmean(result.rate_ratio) < 1.1 and result.pixel_correlation > 0.75
+
+
+def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
+    """The DAVIS346's bus carries 12 M events/s: a strobing clip makes more, and what does not fit is lost and counted."""
+    from blinkgl.config.sensor import load_sensor
+    from blinkgl.show.simulate import emulator_options
+
+    options = emulator_options("v2e", None, ["contrast_threshold=0.3"], "davis346")
+    assert options["emulator"].refractory_us == 500 and options["emulator"].contrast_threshold == 0.3
+    assert options["readout"] == load_sensor("davis346").readout
+    strobe = [np.full((120, 160), 0.1 if k % 2 else 1.0, np.float32) for k in range(20)]
+    report = SimulationReport()
+    kept = all_of(strobe, fps=2000, emulator=EsimConfig(), readout=options["readout"], report=report)
+    free = all_of(strobe, fps=2000, emulator=EsimConfig())
+    assert report.lost > 0 < report.late and len(kept) + report.lost + report.late == len(free)
+    assert len(kept) <= 12e6 * 19 / 2000 + 1 and kept.t[-1] <= report.last_ns // 1000
+    np.save(tmp_path / "strobe.npy", np.stack(strobe))
+    command = ["simulate", str(tmp_path / "strobe.npy"), "--fps", "2000", "--sensor", "DAVIS 346", "--set", "refractory_us=0",
+               "--out", str(tmp_path / "e.h5")]
+    assert run(command) == 0 and "lost in the sensor's read-out" in capsys.readouterr().out
+    assert run([*command[:-1], str(tmp_path / "f.h5"), "--sensor", "kodak"]) == 2
+    assert "unknown sensor" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text, overrides, message", [
+    ("{1: 2}", [], "esim: a key is not text"), ("emulator: [esim]", [], "emulator: unknown emulator"), ("emulator: {a: 1}", [], "emulator: unknown emulator"),
+    ("- 1", [], "not a table of keys .got .1..; expected emulator parameters"), ("contrast_threshold: [", [], "not valid YAML"),
+    ("", ["preset=[]"], "esim.preset: unknown key"), ("", ["emulator=v2e", "preset=[]"], "v2e.preset: unknown choice"),
+    ("", ["contrast_threshold={"], "--set contrast_threshold.*not valid YAML"), ("", ["emulator=v2e", "contrast_threshold=many"], "not a number"),
+])
+@pytest.mark.parametrize("sensor", [None, "davis346"])
+def test_emulator_parameters_that_cannot_be_used(tmp_path, text, overrides, message, sensor):
+    from blinkgl.recordings.simulation import emulator_config
+    from blinkgl.show.simulate import emulator_options
+
+    (tmp_path / "e.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        emulator_config(emulator_options("esim", str(tmp_path / "e.yaml"), overrides, sensor)["emulator"])

@@ -1,0 +1,191 @@
+"""Random trajectories: what was configured is what they do."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.base import validate
+from blinkgl.config.trajectory import CameraMotion, ObjectMotion
+from blinkgl.errors import ConfigError
+from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path, statistics
+
+SECOND = 1_000_000_000
+SPACE = FreeSpace((-4, -4, 0), (4, 4, 3), 0.0, [[0, 0, 0.5], [2, 2, 0.5], [-2, 1, 1]], [0.5, 0.6, 0.4])
+TARGET = np.array([0.0, 0.0, 0.5])
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def placed(x, y, z):
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", [0.4, 0.2, 1.0]).as_matrix(), [x, y, z]
+    return T
+
+
+@pytest.mark.parametrize("speed, rate, duration", [(1.0, 90.0, SECOND), (0.05, 5.0, SECOND), (8.0, 1500.0, SECOND), (1.0, 40.0, 20 * SECOND)])
+def test_mean_speed_and_rate_are_the_configured_ones(speed, rate, duration):
+    config = ObjectMotion(speed=speed, rotation_rate=rate)
+    for seed in range(4):
+        path = random_path(rng(seed), 0, duration, config, SPACE, 0.2)
+        got = statistics(path, 0, duration, samples=2000)
+        assert got.mean_speed == pytest.approx(speed, rel=5e-3)
+        assert math.degrees(got.mean_rate) == pytest.approx(rate, rel=5e-3)
+        assert got.mean_speed <= got.peak_speed < 5 * speed and got.mean_rate <= got.peak_rate < 4 * got.mean_rate
+        assert path.t0_ns == 0 and path.t1_ns >= duration - 1
+
+
+def test_ranges_are_drawn_per_body():
+    config = ObjectMotion(speed=[0.5, 2.0], rotation_rate=[30, 90])
+    found = [statistics(random_path(rng(s), 0, SECOND, config, SPACE, 0.1), 0, SECOND, 200) for s in range(12)]
+    speeds = np.array([f.mean_speed for f in found])
+    assert speeds.min() > 0.49 and speeds.max() < 2.02 and np.ptp(speeds) > 0.5
+
+
+def test_waypoints_and_curve_lie_in_free_space():
+    config = ObjectMotion(speed=3.0, waypoints=8)
+    inside = 0
+    for seed in range(20):
+        path = random_path(rng(seed), 0, 2 * SECOND, config, SPACE, 0.3)
+        keys = path.poses(path.key_times_ns)[:, :3, 3]
+        # Way-points: all; refined keys lie on the curve, which is checked below.
+        assert SPACE.depth(keys, 0.3).max() < 0.2
+        inside += SPACE.depth(path.poses(np.linspace(0, 2 * SECOND, 300).astype(np.int64))[:, :3, 3], 0.3).max() <= 1e-3
+    assert inside >= 17
+
+
+def test_the_start_pose_is_kept_exactly_and_hemmed_in_bodies_get_out():
+    start = placed(0.05, 0.0, 0.6)  # inside the first obstacle's bounding sphere
+    for seed in range(5):
+        path = random_path(rng(seed), 7, SECOND, ObjectMotion(speed=1.0), SPACE, 0.2, start)
+        assert np.abs(path.pose(7) - start).max() < 1e-14
+        distance = np.linalg.norm(path.poses(np.linspace(7, SECOND, 50).astype(np.int64))[:, :3, 3] - SPACE.centres[0], axis=1)
+        assert distance.max() > 0.5
+    camera = random_camera_path(rng(1), 7, SECOND, CameraMotion(shake=1.0), SPACE, 0.1, TARGET, start_pose=start)
+    assert np.abs(camera.pose(7) - start).max() < 1e-14
+
+
+def test_on_the_ground_it_slides_and_turns_about_the_vertical():
+    start = placed(2.0, -2.0, 0.21)
+    path = random_path(rng(3), 0, SECOND, ObjectMotion(speed=1.0, rotation_rate=90), SPACE, 0.3, start, on_ground=True)
+    T = path.poses(np.linspace(0, SECOND, 200).astype(np.int64))
+    assert np.ptp(T[:, 2, 3]) < 1e-14
+    # The world's vertical stays where it was in the body's frame: pure yaw.
+    assert np.abs(T[:, 2, :3] - start[2, :3]).max() < 1e-12
+    got = statistics(path, 0, SECOND)
+    assert got.mean_speed == pytest.approx(1.0, rel=5e-3) and math.degrees(got.mean_rate) == pytest.approx(90, rel=5e-3)
+
+
+def test_the_camera_keeps_its_target_in_view():
+    config = CameraMotion(speed=1.0, rotation_rate=45.0, view_cone=15.0, roll=10.0)
+    space = FreeSpace((-4, -4, 0), (4, 4, 3), 0.0, [TARGET], [1.5])
+    for seed in range(12):
+        path = random_camera_path(rng(seed), 0, SECOND, config, space, 0.2, TARGET)
+        T = path.poses(np.linspace(0, SECOND, 100).astype(np.int64))
+        aim = TARGET - T[:, :3, 3]
+        cosine = np.einsum("ij,ij->i", aim / np.linalg.norm(aim, axis=1, keepdims=True), T[:, :3, 2])
+        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 30
+        assert np.degrees(np.arcsin(np.abs(T[:, 2, 0]))).max() < 25
+        assert (T[:, 2, 1] < 0).all()  # image down is world down
+        assert statistics(path, 0, SECOND).mean_speed == pytest.approx(1.0, rel=5e-3)
+
+
+def test_the_cameras_first_horizon_is_within_half_the_roll():
+    config = CameraMotion(speed=1.0, rotation_rate=45.0, roll=40.0)
+    space = FreeSpace((-4, -4, 0), (4, 4, 3), 0.0, [TARGET], [1.5])
+    rolls = []
+    for seed in range(60):
+        R = random_camera_path(rng(seed), 0, SECOND, config, space, 0.2, TARGET).pose(0)[:3, :3]
+        level = look_rotation(R[:, 2])  # the same direction of view with a level horizon
+        rolls.append(math.degrees(math.atan2(*(level.T @ R)[:2, 0][::-1])))
+    assert 17 < max(map(abs, rolls)) <= 20.001 and min(rolls) < -10 and max(rolls) > 10
+
+
+def test_the_camera_follows_a_moving_target():
+    # The target passes at 3 units/s, 4 units away: about 40 deg/s are needed.
+    target = SplinePath([0, SECOND], [[-1.5, 0, 1], [1.5, 0, 1]], Rotation.identity(2))
+    start = np.eye(4)
+    start[:3, :3], start[:3, 3] = look_rotation([-1.5, 4, 0]), [0, -4, 1]
+    config = CameraMotion(speed=0.1, rotation_rate=80.0, view_cone=10.0, waypoints=12)
+    for seed in range(4):
+        path = random_camera_path(rng(seed), 0, SECOND, config, FreeSpace((-9, -9, 0), (9, 9, 9)), 0.1, target, start)
+        for t in range(0, SECOND, SECOND // 20):
+            aim = target.pose(t)[:3, 3] - path.pose(t)[:3, 3]
+            assert aim @ path.pose(t)[:3, 2] > np.cos(np.radians(22)) * np.linalg.norm(aim)
+
+
+def test_shake_adds_high_frequencies_only_to_the_rotation():
+    calm = CameraMotion(speed=1.0, rotation_rate=20.0)
+    shaky = calm.model_copy(update={"shake": 1.0, "shake_rate": 30.0})
+    a, b = (random_camera_path(rng(5), 0, SECOND, c, SPACE, 0.1, TARGET) for c in (calm, shaky))
+    times = np.linspace(0, SECOND, 400).astype(np.int64)
+    A, B = a.poses(times), b.poses(times)
+    assert np.abs(A[:, :3, 3] - B[:, :3, 3]).max() < 1e-9  # the curve is the same
+    angle = Rotation.from_matrix(A[:, :3, :3].transpose(0, 2, 1) @ B[:, :3, :3]).magnitude()
+    assert 0.5 < np.degrees(np.sqrt((angle**2).mean())) < 3.5
+    assert statistics(b, 0, SECOND).mean_rate > 2 * statistics(a, 0, SECOND).mean_rate
+
+
+def test_the_same_generator_gives_the_same_path_and_another_a_different_one():
+    def make(seed):
+        return random_path(rng(seed), 0, SECOND, ObjectMotion(), SPACE, 0.2).poses(np.arange(0, SECOND, 10**7))
+
+    assert np.array_equal(make(1), make(1)) and not np.allclose(make(1), make(2))
+
+
+def test_precision_does_not_depend_on_when_it_starts():
+    late = 1_000_000 * SECOND
+    a = random_path(rng(4), 0, SECOND, ObjectMotion(), SPACE, 0.2)
+    b = random_path(rng(4), late, late + SECOND, ObjectMotion(), SPACE, 0.2)
+    times = np.arange(0, SECOND, 10**7)
+    assert np.array_equal(a.poses(times), b.poses(times + late))
+
+
+def test_standing_still():
+    still = ObjectMotion(kind="static")
+    assert isinstance(random_path(rng(), 0, SECOND, still, SPACE, 0.2), StaticPath)
+    assert random_path(rng(), 0, SECOND, ObjectMotion(speed=0, rotation_rate=0), SPACE, 0.2).is_static
+    spin = random_path(rng(), 0, SECOND, ObjectMotion(speed=0, rotation_rate=50), SPACE, 0.2)
+    assert statistics(spin, 0, SECOND).peak_speed < 1e-9 and not spin.is_static
+    glide = random_path(rng(), 0, SECOND, ObjectMotion(speed=1, rotation_rate=0), SPACE, 0.2)
+    assert statistics(glide, 0, SECOND).peak_rate < 1e-9
+    share = [random_path(rng(s), 0, SECOND, ObjectMotion(static_share=0.5), SPACE, 0.2).is_static for s in range(60)]
+    assert 15 <= sum(share) <= 45  # binomial(60, 1/2): outside with probability 1e-4
+    assert random_camera_path(rng(), 0, SECOND, CameraMotion(kind="static"), SPACE, 0.2, TARGET).is_static
+
+
+def test_look_rotation_is_a_rotation_with_a_level_horizon():
+    for direction in ([1, 0, 0], [0.3, -2, 1], [0, 0, -1], [0, 0, 1], [0, 0, 0]):
+        R = look_rotation(direction)
+        assert np.allclose(R @ R.T, np.eye(3), atol=1e-14) and np.isclose(np.linalg.det(R), 1)
+        assert abs(R[2, 0]) < 1e-14
+        if np.any(direction):
+            assert np.allclose(R[:, 2], np.array(direction) / np.linalg.norm(direction))
+
+
+def test_no_free_space_is_said():
+    with pytest.raises(ConfigError, match="no free space for a body of radius 5.*fewer or smaller objects"):
+        random_path(rng(), 0, SECOND, ObjectMotion(), SPACE, 5.0)
+
+
+@pytest.mark.parametrize("data, message", [
+    ({"speeed": 1}, r"scene.object_motion.speeed: unknown key; expected 'speed'"),
+    ({"speed": [2, 1]}, r"scene.object_motion.speed: .*lower end"),
+    ({"speed": -1}, r"scene.object_motion.speed.0: too small \(got -1\); expected a number from 0 to"),
+    ({"speed": "fast"}, r"scene.object_motion.speed"),
+    ({"waypoints": 1}, r"scene.object_motion.waypoints: too small \(got 1\); expected a whole number from 2 to 1000"),
+    ({"smoothness": 1.5}, r"scene.object_motion.smoothness"),
+    ({"kind": "circle"}, r"scene.object_motion.kind.*'spline' or 'static'"),
+])
+def test_bad_settings_are_named(data, message):
+    with pytest.raises(ConfigError, match=message):
+        validate(ObjectMotion, data, where="scene.object_motion")
+
+
+def test_numbers_written_as_text_and_single_numbers_are_taken():
+    config = validate(ObjectMotion, {"speed": "1e-1", "rotation_rate": [10, "2e1"]})
+    assert config.speed == (0.1, 0.1) and config.rotation_rate == (10.0, 20.0)

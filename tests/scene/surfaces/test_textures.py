@@ -1,0 +1,208 @@
+"""Procedural textures and image files."""
+
+import io
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from blinkgl.config.scene import TEXTURE_KINDS
+from blinkgl.errors import AssetError
+from blinkgl.scene.surfaces import images as I
+from blinkgl.scene.surfaces.textures import procedural_hash, procedural_texture
+from blinkgl.srgb import linear_from_srgb, srgb_from_linear
+from tests.shared_data import shared
+
+
+@pytest.mark.parametrize("kind", TEXTURE_KINDS)
+def test_procedural(kind):
+    for index in range(6):
+        texture = procedural_texture(kind, index, 128)
+        again = procedural_texture(kind, index, 128)
+        assert texture.image.shape == (128, 128, 3) and texture.image.dtype == np.uint8
+        assert texture.image.tobytes() == again.image.tobytes() and texture.source_hash == procedural_hash(kind, index)
+        assert texture.image.min() >= 15 and texture.image.max() <= 245      # never black, never clipped
+        assert (texture.image @ np.array([0.299, 0.587, 0.114])).std() > 5
+    assert procedural_texture(kind, 0, 128).image.tobytes() != procedural_texture(kind, 1, 128).image.tobytes()
+
+
+@pytest.mark.parametrize("kind", ["value", "perlin", "fbm", "gradient"])
+def test_smooth_kinds_tile(kind):
+    """Across the wrapped edge neighbours differ no more than inside."""
+    for index in range(4):
+        image = procedural_texture(kind, index, 128).image.astype(float)
+        inside = max(np.abs(np.diff(image, axis=a)).max() for a in (0, 1))
+        assert np.abs(image[0] - image[-1]).max() <= 1.5 * inside + 2
+        assert np.abs(image[:, 0] - image[:, -1]).max() <= 1.5 * inside + 2
+
+
+@pytest.mark.parametrize("kind", TEXTURE_KINDS)
+def test_a_texture_is_the_same_pattern_at_any_size(kind):
+    small, large = (procedural_texture(kind, 3, n).image.astype(float) for n in (128, 512))
+    reduced = cv2.resize(large, (128, 128), interpolation=cv2.INTER_AREA)
+    assert np.corrcoef(small.ravel(), reduced.ravel())[0, 1] > 0.85
+    assert procedural_texture(kind, 3, 8).image.shape == (8, 8, 3)
+
+
+def test_srgb_round_trip():
+    codes = np.arange(256) / 255
+    np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(codes)), codes, atol=1e-5)
+    assert linear_from_srgb(0.5) == pytest.approx(0.21404, abs=1e-5)      # IEC 61966-2-1
+
+
+def test_shrinking_averages_light_not_codes():
+    board = np.zeros((64, 64, 3), np.uint8)
+    board[::2, ::2] = board[1::2, 1::2] = 255
+    assert (I.shrink(board, 32) == 188).all()      # half the light is code 188, not 128
+
+
+def write_image(path, mode="RGB", size=(8, 6), **options):
+    Image.fromarray((np.arange(size[0] * size[1] * 3) % 255).astype(np.uint8).reshape(size[1], size[0], 3)).convert(mode).save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P", "1"])
+def test_modes(tmp_path, mode):
+    image = I.load_image(write_image(tmp_path / "a.png", mode))
+    assert image.shape == (6, 8, 3) and image.dtype == np.uint8
+
+
+def test_sixteen_bit_grey(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.full((4, 4), 32768, np.uint16))
+    assert (I.load_image(tmp_path / "a.png") == 127).all() or (I.load_image(tmp_path / "a.png") == 128).all()
+
+
+def test_exif_orientation_is_applied(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6      # to be turned a quarter
+    write_image(tmp_path / "a.jpg", exif=exif)
+    assert I.load_image(tmp_path / "a.jpg").shape == (8, 6, 3)
+
+
+def test_hdr_is_linear_and_bounded():
+    image = I.load_image(shared("data/assets/hdri/park.hdr"))
+    assert image.dtype == np.float32 and image.shape == (512, 1024, 3) and image.min() >= 0 and image.max() <= I.HDR_WHITE
+    assert np.percentile(image.max(axis=2), 90) == pytest.approx(0.8, rel=1e-3)
+
+
+def test_cube_faces_look_where_they_should():
+    """A panorama that stores the viewing direction comes back as the directions of the six sides."""
+    h, w = 256, 512
+    longitude = ((np.arange(w) + 0.5) / w - 0.5) * 2 * np.pi
+    latitude = (0.5 - (np.arange(h) + 0.5) / h) * np.pi
+    direction = np.stack([np.cos(latitude)[:, None] * np.cos(longitude), -np.cos(latitude)[:, None] * np.sin(longitude),
+                          np.repeat(np.sin(latitude)[:, None], w, axis=1)], axis=2).astype(np.float32)
+    s = (np.arange(32) + 0.5) / 32 * 2 - 1
+    right, down = np.meshgrid(s, s)
+    for face, (forward, to_right, to_down) in zip(I.cube_faces(direction, 32), I.SKY_SIDES):
+        ray = forward + right[..., None] * to_right + down[..., None] * to_down
+        ray /= np.linalg.norm(ray, axis=2, keepdims=True)
+        assert np.abs(face - ray).max() < 0.02
+        assert np.cross(to_right, to_down) == pytest.approx(forward)      # not mirrored for the viewer inside
+
+
+def png(**options) -> bytes:
+    stream = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)).save(stream, **options)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("data, problem", [
+    (b"", "corrupt or of an unknown format"),
+    (b"not an image at all", "corrupt or of an unknown format"),
+    (png(format="PNG")[:2000], "corrupt or of an unknown format"),
+    (png(format="JPEG")[:1500], "corrupt or of an unknown format"),
+    (png(format="PNG").replace(b"IDAT", b"JDAT"), "corrupt or of an unknown format"),
+    (b"#?RADIANCE\n\n-Y 90000 +X 90000\n", "too large (got '90000x90000')"),
+    (b"#?RADIANCE\n\n-Y 16 +X 16\nshort", "corrupt"),
+    (b"#?RADIANCE\nno size", "corrupt (no size"),
+])
+def test_bad_images_are_named(tmp_path, data, problem, capfd):
+    path = tmp_path / "picture.jpg"
+    path.write_bytes(data)
+    with pytest.raises(AssetError) as error:
+        I.load_image(path)
+    assert str(error.value).startswith(str(path)) and problem in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_huge_claim_is_refused_before_decoding(tmp_path):
+    data = bytearray(png(format="PNG"))
+    data[16:24] = (200_000).to_bytes(4, "big") * 2      # IHDR width and height
+    import zlib
+    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
+    (tmp_path / "a.png").write_bytes(bytes(data))
+    with pytest.raises(AssetError, match="too large|corrupt"):
+        I.load_image(tmp_path / "a.png")
+
+
+def large_png(width: int, height: int) -> bytes:
+    """A black 1-bit PNG of any size in a few kB, made without an image in memory."""
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    packer, row = zlib.compressobj(9), b"\0" * (1 + (width + 7) // 8)
+    data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR",
+                                        struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)) + chunk(b"IDAT",
+                                                                                                       data) + chunk(b"IEND", b"")
+
+
+def test_pillows_guard_is_not_ours_and_stays_as_it_is(monkeypatch):
+    """Images within our own limit load however low the process has set Pillow's, and nobody's setting is changed."""
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    image = I.decode_image(large_png(301, 200), 100, "a.png")
+    assert image.shape == (66, 100, 3) and Image.MAX_IMAGE_PIXELS == 1000
+    with pytest.raises(Image.DecompressionBombError):
+        Image.open(io.BytesIO(large_png(301, 200)))
+
+
+@pytest.mark.slow
+def test_the_largest_image_that_is_documented_loads():
+    assert I.decode_image(large_png(16384, 16384), 64, "a.png").shape == (64, 64, 3)
+
+
+@pytest.mark.parametrize("width, height", [(60_000, 60_000), (16_384, 16_385), (2_000_000, 1)])
+def test_a_claim_beyond_the_limit_names_size_and_limit(width, height):
+    data = large_png(8, 8)
+    data = data[:16] + width.to_bytes(4, "big") + height.to_bytes(4, "big") + data[24:]
+    import zlib
+    data = data[:29] + zlib.crc32(data[12:29]).to_bytes(4, "big") + data[33:]
+    with pytest.raises(AssetError) as error:
+        I.decode_image(data, 64, "a.png")
+    assert str(error.value) == f"a.png: the image is too large (got '{width}x{height}'); expected at most 268 Mpx, as 16384x16384 has"
+
+
+def test_shrinking_in_blocks_is_shrinking_at_once(monkeypatch):
+    image = np.random.default_rng(0).integers(0, 256, (301, 217, 3), dtype=np.uint8)
+    for max_size in (300, 128, 7):
+        whole = I.shrink(image, max_size)
+        monkeypatch.setattr(I, "_BLOCK_PIXELS", 2000)
+        assert len(I._blocks(301, 217)) > 10
+        assert np.abs(I.shrink(image,
+                               max_size).astype(int) - whole).max() <= 1      # the float32 sums differ in their last bit
+        monkeypatch.undo()
+        linear = linear_from_srgb(image / 255.0).astype(np.float32)
+        reference = cv2.resize(linear, whole.shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(linear_from_srgb(whole / 255.0) - reference).max() < 6e-3       # half a code, at its widest
+
+
+def test_no_other_program_is_run_for_a_texture():
+    """Pillow hands EPS to Ghostscript: it is none of a texture's formats, whatever its name."""
+    with pytest.raises(AssetError, match="corrupt or of an unknown format; expected one of PNG, JPEG"):
+        I.decode_image(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n%%EndComments\n", 64, "a.png")
+
+
+def test_missing_image(tmp_path):
+    with pytest.raises(AssetError, match="cannot read the image: No such file"):
+        I.load_image(tmp_path / "none.png")
+
+
+def test_photographs_are_bundled_ones():
+    found = I.photographs()
+    if not found:
+        pytest.skip("scikit-image is not installed")
+    assert "astronaut" in found and all(p.is_file() for p in found.values())

@@ -1,0 +1,319 @@
+"""Pools: splits by content, order, caching, sources, and what is refused."""
+
+import shutil
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from blinkgl.config.scene import PoolConfig, TexturesConfig
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.scene.worlds.pool import object_pool, split_of, texture_pool
+from tests.scene.gltf_files import GltfBuilder, triangle
+from tests.shared_data import shared
+
+NOTHING = dict(primitives=(), urdfs=False)
+
+
+def box(path, seed=0):
+    rng = np.random.default_rng(seed)
+    trimesh.creation.box(extents=rng.uniform(0.5, 2, 3)).export(path)
+    return path
+
+
+def test_split_is_a_fraction_of_hashes():
+    rng = np.random.default_rng(0)
+    hashes = [rng.bytes(16).hex() for _ in range(20_000)]
+    tests = [h for h in hashes if split_of(h, 0.1) == "test"]
+    assert abs(len(tests) - 2000) < 4 * np.sqrt(20_000 * 0.1 * 0.9)
+    assert set(tests) <= {h for h in hashes if split_of(h, 0.2) == "test"}      # a larger fraction only adds
+    assert all(split_of(h, 0.0) == "train" and split_of(h, 1.0) == "test" for h in hashes[:100])
+
+
+def test_splits_are_disjoint_and_complete():
+    for pool in (object_pool(PoolConfig(), "."), texture_pool(TexturesConfig(), ".")):
+        sides = {s: {e.source_hash for group in pool.split(s).values() for e in group} for s in ("train", "test")}
+        assert not sides["train"] & sides["test"]
+        assert sides["train"] | sides["test"] == {e.source_hash for e in pool.entries}
+        assert 0.03 < len(sides["test"]) / len(pool.entries) < 0.2
+
+
+def test_generated_content_differs_between_splits():
+    """Not only the hashes: no shape of one split is a shape of the other."""
+    pool = object_pool(PoolConfig(primitives=("sphere", "icosphere", "prism"), test_fraction=0.5), ".")
+    shapes = {s: {np.round(pool.load(e).parts[0].mesh.vertices, 9).tobytes() for g in pool.split(s).values() for e in g} for s in ("train", "test")}
+    assert shapes["train"] and shapes["test"] and not shapes["train"] & shapes["test"]
+
+
+def test_same_content_under_two_names_is_one_entry_on_one_side(tmp_path):
+    for k in range(8):
+        box(tmp_path / f"{k}.ply", k)
+    pool = object_pool(PoolConfig(folders=(str(tmp_path),), test_fraction=0.4, **NOTHING), ".")
+    before = {e.source_hash: split_of(e.source_hash, 0.4) for e in pool.entries}
+    other = tmp_path / "other"
+    (other / "deep").mkdir(parents=True)
+    for k in range(8):
+        shutil.copy(tmp_path / f"{k}.ply", other / "deep" / f"z{9 - k}.ply")
+        shutil.copy(tmp_path / f"{k}.ply", other / f"a{k}.ply")
+    box(other / "new.ply", 99)
+    again = object_pool(PoolConfig(folders=("other",), test_fraction=0.4, **NOTHING), tmp_path)
+    assert len(again.entries) == 9
+    assert {e.source_hash: split_of(e.source_hash, 0.4) for e in again.entries}.items() >= before.items()
+    assert [e.source_hash for e in again.entries] == sorted(e.source_hash for e in again.entries)
+
+
+def test_gltf_with_another_buffer_is_another_mesh(tmp_path):
+    hashes = set()
+    for k in (1, 2):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        builder = GltfBuilder()
+        builder.node(mesh=builder.mesh(np.eye(3) * k, [[0, 1, 2]]))
+        path = builder.gltf(folder)
+        hashes.add(object_pool(PoolConfig(folders=(str(folder),), **NOTHING), ".").entries[0].source_hash)
+    assert len(hashes) == 2 and (tmp_path / "1" / "scene.gltf").read_text() == path.read_text()
+
+
+def test_sources_have_equal_chances(tmp_path):
+    Image.new("RGB", (8, 8), (200, 100, 50)).save(tmp_path / "one.png")
+    pool = texture_pool(TexturesConfig(photographs=False, folders=(str(tmp_path),), test_fraction=0, max_size=8), ".")
+    rng = np.random.default_rng(0)
+    drawn = [pool.draw(rng, "train").name for _ in range(400)]
+    assert abs(drawn.count("one.png") - 200) < 4 * 10
+
+
+def test_cache_keeps_identity_and_stays_bounded():
+    pool = texture_pool(TexturesConfig(photographs=False, max_size=8), ".")
+    pool.cache_bytes = 5 * 8 * 8 * 3
+    first = pool.load(pool.entries[0])
+    assert pool.load(pool.entries[0]) is first
+    for entry in pool.entries[:20]:
+        pool.load(entry)
+    assert len(pool._cache) == 5 and pool.load(pool.entries[0]) is not first
+
+
+def test_loaded_objects_are_normalised():
+    pool = object_pool(PoolConfig(folders=(str(shared("data/assets/models_cc0")),), **NOTHING), ".")
+    for entry in pool.entries[:12]:
+        (part,) = pool.load(entry).parts
+        assert part.mesh.radius == pytest.approx(1, abs=1e-9)
+        np.testing.assert_allclose(part.mesh.vertices.min(axis=0), -part.mesh.vertices.max(axis=0), atol=1e-9)
+        assert part.mesh.source_hash == entry.source_hash
+
+
+def test_all_real_models_load_both_ways():
+    for keep in (False, True):
+        pool = object_pool(PoolConfig(folders=(str(shared("data/assets/models_cc0")),), keep_materials=keep, **NOTHING), ".")
+        assert len(pool.entries) == 81
+        for entry in pool.entries:
+            asset = pool.load(entry)
+            assert asset.parts and all(np.isfinite(p.mesh.uvs).all() and np.abs(np.linalg.norm(p.mesh.normals, axis=1) - 1).max() < 1e-5 for p in asset.parts)
+            assert len(asset.parts) == 1 or keep
+
+
+def test_random_urdfs():
+    pytest.importorskip("pybullet_data", reason="pybullet is not installed")
+    pool = object_pool(PoolConfig(primitives=(), urdfs=True), ".")
+    assert len(pool.entries) == 1000
+    mesh = pool.load(pool.entries[0]).parts[0].mesh
+    assert mesh.closed and mesh.uvs.min() >= 0 and mesh.uvs.max() <= 1
+
+
+def config_error(make):
+    with pytest.raises((ConfigError, AssetError)) as error:
+        make()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_missing_folders_and_empty_pools(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "empty").mkdir()
+    folders = lambda *f, **more: config_error(lambda: object_pool(PoolConfig(folders=f, **NOTHING, **more), tmp_path))
+    assert folders("nowhere") == "scene.pool.folders.0: no such folder (got 'nowhere'); expected a folder of meshes"
+    assert folders("file") == "scene.pool.folders.0: is not a folder (got 'file'); expected a folder of meshes"
+    assert folders("empty") == "scene.pool.folders.0: the folder holds no meshes (got 'empty'); expected files of .obj .ply .stl .glb .gltf"
+    box(tmp_path / "empty" / "a.ply")
+    assert folders("empty", "nowhere").startswith("scene.pool.folders.1: no such folder")
+    pool = object_pool(PoolConfig(**NOTHING), tmp_path)
+    assert config_error(lambda: pool.split("train")) == "scene.pool: the pool of meshes is empty; expected at least one source of meshes"
+    pool = object_pool(PoolConfig(test_fraction=0), tmp_path)
+    assert config_error(lambda: pool.split("test")).startswith("scene.pool.test_fraction: none of the 216 meshes falls to split 'test' (got 0.0)")
+    assert config_error(lambda: pool.split("val")) == "unknown split (got 'val'); expected train or test"
+    assert config_error(lambda: texture_pool(TexturesConfig(procedural=False, photographs=False), tmp_path).split("train")) == (
+        "scene.textures: the pool of textures is empty; expected at least one source of textures")
+    assert config_error(lambda: texture_pool(TexturesConfig(folders=("empty",)), tmp_path)).startswith("scene.textures.folders.0: the folder holds no images")
+
+
+def write_nan(path):
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n")
+
+
+def write_no_faces(path):
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
+
+
+def write_billion_stl(path):
+    path.write_bytes(b"binary".ljust(80, b"\0") + struct.pack("<I", 1_000_000_000) + b"\0" * 500)
+
+
+def write_truncated_stl(path):
+    path.write_bytes(b"binary".ljust(80, b"\0") + struct.pack("<I", 100) + b"\0" * 500)
+
+
+def write_billion_ply(path):
+    path.write_text("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+                    "element face 1000000000\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n")
+
+
+def write_billion_vertices(path):
+    write_billion_ply(path)
+    path.write_text(path.read_text().replace("vertex 3\n", "vertex 999999999\n").replace("face 1000000000", "face 1"))
+
+
+def write_billion_glb(path):
+    builder = GltfBuilder()
+    builder.node(mesh=triangle(builder))
+    builder.tree["accessors"][1]["count"] = 3_000_000_000
+    path.write_bytes(builder.glb())
+
+
+def write_billion_virtual(path):
+    """An accessor without a buffer view is all zeros by the specification: any count costs no byte."""
+    builder = GltfBuilder()
+    builder.node(mesh=triangle(builder))
+    for accessor in builder.tree["accessors"]:
+        accessor.pop("bufferView")
+        accessor["count"] = 3_000_000_000
+    path.write_bytes(builder.glb())
+
+
+def write_many_faces(path):
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 2001)
+
+
+def write_truncated_glb(path):
+    builder = GltfBuilder()
+    builder.node(mesh=triangle(builder))
+    path.write_bytes(builder.glb()[:-20])
+
+
+def write_short_accessor(path):
+    builder = GltfBuilder()
+    builder.node(mesh=triangle(builder))
+    builder.tree["accessors"][0]["count"] = 30
+    path.write_bytes(builder.glb())
+
+
+def write_bad_index(path):
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
+
+
+@pytest.mark.parametrize("suffix, write, problem", [
+    ("obj", write_nan, "vertices are NaN, infinite"),
+    ("obj", write_no_faces, "no faces"),
+    ("obj", write_many_faces, "too many faces (got 2001); expected at most 1000"),
+    ("obj", write_bad_index, ""),
+    ("stl", write_billion_stl, "too many faces (got 1000000000)"),
+    ("stl", write_truncated_stl, "truncated: 100 faces need 5084 bytes (got 584)"),
+    ("ply", write_billion_ply, "too many faces (got 1000000000)"),
+    ("ply", write_billion_vertices, "too many vertex elements (got 999999999)"),
+    ("glb", write_billion_glb, "too many faces (got 1000000000)"),
+    ("glb", write_billion_virtual, "too many faces (got 1000000000)"),
+    ("glb", write_truncated_glb, "truncated"),
+    ("glb", write_short_accessor, "reaches outside its buffer"),
+    ("ply", lambda p: p.write_bytes(b"ply nonsense"), "no PLY header"),
+    ("glb", lambda p: p.write_bytes(b"glTF"), "truncated"),
+    ("gltf", lambda p: p.write_text("{"), "JSON cannot be read"),
+    ("gltf", lambda p: p.write_text('{"asset": {"version": "1.0"}}'), "no glTF 2"),
+    ("gltf", lambda p: p.write_text('{"asset": {"version": "2.0"}, "nodes": 7}'), "no valid glTF"),
+    ("obj", lambda p: p.write_bytes(b""), ""),
+    ("stl", lambda p: p.write_bytes(b""), ""),
+])
+def test_bad_meshes_are_named(tmp_path, suffix, write, problem):
+    path = tmp_path / f"broken.{suffix}"
+    write(path)
+
+    def load():
+        pool = object_pool(PoolConfig(folders=(str(tmp_path),), max_faces=1000, test_fraction=0, **NOTHING), ".")
+        pool.draw(np.random.default_rng(0), "train")
+
+    message = config_error(load)
+    assert message.startswith(str(path)) and problem in message
+
+
+def test_a_file_too_large_is_not_read(tmp_path):
+    with open(tmp_path / "big.stl", "wb") as file:
+        file.truncate(10_000_000_000)      # sparse
+    message = config_error(lambda: object_pool(PoolConfig(folders=(str(tmp_path),), **NOTHING), "."))
+    assert message.endswith("big.stl: the mesh file is too large (got '10000 MB'); expected at most 512 MB")
+
+
+@pytest.mark.parametrize("uri", ["../secret.bin", "/etc/hostname", "sub/../../secret.bin", "..%2Fsecret.bin", "link.bin", "https://example.org/a.bin", "..\\secret.bin"])
+def test_gltf_cannot_leave_its_folder(tmp_path, uri):
+    folder = tmp_path / "models"
+    (folder / "sub").mkdir(parents=True)
+    (tmp_path / "secret.bin").write_bytes(b"\0" * 1000)
+    (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
+    builder = GltfBuilder()
+    builder.node(mesh=triangle(builder))
+    builder.tree["buffers"] = [{"byteLength": 100, "uri": uri}]
+    import json
+    (folder / "a.gltf").write_text(json.dumps(builder.tree))
+    message = config_error(lambda: object_pool(PoolConfig(folders=(str(folder),), **NOTHING), "."))
+    assert message.startswith(str(folder / "a.gltf")) and ("outside its folder" in message or "on a network" in message)
+
+
+def test_obj_materials_cannot_leave_their_folder(tmp_path):
+    folder = tmp_path / "models"
+    folder.mkdir()
+    (tmp_path / "secret.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    (folder / "a.obj").write_text("mtllib ../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
+    pool = object_pool(PoolConfig(folders=(str(folder),), keep_materials=True, **NOTHING), ".")
+    assert "refers to a file outside its folder (got '../secret.mtl')" in config_error(lambda: pool.load(pool.entries[0]))
+    plain = object_pool(PoolConfig(folders=(str(folder),), **NOTHING), ".")
+    assert len(plain.load(plain.entries[0]).parts[0].mesh.faces) == 1      # not asked for, not read
+
+
+def test_obj_materials(tmp_path):
+    Image.new("RGB", (4, 4), (10, 200, 30)).save(tmp_path / "t.png")
+    (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0.5 0\nnewmtl tex\nKd 0.2 0.2 0.2\nmap_Kd t.png\n")
+    (tmp_path / "a.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\n"
+                                    "usemtl red\nf 1/1/1 2/2/1 3/3/1\nusemtl tex\nf 2/1/1 4/2/1 3/3/1\n")
+    parts = {p.material.texture is not None: p for p in load_asset(tmp_path / "a.obj").parts}
+    assert parts[False].material.base_color == pytest.approx((1, 0.214, 0), abs=3e-3)      # Kd is a code, made linear
+    assert (parts[True].material.texture.image == (10, 200, 30)).all() and parts[True].material.base_color == (1, 1, 1)
+    corner = (parts[False].mesh.vertices == [0, 0, 0]).all(axis=1)
+    np.testing.assert_array_equal(parts[False].mesh.uvs[corner], [[0, 1]])      # vt (0, 0) is the bottom left
+    assert len(load_asset(tmp_path / "a.obj", keep_materials=False).parts) == 1
+    (tmp_path / "b.obj").write_text("mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    plain = load_asset(tmp_path / "b.obj")
+    assert plain.omissions == ("b.obj asks for what is not drawn: 'gone.mtl', which is missing",
+                               ) and not plain.has_materials
+
+
+def test_corrupt_image_in_a_folder_is_named_or_skipped(tmp_path):
+    (tmp_path / "bad.jpg").write_bytes(b"\xff\xd8\xff broken")
+    pool = texture_pool(TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0), ".")
+    assert config_error(lambda: pool.draw(np.random.default_rng(0), "train")).startswith(str(tmp_path / "bad.jpg"))
+    Image.new("RGB", (8, 8), (200, 100, 50)).save(tmp_path / "good.png")
+    pool = texture_pool(TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"), ".")
+    log = []
+    rng = np.random.default_rng(0)
+    assert {pool.draw(rng, "train", log).name for _ in range(10)} == {"good.png"}
+    assert log and all("bad.jpg" in line for line in log)
+    (tmp_path / "good.png").unlink()
+    pool = texture_pool(TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"), ".")
+    assert "50 textures drawn in a row are unusable" in config_error(lambda: pool.draw(rng, "train"))
+
+
+def test_a_file_too_large_to_look_at_is_named_or_skipped(tmp_path):
+    """Files are read once for their content's hash; what is refused there is as bad an asset as what cannot be decoded."""
+    (tmp_path / "large.obj").write_text("v 0 0 0\n" * 1000)
+    (tmp_path / "small.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    settings = dict(primitives=(), folders=(str(tmp_path),), test_fraction=0, max_file_mb=0.001)
+    assert config_error(lambda: object_pool(PoolConfig(**settings), ".")).startswith(str(tmp_path / "large.obj"))
+    assert [e.name for e in object_pool(PoolConfig(**settings, bad_assets="skip"), ".").entries] == ["small.obj"]

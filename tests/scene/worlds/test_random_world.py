@@ -1,0 +1,259 @@
+"""Random worlds: determinism, placement, splits, look, light; and configuration errors by message."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blinkgl.config.base import validate
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    LightConfig,
+    ObjectsConfig,
+    PoolConfig,
+    RandomSceneConfig,
+    RegionConfig,
+    SkyConfig,
+    TexturesConfig,
+    WallsConfig,
+)
+from blinkgl.config.sequence import CameraConfig, near_corner
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.scene.build import build_scene, check_assets
+from blinkgl.scene.types import Light
+from blinkgl.scene.worlds.random_world import make_light, pools
+from tests.shared_data import shared
+
+CAMERA = CameraConfig(width=96, height=72)
+T1 = 400_000_000
+SMALL = TexturesConfig(max_size=32, variants=10)
+
+
+def config(**changes) -> RandomSceneConfig:
+    return RandomSceneConfig(**{"textures": SMALL, "objects": ObjectsConfig(count=10), **changes})
+
+
+def build(settings, sequence=0, seed=0, split="train", base="."):
+    return build_scene(settings, CAMERA, 0, T1, split=split, seed=seed, sequence=sequence, base=base)
+
+
+def fingerprint(scene) -> bytes:
+    times = np.array([0, 123_456_789, T1])
+    chunks = [scene.camera.path.poses(times).tobytes(), repr((scene.light, scene.log, scene.camera.K.tolist())).encode()]
+    for o in scene.objects:
+        chunks += [o.name.encode(), bytes([o.instance_id]), o.path.poses(times).tobytes()]
+        for p in o.parts:
+            m = p.mesh
+            chunks += [m.vertices.tobytes(), m.faces.tobytes(), m.normals.tobytes(), m.uvs.tobytes(), repr(replace(p.material, texture=None)).encode()]
+            chunks += [p.material.texture.image.tobytes()] if p.material.texture else []
+    return b"".join(chunks)
+
+
+def test_same_seed_same_arrays_whatever_was_built_before():
+    first = fingerprint(build(config(walls=True), sequence=3))
+    pools.__globals__["_object_pool"].cache_clear()
+    pools.__globals__["_texture_pool"].cache_clear()
+    assert fingerprint(build(config(walls=True), sequence=3)) == first
+    build(config(walls=True), sequence=1)
+    assert fingerprint(build(config(walls=True), sequence=3)) == first
+    others = [fingerprint(build(config(walls=True), **k)) for k in (dict(sequence=4), dict(sequence=3, seed=1), dict(sequence=3, split="test"))]
+    assert first not in others and len(set(others)) == 3
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    return [build(config(), sequence=k) for k in range(8)]
+
+
+def world_vertices(o, t=0):
+    T = o.path.pose(t)
+    return np.concatenate([p.mesh.vertices @ T[:3, :3].T + T[:3, 3] for p in o.parts])
+
+
+def things(scene):
+    return [o for o in scene.objects if o.category == "object"]
+
+
+def test_resting_objects_touch_the_ground_and_nothing_is_below(worlds):
+    resting = flying = 0
+    for scene in worlds:
+        for o in things(scene):
+            lowest = world_vertices(o)[:, 2].min()
+            assert lowest > -1e-9
+            resting += abs(lowest) < 1e-9
+            flying += lowest > 0.01
+    assert resting + flying == sum(len(things(s)) for s in worlds)
+    assert 0.3 < resting / (resting + flying) < 0.7
+
+
+def test_objects_that_slide_stay_on_the_ground(worlds):
+    for scene in worlds:
+        for o in things(scene):
+            if abs(world_vertices(o)[:, 2].min()) < 1e-9:
+                heights = [world_vertices(o, t)[:, 2].min() for t in np.linspace(0, T1, 9).astype(int)]
+                np.testing.assert_allclose(heights, 0, atol=1e-9)
+
+
+def test_bounding_spheres_are_apart_at_the_start(worlds):
+    for scene in worlds:
+        centres = np.array([o.path.pose(0)[:3, 3] for o in things(scene)] + [scene.camera.path.pose(0)[:3, 3]])
+        radii = np.array([o.radius for o in things(scene)] + [near_corner(CAMERA)])
+        gap = np.linalg.norm(centres[:, None] - centres, axis=2) - radii[:, None] - radii
+        assert gap[~np.eye(len(gap), dtype=bool)].min() > 0
+
+
+def test_most_objects_are_in_view_at_many_distances(worlds):
+    seen, distances, total = 0, [], 0
+    for scene in worlds:
+        T = np.linalg.inv(scene.camera.path.pose(0))
+        for o in things(scene):
+            X = T[:3, :3] @ o.path.pose(0)[:3, 3] + T[:3, 3]
+            total += 1
+            if X[2] > 0:
+                x, y = scene.camera.fx * X[0] / X[2] + scene.camera.cx, scene.camera.fy * X[1] / X[2] + scene.camera.cy
+                margin = scene.camera.fx * o.radius / X[2]
+                if -margin < x < CAMERA.width + margin and -margin < y < CAMERA.height + margin:
+                    seen += 1
+                    distances.append(np.linalg.norm(X))
+    assert seen / total > 0.7 and total >= 70
+    assert min(distances) < 4 and max(distances) > 12
+
+
+def test_structure(worlds):
+    for scene in worlds:
+        ids = [o.instance_id for o in scene.objects]
+        assert ids[0] == 1 and len(set(ids)) == len(ids) and len({o.name for o in scene.objects}) == len(ids)
+        sky, ground = scene.objects[:2]
+        assert (sky.category, ground.category) == ("sky", "ground") and sky.path.is_static and ground.path.is_static
+        assert all(p.material.unlit for p in sky.parts) and len(sky.parts) == 6
+        for p in sky.parts:      # faces look inwards, cells are small
+            v = p.mesh.vertices[p.mesh.faces]
+            assert (np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]) * -v.mean(axis=1)).sum(axis=1).min() > 0
+            assert np.linalg.norm(v[:, 1] - v[:, 0], axis=1).max() < 1.5 * SkyConfig().size / SkyConfig().subdivisions
+        assert np.ptp(sky.parts[0].mesh.vertices) == pytest.approx(100)
+        for o in scene.objects:
+            assert all(p.mesh.closed or o.category != "object" for p in o.parts)
+            for p in o.parts:
+                top = np.asarray(p.material.base_color) * (scene.light.sun + scene.light.sky if not p.material.unlit else 1)
+                assert p.material.texture is not None and top.max() <= 1.5
+        assert np.linalg.norm(scene.light.sun_direction) == pytest.approx(1) and scene.light.sun_direction[2] > 0.4
+
+
+def test_some_stand_still_and_some_move(worlds):
+    still = np.mean([o.path.is_static for s in worlds for o in things(s)])
+    assert 0.1 < still < 0.5
+
+
+def test_options():
+    bare = build(config(sky=None, ground=None, objects=ObjectsConfig(count=6, flying=0.0)))
+    assert {o.category for o in bare.objects} == {"object"}
+    walled = build(config(walls=WallsConfig(count=3)))
+    walls = [o for o in walled.objects if o.category == "wall"]
+    assert len(walls) == 3 and all(np.abs(world_vertices(w)[:, :2]).max(axis=0).min() > 15 for w in walls)
+    assert all(world_vertices(w)[:, 2].min() == pytest.approx(0, abs=1e-9) for w in walls)
+    unlit = build(config(light=LightConfig(unlit=True)))
+    assert all(p.material.unlit for o in unlit.objects for p in o.parts)
+    assert len(things(build(config(objects=ObjectsConfig(count=0))))) == 0
+    raised = build(config(ground={"height": 5.0}))
+    assert min(world_vertices(o)[:, 2].min() for o in things(raised)) == pytest.approx(5, abs=1e-9)
+    assert raised.camera.path.pose(0)[2, 3] > 5.9
+
+
+def test_crowded_worlds_leave_objects_out_and_say_so():
+    scene = build(config(objects=ObjectsConfig(count=60, size=(3.0, 4.0)), region=RegionConfig(width=10, height=5)))
+    missing = 60 - len(things(scene))
+    assert missing > 0 and sum("left out" in line for line in scene.log) == missing
+
+
+def test_splits_share_neither_meshes_nor_textures():
+    used = {}
+    for split in ("train", "test"):
+        scenes = [build(config(pool=PoolConfig(test_fraction=0.5), textures=TexturesConfig(max_size=16, test_fraction=0.5)), k, split=split) for k in range(4)]
+        used[split] = ({p.mesh.source_hash for s in scenes for o in things(s) for p in o.parts},
+                       {p.material.texture.source_hash for s in scenes for o in s.objects for p in o.parts})
+    for train, test in zip(used["train"], used["test"]):
+        assert train and test and not train & test
+
+
+def test_real_assets_with_their_materials_and_panorama_sky():
+    base = shared("data/assets")
+    settings = config(pool=PoolConfig(primitives=(), folders=("models_cc0",), keep_materials=True),
+                      textures=TexturesConfig(max_size=64, folders=("textures_cc0",)), sky=SkyConfig(panoramas=("hdri",)))
+    scene = build(settings, base=base)
+    assert any(len(o.parts) > 1 for o in things(scene))
+    assert any(p.material.base_color != (1.0, 1.0, 1.0) for o in things(scene) for p in o.parts)
+    sky = scene.objects[0]
+    assert all(p.material.texture.image.dtype == np.float32 and p.material.uv_scale == (1, 1) for p in sky.parts)
+    assert max(p.mesh.uvs.max() for p in sky.parts) < 1      # the margin keeps filtering away from the wrap
+    assert fingerprint(build(settings, base=base)) == fingerprint(scene)
+
+
+def test_light_from_angles():
+    assert make_light(LightConfig(sun_elevation=90)).sun_direction == pytest.approx((0, 0, 1), abs=1e-12)
+    assert make_light(LightConfig(sun_elevation=0, sun_azimuth=90)).sun_direction == pytest.approx((0, 1, 0), abs=1e-12)
+    rng = np.random.default_rng(0)
+    assert make_light(LightConfig(sun_azimuth=0, sun_elevation=45), rng).sun_direction == pytest.approx((2**-0.5, 0, 2**-0.5))
+
+
+def test_near_corner():
+    camera = SimpleNamespace(width=3, height=1, fx=1.5, fy=1.0, cx=1.0, cy=0.0, near=2.0)
+    assert near_corner(camera) == pytest.approx(2 * np.sqrt(1 + 1 + 0.25))
+
+
+def message(make):
+    with pytest.raises((ConfigError, AssetError)) as error:
+        make()
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+@pytest.mark.parametrize("tree, expected", [
+    ({"objects": {"cuont": 3}}, "scene.objects.cuont: unknown key; expected 'count' (nearest)"),
+    ({"objects": {"count": -1}}, "scene.objects.count: too small (got -1)"),
+    ({"objects": {"size": [2, 1]}}, "scene.objects.size: the range must be [smallest, largest] (got [2, 1])"),
+    ({"objects": {"size": [0, 1]}}, "scene.objects.size.0: too small (got 0)"),
+    ({"pool": {"primitives": ["cube"]}}, "scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid (got ['cube'])"),
+    ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),
+    ({"pool": {"test_fraction": 1.5}}, "scene.pool.test_fraction: too large (got 1.5); expected a number from 0 to 1"),
+    ({"textures": {"procedural": ["noise"]}}, "scene.textures.procedural: must be true, false or a list of value, perlin,"),
+    ({"sky": {"size": 20}}, "scene.sky.size: must be at least 36 to hold the region and its objects (got 20.0)"),
+    ({"region": {"height": 0.5}}, "scene.region.camera_height: must begin below region.height 0.5 (got [1.0, 3.5])"),
+])
+def test_configuration_errors(tree, expected):
+    assert message(lambda: validate(RandomSceneConfig, tree, where="scene")).startswith(expected)
+
+
+def test_assets_are_checked_before_work_starts(tmp_path):
+    check_assets(config(), tmp_path)
+    assert message(lambda: check_assets(config(pool=PoolConfig(folders=("gone",))), tmp_path)).startswith("scene.pool.folders.0: no such folder (got 'gone')")
+    assert message(lambda: check_assets(config(pool=PoolConfig(primitives=())), tmp_path)).startswith("scene.pool: the pool of meshes is empty")
+    assert message(lambda: check_assets(config(textures=TexturesConfig(folders=("gone",))), tmp_path)).startswith("scene.textures.folders.0: no such folder")
+    assert message(lambda: build(config(sky=SkyConfig(panoramas=("gone.hdr",))), base=tmp_path)).startswith("scene.sky.panoramas.0: no such file or folder")
+    explicit = validate(ExplicitSceneConfig, {"kind": "explicit", "meshes": {"a": {"file": "gone.obj"}}, "objects": [{"mesh": "a"}], "camera": {}})
+    assert message(lambda: check_assets(explicit, tmp_path)) == "scene.meshes.a.file: no such file (got 'gone.obj'); expected a mesh file"
+    assert message(lambda: build(config(), split="val")) == "output.split: unknown split (got 'val'); expected train or test"
+
+
+def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_path):
+    """The first path is reported as cut; the world then draws another, and the scene's camera is not stopped."""
+    from blinkgl.scene.motion.collision import Collision
+    from blinkgl.scene.worlds import random_world as module
+
+    drawn, resolve = [], module.resolve_collisions
+
+    def once_unlucky(objects, path, *rest):
+        drawn.append(path)
+        result = resolve(objects, path, *rest)
+        if len(drawn) == 1:
+            return replace(result, events=(Collision(1, "camera", objects[0].name, "contact", 0.0, ("camera",)),))
+        return result
+
+    monkeypatch.setattr(module, "resolve_collisions", once_unlucky)
+    scene = module.random_world(config(), CAMERA, 0, 10**9, "train", 3, 0, tmp_path)
+    assert len(drawn) >= 2 and not np.allclose(drawn[0].pose(5 * 10**8), drawn[1].pose(5 * 10**8))
+    assert scene.camera.path is drawn[-1]
+
+
+def test_there_is_one_set_of_light_defaults():
+    assert Light() == make_light(LightConfig()) and Light().sun == LightConfig().sun and Light().sky == LightConfig().sky

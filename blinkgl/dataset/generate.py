@@ -17,6 +17,7 @@ from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
+from blinkgl.labels import LABELS
 from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock
 
@@ -53,7 +54,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
     with (
         simulate_sequence(config, index, gl, base=base, pictures_hz=config.preview.rate if config.preview.enabled else None) as sequence,
         SequenceWriter(report.path, sequence.height, sequence.width, config_yaml=config_yaml(sequence.config, index),
-                       t_offset_us=sequence.t0_ns // 1000, float_flow=config.labels.float_flow) as writer,
+                       t_offset_us=sequence.t0_ns // 1000, labels=config.labels) as writer,
     ):
         clock, span_ns = sequence.clock, sequence.t1_ns - sequence.t0_ns
         with PreviewRecorder(config.preview, sequence, writer) as preview:
@@ -86,20 +87,10 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
 
 
 def _write_labels(writer: SequenceWriter, truth: GroundTruth) -> None:
-    k, frame, t_us = truth.k, truth.frame, truth.t_ns // 1000
-    if truth.image is not None:
-        writer.image(k, t_us, truth.image)
-    if frame is None:
-        return
-    for direction, flow, t_other in (("forward", frame.forward, truth.forward_ns), ("backward", frame.backward, truth.backward_ns)):
-        if flow is None:
-            continue
-        writer.flow(direction, k, flow.flow, flow.valid, t_us, t_other // 1000)
-        if flow.occluded is not None:
-            writer.occlusion(direction, k, flow.occluded)
-    for name in ("depth", "ids", "normals", "velocity"):
-        if (array := getattr(frame, name)) is not None:
-            getattr(writer, name)(k, array)
+    leads_to = {"forward": truth.forward_ns, "backward": truth.backward_ns}
+    for name, value in truth.frame.values.items():
+        to_ns = leads_to.get(LABELS[name].towards)
+        writer.label(name, truth.k, value, truth.t_ns // 1000, None if to_ns is None else to_ns // 1000)
 
 
 def manifest_info(sequence: Simulation) -> dict:

@@ -9,14 +9,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import Emulator, Source, Timeline, configured, label_names
+from blinkgl.front.runs import Emulator, Source, Timeline, configured, labels_tree
 from blinkgl.front.scenes import Scene
 from blinkgl.gl import create_context
-from blinkgl.render.frames import LabelFrame, LabelRequest
+from blinkgl.labels import LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.scene import types as data
 from blinkgl.scene.build import build_scene
@@ -94,9 +95,9 @@ def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, 
                 chunks.append(item.events)
                 continue
             times.append(item.t_ns // 1000)
-            if item.image is not None:
-                images.append(to_srgb8(item.image))
-            if item.frame is not None:
+            if (image := item.frame.values.pop("images", None)) is not None:
+                images.append(to_srgb8(image))
+            if item.forward_ns is not None:
                 frames.append(item.frame)
     t_us, camera = np.array(times, np.int64), sequence.camera
     return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames), t_us, np.stack(images) if images else None, config, sequence.frames,
@@ -140,10 +141,8 @@ class Renderer:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
         labels : as of :func:`record`.   to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
-        wanted = label_names(labels)
+        request = asked_for(LabelsConfig.model_validate(labels_tree(labels)))
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
-        request = LabelRequest(colour="images" in wanted, flow_forward="flow" in wanted, flow_backward="flow_backward" in wanted,
-                               **{name: name in wanted for name in ("depth", "ids", "normals", "velocity", "occlusion")})
         return self._renderer.labels(t_ns, request, t_ns + interval if to is None else _ns(to, "to"),
                                      t_ns - interval if back_to is None else _ns(back_to, "back_to"))
 

@@ -1,7 +1,8 @@
-"""One sequence as it happens.
+"""One sequence as it happens; whoever writes, keeps, judges or counts it lives in another room.
 
-In: the configuration of one sequence, and OpenGL where a scene is drawn. Out: its events, ground truth and pictures, in the order of time;
-whoever writes, keeps, judges or counts them lives in another room. Start in simulate.py; rendered.py and recorded.py are its two sources.
+In: the configuration of one sequence, and OpenGL where a scene is drawn.
+Out: its events, ground truth and pictures, in the order of time.
+Start: simulate.py; rendered.py and recorded.py are its two sources.
 """
 
 from blinkgl.sequence.items import EventChunk, GroundTruth, Item, Picture

@@ -8,7 +8,7 @@ from typing import Union
 import numpy as np
 
 from blinkgl.events.types import Events
-from blinkgl.render.frames import LabelFrame
+from blinkgl.labels import LabelFrame
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,16 +25,15 @@ class EventChunk:
 class GroundTruth:
     """What is true at a label's time. Every event before its microsecond, t_ns // 1000, came before it, and no other did.
 
-    k : number of the label, from 0.   t_ns : its time, ns.   forward_ns, backward_ns : where its flow leads, ns; None: nowhere.
-    image : (H, W, 3) float32 linear light as drawn, or (H, W[, 3]) sRGB codes as recorded; None: not asked for.
-    frame : flow, depth … as :class:`LabelFrame` says; None at the last time of a sequence, from where flow leads nowhere, and of frames
-    that were recorded without flow.
+    k : number of the label, from 0.   t_ns : its time, ns.
+    frame : what ``labels:`` asks for, as :class:`LabelFrame` says; images as they were drawn, float32 linear light, or as they were recorded,
+    sRGB codes. At the last time of a sequence, from where nothing leads on, images alone.
+    forward_ns, backward_ns : where it leads, ns; None: nowhere.
     T_world_cam : (4, 4) float64, OpenCV axes.   T_world_obj : (n, 4, 4) float64, n objects; both None where nobody knows (recorded frames)."""
 
     k: int
     t_ns: int
-    image: np.ndarray | None = None
-    frame: LabelFrame | None = None
+    frame: LabelFrame
     forward_ns: int | None = None
     backward_ns: int | None = None
     T_world_cam: np.ndarray | None = None

@@ -24,14 +24,16 @@ from blinkgl.events.types import Events
 from blinkgl.io.flow import read_flow
 from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
+from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.simulation import Decoder, stepped, timed
-from blinkgl.render.frames import Flow, LabelFrame
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.items import GroundTruth, Picture
 from blinkgl.sequence.simulate import Simulation
 
+RECORDED = ("images", "flow_forward", "occlusion_forward")
+"""Labels that recorded frames may bring."""
 _FLOW = (".npy", ".flo", ".png")
 
 
@@ -99,7 +101,7 @@ class RecordedSequence(Simulation):
         return round(k * 1e9 / fps)
 
     def _given(self) -> Iterator[tuple[np.ndarray, int, str]]:
-        keep = self._labels and self.config.labels.images
+        keep = self._labels and "images" in asked_for(self.config.labels)
         for k, file in enumerate(self.files):
             frame = self._kept.pop(0) if k == 0 else read_frame(file)
             if keep and k:
@@ -122,17 +124,16 @@ class RecordedSequence(Simulation):
         return ((k - 1, self._time_of(k, self.config.frames.fps)) for k in range(1, len(self.files)))
 
     def _truth(self, k: int, t_ns: int) -> GroundTruth:
-        number, labels = k + 1, self.config.labels  # of the frame
-        image = None
-        if labels.images:
-            image = self._kept.pop(number) if number in self._kept else read_frame(self.files[number])
-        if number == len(self.files) - 1 or not self.flows or "forward" not in labels.flow:
-            return GroundTruth(k, t_ns, image)
+        number, request, values = k + 1, asked_for(self.config.labels), {}  # number: of the frame
+        if "images" in request:
+            values["images"] = self._kept.pop(number) if number in self._kept else read_frame(self.files[number])
+        if number == len(self.files) - 1 or not self.flows or "flow_forward" not in request:
+            return GroundTruth(k, t_ns, LabelFrame(t_ns, values))
         size = (self.height, self.width)
-        flow, valid = _flow(self.flows[number], size)
-        occluded = _mask(self.masks[number], size) if self.masks and labels.occlusion else None
-        return GroundTruth(k, t_ns, image, LabelFrame(t_ns, forward=Flow(flow, valid, occluded)),
-                           forward_ns=self._time_of(number + 1, self.config.frames.fps))
+        values["flow_forward"] = Flow(*_flow(self.flows[number], size))
+        if self.masks and "occlusion_forward" in request:
+            values["occlusion_forward"] = _mask(self.masks[number], size)
+        return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self.config.frames.fps))
 
     def _picture(self, t_ns: int) -> Picture:
         frame = self._luminance

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.config.sequence import LabelsConfig, SequenceConfig
+from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
@@ -88,14 +89,14 @@ class RenderedSequence(Simulation):
         return ((k, t) for k, t in enumerate(self.config.time.label_times_ns) if self.t0_ns <= t <= self.t1_ns)
 
     def _truth(self, k: int, t_ns: int) -> GroundTruth:
-        """Image at every label time, ground truth at every one but the last (whose flow has no end)."""
-        config, interval = self.config, self.config.time.interval_ns
-        image = self.renderer.colour(t_ns) if config.labels.images else None
+        request, interval = asked_for(self.config.labels), self.config.time.interval_ns
+        last = k == self.config.time.label_count
+        if last:
+            request = LabelRequest(*(name for name in request if LABELS[name].at_last))
+        frame = self.renderer.labels(t_ns, request, t_ns + interval, t_ns - interval)
         camera, objects = poses_at(self.scene, [t_ns])
-        if k == config.time.label_count:
-            return GroundTruth(k, t_ns, image, T_world_cam=camera[0], T_world_obj=objects[:, 0])
-        frame = self.renderer.labels(t_ns, label_request(config.labels), t_ns + interval, t_ns - interval)
-        return GroundTruth(k, t_ns, image, frame, t_ns + interval, t_ns - interval, camera[0], objects[:, 0])
+        leads_to = (None, None) if last else (t_ns + interval, t_ns - interval)
+        return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
         return Picture(t_ns, self.renderer.colour(t_ns, antialiasing="none"), self.renderer.velocity(t_ns))
@@ -133,12 +134,6 @@ class RenderedSequence(Simulation):
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
         }
-
-
-def label_request(labels: LabelsConfig) -> LabelRequest:
-    """The buffers that ``labels:`` asks for; images are drawn by themselves."""
-    return LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
-                        flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=labels.occlusion)
 
 
 def poses_at(scene: Scene, times_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:

@@ -124,7 +124,7 @@ class Simulation(ABC):
 
     def _counted(self, k: int, t_ns: int) -> GroundTruth:
         truth = self._truth(k, t_ns)
-        self.labels += truth.frame is not None
+        self.labels += truth.forward_ns is not None
         return truth
 
     @property

@@ -67,7 +67,7 @@ def test_ground_truth_comes_between_the_events_before_and_after_its_time(tmp_pat
         inside += isinstance(item, GroundTruth)
     truths = [item for item in items if isinstance(item, GroundTruth)]
     assert [t.t_ns for t in truths] == list(config.time.label_times_ns) and [t.k for t in truths] == list(range(len(truths)))
-    assert [t.frame is not None for t in truths] == [True] * config.time.label_count + [False] and sequence.labels == config.time.label_count
+    assert [t.forward_ns is not None for t in truths] == [True] * config.time.label_count + [False] and sequence.labels == config.time.label_count
     assert len([item for item in items if isinstance(item, Picture)]) > 3
     assert done_us == config.time.t1_ns // 1000 and sequence.events == len(events_of(items)) > 100
 
@@ -90,8 +90,10 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
     assert_same(events_of(made["everything"]), events_of(made["events"]))
     assert not events_of(made["labels"]).t.size
     for a, b in zip((i for i in made["everything"] if isinstance(i, GroundTruth)), made["labels"], strict=True):
-        np.testing.assert_array_equal(a.image, b.image)
-        assert a.frame is b.frame is None or (np.array_equal(a.frame.depth, b.frame.depth) and np.array_equal(a.frame.backward.flow, b.frame.backward.flow))
+        assert a.frame.values.keys() == b.frame.values.keys() and a.frame.values
+        for name in ("images", "depth"):
+            np.testing.assert_array_equal(getattr(a.frame, name), getattr(b.frame, name))
+        assert a.frame.backward is b.frame.backward is None or np.array_equal(a.frame.backward.flow, b.frame.backward.flow)
 
 
 # --- its consumers see one and the same -------------------------------------------------------------------------------
@@ -173,4 +175,4 @@ def test_two_at_once_are_as_one_after_the_other(tmp_path):
             other.make_current()
         truths = [(x, y) for x, y in zip(together, alone, strict=True) if isinstance(x, GroundTruth)]
         assert_same(events_of(together), events_of(alone))
-        assert truths and all(np.array_equal(x.image, y.image) for x, y in truths)
+        assert truths and all(np.array_equal(x.frame.images, y.frame.images) for x, y in truths)

@@ -16,8 +16,8 @@ from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import load_run
 from blinkgl.events.table import EMULATORS
-from blinkgl.render.renderer import Renderer
 from blinkgl.render.rectangles import Rectangle
+from blinkgl.render.renderer import Renderer
 from blinkgl.show.trade import show
 from blinkgl.tools import peer_cycles
 from blinkgl.trade.front import front
@@ -68,7 +68,7 @@ def test_fine_tiles_are_the_image_itself_and_then_its_mean(gl, config):
             # The tiles' projection rounds differently: a sample on an edge may fall on its other side.
             assert np.percentile(inside, 97) < 2e-4 * image.max() and inside.mean() < 2e-3 * image.max()
             assert not mine[~bench.mask].any()
-            speed = np.hypot(*np.moveaxis(whole.velocity(t), -1, 0))[bench.mask].max()
+            speed = np.hypot(*np.moveaxis(whole.velocity(t).read(), -1, 0))[bench.mask].max()
             assert tiles.speed(t) == pytest.approx(speed, rel=0.05)
 
 

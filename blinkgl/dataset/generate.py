@@ -156,7 +156,7 @@ def poses_of(scene: Scene, times_ns: list[int]) -> dict[str, np.ndarray]:
     t = np.asarray(times_ns, np.int64)
     return {
         "t_ns": t,
-        "T_world_cam": scene.camera.path.poses(t),
+        "T_world_cam": scene.camera_path.poses(t),
         "T_world_obj": np.stack([o.path.poses(t) for o in scene.objects]) if scene.objects else np.zeros((0, len(t), 4, 4)),
         "object_ids": np.array([o.instance_id for o in scene.objects], np.int64),
         "object_names": np.array([o.name for o in scene.objects], dtype=str),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tests.render.render_scenes import LEVEL, SECOND, camera, drift
+from tests.render.render_scenes import LEVEL, SECOND, rig, drift
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import reference
@@ -48,7 +48,7 @@ def length(v) -> np.ndarray:
 
 def moving_camera(near=0.05, step=1.0, **keys):
     turn = Rotation.from_rotvec(np.array([0.02, -0.01, 0.03]) * min(step, 1.0))
-    return camera(near=near, path=drift((0, 0, 0), np.array([0.02, 0.01, -0.01]) * step, LEVEL, LEVEL * turn), **keys)
+    return rig(near=near, path=drift((0, 0, 0), np.array([0.02, 0.01, -0.01]) * step, LEVEL, LEVEL * turn), **keys)
 
 
 def compare(gl, world, t_ns: int = 0, to_ns: int = SECOND) -> Errors:

@@ -20,7 +20,7 @@ from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.reading import contents, reading
 from tests.scene.gltf_files import GltfBuilder, triangle
 
-CAMERA = CameraConfig(width=64, height=48)
+CAMERA = CameraConfig(width=64, height=48).model
 
 
 def everything() -> GltfBuilder:

@@ -16,7 +16,7 @@ from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.worlds.pool import object_pool
 from tests.scene.gltf_files import GltfBuilder, triangle
 
-CAMERA = CameraConfig(width=64, height=48)
+CAMERA = CameraConfig(width=64, height=48).model
 MATT = {"metallicFactor": 0}
 
 

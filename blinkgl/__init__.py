@@ -29,7 +29,17 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError
     from blinkgl.events.types import Events
     from blinkgl.front.drawing import Recording, Renderer, record, render_frame
-    from blinkgl.front.files import compare, convert, open_events, read_events, read_flow, simulate, simulate_file, write_events, write_flow
+    from blinkgl.front.files import (
+        compare,
+        convert,
+        open_events,
+        read_events,
+        read_flow,
+        simulate,
+        simulate_file,
+        write_events,
+        write_flow,
+    )
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import Camera, Keyframes, Light, Material, Mesh, Pose, Primitive, Scene, look_at
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor

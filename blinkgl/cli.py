@@ -2,7 +2,8 @@
 
 Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine (``error: …`` on
 stderr, one line); 3 done but for sequences that were set aside; 130 interrupted. A traceback means a bug in BlinkGL, or
-``--debug``. Commands import what they need inside the function, so that ``--help`` answers at once.
+``--debug``. What a command does and prints is ``blinkgl.show.COMMAND.run``, which returns the status; it is imported inside the function, so that
+``--help`` answers at once.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import errno
 import os
 import sys
 import traceback
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
@@ -27,7 +28,7 @@ app.add_typer(shader_app)
 def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"blinkgl {__version__}")
-        raise typer.Exit()
+        raise typer.Exit
 
 
 @app.callback()
@@ -46,48 +47,37 @@ def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
     backend: Annotated[str, typer.Option(help="OpenGL backend to examine: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device to examine.")] = 0,
-) -> None:
+) -> int:
     """Say what this machine offers, what is missing, and the command that mends it. Exit status 2 if something required is missing."""
-    from blinkgl.machine import doctor as examination
+    from blinkgl.show import doctor as command
 
-    report = examination.examine(backend, device)
-    if as_json:
-        typer.echo(report.to_json())
-    else:
-        examination.show(report)
-    if not report.ok:
-        raise typer.Exit(BlinkGLError.exit_status)
+    return command.run(backend, device, as_json)
 
 
 @app.command()
 def generate(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")],
-    num: Annotated[Optional[int], typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")] = None,
-    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    num: Annotated[int | None, typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
-    workers: Annotated[Optional[int], typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
+    workers: Annotated[int | None, typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
     executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
-    address: Annotated[Optional[str], typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
+    address: Annotated[str | None, typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
     gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
-    devices: Annotated[Optional[str], typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
+    devices: Annotated[str | None, typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,
     mixed: Annotated[bool, typer.Option("--mixed", help="Go on although recipe, assets or software have changed since the run began.")] = False,
     time_limit: Annotated[float, typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers.")] = 3600.0,
-) -> None:
+) -> int:
     """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but some sequences were set aside."""
-    from blinkgl.dataset.choose import choose_executor
-    from blinkgl.show.generate import SET_ASIDE, generate_with_progress
+    from blinkgl.show import generate as command
+    from blinkgl.show.executors import choose_executor
 
     chosen = choose_executor(executor, workers, address=address, gpus=gpus, devices=devices)
-    outcome = generate_with_progress(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet, executor=chosen, resume=resume,
-                                     mixed=mixed, time_limit_s=time_limit)
-    if outcome.set_aside:
-        if quiet:
-            for name, reason in sorted(outcome.set_aside.items()):
-                typer.echo(f"set aside: {name}: {reason}", err=True)
-        raise typer.Exit(SET_ASIDE)
+    return command.run(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet, executor=chosen, resume=resume, mixed=mixed,
+                       time_limit_s=time_limit)
 
 
 @app.command()
@@ -96,28 +86,26 @@ def verify(
     deep: Annotated[bool, typer.Option("--deep", help="Also generate a sample of sequences again and compare bit by bit.")] = False,
     sample: Annotated[int, typer.Option(min=1, help="How many sequences --deep makes again.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
-    base: Annotated[Optional[str], typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
-) -> None:
+    base: Annotated[str | None, typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
+) -> int:
     """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is wrong; what could not be compared
     is noted, and said in the last line."""
-    from blinkgl.show.verify import verify_and_show
+    from blinkgl.show import verify as command
 
-    if not verify_and_show(folder, deep=sample if deep else 0, seed=seed, base=base):
-        raise typer.Exit(BlinkGLError.exit_status)
+    return command.run(folder, deep=sample if deep else 0, seed=seed, base=base)
 
 
 @app.command()
 def explain(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
-    sequence: Annotated[Optional[int], typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
-    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
-) -> None:
+    sequence: Annotated[int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+) -> int:
     """Say what a run will model, what it leaves out and why, and what it will cost. Writes nothing."""
-    from blinkgl.dataset import explain as explanation
-    from blinkgl.config.sequence import load_run
+    from blinkgl.show import explain as command
 
-    explanation.show(explanation.explain(load_run(config, overrides or [], seed=seed), sequence))
+    return command.run(config, sequence=sequence, seed=seed, overrides=overrides or [])
 
 
 @app.command()
@@ -125,36 +113,36 @@ def trade(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")] = "trade",
     quick: Annotated[bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")] = False,
-    only: Annotated[Optional[list[str]], typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated.")] = None,
-    skip: Annotated[Optional[list[str]], typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated.")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
-    seed: Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    sequence: Annotated[Optional[int], typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
-    clip: Annotated[Optional[float], typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated.")] = None,
+    skip: Annotated[list[str] | None, typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated.")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
+    sequence: Annotated[int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
+    clip: Annotated[float | None, typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")] = None,
     limit_ms: Annotated[float, typer.Option(min=0.001, help="Events further apart than this are not the same event.")] = 10.0,
-    rounds: Annotated[Optional[int], typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
-    minutes: Annotated[Optional[float], typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long.")] = None,
+    rounds: Annotated[int | None, typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long.")] = None,
     cost: Annotated[str, typer.Option(help="What the front is drawn over: wall, or cpu on a busy machine.")] = "wall",
     reference: Annotated[str, typer.Option(help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
                                            "small camera and a short --clip).")] = "raster",
-) -> None:
+) -> int:
     """Measure what accuracy costs: settings timed and judged against a converged reference, as a table, a plot and a page."""
-    from blinkgl.show.trade import trade_and_show
+    from blinkgl.show import trade as command
 
-    trade_and_show(config, out, overrides=overrides or [], quick=quick, only=only or [], skip=skip or [], sequence=sequence, clip=clip, limit_ms=limit_ms, rounds=rounds,
-                   minutes=minutes, cost=cost, reference=reference, seed=seed)
+    return command.run(config, out, overrides=overrides or [], quick=quick, only=only or [], skip=skip or [], sequence=sequence, clip=clip,
+                       limit_ms=limit_ms, rounds=rounds, minutes=minutes, cost=cost, reference=reference, seed=seed)
 
 
 @app.command()
 def report(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
-    out: Annotated[Optional[str], typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="The page (default: DIR/report.html).")] = None,
     examples: Annotated[int, typer.Option(min=0, max=100, help="Sequences shown in pictures.")] = 6,
-) -> None:
+) -> int:
     """Write one self-contained HTML page about a data set, and its index.jsonl."""
-    from blinkgl.report import write_report
+    from blinkgl.show import report as command
 
-    typer.echo(f"written to {write_report(folder, out, examples=examples)}")
+    return command.run(folder, out, examples=examples)
 
 
 @app.command()
@@ -163,11 +151,11 @@ def export(
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for the shards: SPLIT-000000.tar …")],
     shard_mb: Annotated[float, typer.Option("--shard-mb", min=1, help="Size of a shard.")] = 512.0,
     seed: Annotated[int, typer.Option(min=0, help="Order of the samples; a reader then only has to shuffle shards.")] = 0,
-) -> None:
+) -> int:
     """Write a data set as WebDataset shards, one sample per flow label, for training from object storage."""
-    from blinkgl.dataset.shards import export_and_show
+    from blinkgl.show import export as command
 
-    export_and_show(folder, out, shard_bytes=int(shard_mb * 1e6), seed=seed)
+    return command.run(folder, out, shard_bytes=int(shard_mb * 1e6), seed=seed)
 
 
 @app.command()
@@ -175,62 +163,62 @@ def simulate(
     source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")],
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
-    sensor: Annotated[Optional[str], typer.Option("--sensor", help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.")] = None,
-    config: Annotated[Optional[str], typer.Option("--config", help="YAML file of emulator parameters.")] = None,
-    overrides: Annotated[Optional[list[str]], typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")] = None,
-    fps: Annotated[Optional[float], typer.Option(help="Frames per second (default: the video's, or the time stamps).")] = None,
-    timestamps: Annotated[Optional[str], typer.Option(help="File of frame times: µs as integers, or seconds with a point.")] = None,
-    gamma: Annotated[Optional[str], typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats).")] = None,
+    sensor: Annotated[str | None, typer.Option("--sensor", help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.")] = None,
+    config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,
+    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames per second (default: the video's, or the time stamps).")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="File of frame times: µs as integers, or seconds with a point.")] = None,
+    gamma: Annotated[str | None, typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats).")] = None,
     interpolate: Annotated[str, typer.Option(help="Between frames: linear, cubic, or motion (dense-flow warp).")] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     factor: Annotated[int, typer.Option(min=1, max=1000, help="cubic: steps per given frame.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
-    preview: Annotated[Optional[str], typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
+    preview: Annotated[str | None, typer.Option(help="Also write a video of frames and events, .mp4.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
-) -> None:
+) -> int:
     """Turn any video into events."""
-    from blinkgl.show import recordings
+    from blinkgl.show import simulate as command
 
-    recordings.simulate(source, out, quiet, **recordings.emulator_options(emulator, config, overrides or [], sensor), fps=fps,
-                      timestamps=timestamps, gamma=gamma, interpolate=interpolate, max_px=max_px, factor=factor, seed=seed,
-                      preview=preview, overwrite=overwrite)
+    return command.run(source, out, emulator=emulator, sensor=sensor, config=config, overrides=overrides or [], quiet=quiet, fps=fps,
+                       timestamps=timestamps, gamma=gamma, interpolate=interpolate, max_px=max_px, factor=factor, seed=seed, preview=preview,
+                       overwrite=overwrite)
 
 
 @app.command()
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
-    b: Annotated[Optional[str], typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")] = None,
-    frames: Annotated[Optional[str], typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
-    out: Annotated[Optional[str], typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
-    fps: Annotated[Optional[float], typer.Option(help="Frame rate of the frames.")] = None,
-    timestamps: Annotated[Optional[str], typer.Option(help="Frame times.")] = None,
+    b: Annotated[str | None, typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")] = None,
+    frames: Annotated[str | None, typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
     gamma: Annotated[str, typer.Option(help="Of the frames: linear, srgb or an exponent.")] = "linear",
     frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
-) -> None:
+) -> int:
     """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against brightness."""
-    from blinkgl.show import recordings
+    from blinkgl.show import compare as command
 
-    recordings.compare(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
-                     interval_ms=interval_ms, zero_time=zero_time)
+    return command.run(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
+                       interval_ms=interval_ms, zero_time=zero_time)
 
 
 @app.command()
 def convert(
     source: Annotated[str, typer.Argument(metavar="IN", help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .txt, .csv, .npz, .npy.")],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
-    format: Annotated[Optional[str], typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
-    size: Annotated[Optional[str], typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
+    format: Annotated[str | None, typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
+    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")] = False,
     time_unit: Annotated[str, typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's).")] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
-) -> None:
+) -> int:
     """Convert an event file from one format to another."""
-    from blinkgl.show import recordings
+    from blinkgl.show import convert as command
 
-    recordings.convert(source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
+    return command.run(source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------
@@ -251,7 +239,7 @@ def run(arguments: list[str]) -> int:
     except BrokenPipeError:  # `blinkgl … | head`: nobody reads any more, which is no error of ours
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - nothing leaves without a line for the user
         line = _user_line(error)
         if debug or line is None:
             traceback.print_exc()

@@ -36,7 +36,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         if head[8:] != b"{" and (head[:2] == b"PK" or head[:1] == b"\x80"):
             raise AssetError("is a PyTorch pickle, which could run any code when loaded; refused", where=str(path), accepted="a .safetensors file")
         with safe_open(path, framework="pt") as file:
-            return {k: file.get_tensor(k) for k in file.keys()}, dict(file.metadata() or {})
+            return {k: file.get_tensor(k) for k in file}, dict(file.metadata() or {})
     except FileNotFoundError:
         raise AssetError("no such file", where=str(path)) from None
     except OSError as error:

@@ -5,26 +5,26 @@ from __future__ import annotations
 import sys
 import traceback
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 from blinkgl import __version__
 from blinkgl.cli import _user_line
 from blinkgl.errors import BlinkGLError, ConfigError
-from blinkgl.show.terminal import never_fail_to_print
 from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.show.terminal import never_fail_to_print
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
-Overrides = Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")]
 
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=lambda v: _print_version(v), is_eager=True, help="Print the version.")] = False,
+    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")] = False,
 ) -> None:
     """Train, evaluate and run event-flow networks."""
@@ -33,7 +33,7 @@ def _options(
 def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"eflow {__version__}")
-        raise typer.Exit()
+        raise typer.Exit
 
 
 @app.command()
@@ -57,13 +57,13 @@ def train(
 def evaluate(
     checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
     dataset: Annotated[str, typer.Argument(help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences.")],
-    out: Annotated[Optional[str], typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
-    iterations: Annotated[Optional[int], typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
-    limit: Annotated[Optional[int], typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
     precision: Precision = "fp32",
     device: Device = "auto",
@@ -90,18 +90,18 @@ def evaluate(
 def predict(
     checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
     events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
-    out: Annotated[Optional[str], typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
     window_ms: Annotated[float, typer.Option("--window-ms", min=0.001, help="Δ: length of each of the two windows.")] = 100.0,
-    start_ms: Annotated[Optional[float], typer.Option("--start-ms", help="From this time after the first event.")] = None,
-    end_ms: Annotated[Optional[float], typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
+    start_ms: Annotated[float | None, typer.Option("--start-ms", help="From this time after the first event.")] = None,
+    end_ms: Annotated[float | None, typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="One flow: first half against second half, scaled to the whole file.")] = False,
-    truth: Annotated[Optional[str], typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")] = None,
-    size: Annotated[Optional[str], typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
+    truth: Annotated[str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
     warm_start: Annotated[bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")] = False,
     empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
-    iterations: Annotated[Optional[int], typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
@@ -122,7 +122,7 @@ def predict(
         first = next((int(c.t[0]) for c in file.chunks()), None)
         if first is None:
             raise BlinkGLError("holds no events", where=events)
-        at = lambda ms: None if ms is None else first + round(ms * 1000)  # noqa: E731
+        at = lambda ms: None if ms is None else first + round(ms * 1000)
         span, factor = round(window_ms * 1000), 1.0
         stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
@@ -185,12 +185,12 @@ def submit(
 
 @app.command()
 def bench(
-    model: Annotated[Optional[list[str]], typer.Option("--model", "-m", help="May be repeated; default: all.")] = None,
-    size: Annotated[Optional[list[str]], typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")] = None,
+    model: Annotated[list[str] | None, typer.Option("--model", "-m", help="May be repeated; default: all.")] = None,
+    size: Annotated[list[str] | None, typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")] = None,
     repeats: Annotated[int, typer.Option(min=1)] = 5,
     training: Annotated[bool, typer.Option("--training/--no-training", help="Also a training step.")] = True,
     plain: Annotated[bool, typer.Option("--plain", help="Also the RAFT-style slow twin of lookup and upsampling.")] = False,
-    json_out: Annotated[Optional[str], typer.Option("--json", help="Also write the rows to this file.")] = None,
+    json_out: Annotated[str | None, typer.Option("--json", help="Also write the rows to this file.")] = None,
     precision: Precision = "fp32",
 ) -> None:
     """Milliseconds, GMACs and peak memory per model and resolution; each measured in a process of its own."""
@@ -286,7 +286,7 @@ def run(arguments: list[str]) -> int:
             raise
         print(f"error: {error.name} is not installed; run {install(*EXTRAS['learn'][0])}", file=sys.stderr)
         return BlinkGLError.exit_status
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - nothing leaves without a line for the user
         line = _user_line(error)
         if debug or line is None:
             traceback.print_exc()

@@ -171,7 +171,7 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     Raises ConfigError: missing file, bad YAML, unknown key, bad value."""
     path, tree = Path(path), read_table(path)
     config = validate(TrainConfig, apply_overrides(tree, overrides))
-    absolute = lambda p: str(path.parent.resolve() / p)  # noqa: E731 - an absolute p stays
+    absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p stays
     sources = {k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k)) for k in ("train", "validate_on")}
     return config.model_copy(update={"data": config.data.model_copy(update=sources),
                                      "init_from": absolute(config.init_from) if config.init_from else None})

@@ -93,7 +93,7 @@ def whole_file(file: EventFile) -> tuple[StreamWindow, float]:
         raise EventDataError("no events", where=str(file.path))
     t0, t1 = int(events.t[0]), int(events.t[-1]) + 1
     t = (t0 + t1) // 2
-    cut = lambda a, b: Window(*(getattr(w := events.window(a, b), k) for k in "xytp"), a, b)  # noqa: E731
+    cut = lambda a, b: Window(*(getattr(events.window(a, b), k) for k in "xytp"), a, b)
     return StreamWindow(t, cut(t0, t), cut(t, t1)), (t1 - t0) / (t1 - t)
 
 
@@ -172,7 +172,7 @@ class FlowWriter:
         self.final, self.npy, self.pictures, self.count = Path(final), npy, pictures, 0
         self._lines = ["# from_timestamp_us, to_timestamp_us"]
 
-    def __enter__(self) -> "FlowWriter":
+    def __enter__(self) -> FlowWriter:
         refuse_existing(self.final)
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)

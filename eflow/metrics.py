@@ -38,7 +38,7 @@ def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -
     epe = np.hypot(*(pr - gt).T)
     size = np.hypot(*gt.T)
     angle = angle_2d(pr, gt)
-    share = lambda mask: float(100 * np.mean(mask)) if np.isfinite(epe).all() else float("nan")  # noqa: E731
+    share = lambda mask: float(100 * np.mean(mask)) if np.isfinite(epe).all() else float("nan")
     return {
         "AEE": float(epe.mean()),
         "outlier": share((epe > 3) & (epe > 0.05 * size)),

@@ -27,7 +27,7 @@ def events_of(tensor: np.ndarray) -> np.ndarray:
     """(H, W, 3) uint8 picture of an event tensor (C, H, W): where it is positive (blue) and negative (red)."""
     strength = np.abs(tensor)
     top = np.percentile(strength[strength > 0], 95) if (strength > 0).any() else 1.0
-    level = lambda t: np.minimum(8, np.ceil(3 * np.clip(t, 0, None).sum(0) / top)).astype(np.uint16)  # noqa: E731
+    level = lambda t: np.minimum(8, np.ceil(3 * np.clip(t, 0, None).sum(0) / top)).astype(np.uint16)
     return event_colour(np.stack([level(-tensor), level(tensor)]))
 
 

@@ -25,5 +25,5 @@ def precision_on(device: torch.device, wanted: str, quiet: bool = False) -> str:
     """``wanted`` ("fp32" or "bf16"), or "fp32" where the device cannot; one line on stderr says so."""
     reason = lacks_bf16(device) if wanted == "bf16" else ""
     if reason and not quiet:
-        print(f"precision: fp32 instead of bf16: {reason}", file=sys.stderr, flush=True)
+        print(f"precision: fp32 instead of bf16: {reason}", file=sys.stderr, flush=True)  # noqa: T201
     return "fp32" if reason else wanted

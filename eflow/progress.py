@@ -31,7 +31,7 @@ class TrainProgress:
         self._where = where
         self._console = plain_console(file=sys.stderr)
 
-    def __enter__(self) -> "TrainProgress":
+    def __enter__(self) -> TrainProgress:
         self._live = None
         if self.enabled:
             limit = "" if self._deadline is None else f", {_hms(self._deadline - self._clock())} at most"
@@ -66,14 +66,14 @@ class TrainProgress:
         return f"{_hms(left)} left, the time limit, at about step {self._step + int(left * self.rate / self.batch)}"
 
     def _print(self, line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
+        print(line, file=sys.stderr, flush=True)  # noqa: T201
 
     def note(self, step: int, scores: dict[str, float]) -> None:
         """A validation result."""
         self._time = self._clock()  # validation is not training time
         if self.enabled:
             line = f"step {step}  " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items())
-            self._live.console.print(line) if self._live is not None else print(line, file=sys.stderr, flush=True)
+            self._live.console.print(line) if self._live is not None else self._print(line)
 
     def __exit__(self, *_) -> None:
         if self._live is not None:

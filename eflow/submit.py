@@ -80,7 +80,7 @@ def submit_blinkflow(model: FlowModel, root: str | os.PathLike, out: str | os.Pa
     Raises as :func:`submit_dsec`."""
     source = open_source(root, "blinkflow")
     assert isinstance(source, FolderSource)
-    name = lambda i: f"{source.entry(i)[0].name}/{source.entry(i)[1].from_us // 1000:d}_{source.entry(i)[1].to_us // 1000:d}.flo"  # noqa: E731
+    name = lambda i: f"{source.entry(i)[0].name}/{source.entry(i)[1].from_us // 1000:d}_{source.entry(i)[1].to_us // 1000:d}.flo"
     wanted = {name(i) for i in range(len(source))}
     sizes: dict[str, tuple[int, int]] = {}
     with atomic_file(out, overwrite=False) as temporary:

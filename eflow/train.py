@@ -325,7 +325,7 @@ def _stop_on_nan(out: Path, step: int, batch: dict, loss: float, norm: float) ->
 
 
 def _picture(path: Path, batch: dict, flow: Tensor) -> None:
-    first = lambda k: batch[k][0].detach().float().cpu().numpy()  # noqa: E731
+    first = lambda k: batch[k][0].detach().float().cpu().numpy()
     write_picture(path, comparison(events_of(first("new")), flow[0].float().cpu().numpy().transpose(1, 2, 0), first("flow").transpose(1, 2, 0),
                                    batch["valid"][0].cpu().numpy()))
 
@@ -352,7 +352,7 @@ class _Signals:
 
     reason: str | None = None
 
-    def __enter__(self) -> "_Signals":
+    def __enter__(self) -> _Signals:
         self._old = {}
         with contextlib.suppress(ValueError):  # not the main thread: the caller's business
             for s in (signal.SIGINT, signal.SIGTERM):
@@ -375,13 +375,13 @@ class _Log:
     def __init__(self, out: Path, start: int, enabled: bool):
         self.path, self.start, self.enabled = out / "log.jsonl", start, enabled
 
-    def __enter__(self) -> "_Log":
+    def __enter__(self) -> _Log:
         if self.enabled:
             with output_errors(self.path):
                 lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
                 kept = [line for line in lines if line.startswith("{") and line.endswith("}") and json.loads(line)["step"] <= self.start]
                 self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-                self._file = open(self.path, "a", encoding="utf-8")  # noqa: SIM115
+                self._file = open(self.path, "a", encoding="utf-8")
             from torch.utils.tensorboard import SummaryWriter
 
             self._board = SummaryWriter(str(self.path.parent / "tb"), purge_step=self.start + 1 if self.start else None)

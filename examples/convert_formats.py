@@ -4,7 +4,19 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl import Camera, Keyframes, Material, Primitive, Scene, convert, look_at, open_events, read_events, record, write_events
+from blinkgl import (
+    Camera,
+    Keyframes,
+    Material,
+    Primitive,
+    Scene,
+    convert,
+    look_at,
+    open_events,
+    read_events,
+    record,
+    write_events,
+)
 
 
 def main(out: Path) -> None:

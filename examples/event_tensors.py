@@ -9,7 +9,7 @@ from blinkgl import Camera, Keyframes, Material, Primitive, Scene, look_at, reco
 from eflow.ops.voxel import voxel_grid
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 
 def main(out: Path) -> None:

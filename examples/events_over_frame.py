@@ -8,7 +8,7 @@ import numpy as np
 from blinkgl import Camera, Keyframes, Material, Pose, Primitive, Scene, look_at, record
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 
 def main(out: Path) -> None:

@@ -56,7 +56,7 @@ def test_notebook(monkeypatch, capsys):
     monkeypatch.chdir(REPOSITORY)
     names: dict = {}
     for number, cell in enumerate(example_docs.cells(path)):
-        exec(compile(cell, f"demo.ipynb, code cell {number}", "exec"), names)  # noqa: S102 - our own notebook
+        exec(compile(cell, f"demo.ipynb, code cell {number}", "exec"), names)
     plt.close("all")
     assert "events per pixel" in capsys.readouterr().out
 
@@ -67,5 +67,5 @@ def test_readme_hello_world(tmp_path, monkeypatch):
     assert len(block.strip().splitlines()) <= 10
     monkeypatch.chdir(tmp_path)
     names: dict = {}
-    exec(compile(block, "README.md", "exec"), names)  # noqa: S102
+    exec(compile(block, "README.md", "exec"), names)
     assert len(names["events"]) > 1000 and names["flow"].shape[-1] == 2

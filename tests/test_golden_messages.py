@@ -12,7 +12,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from blinkgl import cli
 from blinkgl.tools import messages

@@ -29,7 +29,6 @@ from blinkgl.trade.measure import Options
 from blinkgl.trade.run import trade, write
 from blinkgl.trade.settings import Setting
 
-
 # --- an emulator (docs/extending.md shows this class) ---------------------------------------------------------------
 
 
@@ -128,7 +127,7 @@ def test_a_toy_emulator_simulates(toy, tmp_path, capsys):
     assert "events in 0.05 s" in capsys.readouterr().out
     assert run(["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "n.h5"), "-e", "toi"]) == 2
     assert "esim, v2e, voltmeter, toy" in capsys.readouterr().err
-    from blinkgl.show.recordings import emulator_options
+    from blinkgl.show.simulate import emulator_options
 
     assert emulator_options("toy", None, [], "davis346")["emulator"] == Toy.Config(contrast_threshold=0.2, dead_us=500)
     frames = [np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)]
@@ -228,7 +227,7 @@ def toy_with(part, line=None):
     body, name = tree.body[0].body, part
     if part.startswith("Config."):
         body, name = next(n for n in body if isinstance(n, ast.ClassDef)).body, part.removeprefix("Config.")
-    named = lambda node: getattr(node, "name", None) or getattr(getattr(node, "target", None) or getattr(node, "targets", [None])[0], "id", None)  # noqa: E731
+    named = lambda node: getattr(node, "name", None) or getattr(getattr(node, "target", None) or getattr(node, "targets", [None])[0], "id", None)
     (at,) = (k for k, node in enumerate(body) if named(node) == name)
     body[at:at + 1] = ast.parse(line).body if line else []
     made = {}

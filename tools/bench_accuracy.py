@@ -17,9 +17,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine import bench
 from blinkgl.config.sequence import load_run
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.build import build_scene

@@ -39,7 +39,7 @@ def voxels(height: int, width: int, events: int, rounds: int) -> dict[str, float
     for name, (x, y) in (("uniform", uniform), ("edges", edges)):
         for kind, dtype in (("integer pixels", np.uint16), ("rectified", np.float32)):
             columns = x.astype(dtype), y.astype(dtype), t, p
-            run = lambda: voxel_grid(*columns, 0, 100_000, BINS, height, width)  # noqa: E731, B023
+            run = lambda: voxel_grid(*columns, 0, 100_000, BINS, height, width)
             out[f"{name}, {kind}"] = events / 1e6 / bench.seconds(run, rounds, 1)["min"]
     return out
 
@@ -109,7 +109,7 @@ def samples(folder: str, count: int = 50) -> dict[str, float]:
     whole, grids = [], []
     for i in indices:
         raw = source[i]
-        for times, run in ((whole, lambda: dataset[i]), (grids, lambda: [grid(w, raw.height, raw.width) for w in (raw.old, raw.new)])):  # noqa: B023
+        for times, run in ((whole, lambda: dataset[i]), (grids, lambda: [grid(w, raw.height, raw.width) for w in (raw.old, raw.new)])):
             began = time.perf_counter()
             run()
             times.append(time.perf_counter() - began)

@@ -24,9 +24,9 @@ from rich.console import Console
 from rich.table import Table
 from skimage import data
 
-from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import make_emulator
+from blinkgl.machine import bench
 
 HEIGHT, WIDTH, FPS = 480, 640, 1000
 EMULATORS = {

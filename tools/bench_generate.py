@@ -27,19 +27,18 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole, focal_length
-from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.report import Totals
-from blinkgl.show.generate import STAGES, summary
+from blinkgl.dataset.report import STAGES, Totals
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene.geometry import primitives
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.rig import Rig
+from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject
 
@@ -106,7 +105,7 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     events = {}
     for name in ("full redraw", "what moves"):
         with Renderer(gl, scene, PLAIN) as renderer:
-            renderer._still = name == "what moves"
+            renderer._still = name == "what moves"  # noqa: SLF001 - what is measured cannot be switched from outside
             emulator, out, moment = make_emulator(EsimConfig(), 480, 640, seed=1), np.empty((480, 640), np.float32), iter(range(1 << 30))
             made = events[name] = []
 
@@ -128,7 +127,7 @@ def sequence(name: str, quick: bool) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         list(generate_run(load_run(path, ["time.duration=0.1"]), f"{folder}/warm", 1))
         report = list(generate_run(load_run(path, overrides), f"{folder}/timed", 1))[0]
-    return {"config": name, "triangles": report.triangles, **summary(Totals().add(report))}
+    return {"config": name, "triangles": report.triangles, **Totals().add(report).summary()}
 
 
 def peer(gl, quick: bool) -> dict:

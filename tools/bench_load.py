@@ -26,9 +26,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import make_emulator
+from blinkgl.machine import bench
 from blinkgl.tools.bench_events import FPS, HEIGHT, WIDTH, clip
 
 EMULATORS = {"ESIM": EsimConfig(contrast_threshold=0.2, threshold_sigma=0.0), "V2E": V2eConfig(), "Voltmeter": VoltmeterConfig()}

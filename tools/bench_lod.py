@@ -21,12 +21,12 @@ import trimesh
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
@@ -63,7 +63,7 @@ def _grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _knot(rng):
     u, v, faces = _grid(24, 300)
     p, q = [(2, 3), (3, 2), (2, 5), (1, 1)][rng.integers(4)]
-    centre = lambda t: np.stack([(2 + np.cos(q * t)) * np.cos(p * t), (2 + np.cos(q * t)) * np.sin(p * t), np.sin(q * t)], -1)  # noqa: E731
+    centre = lambda t: np.stack([(2 + np.cos(q * t)) * np.cos(p * t), (2 + np.cos(q * t)) * np.sin(p * t), np.sin(q * t)], -1)
     t = 2 * np.pi * u
     along = centre(t + 1e-4) - centre(t - 1e-4)
     along /= np.linalg.norm(along, axis=1, keepdims=True)

@@ -20,7 +20,6 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine import bench
 from blinkgl.config.base import validate
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
@@ -28,6 +27,7 @@ from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, Displace
 from blinkgl.dataset.event_pass import EventPass
 from blinkgl.events import Events
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
@@ -59,7 +59,7 @@ class WarpedPath:
     def __init__(self, path, t0_ns: int, length_ns: int):
         self.path, self.t0_ns, self.t1_ns = path, t0_ns, t0_ns + length_ns
         s = np.linspace(0, 1, 4001)
-        ramp = lambda edge: 0.5 * (1 + np.tanh((s - edge) / 0.015))  # noqa: E731
+        ramp = lambda edge: 0.5 * (1 + np.tanh((s - edge) / 0.015))
         self._s, self._rate = s, SLOW + (FAST - SLOW) * (ramp(FAST_FROM) - ramp(FAST_TO))
         self._tau = np.concatenate([[0], np.cumsum((self._rate[1:] + self._rate[:-1]) / 2 * np.diff(s))])
 
@@ -87,7 +87,7 @@ def random_scene(seed: int, still_camera: bool = False) -> Scene:
                       "object_motion": {"speed": [0.2, 1.5], "rotation_rate": [20, 120], "static_share": 0.4}}}
     c = validate(SequenceConfig, tree)
     scene = build_scene(c.scene, c.camera, c.time.t0_ns, c.time.t1_ns, split="train", seed=seed, sequence=0, base=Path("."))
-    warp = lambda path: path if path.is_static else WarpedPath(path, scene.t0_ns, DURATION_NS)  # noqa: E731
+    warp = lambda path: path if path.is_static else WarpedPath(path, scene.t0_ns, DURATION_NS)
     objects = list(scene.objects)
     if still_camera:  # the first that moves runs fast, the others on their own slow clock
         fast = next(i for i, o in enumerate(objects) if not o.path.is_static)
@@ -164,7 +164,7 @@ def main() -> None:
     options = parser.parse_args()
     console = Console()
     console.width = max(console.width, 150)
-    say = lambda text: console.print(text, highlight=False, soft_wrap=True)  # noqa: E731
+    say = lambda text: console.print(text, highlight=False, soft_wrap=True)
     scenes = {f"mixed {k}": (k, False) for k in range(1, options.scenes + 1)} | {"still camera": (11, True)}
     results = {}
     with create_context() as gl:

@@ -19,10 +19,10 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from blinkgl.machine import bench
 from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events, make_emulator
 from blinkgl.gl import create_context
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.types import Scene
@@ -44,7 +44,7 @@ def one_mover(kind: str, coverage: float) -> Scene:
     radius = float(np.linalg.norm(mover.parts[0].mesh.vertices, axis=1).max())
     distance = 2 * radius * focal / np.sqrt(coverage * WIDTH * HEIGHT)
     speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / focal  # units per second, across the image
-    seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]  # noqa: E731
+    seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]
     path = KeyframePath([0, 2 * SECOND], [seen(-speed / 4), seen(speed * 7 / 4)], [Rotation.identity().as_quat()] * 2, interpolation="linear")
     objects = tuple(replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
     return replace(scene, objects=objects).with_path(StaticPath(at))
@@ -55,7 +55,7 @@ class Way:
 
     def __init__(self, gl, scene: Scene, still: bool):
         self.renderer = Renderer(gl, scene, PLAIN)
-        self.renderer._still = still
+        self.renderer._still = still  # noqa: SLF001 - what is measured cannot be switched from outside
         self.emulator = make_emulator(EsimConfig(), HEIGHT, WIDTH, seed=1)
         self.frame = np.empty((HEIGHT, WIDTH), np.float32)
         self.events: list[Events] = []

@@ -20,11 +20,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine.bench import machine_line
 from blinkgl.config.sequence import RunTemplate, load_run
 from blinkgl.dataset.executor import Local
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.work import RUN_FOLDER
+from blinkgl.machine.bench import machine_line
 
 SIZE = ["camera.width=346", "camera.height=260"]
 ONE_GROUP = ["groups.flying_test.enabled=false", "groups.falling_dice.enabled=false"]

@@ -18,11 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
-from blinkgl.machine.bench import machine_line
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
+from blinkgl.machine.bench import machine_line
 
 BASE = {
     "seed": 5,

@@ -44,7 +44,6 @@ import annotated_types
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine.bench import machine_line
 from blinkgl.config.base import is_model, members, tag_of
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.quality import QUALITIES
@@ -52,6 +51,7 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import SequenceConfig, load_run
 from blinkgl.errors import BlinkGLError, ConfigError
+from blinkgl.machine.bench import machine_line
 from blinkgl.show.terminal import plain_console
 
 DRAWS = 12
@@ -139,7 +139,7 @@ class Maker:
         return made
 
     def _drawn(self, name: str, annotation: Any, metadata: Any, made: Any) -> Any:
-        again = lambda: self._plain(name, self.rng.choice(members(annotation)), [*metadata, *_metadata(annotation)])  # noqa: E731
+        again = lambda: self._plain(name, self.rng.choice(members(annotation)), [*metadata, *_metadata(annotation)])
         other = again()
         if isinstance(made, int) and isinstance(other, int) and not isinstance(made, bool):
             return {"integer": sorted((made, other))}
@@ -295,12 +295,12 @@ def _shrink(rng: random.Random, tree: dict[str, Any]) -> None:
                 tree["camera"].pop(key, None)
     for path, value in SMALL.items():
         top = path.split(".")[0]
-        if "." not in path or top == "camera" or isinstance(tree.get(top), dict) and not _has_distribution(tree[top]):
+        if "." not in path or top == "camera" or (isinstance(tree.get(top), dict) and not _has_distribution(tree[top])):
             _put(tree, path, value(rng) if callable(value) else value)
         elif top in tree:
             del tree[top]
     timeline = tree.get("timeline")
-    if not isinstance(timeline, dict) or _has_distribution({"x": timeline.get("kind")}) or len(timeline) == 1 and _has_distribution(timeline):
+    if not isinstance(timeline, dict) or _has_distribution({"x": timeline.get("kind")}) or (len(timeline) == 1 and _has_distribution(timeline)):
         timeline = tree["timeline"] = {"kind": rng.choice(["uniform", "displacement", "brightness"])}
     quality = tree.get("quality") is not None
     for key, value in SMALL_TIMELINE["uniform" if timeline.get("kind", "displacement") == "uniform" else None].items():
@@ -450,7 +450,7 @@ class Worker:
     def __init__(self, seed: int, memory_mb: int, cpu_s: float):
         self.arguments = [sys.executable, "-m", "blinkgl.tools.fuzz_configs", "--worker", "--seed", str(seed), "--memory", str(memory_mb)]
         self.cpu_s, self.process = cpu_s, None
-        self.said = tempfile.TemporaryFile("w+")
+        self.said = tempfile.TemporaryFile("w+")  # noqa: SIM115 - lives as long as the worker
 
     def try_one(self, what: str, number: int) -> Outcome:
         if self.process is None:

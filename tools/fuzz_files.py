@@ -41,8 +41,8 @@ if __name__ == "__main__":  # a process with threads cannot be forked safely; wh
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(_name, "1")
 
-from blinkgl.errors import BlinkGLError  # noqa: E402
-from blinkgl.tools.fuzz_formats import FORMATS, MARK, Format  # noqa: E402
+from blinkgl.errors import BlinkGLError
+from blinkgl.tools.fuzz_formats import FORMATS, MARK, Format
 
 OK, REFUSED, WRONG, TRACEBACK, CRASH, HANG, MEMORY = "ok", "refused", "wrong answer", "traceback", "crash", "hang", "memory"
 DEFECTS = (WRONG, TRACEBACK, CRASH, HANG, MEMORY)
@@ -174,7 +174,7 @@ class _Task:
         if late:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        _, status, usage = os.wait4(pid, 0)
+        _, status, _ = os.wait4(pid, 0)
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(pid, signal.SIGKILL)  # what it may have started
         for name, data in self.originals.items():

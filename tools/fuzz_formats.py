@@ -100,7 +100,7 @@ def _as_stored(folder: Path, name: str) -> dict[str, np.ndarray] | None:
         return {"x": data["x"], "y": data["y"], "t": np.rint(t.astype(float) * 1e6) if t.dtype.kind == "f" else t, "p": (data["p"] > 0) * 1}
     if path.suffix in (".txt", ".csv"):
         lines = [line for line in path.read_bytes().split(b"\n") if line.strip() and line.strip()[:1] not in b"#%"]
-        events = [f for line in lines if len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit() or f[0][:1] in b"."]
+        events = [f for line in lines if (len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit()) or f[0][:1] in b"."]
         return {"x": np.array([float(f[1]) for f in events])}
     return None
 
@@ -468,7 +468,6 @@ _RECIPE = {
 def _make_data_set(folder: Path) -> None:
     """One sequence, its index and the run's record; nothing of it was rendered."""
     from blinkgl.config.reader import to_yaml
-
     from blinkgl.config.sequence import load_run
     from blinkgl.dataset.plan import Plan
     from blinkgl.dataset.run_folder import RunFolder
@@ -641,8 +640,8 @@ def _make_emulator_yaml(folder: Path) -> list[str]:
 
 
 def _judge_emulator_yaml(folder: Path) -> str | None:
-    from blinkgl.show.recordings import emulator_options
     from blinkgl.recordings.simulation import emulator_config
+    from blinkgl.show.simulate import emulator_options
 
     emulator_config(emulator_options("esim", str(folder / "e.yaml"), [])["emulator"])
     return None

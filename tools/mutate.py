@@ -33,6 +33,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import ClassVar
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -70,7 +71,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        shorten = lambda text: " ".join(text.split())[:60]  # noqa: E731
+        shorten = lambda text: " ".join(text.split())[:60]
         return f"{self.path}:{self.line}:{self.column}: {shorten(self.before)} -> {shorten(self.after) or '(nothing)'}"
 
     def apply(self, source: str) -> str:
@@ -146,7 +147,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_BinOp(self, node) -> None:
         symbol = ARITHMETIC.get(type(node.op))
-        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))  # noqa: E731
+        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
         if symbol and not literal(node.left) and not literal(node.right):
             self.between(node.left, node.right, symbol, "arithmetic")
         self.generic_visit(node)
@@ -166,7 +167,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node) -> None:
-        start, end = self.span(node)
+        start, _end = self.span(node)
         inner = self.span(node.operand)[0]
         if isinstance(node.op, (ast.Not, ast.USub)):
             self.add(start, inner, "", "negation left out")
@@ -200,7 +201,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_Attribute(self, node) -> None:
         if node.attr in NAMES:
-            start, end = self.span(node)
+            _start, end = self.span(node)
             self.add(end - len(node.attr), end, NAMES[node.attr], "function")
         self.visit(node.value)
 
@@ -358,8 +359,9 @@ class Copy:
         if kernels is not None:
             environment["NUMBA_CACHE_DIR"] = str(kernels)
         process = subprocess.Popen([sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", f"@{listing}"],
-                                   cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-                                   preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY)))
+                                   cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
+        # Not by preexec_fn, which may hang: it runs between fork and exec, where another thread's lock is held for ever.
+        resource.prlimit(process.pid, resource.RLIMIT_AS, (MEMORY, MEMORY))
         try:
             output, _ = process.communicate(timeout=limit_s)
         except subprocess.TimeoutExpired:
@@ -368,8 +370,8 @@ class Copy:
             return "time", ""
         return ("passed" if process.returncode == 0 else "failed"), output[-3000:]
 
-    sound: set[str] = set()
-    unfit: set[str] = set()
+    sound: ClassVar[set[str]] = set()
+    unfit: ClassVar[set[str]] = set()
     """tests that pass, and that fail, in a copy without any mutant; known to all copies"""
 
     def passes(self, test: str) -> bool:
@@ -444,7 +446,7 @@ def _made(folder: Path) -> Path:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--map", action="store_true", help="run the suite under coverage (needs pytest-cov) and stop")
-    parser.add_argument("--count", type=int, default=200, help="mutants drawn, over %s" % ", ".join(ROOMS))
+    parser.add_argument("--count", type=int, default=200, help=f"mutants drawn, over {', '.join(ROOMS)}")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2, help="mutants side by side")
     parser.add_argument("--show", metavar="FILE", help="list the mutants of a module")

@@ -133,7 +133,7 @@ def _run(scene: Scene, times_ns, near, repeat: int) -> dict[str, np.ndarray]:
 
 
 def _main(job_path: str, answer_path: str) -> None:
-    np.infty = np.inf
+    np.inf = np.inf
     import pyrender
 
     with np.load(job_path, allow_pickle=False) as stored:
@@ -144,7 +144,7 @@ def _main(job_path: str, answer_path: str) -> None:
     world = pyrender.Scene(bg_color=background)
     nodes = [world.add(pyrender.Mesh([_primitive(pyrender, job, k)])) for k in range(len(job["ids"]))]
     camera = pyrender.IntrinsicsCamera(fx, fy, cx, cy, znear=near)
-    camera._zfar = None  # infinite: its matrix and its read-back know it, only its setter does not
+    camera._zfar = None  # noqa: SLF001 - infinite: its matrix and its read-back know it, only its setter does not
     eye = world.add(camera)
     # 24 bits of id in three 8-bit colour channels
     codes = {node: [int(i) >> shift & 255 for shift in (16, 8, 0)] for node, i in zip(nodes, job["ids"])}

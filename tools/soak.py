@@ -39,10 +39,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from blinkgl.machine.bench import machine_line
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.work import RUN_FOLDER
+from blinkgl.machine.bench import machine_line
 from blinkgl.scene.geometry import primitives
 
 LOCAL = ("kill-worker", "hang", "kill-driver", "sigterm", "sigint", "disk-full", "corrupt-asset")

@@ -23,7 +23,7 @@ class PinHole(CameraModel):
     kind: ClassVar[str] = "pinhole"
 
     @classmethod
-    def centred(cls, width: int, height: int, fx: float, fy: float | None = None, near: float = 0.05) -> "PinHole":
+    def centred(cls, width: int, height: int, fx: float, fy: float | None = None, near: float = 0.05) -> PinHole:
         """With the principal point in the middle of the image; ``fy``: as fx."""
         return cls(width, height, fx, fx if fy is None else fy, (width - 1) / 2, (height - 1) / 2, near)
 

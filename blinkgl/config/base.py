@@ -29,7 +29,15 @@ from functools import partial
 from typing import Annotated, Any, ClassVar
 
 import annotated_types
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, TypeAdapter, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 from pydantic.fields import FieldInfo
 from pydantic_core import core_schema
 
@@ -59,7 +67,7 @@ class Rule:
         """Path of every key, and whether it is read with all that is below it."""
         return tuple((tuple(key.lstrip("?#").split(".")), key[0] not in "?#") for key in self.keys)
 
-    def __call__(self, model: "Config") -> None:
+    def __call__(self, model: Config) -> None:
         self.check(*(_value(model, key) for key in self.keys))
 
 
@@ -110,7 +118,7 @@ class Config(BaseModel):
 def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
     """Annotation of a field that is one of ``models``, told apart by the value of the key ``tag``; where that key is not given
     it is ``default``, so that a table may say only what it changes."""
-    union = typing.Union[models]
+    union = typing.Union[models]  # noqa: UP007 - of as many as there are
     if default is None:
         return Annotated[union, Discriminator(tag)]
     return Annotated[union, Discriminator(tag), BeforeValidator(partial(_with_tag, tag, default))]
@@ -268,7 +276,7 @@ def validate_field(model: type[Config], name: str, value: Any) -> Any:
     """``value`` as the model's field ``name`` alone would hold it. Raises ConfigError as :func:`validate`."""
     info = model.model_fields[name]
     try:
-        kind = Annotated[info.annotation, *info.metadata] if info.metadata else info.annotation
+        kind = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:
         raise _translate(model, error, "", (name,)) from None

@@ -9,7 +9,7 @@ key (``<<: *base``) brings. Dates are text, since nothing here is a date. ``1e-4
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 from yaml.composer import Composer, ComposerError
@@ -37,9 +37,9 @@ if not _Events:
 class _Loader(Composer, _Events, SafeConstructor, Resolver):
     """Composes with a count of the values that the document expands to; refuses what is not plain data."""
 
-    yaml_constructors: dict = {}
-    yaml_implicit_resolvers: dict = {first: [(tag, regexp) for tag, regexp in known if not tag.endswith(":timestamp")]
-                                     for first, known in Resolver.yaml_implicit_resolvers.items()}
+    yaml_constructors: ClassVar[dict] = {}
+    yaml_implicit_resolvers: ClassVar[dict] = {
+        first: [(tag, regexp) for tag, regexp in known if not tag.endswith(":timestamp")] for first, known in Resolver.yaml_implicit_resolvers.items()}
 
     def __init__(self, text: str):
         _Events.__init__(self, text)

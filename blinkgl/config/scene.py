@@ -6,6 +6,7 @@ whether they exist; the models here only know shapes, units and limits.
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Annotated, Any, Literal
 
@@ -254,7 +255,7 @@ class KeyedMotionConfig(PoseConfig):
     def _in_order(times):
         if len(times) == 1:
             raise Refused("one key frame is no motion; give two or more, or a fixed pose", where="keyframes")
-        for k, (before, after) in enumerate(zip(times, times[1:])):
+        for k, (before, after) in enumerate(itertools.pairwise(times)):
             if after - before < 1e-6:
                 raise Refused("the key frames' times must increase by at least 1e-6 s", where=f"keyframes.{k + 1}.time", value=after)
 

@@ -88,7 +88,7 @@ def load_sensor(name: str) -> SensorConfig:
 
 def known_sensor(name: Any) -> str | None:
     """The name in :func:`sensor_names` that ``name`` means; None for one that is not shipped."""
-    plain = lambda s: "".join(c for c in s.lower() if c.isalnum())  # noqa: E731
+    plain = lambda s: "".join(c for c in s.lower() if c.isalnum())
     return next((known for known in sensor_names() if plain(known) == plain(name)), None) if isinstance(name, str) else None
 
 

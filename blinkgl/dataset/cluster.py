@@ -139,7 +139,7 @@ class RayCluster:
                 ray.init(address=address, log_to_driver=False, logging_level="ERROR", configure_logging=True)
         except BlinkGLError:
             raise
-        except Exception as error:  # Ray raises ConnectionError, RuntimeError, ValueError, grpc's own
+        except Exception as error:  # noqa: BLE001 - Ray raises ConnectionError, RuntimeError, ValueError, grpc's own
             text = " ".join(str(error).split())[:200]
             what = "Ray's or Python's version differs from the cluster's" if "ersion mismatch" in text else "cannot connect to Ray"
             raise ConfigError(f"{what}: {text}", where="--address", value=address if address != "local" else "a local cluster",
@@ -263,7 +263,7 @@ def _work(job: dict[str, Any], task: int, attempt: int, expected: tuple[dict[str
                 return {"kind": "refused", "error": f"node {socket.gethostname()} sees other meshes or textures"}
     except BlinkGLError as error:
         return {"kind": "refused", "error": str(error)}
-    return _maker.make(task, attempt, lambda message: board.put.remote(message))
+    return _maker.make(task, attempt, board.put.remote)
 
 
 def _failure(task: int, error: str, lost: bool = False) -> Message:

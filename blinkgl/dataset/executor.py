@@ -170,7 +170,7 @@ class Local:
         self._selector.register(process.channel, selectors.EVENT_READ, process)
         process.send({"job": self._job.to_dict(), "device": device})
 
-    def _bury(self, process: "_Process") -> list[Message]:
+    def _bury(self, process: _Process) -> list[Message]:
         """The process ended by itself: its task failed, and another takes its place."""
         self._selector.unregister(process.channel)
         self._processes.remove(process)
@@ -199,9 +199,9 @@ class _Process:
         self.channel, write_end = os.pipe()
         try:
             log.parent.mkdir(parents=True, exist_ok=True)
-            output = open(log, "ab")
+            output = open(log, "ab")  # noqa: SIM115 - either of the two is closed below
         except OSError:
-            output = open(os.devnull, "ab")
+            output = open(os.devnull, "ab")  # noqa: SIM115
         with output:
             self.popen = subprocess.Popen([sys.executable, "-m", "blinkgl.dataset.worker", str(write_end)], stdin=subprocess.PIPE,
                                           stdout=output, stderr=output, pass_fds=(write_end,), env=environment, start_new_session=True)

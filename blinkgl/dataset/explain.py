@@ -14,20 +14,17 @@ from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.dataset.frames import flow_files, folder_of, read_frame, used_images
 from blinkgl.events import emulator_of, make_emulator
 from blinkgl.gl import GLContext, create_context
+from blinkgl.recordings.simulation import SimulationReport, simulate
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.recordings.simulation import SimulationReport, simulate
-from blinkgl.show.terminal import plain_console
 from blinkgl.timeline import make_timeline
 
 PROBES = 12
@@ -252,24 +249,3 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         if value in (0, 0.0, False) and name not in ("seed",):
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
     add("shadows, inter-reflection, motion blur, depth of field", "BlinkGL does not model them")
-
-
-def show(result: Explanation, console: Console | None = None) -> None:
-    """Prints an explanation as three tables."""
-    console = console or plain_console()
-    scene = Table(title="what is modelled", title_justify="left", show_header=False)
-    for key, value in result.scene.items():
-        scene.add_row(key, value)
-    console.print(scene)
-    passes = Table(title=f"what is computed (timed on {result.machine})", title_justify="left")
-    for column, side in (("pass", "left"), ("why", "left"), ("variants", "left"), ("MB/frame", "right"), ("times", "right"), ("seconds", "right")):
-        passes.add_column(column, justify=side)
-    for p in result.passes:
-        passes.add_row(p.name, p.why, ", ".join(p.variants), f"{p.bytes / 1e6:.2f}" if p.bytes else "–", f"{p.count:,}", f"{p.seconds:.2f}")
-    console.print(passes)
-    left = Table(title="what is left out", title_justify="left", show_header=False)
-    for what, why in result.left_out:
-        left.add_row(what, why)
-    console.print(left)
-    console.print(f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
-                  f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video", highlight=False, soft_wrap=True)

@@ -28,9 +28,9 @@ from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
 from blinkgl.io.preview import PreviewWriter
 from blinkgl.io.sequence_dir import SequenceWriter
+from blinkgl.recordings.simulation import Decoder, SimulationReport, simulate
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.worlds.pool import resolve
-from blinkgl.recordings.simulation import Decoder, SimulationReport, simulate
 
 _FLOW = (".npy", ".flo", ".png")
 
@@ -83,7 +83,7 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
     files = used_images(frames, folder)
     flows, masks = flow_files(folder, frames, len(files))
     clock, report, counted = StageClock(), SequenceReport(index, path), SimulationReport()
-    time_of = lambda k: round(k * 1e9 / frames.fps)  # noqa: E731 - frame k's time, ns
+    time_of = lambda k: round(k * 1e9 / frames.fps)  # frame k's time, ns
     first = read_frame(files[0])
     height, width = first.shape[:2]
     decode = Decoder(frames.gamma)

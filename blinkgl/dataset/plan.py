@@ -21,8 +21,8 @@ from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
 from blinkgl.dataset.frames import matching_folders, used_images
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.importing.mesh_files import dependencies
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below, resolve
 from blinkgl.scene.worlds.random_world import pools
 
@@ -112,7 +112,7 @@ class Plan:
     """How many sequences of each group that has any."""
 
     @classmethod
-    def of(cls, template: RunTemplate, num: int | None = None) -> "Plan":
+    def of(cls, template: RunTemplate, num: int | None = None) -> Plan:
         """``num``: at most so many of each group (a configuration without groups: exactly so many).
 
         Raises ConfigError: any bad value of the recipe, or every group switched off."""

@@ -42,7 +42,7 @@ class PreviewRecorder:
             self._video.set_flow(velocity * self._interval_s)
             self._video.frame(t_ns // 1000, colour)
 
-    def __enter__(self) -> "PreviewRecorder":
+    def __enter__(self) -> PreviewRecorder:
         return self
 
     def __exit__(self, kind, *_) -> None:

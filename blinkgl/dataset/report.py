@@ -11,6 +11,8 @@ import blinkgl
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import SequenceConfig
 
+STAGES = ("scene", "render", "read-back", "events", "write", "preview")
+"""What the seconds of a sequence are told apart by; the rest is "other"."""
 Progress = Callable[["SequenceReport", float], None]
 """Called now and then with the running report and the fraction done, 0 … 1."""
 
@@ -71,6 +73,15 @@ class Totals:
         for stage, seconds in report.seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
         return self
+
+    def summary(self) -> dict[str, float]:
+        """Totals of a run: counts, wall seconds per stage, and the rates the table shows."""
+        stages = {name: self.seconds.get(name, 0.0) for name in STAGES}
+        stages["other"] = max(0.0, self.total_s - sum(stages.values()))
+        return {"sequences": self.count, "frames": self.frames, "events": self.events,
+                "labels": self.labels, "simulated_s": self.simulated_s, "total_s": self.total_s,
+                "seconds_per_simulated_second": self.total_s / self.simulated_s, "events_per_second": self.events / self.total_s,
+                **{f"{name}_s": seconds for name, seconds in stages.items()}}
 
 
 def config_yaml(config: SequenceConfig, index: int) -> str:

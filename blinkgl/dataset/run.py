@@ -20,12 +20,12 @@ from typing import Protocol
 
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.executor import Executor, Inline, StartError
-from blinkgl.io.index import write_index
 from blinkgl.dataset.plan import Plan, check_output, digest
 from blinkgl.dataset.report import Totals
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, Message, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
+from blinkgl.io.index import write_index
 
 ATTEMPTS = 3
 """A sequence is set aside after so many failures that could have passed, or one that could not (:func:`blinkgl.errors.may_pass`)."""

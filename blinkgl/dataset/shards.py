@@ -21,13 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.io.index import sequence_folders
 from blinkgl.errors import AssetError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.index import sequence_folders
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
-from blinkgl.show.terminal import plain_console
 
 _EXTRAS = {"back.png": "flow/backward", "image.png": "images", "occlusion.png": "occlusion/forward"}
 
@@ -98,12 +97,3 @@ def _npz(events: Events) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, x=events.x, y=events.y, t=events.t, p=events.p)
     return buffer.getvalue()
-
-
-def export_and_show(root: str, out: str, *, shard_bytes: int, seed: int) -> None:
-    """What ``blinkgl export`` shows."""
-    console = plain_console()
-    with console.status("writing shards"):
-        written = export_shards(root, out, shard_bytes=shard_bytes, seed=seed)
-    for split, counts in written.items():
-        console.print(f"{out}/{split}-*.tar: {sum(counts):,} samples in {len(counts)} shard{'s' * (len(counts) != 1)}", highlight=False, soft_wrap=True)

@@ -176,7 +176,7 @@ def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[
 def _files_of(config: SequenceConfig) -> Iterator[str]:
     """Names of the files of a generated sequence, the manifest left out."""
     labels, count = config.labels, config.time.label_count
-    numbered = lambda folder, ending, n=count: (f"{folder}/{k:06d}.{ending}" for k in range(n))  # noqa: E731
+    numbered = lambda folder, ending, n=count: (f"{folder}/{k:06d}.{ending}" for k in range(n))
     yield from ("events.h5", "poses.npz", "config.yaml")
     if labels.images:
         yield "images/timestamps.txt"
@@ -436,7 +436,7 @@ def _deep(root: Path, chosen: dict[str, _Known], result: Verification, base: str
                 if progress:
                     progress(result.sequences, "again: " + shown(name))
 
-                def again() -> list[str]:
+                def again(name: str = name, one: _Known = one) -> list[str]:
                     nonlocal gl
                     if one.config.frames is None and gl is None:
                         gl = create_context(one.config.gl.backend, one.config.gl.device)

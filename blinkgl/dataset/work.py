@@ -119,7 +119,7 @@ class Maker:
         return {"kind": "done", "task": number, "bytes": size, "cpu_s": time.process_time() - cpu, "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
                 "report": {**asdict(report), "path": str(report.path)}}
 
-    def __enter__(self) -> "Maker":
+    def __enter__(self) -> Maker:
         return self
 
     def __exit__(self, *_) -> None:

@@ -98,7 +98,7 @@ class Emulator(ABC):
         self._decode = table
         self._tables_changed()
 
-    def _tables_changed(self) -> None:
+    def _tables_changed(self) -> None:  # noqa: B027 - most emulators keep nothing that depends on the tables
         pass
 
     @property

@@ -313,7 +313,7 @@ class Esim(Emulator):
             smallest = min(self._floor_on, self._floor_off)
         self._inverse_threshold = 1.0 / smallest
         self._fired = np.zeros(pixels if config.threshold_jitter else 0, np.int32)
-        self._refractory_ns = int(round(config.refractory_us * 1000))
+        self._refractory_ns = round(config.refractory_us * 1000)
         self._last_ns = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
         self._upper, self._lower = (np.zeros(pixels, np.int32) for _ in range(2))
         if self.lags:

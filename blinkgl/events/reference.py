@@ -12,8 +12,7 @@ import math
 import numpy as np
 
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.events import v2e_model as v2e
-from blinkgl.events import voltmeter
+from blinkgl.events import v2e_model as v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.noise import noise_table
 from blinkgl.events.philox import Stream, normal2, normal_and_uniform, pixel_counters, rough_normal, uniform2

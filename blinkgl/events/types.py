@@ -37,17 +37,17 @@ class Events:
         return len(self.t)
 
     @staticmethod
-    def empty() -> "Events":
+    def empty() -> Events:
         return Events(np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.int64), np.empty(0, np.uint8))
 
     @staticmethod
-    def concatenate(chunks: "list[Events] | tuple[Events, ...]") -> "Events":
+    def concatenate(chunks: list[Events] | tuple[Events, ...]) -> Events:
         """Chunks joined in the given order (they must already be in time order)."""
         if not chunks:
             return Events.empty()
         return Events(*(np.concatenate([getattr(c, k) for c in chunks]) for k in "xytp"))
 
-    def window(self, t0_us: int, t1_us: int) -> "Events":
+    def window(self, t0_us: int, t1_us: int) -> Events:
         """Events of the half-open window [t0_us, t1_us); views, no copy."""
         i, j = np.searchsorted(self.t, (t0_us, t1_us), side="left")
         return Events(self.x[i:j], self.y[i:j], self.t[i:j], self.p[i:j])

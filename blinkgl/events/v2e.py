@@ -37,9 +37,23 @@ from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal,
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
-from blinkgl.events.v2e_model import (DARKEST, REBASE, crossing_fraction, curve_of, draw_leaks, draw_start_noise, lin_log,
-                                      next_noise, noise_place, relax, relax_gently, shot_draw, shot_factor, shot_tables,
-                                      signal_at)
+from blinkgl.events.v2e_model import (
+    DARKEST,
+    REBASE,
+    crossing_fraction,
+    curve_of,
+    draw_leaks,
+    draw_start_noise,
+    lin_log,
+    next_noise,
+    noise_place,
+    relax,
+    relax_gently,
+    shot_draw,
+    shot_factor,
+    shot_tables,
+    signal_at,
+)
 
 _F = np.float32
 _ZERO, _ONE, _HALF, _JOINT, _INF = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.inf)
@@ -450,7 +464,7 @@ class V2e(Emulator):
             self._rebase_ns = int(REBASE / float(np.median(self._leak[self._leak > 0])) * 1e9)
         self._epoch_ns, self._brightest = np.zeros(1, np.int64), np.zeros(1)
 
-        self._refractory_ns = int(round(config.refractory_us * 1000))
+        self._refractory_ns = round(config.refractory_us * 1000)
         self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
 
         shot = config.shot_noise_rate_hz > 0 and not config.photoreceptor_noise

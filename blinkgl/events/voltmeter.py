@@ -299,7 +299,7 @@ class DvsVoltmeter(Emulator):
         self.config = config = config or VoltmeterConfig()
         pixels = self.height * self.width
         self._intensity, self._v = np.zeros(pixels, np.float32), np.zeros(pixels, np.int32)
-        self._refractory_ns = int(round(config.refractory_us * 1000))
+        self._refractory_ns = round(config.refractory_us * 1000)
         self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
         self._scale = np.float32(config.full_scale)
         self._tables_changed()

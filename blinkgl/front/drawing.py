@@ -122,7 +122,7 @@ class Renderer:
             self._renderer = stack.enter_context(SceneRenderer(gl, self.scene, self.config.render))
             self._stack = stack.pop_all()
 
-    def __enter__(self) -> "Renderer":
+    def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -12,8 +12,7 @@ from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import Emulator, events_tree
-from blinkgl.io import flow as flow_files
-from blinkgl.io import formats
+from blinkgl.io import flow as flow_files, formats
 from blinkgl.io.formats import EventFile
 
 if TYPE_CHECKING:
@@ -95,7 +94,7 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
 
 
 def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames: str | os.PathLike | None = None, fps: float | None = None,
-            interval_ms: float = 20.0, zero_time: bool = False) -> "Comparison":
+            interval_ms: float = 20.0, zero_time: bool = False) -> Comparison:
     """How alike two event files are, over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
 
     b : event file; None: ``a`` is described.   frames : video or folder of images both are compared with.   fps : of the frames, Hz.
@@ -109,7 +108,7 @@ def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames:
 
 def simulate(frames: Iterable, *, fps: float | None = None, emulator: Emulator = "esim", gamma: str | float | None = None,
              interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, sensor: str | None = None,
-             report: "SimulationReport | None" = None) -> Iterator[Events]:
+             report: SimulationReport | None = None) -> Iterator[Events]:
     """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
 
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array, t_ns). uint8, uint16, or
@@ -127,7 +126,7 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: Emulator =
 def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None, emulator: Emulator = "esim",
                   gamma: str | float | None = None, interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
                   sensor: str | None = None, timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None,
-                  overwrite: bool = True) -> "SimulationReport":
+                  overwrite: bool = True) -> SimulationReport:
     """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as ``blinkgl simulate``; files appear whole or not at all.
 
     timestamps : file of times, one a frame.   preview : a video of frames and events to write.   The rest: as of :func:`simulate`.
@@ -141,8 +140,8 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
 
 
 def _options(emulator: Emulator, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
-    from blinkgl.recordings import simulation
     from blinkgl.config.sensor import load_sensor
+    from blinkgl.recordings import simulation
 
     tree = events_tree(emulator)
     camera = None if sensor is None else load_sensor(sensor)

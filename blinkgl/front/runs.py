@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import Config, validate_field
 from blinkgl.config.recipe import merge
@@ -20,8 +19,8 @@ if TYPE_CHECKING:
 
 LABELS = ("images", "flow", "flow_backward", "occlusion", "depth", "ids", "normals", "velocity")
 
-Source = Union[Scene, RunTemplate]
-Emulator = Union[str, Mapping[str, Any], Config]
+Source = Scene | RunTemplate
+Emulator = str | Mapping[str, Any] | Config
 
 
 class Timeline:
@@ -57,7 +56,7 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 
 def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, workers: int = 1, resume: bool = False,
              emulator: Emulator | None = None, sensor: str | None = None, timeline: Timeline | None = None, quality: str | None = None,
-             labels: Sequence[str] | None = None) -> "Outcome":
+             labels: Sequence[str] | None = None) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at most).   workers : processes; 1: this one.
@@ -77,7 +76,7 @@ def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, 
     return run_dataset(template, check.path(out, "out"), executor, num=num, resume=bool(resume))
 
 
-def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> "Verification":
+def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verification:
     """Looks through a data set; ``.clean`` says whether all is well, ``.problems`` what is not, by sequence.
 
     deep : so many sequences are made again and compared.   seed : draws which. Raises AssetError: no data set there."""

@@ -12,22 +12,30 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Union
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from blinkgl.config.base import Config, validate
-from blinkgl.config.scene import ExplicitSceneConfig, KeyedMotionConfig, LightConfig, MaterialConfig, MeshConfig, ObjectConfig, PoseConfig
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    KeyedMotionConfig,
+    LightConfig,
+    MaterialConfig,
+    MeshConfig,
+    ObjectConfig,
+    PoseConfig,
+)
 from blinkgl.config.sequence import CameraConfig, RunTemplate, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.scene import types as data
-from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_mesh
-from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.geometry.meshes import make_mesh
+from blinkgl.scene.surfaces.images import content_hash
+from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_mesh
 
-Vector = Union[Sequence[float], np.ndarray]
+Vector = Sequence[float] | np.ndarray
 
 
 class _Piece:
@@ -184,7 +192,7 @@ class Primitive(_Body):
             self._checked(MeshConfig, self.mesh, primitive="kind")
             primitive_mesh(validate(MeshConfig, self.mesh), "mesh")
         except ConfigError as error:
-            before, said, key = (error.where or "").rpartition("parameters")
+            _, said, key = (error.where or "").rpartition("parameters")
             raise ConfigError(error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted) from None
         self.tree = self._placed(name, material if material is not None else Material(), pose, scale, category)
         self.tree.setdefault("name", kind)
@@ -274,7 +282,7 @@ class Scene(_Piece):
         if named:
             self._checked(ExplicitSceneConfig, self.tree)
 
-    def __add__(self, body: Primitive | Mesh) -> "Scene":
+    def __add__(self, body: Primitive | Mesh) -> Scene:
         check.one_of(body, "Scene + …", _Body, "a Primitive or a Mesh")
         return Scene(self.camera, (*self.objects, body), light=self.light, seed=self._run["seed"], **self._plain, **self._run["time"])
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from blinkgl.config.sensor import SensorConfig
-from blinkgl.config.sensor import load_sensor as _load_sensor
+from blinkgl.config.sensor import SensorConfig, load_sensor as _load_sensor
 from blinkgl.events import Emulator, make_emulator
 from blinkgl.events.emulator import MAX_SIDE
 from blinkgl.front import arguments as check

@@ -65,7 +65,7 @@ class GLContext:
         _opened_by = _opened_by or os.getpid()
         try:
             self.ctx = moderngl.create_context(require=REQUIRED_VERSION, standalone=True, context=raw)
-        except Exception as error:  # moderngl raises bare Exception, ValueError and its own Error here
+        except Exception as error:  # noqa: BLE001 - moderngl raises bare Exception, ValueError and its own Error here
             raw.release()
             raise _EGLUnavailable(_one_line(error)) from None
         self.backend, self.device, self.notes = backend, device, notes
@@ -220,7 +220,7 @@ def _egl(device: int) -> Any:
     libgl = os.environ.get("GLCONTEXT_LINUX_LIBGL") or _loadable(_GL_LIBRARIES) or libegl
     try:
         return egl.create_context(mode="standalone", libegl=libegl, libgl=libgl, glversion=REQUIRED_VERSION, device_index=device)
-    except Exception as error:  # glcontext raises bare Exception
+    except Exception as error:  # noqa: BLE001 - glcontext raises bare Exception
         message = _one_line(error)
         if "but found 0 devices" in message:
             raise _EGLUnavailable("no driver (Mesa's is in libegl-mesa0 and libgl1-mesa-dri)") from None

@@ -18,10 +18,10 @@ import numpy as np
 
 from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
 from blinkgl.events.types import Events
-from blinkgl.machine.extras import install
 from blinkgl.io import aedat4_decode
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of
+from blinkgl.machine.extras import install
 
 MAGIC = b"#!AER-DAT4"
 

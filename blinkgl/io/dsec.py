@@ -138,7 +138,7 @@ class DsecEventWriter:
         with contextlib.suppress(Exception):
             self._file.close()
 
-    def __enter__(self) -> "DsecEventWriter":
+    def __enter__(self) -> DsecEventWriter:
         return self
 
     def __exit__(self, kind, *_) -> None:
@@ -285,7 +285,7 @@ class DsecEventReader:
     def close(self) -> None:
         self._file.close()
 
-    def __enter__(self) -> "DsecEventReader":
+    def __enter__(self) -> DsecEventReader:
         return self
 
     def __exit__(self, *_) -> None:

@@ -72,7 +72,7 @@ class EventFile:
         """Lets go of the file (only HDF5's stay open between reads)."""
         getattr(self._reader, "close", lambda: None)()
 
-    def __enter__(self) -> "EventFile":
+    def __enter__(self) -> EventFile:
         return self
 
     def __exit__(self, *_) -> None:
@@ -82,7 +82,7 @@ class EventFile:
         """All events at once."""
         return Events.concatenate(list(self.chunks()))
 
-    def sized(self) -> "EventFile":
+    def sized(self) -> EventFile:
         """Self with height and width known: where the file does not say, the smallest known sensor that holds all its
         events (one pass over the file)."""
         if self.height is not None and self.width is not None:

@@ -98,7 +98,7 @@ class NpzReader:
         self.path, self._archive = path, zipfile.ZipFile(path)
         self.names = [n.removesuffix(".npy") for n in self._archive.namelist()]
 
-    def __enter__(self) -> "NpzReader":
+    def __enter__(self) -> NpzReader:
         return self
 
     def __exit__(self, *_) -> None:
@@ -134,5 +134,5 @@ def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
         yield
     except AssetError:
         raise
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         raise AssetError(f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)) from error

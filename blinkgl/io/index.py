@@ -69,7 +69,7 @@ def _sorted_parts(root: Path) -> Iterator[IO[str]]:
     """Open files of sorted lines."""
     found = _lines(root)
     while part := sorted(itertools.islice(found, _PART), key=_path_of):
-        file = tempfile.TemporaryFile("w+", encoding="utf-8", dir=root)
+        file = tempfile.TemporaryFile("w+", encoding="utf-8", dir=root)  # noqa: SIM115 - whoever takes it closes it
         file.writelines(part)
         file.seek(0)
         yield file

@@ -73,7 +73,7 @@ class PreviewWriter:
         speed = speed[np.isfinite(speed) & (True if valid is None else valid[::4, ::4])]
         if speed.size:
             self._flow_max = max(0.95 * self._flow_max, float(np.percentile(speed, 95)))
-        nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # noqa: E731 - edges stay true
+        nearest = lambda a: cv2.resize(a, self._panel, interpolation=cv2.INTER_NEAREST)  # edges stay true
         shown = None if valid is None else nearest(np.asarray(valid, np.uint8)) > 0
         self._panel_view(2)[:] = flow_colour(nearest(np.asarray(flow, np.float32)), self._flow_max or None, shown)
         self._legend()
@@ -106,7 +106,7 @@ class PreviewWriter:
     def abort(self) -> None:
         self._video.abort()
 
-    def __enter__(self) -> "PreviewWriter":
+    def __enter__(self) -> PreviewWriter:
         return self
 
     def __exit__(self, kind, *_) -> None:

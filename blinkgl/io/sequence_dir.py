@@ -91,7 +91,7 @@ class SequenceWriter:
         self._flow_h5: dict[str, h5py.File] = {}
         self._failure: list[BaseException] = []
 
-    def __enter__(self) -> "SequenceWriter":
+    def __enter__(self) -> SequenceWriter:
         refuse_existing(self.final)
         with output_errors(self.final):
             self.final.parent.mkdir(parents=True, exist_ok=True)

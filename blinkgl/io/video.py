@@ -27,7 +27,7 @@ class VideoWriter:
         if height % 2 or width % 2:
             raise ValueError(f"yuv420p needs even sizes, got {width}x{height}")
         self.path, self._shape = Path(path), (height, width, 3)
-        self._log = tempfile.TemporaryFile()
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the writer
         command = [_ffmpeg(OutputError, path), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
                    "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-", "-an", "-c:v", "libx264", "-preset", preset, "-crf", str(crf),
                    "-pix_fmt", "yuv420p", "-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
@@ -99,7 +99,7 @@ class VideoReader:
             probe = imageio_ffmpeg.read_frames(os.fspath(path))
             meta = next(probe)
             probe.close()
-        except Exception as error:  # noqa: BLE001 - it raises IOError, RuntimeError, IndexError, StopIteration …
+        except Exception as error:  # IOError, RuntimeError, IndexError, StopIteration …
             raise AssetError(f"cannot read video: {_gist(str(error))}", where=str(path)) from error
         self.width, self.height = meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]  # ffmpeg turns frames upright
         self.fps = float(meta.get("fps") or 0)

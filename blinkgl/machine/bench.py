@@ -20,7 +20,7 @@ def machine_line(opengl: str | None = None) -> str:
              f"Python {platform.python_version()}", f"NumPy {np.__version__}", f"numba {numba.__version__}"]
     if opengl:
         parts.append(opengl)
-    return ", ".join([*parts, datetime.date.today().isoformat()])
+    return ", ".join([*parts, datetime.datetime.now().astimezone().date().isoformat()])
 
 
 def seconds(run: Callable[[], object], repeat: int = 10, warm_up: int = 2) -> dict[str, float]:

@@ -18,9 +18,10 @@ from importlib import metadata
 import numpy as np
 
 from blinkgl import __version__
-from blinkgl.machine.cpu import bf16_instructions
 from blinkgl.errors import BlinkGLError
+from blinkgl.machine.cpu import bf16_instructions
 from blinkgl.machine.extras import EXTRAS, install, python
+
 
 @dataclass(frozen=True)
 class Check:
@@ -55,7 +56,7 @@ def _try(section: str, name: str, action: Callable[[], str], remedy: str) -> Che
     """``action`` returns the text of success and raises anything on failure."""
     try:
         return Check(section, name, "ok", action())
-    except Exception as error:  # whatever a broken installation throws, the line has to appear
+    except Exception as error:  # noqa: BLE001 - whatever a broken installation throws, the line has to appear
         return Check(section, name, "missing", " ".join(f"{type(error).__name__}: {error}".split())[:200], remedy)
 
 
@@ -296,38 +297,3 @@ def _extras() -> Iterator[Check]:
         value = ", ".join(found + [f"no {name}" for name in lacking]) + f" ({purpose})"
         remedy = install(*lacking) if lacking else ""
         yield Check("Optional extras", f"[{extra}]", "absent" if lacking else "ok", value, remedy)
-
-
-# --- show -------------------------------------------------------------------------------------------------------------
-
-_MARKS = {"ok": ("ok", "green"), "missing": ("MISSING", "bold red"), "absent": ("absent", "yellow"), "info": ("", "")}
-
-
-def show(report: Report) -> None:
-    """Print for people: sections, then what is missing with the commands that mend it."""
-    from rich.table import Table
-    from rich.text import Text
-
-    from blinkgl.show.terminal import plain_console
-
-    console = plain_console(highlight=False)
-    if not console.is_terminal:
-        console = plain_console(highlight=False, width=200)  # piped: one check, one line, for grep
-    table = Table.grid(padding=(0, 2))
-    for _ in range(3):
-        table.add_column(overflow="fold")
-    section = ""
-    for check in report.checks:
-        if check.section != section:
-            section = check.section
-            table.add_row(Text(f"\n{section}" if table.row_count else section, style="bold"))
-        mark, style = _MARKS[check.status]
-        table.add_row(Text("  " + check.name), Text(mark, style=style), Text(check.value))
-    console.print(table)
-    for status, title in (("missing", "Missing, and required:"), ("absent", "Optional:")):
-        mendable = [check for check in report.checks if check.status == status and check.remedy]
-        if mendable:
-            console.print(Text(f"\n{title}", style="bold"))
-            for check in mendable:
-                console.print(Text(f"  {check.name}: {check.remedy}"), soft_wrap=True)
-    console.print(Text("\nAll required parts are there." if report.ok else "\nSomething required is missing.", style="bold"))

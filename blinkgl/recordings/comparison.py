@@ -100,7 +100,7 @@ class Comparison:
     def rows(self) -> list[tuple[str, str, str]]:
         """(quantity, a, b) as text, for a table; quantities of the pair stand in the last column."""
         sides = [self.a] + ([self.b] if self.b else [])
-        each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))  # noqa: E731
+        each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))
         rows = [("sensor", *each(lambda s: s.size)),
                 ("events", *each(lambda s: f"{s.count:,}")),
                 ("rate", *each(lambda s: f"{s.count / self.duration_s / 1e6:.4g} M/s")),
@@ -259,7 +259,7 @@ def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, st
         sizes = "; ".join(f"{name}: {width}x{height}" for name, width, height in [(path, source.width, source.height), *((f.path, f.width, f.height) for f in files)])
         raise EventDataError(f"frames and recordings differ in size ({sizes})", where="compare", accepted="frames of the recordings' size")
     # The first interval may begin a little before the first event, the last end a little after the last one.
-    slack = lambda a, b: (b - a) // 4  # noqa: E731
+    slack = lambda a, b: (b - a) // 4
     times = np.array([t // 1000 + delay_us for _, t, _ in source], np.int64)
     inside = [k for k in range(len(times) - 1) if times[k] >= start - slack(times[k], times[k + 1]) and times[k + 1] <= stop + slack(times[k], times[k + 1])]
     if not inside:

@@ -10,7 +10,6 @@ from blinkgl.render.reference import Flow, Hits, cast, flow_to, relative_pose_at
 from blinkgl.scene.types import Scene
 
 
-
 @dataclass(frozen=True, eq=False)
 class Probe:
     """Everything about one image point at t_ns (and, when asked, where it is at to_ns). float64, None when not there.

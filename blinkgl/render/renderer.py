@@ -20,7 +20,11 @@ from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import Samples, samples_of
 from blinkgl.render.frames import Flow, LabelFrame, LabelRequest, RenderStats
 from blinkgl.render.matrices import (
-    cam_from_obj, cam_from_obj_rate, inverse_depth_bits, mat4_bytes, rows_xyw_bytes,
+    cam_from_obj,
+    cam_from_obj_rate,
+    inverse_depth_bits,
+    mat4_bytes,
+    rows_xyw_bytes,
 )
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
@@ -82,7 +86,7 @@ class Renderer:
         self._frustum = scene.camera.frustum_planes()
         self._whole = Rectangle(0, 0, self.width, self.height)
 
-    def __enter__(self) -> "Renderer":
+    def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_) -> None:

@@ -32,13 +32,13 @@ class Rectangle:
     def area(self) -> int:
         return (self.x1 - self.x0) * (self.y1 - self.y0)
 
-    def meets(self, other: "Rectangle") -> bool:
+    def meets(self, other: Rectangle) -> bool:
         return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
 
-    def union(self, other: "Rectangle") -> "Rectangle":
+    def union(self, other: Rectangle) -> Rectangle:
         return Rectangle(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
 
-    def scaled(self, factor: int) -> "Rectangle":
+    def scaled(self, factor: int) -> Rectangle:
         return Rectangle(self.x0 * factor, self.y0 * factor, self.x1 * factor, self.y1 * factor)
 
 

@@ -22,11 +22,11 @@ def histogram(values: np.ndarray, *, log: bool = False, bins: int = 36, span: tu
     if high <= low:
         low, high = low - 0.5 * (abs(low) or 1), high + 0.5 * (abs(high) or 1)
         log = False
-    scale = (lambda v: np.log(v)) if log else (lambda v: np.asarray(v, float))
+    scale = (np.log) if log else (lambda v: np.asarray(v, float))
     edges = np.linspace(scale(low), scale(high), bins + 1)
     counts, _ = np.histogram(np.clip(scale(values), edges[0], edges[-1]), edges)
     top = counts.max()
-    place = lambda v: LEFT + (float(scale(v)) - edges[0]) / (edges[-1] - edges[0]) * (WIDTH - 2 * LEFT)  # noqa: E731
+    place = lambda v: LEFT + (float(scale(v)) - edges[0]) / (edges[-1] - edges[0]) * (WIDTH - 2 * LEFT)
     body, floor = [], HEIGHT - BOTTOM
     step = (WIDTH - 2 * LEFT) / bins
     for i, count in enumerate(counts):

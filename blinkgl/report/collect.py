@@ -11,7 +11,6 @@ import numpy as np
 
 from blinkgl.config.draw import is_distribution
 from blinkgl.config.reader import read_table
-from blinkgl.io.index import entry, sequence_folders
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import plan_of
@@ -19,6 +18,7 @@ from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.images import read_image, read_npy
+from blinkgl.io.index import entry, sequence_folders
 from blinkgl.io.records import shown
 from blinkgl.io.sequence_dir import verify_sequence
 

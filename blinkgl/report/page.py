@@ -12,8 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from blinkgl.io.index import write_index
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.io.index import write_index
 from blinkgl.report.charts import bars, histogram, number, stacked
 from blinkgl.report.collect import Collected, Example, Parameter, collect
 

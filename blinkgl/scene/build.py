@@ -7,10 +7,10 @@ from pathlib import Path
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import ConfigError
+from blinkgl.scene.types import Scene
 from blinkgl.scene.worlds.explicit import explicit_scene, primitive_mesh
 from blinkgl.scene.worlds.from_file import scene_from_file
 from blinkgl.scene.worlds.pool import SPLITS, resolve
-from blinkgl.scene.types import Scene
 from blinkgl.scene.worlds.random_world import pools, random_world
 
 

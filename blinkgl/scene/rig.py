@@ -29,7 +29,7 @@ class Rig:
     sensors: tuple[Sensor, ...]
 
     @classmethod
-    def alone(cls, camera: CameraModel, path: PosePath) -> "Rig":
+    def alone(cls, camera: CameraModel, path: PosePath) -> Rig:
         """One camera, whose own motion ``path`` is."""
         return cls(path, (Sensor(camera),))
 
@@ -37,6 +37,6 @@ class Rig:
         """T_world_cam over time. Raises ConfigError where the sensor's place is not rigid."""
         return self.path if np.array_equal(sensor.T_rig_cam, np.eye(4)) else OffsetPath(self.path, sensor.T_rig_cam)
 
-    def with_camera(self, camera: CameraModel) -> "Rig":
+    def with_camera(self, camera: CameraModel) -> Rig:
         """With another model in the first sensor."""
         return replace(self, sensors=(replace(self.sensors[0], camera=camera), *self.sensors[1:]))

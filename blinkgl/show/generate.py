@@ -1,4 +1,4 @@
-"""What ``blinkgl generate`` shows: one display over all workers while it runs, a table when it is done."""
+"""``blinkgl generate``: one display over all workers while it runs, a table when it is done."""
 
 from __future__ import annotations
 
@@ -11,32 +11,34 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeElapsedColumn
 from rich.table import Table
 
-from blinkgl.machine.compiling import compiling_line
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Executor
 from blinkgl.dataset.plan import Plan
-from blinkgl.dataset.report import SequenceReport, Totals
+from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
-from blinkgl.show.terminal import plain_column, plain_console
+from blinkgl.machine.compiling import compiling_line
+from blinkgl.show.terminal import plain_column, plain_console, say
 
-STAGES = ("scene", "render", "read-back", "events", "write", "preview")
 MAX_NOTES = 20
 """Files of which it is said what is not drawn; beyond, that there are more."""
 SET_ASIDE = 3
 """Exit status of a run that is over but lacks sequences."""
 
 
-def generate_with_progress(config: str, out: str, *, num: int | None = None, seed: int | None = None, overrides: list[str] = (),
-                           quiet: bool = False, executor: Executor | None = None, resume: bool = False, mixed: bool = False,
-                           time_limit_s: float = 0.0) -> Outcome:
-    """:func:`~blinkgl.dataset.run.run_dataset` behind a display. Raises what it raises."""
+def run(config: str, out: str, *, num: int | None = None, seed: int | None = None, overrides: list[str] = (), quiet: bool = False,
+        executor: Executor | None = None, resume: bool = False, mixed: bool = False, time_limit_s: float = 0.0) -> int:
+    """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing, whose names and reasons
+    are said even when ``quiet``. Raises what it raises."""
     template = load_run(config, overrides, seed=seed)
     console = plain_console(quiet=quiet)
     outcome = run_dataset(template, out, executor, num=num, resume=resume, mixed=mixed, time_limit_s=time_limit_s,
                           listener=None if quiet else Display(console, Path(out)))
     show_outcome(console, outcome, Path(out))
-    return outcome
+    if quiet:
+        for name, reason in sorted(outcome.set_aside.items()):
+            say(plain_console(stderr=True), f"set aside: {name}: {reason}")
+    return SET_ASIDE if outcome.set_aside else 0
 
 
 class Display:
@@ -120,7 +122,7 @@ class Display:
                 self._say("note: more files ask for what is not drawn; the manifests name them under not_drawn")
 
     def _say(self, text: str) -> None:
-        self._console.print(text, highlight=False, soft_wrap=True, markup=False)
+        say(self._console, text)
 
 
 def _shares(seconds: dict[str, float]) -> str:
@@ -137,16 +139,16 @@ def _size(size: float) -> str:
 def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
     """The final table, and what was set aside."""
     if line := compiling_line(outcome.made.compile_s):
-        console.print(line, highlight=False)
+        say(console, line)
     if outcome.made:
         show_table(console, outcome.made, outcome.elapsed_s)
     else:
-        console.print(f"nothing to make: all {outcome.found} sequences are whole" if not outcome.set_aside else "no sequence was made", highlight=False)
+        say(console, f"nothing to make: all {outcome.found} sequences are whole" if not outcome.set_aside else "no sequence was made")
     if outcome.set_aside:
-        console.print(f"{len(outcome.set_aside)} of {outcome.planned} sequences are set aside; run again with --resume to try them again "
-                      f"(logs: {out}/.run/logs)", highlight=False, soft_wrap=True, markup=False)
+        say(console, f"{len(outcome.set_aside)} of {outcome.planned} sequences are set aside; run again with --resume to try them again "
+                     f"(logs: {out}/.run/logs)")
         for name, reason in sorted(outcome.set_aside.items()):
-            console.print(f"  {name}: {reason}", highlight=False, soft_wrap=True, markup=False)
+            say(console, f"  {name}: {reason}")
 
 
 def _line(report: SequenceReport) -> str:
@@ -154,20 +156,10 @@ def _line(report: SequenceReport) -> str:
             f"{report.total_s:.1f} s ({report.total_s / report.simulated_s:.1f} s per simulated second)")
 
 
-def summary(made: Totals) -> dict[str, float]:
-    """Totals of a run: counts, wall seconds per stage, and the rates the table shows."""
-    stages = {name: made.seconds.get(name, 0.0) for name in STAGES}
-    stages["other"] = max(0.0, made.total_s - sum(stages.values()))
-    return {"sequences": made.count, "frames": made.frames, "events": made.events,
-            "labels": made.labels, "simulated_s": made.simulated_s, "total_s": made.total_s,
-            "seconds_per_simulated_second": made.total_s / made.simulated_s, "events_per_second": made.events / made.total_s,
-            **{f"{name}_s": seconds for name, seconds in stages.items()}}
-
-
 def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -> None:
     """The final table: what was made, how fast, and where the time went. ``elapsed_s``: of the run, where several workers
     each spent wall time at once."""
-    s = summary(made)
+    s = made.summary()
     table = Table(title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",
                   title_justify="left", show_header=False)
     table.add_row("event frames", f"{s['frames']:,}")
@@ -188,5 +180,4 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
         table.add_row(name, f"{seconds:.2f} s  {100 * seconds / s['total_s']:4.0f} %")
     console.print(table)
     folder = made.first.path
-    console.print(f"look at {folder / 'preview.mp4'}" if (folder / "preview.mp4").exists() else f"written to {folder}",
-                  highlight=False, soft_wrap=True)
+    say(console, f"look at {folder / 'preview.mp4'}" if (folder / "preview.mp4").exists() else f"written to {folder}")

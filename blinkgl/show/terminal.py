@@ -14,8 +14,14 @@ from rich.progress import TextColumn
 
 
 def plain_console(**options: Any) -> Console:
-    """``rich.console.Console`` whose strings, in tables too, are no markup. For style pass a ``rich.text.Text`` or ``style=``."""
-    return Console(markup=False, **options)
+    """``rich.console.Console`` whose strings, in tables too, are no markup and no names of emoji (``a:bug:b`` is a folder). For style pass a
+    ``rich.text.Text`` or ``style=``."""
+    return Console(markup=False, emoji=False, **options)
+
+
+def say(console: Console, text: str) -> None:
+    """One line as it stands: no colours for numbers, no line breaks of Rich's."""
+    console.print(text, highlight=False, soft_wrap=True, markup=False)
 
 
 def plain_column(text: str) -> TextColumn:

@@ -1,4 +1,4 @@
-"""The command around :mod:`blinkgl.trade.run`: progress, a table, files."""
+"""``blinkgl trade``: the settings that nothing beats as a table, and the files."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ from rich.table import Table
 
 from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
-from blinkgl.show.terminal import plain_console
+from blinkgl.show.terminal import plain_console, say
 from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options
 from blinkgl.trade.run import convergence_line, trade, write
 
 
-def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, only: list[str], skip: list[str], sequence: int | None, clip: float | None,
-                   limit_ms: float, rounds: int | None, minutes: float | None, cost: str, reference: str = "raster",
-                   seed: int | None = None) -> None:
+def run(config: str, out: str, *, overrides: list[str], quick: bool, only: list[str], skip: list[str], sequence: int | None, clip: float | None,
+        limit_ms: float, rounds: int | None, minutes: float | None, cost: str, reference: str = "raster", seed: int | None = None) -> int:
     """Measures, writes the files, and names the settings that nothing beats. Raises BlinkGLError."""
     if cost not in ("wall", "cpu"):
         raise ConfigError("unknown cost", where="--cost", value=cost, accepted="wall or cpu")
@@ -34,11 +33,11 @@ def trade_and_show(config: str, out: str, *, overrides: list[str], quick: bool, 
     if minutes is not None:
         changes |= {"rounds_s": minutes * 30, "reference_s": minutes * 30}
     console = plain_console()
-    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
-    result = trade(template, quick=quick, only=only, skip=skip, options=replace(options, **changes), cost=f"{cost}_s", say=say)
+    result = trade(template, quick=quick, only=only, skip=skip, options=replace(options, **changes), cost=f"{cost}_s", say=lambda text: say(console, text))
     show(result, console)
     paths = write(result, out)
-    say(f"written to {out}: " + ", ".join(p.name for p in paths))
+    say(console, f"written to {out}: " + ", ".join(p.name for p in paths))
+    return 0
 
 
 def show(result: dict, console: Console) -> None:
@@ -57,7 +56,7 @@ def show(result: dict, console: Console) -> None:
         last = size["levels"][-1]
         if last["frame_wall_s"] is not None:
             mine = [r for r in result["settings"] if (r["size"] or "full") == name]
-            span = lambda key: " to ".join(f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max))  # noqa: E731
+            span = lambda key, mine=mine: " to ".join(f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max))
             console.print(f"seconds per frame of {size['width']}x{size['height']}, wall (processor): Cycles {last['frame_wall_s']:.2f} ({last['frame_cpu_s']:.2f}), "
                           f"the settings {span('wall_s')} ({span('cpu_s')})", highlight=False, soft_wrap=True)
         line = convergence_line(result, name)

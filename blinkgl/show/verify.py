@@ -1,31 +1,31 @@
-"""What ``blinkgl verify`` shows."""
+"""``blinkgl verify``: what is wrong, place by place, and a last line."""
 
 from __future__ import annotations
 
 from blinkgl.dataset.verify import Verification, verify_dataset
+from blinkgl.errors import BlinkGLError
 from blinkgl.io.records import shown
-from blinkgl.show.terminal import plain_console
+from blinkgl.show.terminal import plain_console, say
 
 _MOST_LINES = 20
 
 
-def verify_and_show(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -> bool:
-    """:func:`~blinkgl.dataset.verify.verify_dataset` in words; True when nothing was found."""
+def run(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -> int:
+    """:func:`~blinkgl.dataset.verify.verify_dataset` in words; status 2 when something is wrong."""
     console = plain_console()
-    say = lambda text: console.print(text, highlight=False, soft_wrap=True, markup=False)  # noqa: E731
     with console.status("looking") as status:
         result = verify_dataset(folder, deep=deep, seed=seed, base=base, progress=lambda number, name: status.update(f"{number}: {name}"))
     for name, lines in sorted(result.problems.items()):
         for line in lines[:_MOST_LINES]:
-            say(f"{shown(name)}: {line}" if name != "." else line)
+            say(console, f"{shown(name)}: {line}" if name != "." else line)
         if len(lines) > _MOST_LINES:
-            say(f"{shown(name)}: … and {len(lines) - _MOST_LINES} more")
+            say(console, f"{shown(name)}: … and {len(lines) - _MOST_LINES} more")
     for note in result.notes[:_MOST_LINES]:
-        say(f"note: {note}")
+        say(console, f"note: {note}")
     if len(result.notes) > _MOST_LINES:
-        say(f"note: … and {len(result.notes) - _MOST_LINES} more")
-    say(f"{folder}: {last_line(result, bool(deep))}")
-    return result.clean
+        say(console, f"note: … and {len(result.notes) - _MOST_LINES} more")
+    say(console, f"{folder}: {last_line(result, bool(deep))}")
+    return 0 if result.clean else BlinkGLError.exit_status
 
 
 def last_line(result: Verification, deep: bool) -> str:

@@ -131,7 +131,7 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
         return
     height, width = a.shape
     grid = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
-    look = lambda image, flow: cv2.remap(image, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # noqa: E731
+    look = lambda image, flow: cv2.remap(image, grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen_a, seen_b = _consistent(forward, look(backward, forward)), _consistent(backward, look(forward, backward))
     f = np.float32
     for k in range(1, steps):

@@ -109,7 +109,7 @@ class Budget(Timeline):
         speed = self._speeds[nearest]
         # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of the stride or smaller than the stride.
         rows, columns = (((np.arange(few) + 0.5) * many / few).astype(np.intp) for few, many in zip(speed.shape, luminance.shape))
-        pick = lambda a: a[np.ix_(rows, columns)]  # noqa: E731
+        pick = lambda a: a[np.ix_(rows, columns)]
         small = pick(luminance)
         slope = self.response.change(small, pick(rate)) if rate is not None else None
         self.error.observe(t_ns, self.response.signal(small), slope, speed)

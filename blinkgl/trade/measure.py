@@ -179,7 +179,7 @@ class Bench:
         return results
 
     def _run(self, result: Measured, config: SequenceConfig, renderer: Renderer, first: bool) -> None:
-        clip = lambda end: EventPass(config.timeline, self.emulator, renderer, self.seed, window_ns=(self.t0_ns, end))  # noqa: E731
+        clip = lambda end: EventPass(config.timeline, self.emulator, renderer, self.seed, window_ns=(self.t0_ns, end))
         for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # programs, targets, kernels: made the first time
             pass
         run, drawn = clip(self.t1_ns), renderer.stats.triangles

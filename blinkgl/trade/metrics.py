@@ -74,7 +74,7 @@ def event_errors(reference: Events, judged: Events, speeds: SpeedMaps, t0_us: in
     late = np.abs(matching.dt_us[found])
     shift = late * 1e-6 * speeds.at(theirs.x[found], theirs.y[found], theirs.t[found])
     total = len(theirs)
-    share = lambda n: n / total if total else float("nan")  # noqa: E731
+    share = lambda n: n / total if total else float("nan")
     true = voxel_grid(theirs, t0_us, t1_us, height, width)
     norm = float(np.linalg.norm(true))
     difference = float(np.linalg.norm(voxel_grid(mine, t0_us, t1_us, height, width) - true))

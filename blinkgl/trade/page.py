@@ -67,7 +67,7 @@ def _all(result: dict) -> str:
             "extra", "events, relative", "voxel grid", "flow px, median", "max")
     body = []
     for r in sorted(result["settings"], key=lambda r: (r["size"], r[result["cost"]])):
-        percent = lambda v: "–" if v is None else f"{100 * v:.1f} %"  # noqa: E731
+        percent = lambda v: "–" if v is None else f"{100 * v:.1f} %"
         cells = [escape(r["name"]), f"{r['wall_s']:.2f}", f"{r['cpu_s']:.2f}", f"{r['frames_per_s']:.0f}", f"{r['triangles']:,.0f}", f"{r['time_median_us']:.0f}",
                  f"{r['time_p95_us']:.0f}", f"{r['shift_median_px']:.3f}", f"{r['shift_p95_px']:.3f}", percent(r["missed"]), percent(r["extra"]),
                  f"{100 * r['count']:+.1f} %", percent(r["voxel"]), f"{r['flow_median_px']:.1e}", f"{r['flow_max_px']:.1e}"]
@@ -80,8 +80,8 @@ def _reference(result: dict) -> str:
 
     how = ("path-traced by Blender's Cycles (samples are paths), with shadows and inter-reflection, which the settings leave out"
            if result.get("reference") == "cycles" else "drawn much more finely")
-    parts = [f"<h2>The reference</h2><p>Judged by the same scene {how}. It is made finer and finer; each step is judged by the next one "
-             f"as if it were a setting. It is good enough when that error is below {100 * result['enough']:.0f} % of the smallest error of any setting, in all four measures.</p>"]
+    parts = [(f"<h2>The reference</h2><p>Judged by the same scene {how}. It is made finer and finer; each step is judged by the next one "
+              f"as if it were a setting. It is good enough when that error is below {100 * result['enough']:.0f} % of the smallest error of any setting, in all four measures.</p>")]
     for name, size in result["sizes"].items():
         head = "<tr><th>samples a pixel</th><th>px between frames</th><th>frames</th><th>seconds</th>" + "".join(f"<th>moved by, of the smallest error: {NAMES[k]}</th>" for k in NAMES) + "</tr>"
         rows = "".join(f"<tr><td>{lv['scale']}×{lv['scale']}</td><td>{lv['max_px']:g}</td><td>{lv['frames']}</td><td>{lv['seconds']:.0f}</td>"

@@ -57,7 +57,7 @@ class FineTiles:
         self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), RenderConfig())
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
-    def __enter__(self) -> "FineTiles":
+    def __enter__(self) -> FineTiles:
         return self
 
     def __exit__(self, *_) -> None:

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from blinkgl.machine.bench import machine_line
 from blinkgl.config.scene import RandomSceneConfig
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.events import emulator_of
 from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file, output_errors
+from blinkgl.machine.bench import machine_line
 from blinkgl.trade.front import front
 from blinkgl.trade.measure import ENOUGH, QUICK, Bench, Options
 from blinkgl.trade.settings import SIZES, Setting, design
@@ -27,7 +27,7 @@ COLUMNS = ("name", "wall_s", "cpu_s", "frames_per_s", "triangles", "time_median_
 
 def chosen(settings: tuple[Setting, ...], only: list[str], skip: list[str] = ()) -> tuple[Setting, ...]:
     """The settings whose name contains one of ``only`` (all, when there is none) and none of ``skip``. Raises ConfigError when none is left."""
-    has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)  # noqa: E731
+    has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)
     found = tuple(s for s in settings if (not only or has(s, only)) and not has(s, skip))
     if not found:
         raise ConfigError("no setting is called that", where="--only, --skip", value=", ".join([*only, *skip]), accepted="part of a name such as "

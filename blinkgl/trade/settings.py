@@ -58,8 +58,8 @@ class Setting:
 
 def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
     """The settings of a sweep, without repetitions. random_scene : the scene has pools, whose textures can be made smaller."""
-    displacement = lambda *px: [f"displacement {p:g} px" for p in px]  # noqa: E731
-    uniform = lambda *fps: [f"uniform {f}/s" for f in fps]  # noqa: E731
+    displacement = lambda *px: [f"displacement {p:g} px" for p in px]
+    uniform = lambda *fps: [f"uniform {f}/s" for f in fps]
     curves = [r for r in RECONSTRUCTIONS if r != "linear"]
     extra = [s for s in SAMPLINGS if not s.startswith(("uniform", "displacement"))]
     others = [o for o in OTHERS if o and (random_scene or not o.startswith("textures"))]

@@ -24,7 +24,7 @@ class TracedFrames:
         self.cost = peer_cycles.Cost()
         self._frames = peer_cycles.source(scene, peer_cycles.CyclesSettings(samples=scale * scale), self.cost)
 
-    def __enter__(self) -> "TracedFrames":
+    def __enter__(self) -> TracedFrames:
         return self
 
     def __exit__(self, *_) -> None:

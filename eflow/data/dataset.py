@@ -167,7 +167,7 @@ def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) ->
     each axis, validity only where all four contributing pixels are valid."""
     height, width = sample["new"].shape[-2:]
     size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
-    resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]  # noqa: E731
+    resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
     out = {**sample, **{k: resize(sample[k]) for k in ("old", "new")}}
     if "flow" in sample:
         ratio = torch.tensor([size[1] / width, size[0] / height])[:, None, None]

@@ -221,7 +221,7 @@ def find_blinkflow(root: Path) -> list[Sequence]:
         fps = _fps(folder / "config.yaml")
         files = sorted((folder / "forward_flow").glob("*.npy"))
         backward = {int(f.stem): f for f in (folder / "backward_flow").glob("*.npy")}
-        at = lambda i: round(i * 1e6 / fps)  # noqa: E731
+        at = lambda i, fps=fps: round(i * 1e6 / fps)
         # backward_flow/k belongs to frames k+1 -> k in the published sets, so the one that starts at label i is file i - 1.
         entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in ((int(f.stem), f) for f in files) if i > 0)
         parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)
@@ -296,15 +296,15 @@ def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1) -
 
     Raises AssetError: nothing there, or a damaged index; files of single samples are only looked at when they are asked for."""
     root = Path(path)
-    format = detect_format(root) if format == "auto" else format
-    if format == "mvsec":
+    kind = detect_format(root) if format == "auto" else format
+    if kind == "mvsec":
         from eflow.data.mvsec import MvsecSource
 
         return MvsecSource(root, dt)
     if not root.is_dir():
         raise AssetError("no such data set", where=str(root), accepted="a folder")
-    sequences = {"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[format](root)
+    sequences = {"blinkgl": find_blinkgl, "dsec": find_dsec, "blinkflow": find_blinkflow}[kind](root)
     source = FolderSource(sequences)
     if not len(source):
-        raise AssetError(f"no {format} sequence with flow labels", where=str(root))
+        raise AssetError(f"no {kind} sequence with flow labels", where=str(root))
     return source

@@ -25,25 +25,25 @@ class Window:
     def __len__(self) -> int:
         return len(self.t)
 
-    def take(self, keep: np.ndarray) -> "Window":
+    def take(self, keep: np.ndarray) -> Window:
         """Events chosen by mask or index, in order."""
         return replace(self, x=self.x[keep], y=self.y[keep], t=self.t[keep], p=self.p[keep])
 
-    def flipped(self, axis: str, size: int) -> "Window":
+    def flipped(self, axis: str, size: int) -> Window:
         """Mirrored: axis "x" or "y", ``size`` the sensor's width or height."""
         column = getattr(self, axis)
         return replace(self, **{axis: (column.dtype.type(size - 1) - column).astype(column.dtype)})
 
-    def inverted(self) -> "Window":
+    def inverted(self) -> Window:
         """Polarity swapped (a copy: windows may be shared)."""
         return replace(self, p=1 - self.p)
 
-    def reversed(self) -> "Window":
+    def reversed(self) -> Window:
         """The film backwards: t -> t0 + t1 - t, order and polarity turned (what brightened now darkens). Times then lie in (t0, t1];
         voxel(reversed) = -flip(bins) of voxel exactly."""
         return replace(self, x=self.x[::-1], y=self.y[::-1], t=(self.t0 + self.t1) - self.t[::-1], p=(1 - self.p)[::-1])
 
-    def with_events(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> "Window":
+    def with_events(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> Window:
         """Further events merged in, time order kept."""
         columns = [np.concatenate([a, b.astype(a.dtype)]) for a, b in ((self.x, x), (self.y, y), (self.t, t), (self.p, p))]
         order = np.argsort(columns[2], kind="stable")
@@ -73,22 +73,22 @@ class RawSample:
     backward_valid: np.ndarray | None = None
     mask: np.ndarray | None = None
 
-    def flip(self, axis: str) -> "RawSample":
+    def flip(self, axis: str) -> RawSample:
         """Mirror image: horizontal for axis "x", vertical for "y"."""
         size, image_axis, component = (self.width, 1, 0) if axis == "x" else (self.height, 0, 1)
-        turn = lambda a: None if a is None else np.flip(a, image_axis)  # noqa: E731
+        turn = lambda a: None if a is None else np.flip(a, image_axis)
         sign = np.ones(2, np.float32)
         sign[component] = -1
-        signed = lambda f: None if f is None else turn(f) * sign  # noqa: E731 - a fresh array: sources may share theirs
+        signed = lambda f: None if f is None else turn(f) * sign  # a fresh array: sources may share theirs
         return replace(self, old=self.old.flipped(axis, size), new=self.new.flipped(axis, size), flow=signed(self.flow),
                        backward=signed(self.backward), valid=turn(self.valid), backward_valid=turn(self.backward_valid),
                        mask=turn(self.mask))
 
-    def invert(self) -> "RawSample":
+    def invert(self) -> RawSample:
         """Contrast inverted: every polarity swapped, the flow unchanged."""
         return replace(self, old=self.old.inverted(), new=self.new.inverted())
 
-    def reverse(self) -> "RawSample":
+    def reverse(self) -> RawSample:
         """Time reversed about the reference time: the windows swap places and run backwards, and the target becomes the
         *backward* flow (not minus the forward flow: that would be right only for constant velocity).
 
@@ -96,16 +96,16 @@ class RawSample:
         if self.backward is None:
             raise ValueError("time reversal needs the backward flow")
         t = self.new.t0  # mirrored about the reference: [t, t + Δ) becomes (t - Δ, t]
-        move = lambda w: replace(w.reversed(), t=2 * t - w.t[::-1], t0=2 * t - w.t1, t1=2 * t - w.t0)  # noqa: E731
+        move = lambda w: replace(w.reversed(), t=2 * t - w.t[::-1], t0=2 * t - w.t1, t1=2 * t - w.t0)
         return replace(self, old=move(self.new), new=move(self.old), flow=self.backward, valid=self.backward_valid,
                        backward=self.flow, backward_valid=self.valid)
 
-    def drop(self, fraction: float, rng: np.random.Generator) -> "RawSample":
+    def drop(self, fraction: float, rng: np.random.Generator) -> RawSample:
         """Each event lost with probability ``fraction``."""
-        thin = lambda w: w.take(rng.random(len(w)) >= fraction)  # noqa: E731
+        thin = lambda w: w.take(rng.random(len(w)) >= fraction)
         return replace(self, old=thin(self.old), new=thin(self.new))
 
-    def hot_pixels(self, count: int, rate_hz: float, rng: np.random.Generator) -> "RawSample":
+    def hot_pixels(self, count: int, rate_hz: float, rng: np.random.Generator) -> RawSample:
         """``count`` pixels, the same in both windows, fire ON events at ``rate_hz`` (a Poisson process)."""
         x, y = rng.integers(0, self.width, count), rng.integers(0, self.height, count)
 
@@ -116,7 +116,7 @@ class RawSample:
 
         return replace(self, old=burn(self.old), new=burn(self.new))
 
-    def noise(self, rate_hz: float, rng: np.random.Generator) -> "RawSample":
+    def noise(self, rate_hz: float, rng: np.random.Generator) -> RawSample:
         """Background activity: uniform Poisson events of either polarity, ``rate_hz`` per pixel."""
         def add(w: Window) -> Window:
             n = rng.poisson(rate_hz * (w.t1 - w.t0) * 1e-6 * self.height * self.width)

@@ -45,7 +45,7 @@ class FlowModel(nn.Module):
     """Height and width must be multiples of this; :mod:`eflow.infer` pads."""
     least: int = 32
     """Smallest accepted height and width, px."""
-    representation: "Representation"
+    representation: Representation
 
     def check_input(self, batch: dict) -> None:
         """Raises EventDataError for sizes and shapes the network cannot work on."""

@@ -50,7 +50,7 @@ class MotionEncoder(nn.Module):
         self.join = nn.Conv2d(192 + 64, 128 - 2, 3, padding=1)
 
     def forward(self, taps: Tensor, flow: Tensor) -> Tensor:
-        relu = lambda x: F.relu(x, inplace=True)  # noqa: E731
+        relu = lambda x: F.relu(x, inplace=True)
         c = relu(self.corr2(relu(self.corr1(taps))))
         f = relu(self.flow2(relu(self.flow1(flow))))
         joined = relu(self.join(torch.cat([c, f], 1)))
@@ -143,7 +143,7 @@ class Eraft(FlowModel):
         for i in range(iterations):
             flow = flow.detach()
             wanted = self.training or self.plain or i == iterations - 1
-            step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: E731, B023 - called at once
+            step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: B023 - called at once
             if self.training and self.config.checkpoint_iterations:
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
             else:

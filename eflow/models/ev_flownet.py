@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 import torch.nn.functional as F
 from torch import nn
@@ -24,7 +26,7 @@ class EvFlowNet(FlowModel):
         self.representation = CountsAndTimes() if config.input == "counts" else VoxelGrid(config.bins)
         w = config.width
         widths = (self.representation.channels, w, 2 * w, 4 * w, 8 * w)
-        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(widths, widths[1:])])
+        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
         self.residuals = nn.Sequential(Residual(8 * w), Residual(8 * w))
         self.decoders = nn.ModuleList([nn.Conv2d(c, c_out, 3, padding=1) for c, c_out in
                                        ((16 * w, 4 * w), (8 * w + 2, 2 * w), (4 * w + 2, w), (2 * w + 2, w // 2))])

@@ -3,6 +3,8 @@ ECCV 2020), supervised here."""
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -40,7 +42,7 @@ class SpikeFlowNet(FlowModel):
         self.config = config
         self.representation = CountSlices(2 * config.steps)
         widths = (4, *CHANNELS)
-        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1, bias=False) for a, b in zip(widths, widths[1:])])
+        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1, bias=False) for a, b in itertools.pairwise(widths)])
         self.residuals = nn.Sequential(Residual(512), Residual(512))
         inputs = (512, 128 + 256 + 2, 64 + 128 + 2, 64 + 64 + 2)  # decoder features, skip, flow; at 1/16, 1/8, 1/4, 1/2
         self.ups = nn.ModuleList([nn.ConvTranspose2d(c, c_out, 4, 2, 1) for c, c_out in zip(inputs, (128, 64, 64))])

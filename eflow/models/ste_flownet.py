@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -56,7 +58,7 @@ class SteFlowNet(FlowModel):
         self.config = config
         self.representation = CountSlices(config.slices)
         widths = (2, *CHANNELS)
-        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in zip(widths, widths[1:])])
+        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
         self.grus = nn.ModuleList([ConvGru(c) for c in CHANNELS])
         self.bottleneck = nn.Sequential(Residual(512), Residual(512))
         inputs = [c + TAPS + 2 + (0 if c == 512 else c) for c in CHANNELS]

@@ -58,7 +58,7 @@ class GlobalAttention(nn.Module):
         # At most r - 1 rows are padded, so that every reduced cell holds a real token and no key needs masking.
         padded = F.pad(source, (0, 0, 0, -w % r, 0, -h % r))
         keys = self.norm(self.reduce(padded.permute(0, 3, 1, 2)).permute(0, 2, 3, 1).reshape(n, -1, c))
-        split = lambda t: t.view(n, -1, self.heads, c // self.heads).transpose(1, 2)  # noqa: E731
+        split = lambda t: t.view(n, -1, self.heads, c // self.heads).transpose(1, 2)
         k, v = self.kv(keys).chunk(2, -1)
         out = F.scaled_dot_product_attention(split(self.q(x.reshape(n, h * w, c))), split(k), split(v))
         return self.proj(out.transpose(1, 2).reshape(n, h, w, c))

@@ -65,12 +65,12 @@ class DenseCorrelation:
 
     def match(self) -> Tensor:
         """The matching layer, see :func:`expected_flow`."""
-        n, h, w = self.shape
+        _, h, w = self.shape
         return expected_flow(self.volume, h, w)
 
     def match_backward(self) -> Tensor:
         """The same volume's match from f2's pixels to f1, at no further product."""
-        n, h, w = self.shape
+        _, h, w = self.shape
         return expected_flow(self.volume.transpose(1, 2), h, w)
 
 

@@ -112,7 +112,7 @@ def test_a_rule_is_given_what_it_names_and_nothing_else():
         a: int = 1
         inner: Inner | None = Inner()
         many: tuple[Inner, ...] = (Inner(c=4), Inner(c=5))
-        table: dict[str, Inner] = {"x": Inner()}
+        table: dict[str, Inner] = Field({"x": Inner()})
 
         @rule("a", "inner.c", "many.*.c", "#table", "?inner")
         def _one(*values):
@@ -132,7 +132,7 @@ def test_a_wrong_declaration_is_found_when_the_class_is_made(keys, function):
 def test_an_undeclared_write_of_a_fill_is_found():
     with pytest.raises(TypeError, match="wrote camera.width"):
         Fill(("quality",), ("timeline",), lambda q: {"camera": {"width": 3}})({"quality": "fast"})
-    for quality, kind, emulator, frames in itertools.product(("fast", "balanced", "accurate", "reference"), (None, "uniform"), (None, "v2e"), (None, {})):
+    for quality, kind, emulator in itertools.product(("fast", "balanced", "accurate", "reference"), (None, "uniform"), (None, "v2e")):
         FILLS[0]({"quality": quality, "timeline": {"kind": kind} if kind else {}, "events": {"emulator": emulator} if emulator else {}})
     for sensor, emulator in itertools.product(("imx636", "davis346"), ("esim", "v2e", "voltmeter", None)):
         FILLS[1]({"sensor": sensor, "events": {"emulator": emulator} if emulator else {}})

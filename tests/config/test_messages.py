@@ -64,7 +64,7 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
     monkeypatch.setattr(base, "_translate", spy)
     messages = 0
     for root in ROOTS:
-        spots = sorted({p for p in places(root)}, key=str) + [()]
+        spots = sorted(set(places(root)), key=str) + [()]
         for tree in SEEDS[root]:
             for path in spots if tree is SEEDS[root][0] else [p for p in spots if p and p[0] in {*tree} - {"data"}]:
                 for value in BAD:
@@ -89,8 +89,8 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
     ("scene: {kind: explicit, objects: [{mesh: m}], meshes: {m: {primitive: cuboid}}, camera: {position: [1, 2]}}", "scene.camera.position: too few entries (got [1, 2])"),
     ("scene: {kind: explicit, objects: [{mesh: m}], meshes: {m: {primitive: cuboid}}, camera: {position: [1, 2, 3, 4]}}", "scene.camera.position: too many entries (got [1, 2, 3, 4]); expected a list of three numbers"),
     ("scene: {kind: explicit}", "scene.objects: is required"),
-    ("timeline: {fps: 100}", "timeline.fps: unknown key; expected one of: kind, max_px, max_px_peak, max_step_us, min_step_us, percentile, reconstruction, "
-     "sample_every; it is a key of kind: uniform"),
+    ("timeline: {fps: 100}", ("timeline.fps: unknown key; expected one of: kind, max_px, max_px_peak, max_step_us, min_step_us, percentile, reconstruction, "
+                              "sample_every; it is a key of kind: uniform")),
     ("events: {k1: 3}", "events.k1: unknown key; expected one of: contrast_threshold"),
     ("timeline: {kind: regular}", "timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement', 'brightness', 'budget'"),
     ("events: {emulator: [esim]}", "events.emulator: unknown choice (got ['esim']); expected one of 'esim', 'v2e', 'voltmeter'"),

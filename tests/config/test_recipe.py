@@ -47,7 +47,7 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
 
 
 def test_identity_knows_types_and_not_the_order_of_keys():
-    identity = lambda tree: all_groups(RunTemplate(tree, Path()))[0].identity  # noqa: E731
+    identity = lambda tree: all_groups(RunTemplate(tree, Path()))[0].identity
     assert identity({"seed": 1, "camera": {"width": 9, "height": 8}}) == identity({"camera": {"height": 8, "width": 9}, "seed": 1})
     assert identity({"render": {"antialiasing": {"weighted": {"none": 1, "ssaa2": 1}}}}) != identity({"render": {"antialiasing": {"weighted": {"ssaa2": 1, "none": 2}}}})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import tarfile
 from pathlib import Path
@@ -12,10 +13,10 @@ import numpy as np
 import yaml
 
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.dataset.explain import Explanation
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.dataset.explain import Explanation
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png
@@ -124,10 +125,10 @@ def _readers(out: Path, shards: Path) -> Findings:
     for events, count in total.items():
         manifest = read_manifest(events.parent)
         spans, end = sorted(seen[events]), manifest["t_offset_us"] + manifest["duration_us"]
-        whole = spans[0][0] <= manifest["t_offset_us"] and all(b[0] - a[1] in (0, -1) for a, b in zip(spans, spans[1:]))
+        whole = spans[0][0] <= manifest["t_offset_us"] and all(b[0] - a[1] in (0, -1) for a, b in itertools.pairwise(spans))
         with DsecEventReader(events) as reader:
             last = len(reader.slice(end, end + 1))
-            twice = sum(len(reader.slice(b[0], a[1])) for a, b in zip(spans, spans[1:]))
+            twice = sum(len(reader.slice(b[0], a[1])) for a, b in itertools.pairwise(spans))
         if whole and spans[-1][1] == end:
             found.same(f"{events.parent.name}: all windows", eflow=count - twice + last, manifest=manifest["events"])
     return found
@@ -152,7 +153,7 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
         found.same("size", explain=told.scene["frames"].split(", ")[1], manifest=f"{manifest['width']}x{manifest['height']}")
         found.same("event frames", explain=told.frames, manifest=manifest["frames"])
         return found
-    count = lambda prefix, ending: sum(n.startswith(prefix) and n.endswith(ending) for n in files)  # noqa: E731
+    count = lambda prefix, ending: sum(n.startswith(prefix) and n.endswith(ending) for n in files)
     events = next(p for name, p in passes.items() if name.startswith("event frames"))
     wanted = any((config.labels.flow, config.labels.depth, config.labels.ids, config.labels.normals, config.labels.velocity))
     found.same("images", explain=passes["colour"].count if "colour" in passes else 0, files=count("images/", ".png"))

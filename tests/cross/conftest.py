@@ -9,8 +9,8 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scene"))
 
-from features import HEIGHT, WIDTH  # noqa: E402
-from gltf_files import GltfBuilder  # noqa: E402
+from features import HEIGHT, WIDTH
+from gltf_files import GltfBuilder
 
 FRAMES, SHIFT = 5, (1.25, -0.5)
 

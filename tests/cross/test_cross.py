@@ -15,13 +15,25 @@ from agreement import of_data_set, of_explanation
 from blinkgl.cli import run
 from blinkgl.config.sequence import SequenceConfig, load_run
 from blinkgl.dataset.executor import Local
+from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.work import report_of
-from blinkgl.dataset.explain import explain
-from features import (ELSEWHERE, FEATURES, REFUSED, RUN_LEVEL, all_pairs, configuration, covering_rows, fits, merged, options_of_the_schema,
-                      options_of_the_table, pairs)
+from features import (
+    ELSEWHERE,
+    FEATURES,
+    REFUSED,
+    RUN_LEVEL,
+    all_pairs,
+    configuration,
+    covering_rows,
+    fits,
+    merged,
+    options_of_the_schema,
+    options_of_the_table,
+    pairs,
+)
 
 ROWS = covering_rows()
 BATCHES = 8

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from blinkgl.config.sequence import load_run
+from blinkgl.dataset.explain import explain
 from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import ConfigError
-from blinkgl.dataset.explain import explain
 
 SMALL = {
     "camera": {"width": 64, "height": 48}, "time": {"duration": 0.2, "label_rate": 20},

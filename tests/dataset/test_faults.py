@@ -17,9 +17,7 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
-from blinkgl.dataset import executor as executor_module
-from blinkgl.dataset import run_folder as run_folder_module
-from blinkgl.dataset import work
+from blinkgl.dataset import executor as executor_module, run_folder as run_folder_module, work
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.plan import Plan
@@ -27,8 +25,7 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError, may_pass
-from blinkgl.io import atomic
-from blinkgl.io import index as index_module
+from blinkgl.io import atomic, index as index_module
 from blinkgl.io.index import read_index, write_index
 from runs import RECIPE, recipe_file, start, temporaries, tree
 
@@ -472,14 +469,14 @@ def test_a_live_temporary_of_another_user_stays_for_real():
     """This process, root's, writes; one of nobody sweeps."""
     if os.geteuid() != 0:
         pytest.skip("only root can become somebody else")
-    code = f"""
+    code = """
 import os, tempfile
 from pathlib import Path
 from blinkgl.io import atomic
 token = atomic.machine_token()
 atomic.machine_token = lambda: token  # Linux hides a process's namespaces from it when it changes its user
 with tempfile.TemporaryDirectory() as folder:
-    live = Path(folder, f".x.blinkgl-tmp-{{token}}-{{os.getppid()}}-0")
+    live = Path(folder, f".x.blinkgl-tmp-{token}-{os.getppid()}-0")
     live.mkdir()
     for path in (folder, live):
         os.chmod(path, 0o777)

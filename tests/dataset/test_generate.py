@@ -14,6 +14,7 @@ import numba
 import numpy as np
 import pytest
 import yaml
+from shared_data import shared
 
 from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
@@ -22,7 +23,6 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import check_sequence
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.sequence_dir import verify_sequence
-from shared_data import shared
 
 SMALL = {
     "seed": 4,

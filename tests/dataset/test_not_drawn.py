@@ -8,8 +8,8 @@ from rich.console import Console
 
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.executor import Local
-from blinkgl.show.generate import MAX_NOTES, Display, generate_with_progress
 from blinkgl.dataset.explain import explain
+from blinkgl.show.generate import MAX_NOTES, Display, run
 from tests.scene.gltf_files import GltfBuilder, triangle
 
 LINE = "card.glb asks for what is not drawn: alpha BLEND (drawn opaque); metal and roughness (drawn matt)"
@@ -39,8 +39,7 @@ def recipe(tmp_path, scene):
 ])
 def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
     path = recipe(tmp_path, scene)
-    outcome = generate_with_progress(str(path), str(tmp_path / "out"), executor=workers and Local(workers))
-    assert len(outcome.made) == 3
+    assert run(str(path), str(tmp_path / "out"), executor=workers and Local(workers)) == 0
     said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
     assert said == ["note: " + LINE]
     manifests = sorted((tmp_path / "out").glob("*/*/manifest.json"))
@@ -53,8 +52,9 @@ def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
 def test_a_pool_of_textures_of_its_own_asks_for_nothing(tmp_path, capsys):
     """Materials that the pool's textures replace are nobody's wish."""
     path = recipe(tmp_path, {**RANDOM, "pool": {**RANDOM["pool"], "keep_materials": False}})
-    made = generate_with_progress(str(path), str(tmp_path / "out"), num=1).made.first
-    assert "note: " not in capsys.readouterr().out and json.loads((made.path / "manifest.json").read_text())["not_drawn"] == []
+    assert run(str(path), str(tmp_path / "out"), num=1) == 0
+    (manifest,) = (tmp_path / "out").glob("*/*/manifest.json")
+    assert "note: " not in capsys.readouterr().out and json.loads(manifest.read_text())["not_drawn"] == []
 
 
 def test_many_files_are_not_a_screenful(tmp_path, capsys):

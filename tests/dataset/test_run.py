@@ -13,11 +13,11 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset import run as run_module
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
-from blinkgl.io.index import read_index
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.work import thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
+from blinkgl.io.index import read_index
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.worlds import random_world
 from runs import NAMES, alive, children, recipe_file, start, temporaries, tree, wait_for
@@ -129,7 +129,7 @@ def test_driver_killed_then_terminated_then_resumed(reference, tmp_path, capfd):
     assert 1 <= len(half) < 6 and all((p / "manifest.json").is_file() for p in half)
 
     driver = start(recipe, "--out", out, "--resume")  # in one process this time
-    wait_for(lambda: temporaries(out) and "fly" in temporaries(out)[0].name or driver.poll() is not None)
+    wait_for(lambda: (temporaries(out) and "fly" in temporaries(out)[0].name) or driver.poll() is not None)
     driver.send_signal(signal.SIGTERM)
     said, _ = driver.communicate()
     assert driver.returncode in (0, 130) and "Traceback" not in said

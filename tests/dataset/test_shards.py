@@ -1,6 +1,7 @@
 """WebDataset shards, read back with tarfile alone and compared with the sequences."""
 
 import io
+import itertools
 import json
 import tarfile
 
@@ -39,8 +40,8 @@ def test_shards_hold_every_label_once(data, tmp_path):
         files = members(tmp_path / "a", split)
         keys = [n.partition(".")[0] for n, _ in files]
         assert set(keys) == {f"{name}_{s:06d}_{k:06d}" for s in range(2) for k in range(4)}
-        assert len(set(n for n, _ in files)) == len(files)
-        changes = sum(a != b for a, b in zip(keys, keys[1:]))
+        assert len({n for n, _ in files}) == len(files)
+        changes = sum(a != b for a, b in itertools.pairwise(keys))
         assert changes == 7, "a sample's files stand together"
         assert keys[:: len(files) // 8] != sorted(keys[:: len(files) // 8]), "labels are mixed"
         contents = dict(files)

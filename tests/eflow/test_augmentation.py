@@ -59,9 +59,9 @@ def test_on_voxels_they_are_exact(rectified):
     s = sample(rectified)
     for normalise in ("none", "nonzero", "all"):
         grid = VoxelGrid(15, normalise)
-        of = lambda s: np.stack([grid(s.old, H, W), grid(s.new, H, W)])  # noqa: E731, B023
+        of = lambda s: np.stack([grid(s.old, H, W), grid(s.new, H, W)])
         before = of(s)
-        close = lambda a, b: np.testing.assert_allclose(a, b, atol=3e-5)  # noqa: E731
+        close = lambda a, b: np.testing.assert_allclose(a, b, atol=3e-5)
         close(of(s.flip("x")), before[..., ::-1])
         close(of(s.flip("y")), before[..., ::-1, :])
         close(of(s.invert()), -before)

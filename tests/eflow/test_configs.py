@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("torch")
 
-from blinkgl.config.recipe import all_groups  # noqa: E402
-from blinkgl.config.sequence import load_run  # noqa: E402
-from eflow.config import load_train_config  # noqa: E402
-from eflow.models import NAMES, model_config  # noqa: E402
+from blinkgl.config.recipe import all_groups
+from blinkgl.config.sequence import load_run
+from eflow.config import load_train_config
+from eflow.models import NAMES, model_config
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / "configs" / "eflow"

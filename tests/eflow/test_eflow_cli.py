@@ -11,14 +11,14 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from shared_data import shared  # noqa: E402
+
 from blinkgl.io.flow_png import read_flow_png  # noqa: E402
 from blinkgl.io.formats import write_events  # noqa: E402
-from eflow import checkpoint as ckpt  # noqa: E402
-from eflow import submit  # noqa: E402
+from eflow import checkpoint as ckpt, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
 from flow_data import SPAN, blinkflow_set, blinkgl_set, dsec_set, moving_events, mvsec_set  # noqa: E402
-from shared_data import shared  # noqa: E402
 
 
 def weights(folder: Path, **tree) -> Path:

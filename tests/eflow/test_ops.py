@@ -45,7 +45,7 @@ def test_lookup_gather_cpu_and_on_demand_equal_rafts(maps):
 def test_lookup_gradients_equal_rafts(maps):
     coords, weights = targets(), torch.randn(2, 324, H, W)
     gradients = []
-    for make in (lambda a, b: DenseCorrelation(a, b), lambda a, b: DenseCorrelation(a, b, slow=True), OnDemandCorrelation):
+    for make in (DenseCorrelation, lambda a, b: DenseCorrelation(a, b, slow=True), OnDemandCorrelation):
         f1, f2 = (m.clone().requires_grad_() for m in maps)
         (make(f1, f2).lookup(coords) * weights).sum().backward()
         gradients.append((f1.grad, f2.grad))
@@ -127,7 +127,7 @@ def test_window_attention_with_masked_padding_equals_unpadded(size):
             part = x[:, top:top + 10, left:left + 10]
             tokens = part.reshape(2, -1, 32)
             q, k, v = layer.qkv(tokens).chunk(3, -1)
-            heads = lambda t: t.view(2, -1, 4, 8).transpose(1, 2)  # noqa: E731
+            heads = lambda t: t.view(2, -1, 4, 8).transpose(1, 2)
             p = (heads(q) @ heads(k).transpose(-1, -2) / np.sqrt(8)).softmax(-1)
             expected[:, top:top + 10, left:left + 10] = layer.proj((p @ heads(v)).transpose(1, 2).reshape(2, -1, 32)).view(part.shape)
     assert (layer(x) - expected).abs().max() < 1e-5

@@ -53,7 +53,7 @@ def equal(a: dict, b: dict) -> bool:
 
 
 def test_a_sample_is_a_function_of_its_key(source):
-    make = lambda seed=0: FlowDataset([source], VoxelGrid(), seed=seed, augment=STRONG, crop=(96, 112))  # noqa: E731
+    make = lambda seed=0: FlowDataset([source], VoxelGrid(), seed=seed, augment=STRONG, crop=(96, 112))
     key = Key(2, 5, 0, 3)
     a = make()[key]
     assert a["new"].shape == (15, 96, 112) and a["flow"].shape == (2, 96, 112) and a["valid"].dtype == torch.bool
@@ -156,7 +156,7 @@ def test_flow_from_400_px_on_is_not_supervised(source):
 
     class Fast:
         has_backward = True
-        __len__ = lambda self: 1  # noqa: E731
+        __len__ = lambda self: 1
 
         def __getitem__(self, i):
             flow = source[0].flow.copy()

@@ -6,9 +6,9 @@ torch = pytest.importorskip("torch")
 
 from blinkgl.machine import cpu, doctor  # noqa: E402
 from eflow import precision  # noqa: E402
+from eflow.config import load_train_config  # noqa: E402
 from eflow.precision import precision_on  # noqa: E402
 from eflow.progress import TrainProgress  # noqa: E402
-from eflow.config import load_train_config  # noqa: E402
 from eflow.train import train  # noqa: E402
 from test_train import config_file, data, log  # noqa: E402, F401
 
@@ -64,7 +64,7 @@ def test_a_training_that_its_clock_ends_is_validated(tmp_path, data):  # noqa: F
 
 def test_progress_tells_rate_and_time_left_by_steps_and_by_clock(capsys):
     now = [100.0]
-    lines = lambda: capsys.readouterr().err.splitlines()  # noqa: E731
+    lines = capsys.readouterr().err.splitlines
     with TrainProgress(100, 0, 4, True, "cpu, fp32", clock=lambda: now[0]) as progress:
         assert lines() == ["training: 100 steps of 4 samples on cpu, fp32"]
         now[0] += 2.0

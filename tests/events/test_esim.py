@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numba
 import numpy as np
 import pytest
@@ -186,7 +188,7 @@ def crossings(signal, c, end):
     """Times at which levels c apart (hysteresis: from the last one passed) are passed, to 1e-12."""
     t = np.linspace(0, end, 20_001)
     reference, times = signal(0.0), []
-    for a, b in zip(t[:-1], t[1:]):
+    for a, b in itertools.pairwise(t):
         for level in (reference + c, reference - c):
             if (signal(a) - level) * (signal(b) - level) < 0:
                 times.append(brentq(lambda u: signal(u) - level, a, b, xtol=1e-14))
@@ -321,8 +323,8 @@ def test_cubics_converge_faster_than_the_straight_line(reconstruction, order, in
     """A smooth log intensity, away from its turning points (where any monotone curve is of second order in time), and in
     so few intervals that the errors stay far above float32's rounding of the frames."""
     c, period = 0.02, 2000.0  # seconds; so long that 1 us is far below the errors
-    signal = lambda s: np.sin(2 * np.pi * s - 1.0)  # noqa: E731; steep from 0 to 0.3
-    slope = lambda s: 2 * np.pi * np.cos(2 * np.pi * s - 1.0)  # noqa: E731
+    signal = lambda s: np.sin(2 * np.pi * s - 1.0)  # steep from 0 to 0.3
+    slope = lambda s: 2 * np.pi * np.cos(2 * np.pi * s - 1.0)
     end = 0.3
     spacings, errors = [], []
     truth = (np.arcsin(np.sin(-1.0) + c * np.arange(1, 200).clip(max=int((signal(end) - signal(0)) / c))) + 1.0) / (2 * np.pi)

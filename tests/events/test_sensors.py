@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 
 import numpy as np
@@ -46,7 +47,7 @@ def test_bus_equals_slow_twin_at_any_chunking(config):
     events = random_events(np.random.default_rng(0), 5000, 1000)
     readout = Readout(config)
     edges = [0, 10, 11, 700, 3000, 5000]
-    parts = [readout.step(Events(*(getattr(events, c)[a:b] for c in "xytp"))) for a, b in zip(edges, edges[1:])]
+    parts = [readout.step(Events(*(getattr(events, c)[a:b] for c in "xytp"))) for a, b in itertools.pairwise(edges)]
     expected = slow_bus(events, config)
     assert_same(Events.concatenate(parts), expected)
     assert readout.dropped == 5000 - len(expected)

@@ -77,7 +77,7 @@ def in_view(draw, interval: float, start: float):
     """An object that fills much of the image of a level camera near the origin, whatever its size, and moves across it."""
     size = draw(magnitude(1e-4, 1e5, 1.0))
     share = st.floats(-0.6, 0.6)
-    place = lambda: [size * draw(st.floats(0.2, 4.0)), size * draw(share), size * draw(share)]  # noqa: E731
+    place = lambda: [size * draw(st.floats(0.2, 4.0)), size * draw(share), size * draw(share)]
     keys = [{"time": start + k * max(interval, 2e-6), "position": place()} for k in range(draw(st.integers(2, 4)))]
     return {"keyframes": keys, "scale": size, "interpolation": draw(st.sampled_from(["spline", "linear"]))}
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from tests.render.render_scenes import LEVEL, SECOND, rig, drift
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelFrame, LabelRequest, Renderer
+from tests.render.render_scenes import LEVEL, SECOND, drift, rig
 
 FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 MOTION = LabelRequest(depth=True, ids=True, velocity=True, flow_forward=True)

@@ -8,12 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.extremes.measures import FACING
-from tests.render.render_scenes import LEVEL, rig, cube, drift, mesh, quad, scene, smooth_texture, still, thing
-from tests.shared_data import shared
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.dataset.generate import generate_sequence
@@ -23,7 +19,11 @@ from blinkgl.render import renderer as module
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
+from tests.extremes.measures import FACING
+from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, smooth_texture, still, thing
+from tests.shared_data import shared
 
 MS = 1_000_000
 RAW = [("DEPTH", "R32F"), ("ID", "R32UI"), ("NORMAL", "RGBA32F"), ("VELOCITY", "RG32F"), ("FLOW_FORWARD", "RGBA32F"), ("FLOW_BACKWARD", "RGBA32F")]

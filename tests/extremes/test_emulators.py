@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
-from tests.render.render_scenes import SECOND
 
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Esim, make_emulator
 from blinkgl.events.arith import Q_ONE, log_q25
+from tests.render.render_scenes import SECOND
 
 DAY = 86_400 * SECOND
 LONGEST = 1000 * SECOND  # below the emulators' limit of 17 minutes
@@ -133,7 +133,7 @@ def test_v2e_reference_drift(promise, frames):
     150 events per pixel repeats its roundings, so that their mean, 1.4e-7 / sqrt(150), adds up: 1.1e-8 per event, three times
     that in the worst of 32 pixels. (At the default leak rate the leak moves the reference a hundred times faster.)"""
     run = make_emulator(V2eConfig(preset="clean", threshold_sigma=0.0), 4, 8, 1)
-    net, first, _ = soak(frames, run)
+    net, _first, _ = soak(frames, run)
     assert net.sum() > 20 * frames
     start = run._x.astype(np.float64)  # the last frame is the first one
     expected = start + (net[1] - net[0]).ravel() * np.float64(np.float32(0.2))

@@ -11,12 +11,12 @@ import hdf5plugin  # noqa: F401  (registers the Blosc filter for h5py)
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, event, given, settings
-from tests.extremes.configurations import esim, runs, v2e, voltmeter
 
 from blinkgl.config.sequence import RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.sequence_dir import verify_sequence
+from tests.extremes.configurations import esim, runs, v2e, voltmeter
 
 # No explain phase: it re-runs a failing sequence hundreds of times to say which of its values matter.
 COMMON = dict(deadline=None, suppress_health_check=list(HealthCheck), database=None, print_blob=False,

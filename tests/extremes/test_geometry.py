@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
-from tests.render.render_scenes import LEVEL, rig, drift, mesh, mixed_scene, quad, scene, smooth_texture, sphere, still, thing
 
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
@@ -16,6 +14,20 @@ from blinkgl.errors import AssetError, GLError
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.types import Material
+from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
+from tests.render.render_scenes import (
+    LEVEL,
+    drift,
+    mesh,
+    mixed_scene,
+    quad,
+    rig,
+    scene,
+    smooth_texture,
+    sphere,
+    still,
+    thing,
+)
 
 MS = 1_000_000
 MEDIAN, WORST = 5e-7, 1e-5

@@ -10,14 +10,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
-from tests.render.render_scenes import LEVEL, SECOND, rig, cube, curve, drift, mixed_scene, moved_scene, quad, scene, sphere, still, thing
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.timeline import displacement_times, uniform_times
+from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
+from tests.render.render_scenes import (
+    LEVEL,
+    SECOND,
+    cube,
+    curve,
+    drift,
+    mixed_scene,
+    moved_scene,
+    quad,
+    rig,
+    scene,
+    sphere,
+    still,
+    thing,
+)
 
 MS = 1_000_000
 MEDIAN, WORST = 5e-7, 1e-5  # of the motion
@@ -110,7 +124,7 @@ def test_a_million_pixels_per_second(gl, promise, speed):
     promise(f"{speed:g} px/s: velocity, largest, relative", e.velocity.max(), WORST)
     promise(f"{speed:g} px/s: flow over a microsecond, largest, relative", e.worst, WORST)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        fastest = lambda t: largest_speed(renderer.velocity(t, 4))  # noqa: E731
+        fastest = lambda t: largest_speed(renderer.velocity(t, 4))
         ten_px = int(10 / speed * SECOND)
         times = np.array(list(displacement_times(0.5, 1, 20_000_000, 0, ten_px, fastest)))
         slow = np.array(list(displacement_times(0.5, 100_000, 20_000_000, 0, 400_000, fastest)))

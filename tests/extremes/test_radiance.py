@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.extremes.measures import FACING
-from tests.render.render_scenes import LEVEL, SECOND, rig, drift, quad, scene, still, thing
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
@@ -15,6 +13,8 @@ from blinkgl.events import Esim
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.types import Light, Material, Texture
+from tests.extremes.measures import FACING
+from tests.render.render_scenes import LEVEL, SECOND, drift, quad, rig, scene, still, thing
 
 TILTED = LEVEL * Rotation.from_euler("x", 160, degrees=True)
 RADIANCES = [0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9]
@@ -22,8 +22,7 @@ RADIANCES = [0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9]
 
 def bars(**keys):
     """One upright bar per radiance, side by side before a LEVEL camera."""
-    things = [thing(f"bar{k}", k + 1, quad(0.4, 2), still((k - 4, 8, 0), FACING), Material(base_color=(v, v, v), **keys)) for k, v in enumerate(RADIANCES)]
-    return things
+    return [thing(f"bar{k}", k + 1, quad(0.4, 2), still((k - 4, 8, 0), FACING), Material(base_color=(v, v, v), **keys)) for k, v in enumerate(RADIANCES)]
 
 
 @pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa4"])

@@ -13,8 +13,7 @@ import pytest
 from blinkgl.config.base import validate
 from blinkgl.config.gl import GLConfig
 from blinkgl.errors import ConfigError, GLError
-from blinkgl.gl import context as context_module
-from blinkgl.gl import create_context, egl_devices, osmesa
+from blinkgl.gl import context as context_module, create_context, egl_devices, osmesa
 
 VERTEX = """#version 430 core
 in vec3 position;
@@ -187,7 +186,7 @@ def test_glcontext_errors_are_translated(monkeypatch, raw, translated):
     from glcontext import egl
 
     def fail(**_):
-        raise Exception(raw)  # what glcontext raises
+        raise Exception(raw)  # noqa: TRY002 - what glcontext raises
 
     monkeypatch.setattr(egl, "create_context", fail)
     with pytest.raises(GLError, match=translated):
@@ -260,7 +259,7 @@ def test_the_environment_of_the_process_is_left_alone():
         from blinkgl.gl import create_context
         with create_context():
             list(blinkgl.simulate([np.full((4, 4), k, np.uint8) for k in range(3)], fps=100))
-        import blinkgl.cli, blinkgl.show.recordings, blinkgl.recordings.comparison, blinkgl.machine.doctor, blinkgl.dataset.explain, blinkgl.dataset.run, blinkgl.trade.run
+        import blinkgl.cli, blinkgl.show.simulate, blinkgl.recordings.comparison, blinkgl.machine.doctor, blinkgl.dataset.explain, blinkgl.dataset.run, blinkgl.trade.run
         assert dict(os.environ) == before, set(os.environ.items()) ^ set(before.items())
     """
     subprocess.run([sys.executable, "-c", script], check=True)

@@ -23,7 +23,7 @@ def test_names_of_another_context_survive(gl):
     other.release()
     assert other.released
     gl.make_current()
-    for n, program in zip(range(40, 80), ours):
+    for _, program in zip(range(40, 80), ours):
         target = gl.framebuffer(4, 4, ("R32F",), depth=False)
         target.use()
         gl.ctx.vertex_array(program, []).render(vertices=3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 import subprocess
@@ -51,14 +52,14 @@ def test_files_that_lead_elsewhere_are_refused(tmp_path, how, message, kind):
     if kind == "rectify_map":
         with h5py.File(path, "w") as file:
             how(file, "rectify_map", secret)
-        read = lambda: FolderSource([])._map(path)  # noqa: E731
+        read = lambda: FolderSource([])._map(path)
     else:
         (dsec if kind == "dsec" else mvsec)(path)
         with h5py.File(path, "r+") as file:
             name = "events/x" if kind == "dsec" else "davis/left/events"
             del file[name]
             how(file, name, secret)
-        read = lambda: open_events(path).read()  # noqa: E731
+        read = lambda: open_events(path).read()
     with pytest.raises(AssetError, match=rf"e.h5: '.*' is {message}, which leads to other files; refused"):
         read()
 
@@ -154,7 +155,7 @@ def test_rows_written_here_are_those_of_the_filter(tmp_path):
     for name in "ab":
         with h5py.File(tmp_path / name, "w", rdcc_nbytes=0) as file:
             data = blosc_dataset(file, "d", (0,), np.uint64, (4096,))
-            for i, j in zip(cuts, cuts[1:]):
+            for i, j in itertools.pairwise(cuts):
                 if name == "a":
                     write_rows(data, i, rows[i:j])
                 else:

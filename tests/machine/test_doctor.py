@@ -8,9 +8,9 @@ import sys
 import pytest
 
 from blinkgl import cli
-from blinkgl.gl import context as context_module
-from blinkgl.gl import osmesa
+from blinkgl.gl import context as context_module, osmesa
 from blinkgl.machine import doctor
+from blinkgl.show.doctor import show
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +92,7 @@ def test_clip_space_that_is_not_zero_to_one_is_found(gl):
 
 
 def test_shown_text_is_plain_when_piped(report, capsys):
-    doctor.show(report)
+    show(report)
     shown = capsys.readouterr().out
     assert "\x1b" not in shown
     for check in report.checks:  # one check, one line

@@ -18,9 +18,9 @@ from blinkgl.config.events import EsimConfig, V2eConfig
 from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
-from blinkgl.srgb import DECODE_8BIT
 from blinkgl.io.video import VideoReader, VideoWriter
 from blinkgl.recordings.simulation import Decoder, SimulationReport, simulate, simulate_file
+from blinkgl.srgb import DECODE_8BIT
 from tests.shared_data import shared
 
 H, W = 30, 40
@@ -70,8 +70,8 @@ def test_input_types_agree():
 
 def test_luminance_of_colour_and_gamma():
     codes = np.random.default_rng(0).integers(0, 256, (5, 6, 3)).astype(np.uint8)
-    exact = lambda curve: curve(codes / 255.0) @ np.array([0.2126, 0.7152, 0.0722])  # noqa: E731
-    srgb = lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)  # noqa: E731
+    exact = lambda curve: curve(codes / 255.0) @ np.array([0.2126, 0.7152, 0.0722])
+    srgb = lambda x: np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
     assert np.allclose(Decoder(None)(codes, ""), exact(srgb), atol=1e-6)
     assert np.allclose(Decoder("linear")(codes, ""), exact(lambda x: x), atol=1e-6)
     assert np.allclose(Decoder(2.2)(codes, ""), exact(lambda x: x**2.2), atol=1e-6)
@@ -252,8 +252,8 @@ def test_real_frames_against_the_real_recording():
 
 def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
     """The DAVIS346's bus carries 12 M events/s: a strobing clip makes more, and what does not fit is lost and counted."""
-    from blinkgl.show.recordings import emulator_options
     from blinkgl.config.sensor import load_sensor
+    from blinkgl.show.simulate import emulator_options
 
     options = emulator_options("v2e", None, ["contrast_threshold=0.3"], "davis346")
     assert options["emulator"].refractory_us == 500 and options["emulator"].contrast_threshold == 0.3
@@ -280,8 +280,8 @@ def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
 ])
 @pytest.mark.parametrize("sensor", [None, "davis346"])
 def test_emulator_parameters_that_cannot_be_used(tmp_path, text, overrides, message, sensor):
-    from blinkgl.show.recordings import emulator_options
     from blinkgl.recordings.simulation import emulator_config
+    from blinkgl.show.simulate import emulator_options
 
     (tmp_path / "e.yaml").write_text(text)
     with pytest.raises(ConfigError, match=message):

@@ -7,8 +7,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
 
 SECOND = 1_000_000_000

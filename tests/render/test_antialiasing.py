@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.config.base import validate
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.render.antialiasing import ANTIALIASING, samples_of
 from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Scene, Texture
-
 from render_scenes import LEVEL, SECOND, mesh, mixed_scene, quad, scene, still, thing
 
 FACING = LEVEL.as_matrix() @ np.diag([1.0, -1.0, -1.0])  # a quad's +z towards the camera at the origin
@@ -35,7 +34,7 @@ def half_plane(angle: float, offset: float, size: int = 48) -> tuple[Scene, np.n
 def half_plane_area(normal: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Area of {(u, v) in [-1/2, 1/2]²: n.(u, v) < c}: the integral over u of the clipped bound on v, in closed form."""
     a, b = sorted(np.abs(normal))
-    ramp2 = lambda s: np.maximum(s, 0.0) ** 2 / 2  # noqa: E731
+    ramp2 = lambda s: np.maximum(s, 0.0) ** 2 / 2
     if a < 1e-12:
         return np.clip(c / b + 0.5, 0.0, 1.0)
     return (ramp2(c + (a + b) / 2) - ramp2(c + (b - a) / 2) - ramp2(c + (a - b) / 2) + ramp2(c - (a + b) / 2)) / (a * b)

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Esim, Events
 from blinkgl.render.renderer import Renderer
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Texture
-
 from render_scenes import LEVEL, SECOND, drift, mixed_scene, quad, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")

@@ -6,16 +6,12 @@ a pixel centre may fall on either side of an edge, depending on how a rasteriser
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from importlib.resources import files
 
-import shutil
-
 import numpy as np
 import pytest
-from render_scenes import (
-    LEVEL, SECOND, rig, cube, curve, drift, mixed_scene, moved_scene, quad, scene, smooth_texture, sphere, still, thing,
-)  # fmt: skip
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from shared_data import shared
@@ -26,6 +22,22 @@ from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Light, Material
+from render_scenes import (
+    LEVEL,
+    SECOND,
+    cube,
+    curve,
+    drift,
+    mixed_scene,
+    moved_scene,
+    quad,
+    rig,
+    scene,
+    smooth_texture,
+    sphere,
+    still,
+    thing,
+)  # fmt: skip
 
 MS = 1_000_000
 T0, T1, T_BACK = 300 * MS, 400 * MS, 200 * MS
@@ -276,7 +288,7 @@ def test_backward_undoes_forward(gl):
 def test_warping_by_the_flow_reproduces_the_frame(gl):
     """I_t'(x + u(x)) = I_t(x) for unlit surfaces where not occluded; without the flow the difference is far larger."""
     world = mixed_scene(unlit=True)
-    clear, moved = seen_at_both(world, T1, width=3)
+    clear, _moved = seen_at_both(world, T1, width=3)
     labels, now = drawn(gl, world, t=T0, forward=T1)
     then = drawn(gl, world, t=T1)[1]
     there = np.moveaxis(np.indices(now.shape)[::-1], 0, -1) + labels.forward.flow

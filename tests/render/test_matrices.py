@@ -63,7 +63,7 @@ def test_the_rate_is_the_limit_of_differences():
         return T
 
     step = 1e-5
-    rate = lambda seed: (at(0.3 + step, seed) - at(0.3 - step, seed)) / (2 * step)  # noqa: E731
+    rate = lambda seed: (at(0.3 + step, seed) - at(0.3 - step, seed)) / (2 * step)
     camera, thing = np.stack([at(0.3, 1), at(0.3, 2)]), np.stack([at(0.3, 3), at(0.3, 4)])
     got = cam_from_obj_rate(camera, np.stack([rate(1), rate(2)]), thing, np.stack([rate(3), rate(4)]))
     for k in range(2):

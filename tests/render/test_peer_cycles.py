@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from render_scenes import LEVEL, rig, cube, mixed_scene, quad, scene, smooth_texture, sphere, still, thing
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
@@ -22,6 +21,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Light, Material, Part, SceneObject
 from blinkgl.tools import cycles_worker, peer_cycles
 from blinkgl.tools.peer_cycles import Cost, CyclesSettings, blender_camera, colours, export, frames
+from render_scenes import LEVEL, cube, mixed_scene, quad, rig, scene, smooth_texture, sphere, still, thing
 
 TIMES = [300_000_000, 650_000_000]
 needs_blender = pytest.mark.skipif(bool(peer_cycles.available()), reason=peer_cycles.available() or "there")

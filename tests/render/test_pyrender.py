@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from render_scenes import rig, mixed_scene, quad, scene, still, thing
 
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.types import Material, Texture
 from blinkgl.tools import peer_pyrender
+from render_scenes import mixed_scene, quad, rig, scene, still, thing
 
 if peer_pyrender.available():
     pytest.skip(peer_pyrender.available(), allow_module_level=True)

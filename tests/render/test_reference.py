@@ -6,16 +6,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from render_scenes import (
-    LEVEL, SECOND, rig, cube, curve, drift, mesh, mixed_scene, moved_scene, pose, quad, scene, sphere, still, thing,
-)  # fmt: skip
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.render import reference
 from blinkgl.render.probe import probe
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
+from render_scenes import (
+    LEVEL,
+    SECOND,
+    cube,
+    curve,
+    drift,
+    mesh,
+    mixed_scene,
+    moved_scene,
+    quad,
+    rig,
+    scene,
+    sphere,
+    still,
+    thing,
+)  # fmt: skip
 
 MS = 1_000_000
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import renderer as module
@@ -13,8 +12,8 @@ from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.geometry import primitives
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, Scene, SceneObject, Texture
-
 from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")

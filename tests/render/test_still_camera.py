@@ -13,9 +13,7 @@ from blinkgl.events import Esim
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.still import Rectangle, merged, screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath
-from blinkgl.scene.types import Part, SceneObject
 from blinkgl.tools import bench_still
-
 from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")

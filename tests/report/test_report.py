@@ -40,7 +40,7 @@ def data(tmp_path_factory) -> Path:
 class Reader(HTMLParser):
     """Tags balanced, no reference to anything outside."""
 
-    VOID = {"meta", "img", "rect", "line"}
+    VOID = frozenset({"meta", "img", "rect", "line"})
 
     def __init__(self):
         super().__init__()
@@ -58,7 +58,7 @@ class Reader(HTMLParser):
     def handle_endtag(self, tag):
         if tag in self.VOID:
             return
-        while self.open and self.open[-1] != tag and self.open[-1] in ("p",):
+        while self.open and self.open[-1] != tag and self.open[-1] == "p":
             self.open.pop()
         assert self.open and self.open[-1] == tag, f"</{tag}> closes {self.open[-3:]}"
         self.open.pop()

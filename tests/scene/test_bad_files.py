@@ -15,9 +15,9 @@ from PIL import Image
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.worlds.from_file import from_gltf
 from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.reading import contents, reading
+from blinkgl.scene.worlds.from_file import from_gltf
 from tests.scene.gltf_files import GltfBuilder, triangle
 
 CAMERA = CameraConfig(width=64, height=48).model

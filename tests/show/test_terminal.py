@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from blinkgl import cli
-from blinkgl.show.terminal import plain_column, plain_console
+from blinkgl.show.terminal import plain_column, plain_console, say
 
 ROOT = Path(__file__).parents[2]
 
@@ -51,8 +51,9 @@ def test_texts_tables_titles_and_bars_keep_their_brackets(capsys):
     table.add_row("cell [cluster] [/red]")
     console.print(table)
     console.print("path/[red]/x", soft_wrap=True)
+    say(console, "path/:bug:/x " + "y" * 200)
     out = capsys.readouterr().out
-    assert all(text in out for text in ("out/run[1]", "column [bold]", "cell [cluster] [/red]", "path/[red]/x"))
+    assert all(text in out for text in ("out/run[1]", "column [bold]", "cell [cluster] [/red]", "path/[red]/x", "path/:bug:/x " + "y" * 200))
 
     class Task:
         description = "data[train]/a"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -40,7 +42,7 @@ def scene(moved_px: float) -> np.ndarray:
     """A photograph moved right, and a patch of another one moved left over it."""
     big = data.camera().astype(np.float32) / 255
     patch = data.coins()[50:110, 50:110].astype(np.float32) / 255
-    shift = lambda image, x, size: cv2.warpAffine(image, np.float32([[1, 0, x], [0, 1, 0]]), size)  # noqa: E731
+    shift = lambda image, x, size: cv2.warpAffine(image, np.float32([[1, 0, x], [0, 1, 0]]), size)
     frame = shift(big[100:260], -40 + moved_px, (200, 160))
     layer, cover = (shift(p, 120 - moved_px, (200, 60)) for p in (patch, np.ones_like(patch)))
     frame[50:110] = frame[50:110] * (1 - cover) + layer * cover
@@ -52,7 +54,7 @@ def test_motion_recovers_the_frames_that_were_left_out():
     given = [(scene(px), px * 1_000_000) for px in (0, 8, 16)]
     out = list(interpolate.motion(given, max_px=1.0, displacement=statistics))
     times = [t for _, t in out]
-    assert all(np.array_equal(out[times.index(t)][0], f) for f, t in given) and all(b > a for a, b in zip(times, times[1:]))
+    assert all(np.array_equal(out[times.index(t)][0], f) for f, t in given) and all(b > a for a, b in itertools.pairwise(times))
     assert 7 <= statistics.median <= 9 and statistics.pairs == 2 and len(out) == 3 + statistics.inserted
     assert 14 <= statistics.inserted <= 24
     errors, blend = [], []

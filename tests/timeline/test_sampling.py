@@ -1,11 +1,11 @@
 """Frame times: exact grids, and a displacement bound that holds."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from blinkgl.timeline import displacement_times, uniform_times
 
@@ -39,7 +39,7 @@ def test_acceleration_inside_a_step_is_noticed():
     """Speed 10 px/s, then 1000 px/s from 50 ms on: the step that meets the jump has to be cut."""
     speed = lambda t: 10.0 if t < 50 * MS else 1000.0
     times = np.array(list(displacement_times(0.5, MS // 10, 20 * MS, 0, 100 * MS, speed)))
-    for a, b in zip(times[:-1], times[1:]):
+    for a, b in itertools.pairwise(times):
         assert max(speed(a), speed(b)) * (b - a) <= 0.5 * 1e9 * 1.001 or b - a <= MS // 10 + 1
 
 

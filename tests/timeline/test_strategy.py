@@ -130,7 +130,7 @@ def test_budget_finds_the_order_and_the_step_of_a_smooth_signal():
     x = np.linspace(0, 2 * np.pi, 4000, endpoint=False)[None]
     speed_px, wavelength = 50.0, 40.0
     rate = speed_px / wavelength * 2 * np.pi
-    signal = lambda t: np.sin(x - rate * t).astype(np.float32)  # noqa: E731
+    signal = lambda t: np.sin(x - rate * t).astype(np.float32)
     error, t = TimeError("linear", 0.5e-3, in_px=False, percentile=50.0), 0.0
     steps = []
     for k in range(80):

@@ -1,9 +1,9 @@
 from __future__ import annotations
 
 import pytest
-from debugger_scene import copy_shaders, write_config
 
 from blinkgl import cli
+from debugger_scene import copy_shaders, write_config
 
 
 @pytest.fixture(scope="session")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import mmap
 import os
 import signal
-import mmap
 import time
 
 import numpy as np

@@ -11,9 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from debugger_scene import copy_shaders, edit
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl.shader import STAGES, ShaderError, ShaderLoader, expand, normalised, shader_folder
@@ -22,6 +20,7 @@ from blinkgl.scene.build import build_scene
 from blinkgl.tools.shader_debugger import check, diagnostics, preprocess, timing, variants
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment
 from blinkgl.tools.shader_debugger.session import DebugRenderer, moment, open_folder, open_subject
+from debugger_scene import copy_shaders, edit
 
 PRODUCTION = ("luminance.glsl", "label.glsl", "downsample.glsl")
 
@@ -278,8 +277,8 @@ _expressions = st.recursive(
 def test_conditions_against_the_driver(gl, expression):
     """The driver's preprocessor is the oracle."""
     vertex = "#version 430 core\nvoid main() { gl_Position = vec4(0.0); }\n"
-    text = f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform float no;\n#endif\n" \
-           "out vec4 c;\nvoid main() { c = vec4(\n#if " + expression + "\nyes\n#else\nno\n#endif\n); }\n"
+    text = (f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform float no;\n#endif\n"
+            "out vec4 c;\nvoid main() { c = vec4(\n#if " + expression + "\nyes\n#else\nno\n#endif\n); }\n")
     program = gl.ctx.program(vertex_shader=vertex, fragment_shader=text)
     says = "yes" in program
     program.release()
@@ -307,7 +306,7 @@ def test_time_counts_what_is_drawn(shader, config):
     passes = {p["pass"]: p for p in result["passes"]}
     assert set(passes) == {"luminance", "colour", "labels", "occlusion, per direction"}  # a uniform timeline needs no velocity
     for p in passes.values():
-        assert 0 < p["gpu_ms"] and 0 <= p["vertex_ms"] <= p["gpu_ms"] and p["fragment_ms"] == pytest.approx(p["gpu_ms"] - p["vertex_ms"])
+        assert p["gpu_ms"] > 0 and 0 <= p["vertex_ms"] <= p["gpu_ms"] and p["fragment_ms"] == pytest.approx(p["gpu_ms"] - p["vertex_ms"])
         assert p["triangles"] == sum(v["triangles"] for v in p["variants"]) and p["draws"] == sum(v["draws"] for v in p["variants"])
         assert sum(v["fragments"] for v in p["variants"]) == p["fragments"]
         assert 0.3 < p["overdraw"] < 2.5

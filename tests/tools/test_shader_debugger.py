@@ -9,23 +9,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl import create_context
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.resources import SceneResources
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.geometry.primitives import grid
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject, Texture
 from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session
 from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
+from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
 
 DEMO = str(Path(__file__).parents[2] / "configs/demo.yaml")
 T, T_NEXT, T_LAST = 100_000_000, 200_000_000, 0
@@ -78,7 +78,7 @@ def test_pictures_are_labelled_and_large_enough(written):
 
 
 def test_only_the_passes_asked_for(shader, config, tmp_path):
-    status, out, _ = shader("passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "colour_uv", "--time", 0.25)
+    status, _out, _ = shader("passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "colour_uv", "--time", 0.25)
     assert status == 0 and sorted(p.name for p in (tmp_path / "o").iterdir()) == ["colour_uv.npy", "colour_uv.png", "contact_sheet.png",
                                                                                       "depth.npy", "depth.png"]
 
@@ -408,7 +408,7 @@ def test_suspicions_want_evidence(both):
 
 
 def test_a_suspicion_about_one_object_names_it(both):
-    _, ref, comparison, _ = both
+    _, _ref, comparison, _ = both
     ball = comparison.owner("colour") == comparison.objects.index("ball")
     box = comparison.owner("colour") == comparison.objects.index("box")
     wrong = comparison.gpu["colour"].copy()

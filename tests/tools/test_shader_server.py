@@ -15,14 +15,14 @@ import time
 
 import numpy as np
 import pytest
-import webdriver
-from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
 from PIL import Image
 
+import webdriver
 from blinkgl.tools.shader_debugger import server as server_module
 from blinkgl.tools.shader_debugger.moments import PASSES
 from blinkgl.tools.shader_debugger.server import LOCAL, MOST_OPEN, MOST_WAITING, THREADS, DebugServer, host_allowed
 from blinkgl.tools.shader_debugger.session import moment, open_subject
+from debugger_scene import HEIGHT, WIDTH, copy_shaders, edit
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_every_buffer_as_a_picture_from_both_sides(served):
 
 def test_colours_range_and_component(served):
     server, _ = served
-    status, headers, body = ask(server, "/image?pass=flow_forward&component=x&map=gray&low=-10&high=10&t=0.1")
+    _status, headers, body = ask(server, "/image?pass=flow_forward&component=x&map=gray&low=-10&high=10&t=0.1")
     legend = json.loads(headers["X-Legend"])
     assert (legend["low"], legend["high"], legend["map"]) == (-10.0, 10.0, "gray")
     u = next(row for row in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if row["name"] == "flow_forward")
@@ -337,7 +337,7 @@ def test_the_command_says_where_and_ends_on_interrupt(config):
         assert json.load(connection.getresponse())["width"] == WIDTH
         connection.close()
         child.send_signal(signal.SIGINT)
-        out, err = child.communicate(timeout=30)
+        _out, err = child.communicate(timeout=30)
     finally:
         child.kill()
     assert child.returncode == 0 and err == ""
@@ -357,8 +357,8 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         assert page.run("return document.querySelector('#pane-a img').naturalWidth") == WIDTH
         assert page.run("return document.querySelectorAll('#a option').length") == 2 * len(PASSES)
 
-        picture = "const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = i.naturalWidth; c.height = i.naturalHeight;" \
-                  "const g = c.getContext('2d'); g.drawImage(i, 0, 0); return c.toDataURL()"
+        picture = ("const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = i.naturalWidth; c.height = i.naturalHeight;"
+                   "const g = c.getContext('2d'); g.drawImage(i, 0, 0); return c.toDataURL()")
         first = page.run(picture, "#pane-a img")
         page.choose("#time", "0.3")  # scrub
         page.wait("return document.body.dataset.shown === '0.3'")
@@ -418,7 +418,7 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         page.choose("#time", "0.3")
         page.wait("return document.body.dataset.shown === '0.3'")
         assert page.text("#probe [data-gpu=depth]")
-        print(f"error shown {noticed:.2f} s after the edit")
+        print(f"error shown {noticed:.2f} s after the edit")  # noqa: T201
 
         (folder / "include/motion.glsl").write_text(good)
         page.wait("return document.querySelector('#errors').hidden", timeout=20)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from importlib import resources
 
@@ -39,7 +40,7 @@ def test_presets_are_on_the_measured_front(recorded):
     presets = [row_of(name, rows) for name in QUALITIES]
     for preset in presets:
         assert preset["on_front"] and not dominating(preset, rows, recorded["cost"], "voxel"), preset["name"]
-    for cheap, dear in zip(presets, presets[1:]):
+    for cheap, dear in itertools.pairwise(presets):
         assert cheap[recorded["cost"]] < dear[recorded["cost"]] and cheap["voxel"] > dear["voxel"]
 
 

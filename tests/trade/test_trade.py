@@ -18,13 +18,13 @@ from blinkgl.config.sequence import load_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.still import Rectangle
+from blinkgl.show.trade import show
 from blinkgl.tools import peer_cycles
 from blinkgl.trade.front import dominating, front
 from blinkgl.trade.measure import Bench, Level, Options
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
 from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
-from blinkgl.show.trade import show
 
 CONFIG = {
     "seed": 3, "camera": {"width": 64, "height": 48}, "time": {"duration": 0.1, "label_rate": 20},

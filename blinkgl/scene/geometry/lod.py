@@ -26,7 +26,7 @@ TIMES = 129
 """Poses looked at in a sequence. Something nearer for a moment in between is drawn a little too coarse, but steadily so."""
 MIN_FACES = 128
 _CACHE_BYTES = 256_000_000
-_cache: OrderedDict[tuple[str, int], "Level"] = OrderedDict()
+_cache: OrderedDict[tuple[str, int], Level] = OrderedDict()
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ def _decimated(mesh: Mesh, faces: int) -> Level:
     went_in = np.zeros(len(new), np.int64)
     went_in[became] = np.arange(len(old))
     away, face, weights = walk_to_nearest(new, old_at[1][old_at[0][went_in]], old, triangles, *old_at)
-    mixed = lambda values: (weights[:, :, None] * values[triangles[face]]).sum(axis=1)  # noqa: E731
+    mixed = lambda values: (weights[:, :, None] * values[triangles[face]]).sum(axis=1)
     normals = mixed(old_normals.astype(np.float64))
     normals = (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)).astype(np.float32)
     uvs = mixed(old_uvs).astype(np.float32)

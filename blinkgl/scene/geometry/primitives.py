@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import itertools
 import math
 from dataclasses import replace
 from functools import wraps
@@ -53,7 +54,7 @@ def _primitive(build):
         where = build.__name__
         unknown = set(parameters) - set(signature.parameters)
         if unknown:
-            raise AssetError("unknown parameter", where=where, value=sorted(unknown)[0],
+            raise AssetError("unknown parameter", where=where, value=min(unknown),
                              accepted="one of " + ", ".join(signature.parameters))
         bound = signature.bind(**parameters)
         bound.apply_defaults()
@@ -248,7 +249,7 @@ def pyramid(sides=4, radius=0.5, height=1.0):
     rim[-1] = rim[0]
     tip = np.array([0, 0, height / 2])
     walls = []
-    for a, b in zip(rim[:-1], rim[1:]):
+    for a, b in itertools.pairwise(rim):
         normal = np.cross(b - a, tip - a)
         walls.append((np.stack([a, b, tip]), np.broadcast_to(normal / np.linalg.norm(normal), (3, 3)),
                       np.array([[0.0, 1.0], [1.0, 1.0], [0.5, 0.0]]), np.array([[0, 1, 2]])))

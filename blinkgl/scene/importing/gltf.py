@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
-from blinkgl.scene.surfaces.images import content_hash, decode_image
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import contents, reading
+from blinkgl.scene.surfaces.images import content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
 from blinkgl.srgb import linear_from_srgb
 
@@ -165,7 +165,7 @@ class Document:
     def mesh_pieces(self, mesh: int) -> list[Piece]:
         """The triangles of a mesh in its own coordinates, a piece per primitive; points and lines are left out."""
         pieces = []
-        for number, primitive in enumerate(_item(self.tree, "meshes", mesh, self.where)["primitives"]):
+        for primitive in _item(self.tree, "meshes", mesh, self.where)["primitives"]:
             mode, attributes = primitive.get("mode", 4), primitive["attributes"]
             if mode not in (4, 5, 6):
                 self.omissions.add("points and lines")

@@ -18,11 +18,11 @@ import trimesh
 from PIL import Image
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.importing import gltf
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, shrink
 from blinkgl.scene.geometry.meshes import closed_together, concatenate, make_mesh, normalise
+from blinkgl.scene.importing import gltf
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import MAX_BYTES, contents, reading
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, shrink
 from blinkgl.scene.types import Material, Part, Texture
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
@@ -93,7 +93,7 @@ def _load(path: Path, max_faces: int, max_bytes: int, keep_materials: bool, max_
         raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
     has_materials = keep_materials and any(p.material is not None for p in pieces)
     parts = []
-    for number, piece in enumerate(pieces):
+    for piece in pieces:
         if len(piece.faces) == 0 and len(pieces) > 1:
             continue
         # A palette picked by degenerate coordinates is fine with the file's own texture, useless with any other.
@@ -148,7 +148,7 @@ def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: s
     file_normals : use normals that came with the mesh; trimesh's own smooth ones would round off a cuboid.
     max_texture : None leaves the material out.   resolver : what the mesh was loaded with; it knows the images.
     """
-    normals = mesh._cache.cache.get("vertex_normals") if file_normals else None
+    normals = mesh._cache.cache.get("vertex_normals") if file_normals else None  # noqa: SLF001 - .vertex_normals would make them up
     uvs = getattr(mesh.visual, "uv", None)
     if uvs is not None and len(uvs) == len(mesh.vertices):
         uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]      # trimesh has v upwards
@@ -282,7 +282,7 @@ def _check_stl(data: bytes, max_faces: int, where: str) -> None:
     if len(data) >= 84:
         claimed = int(np.frombuffer(data[80:84], "<u4")[0])
         # Binary when the size fits; ASCII begins with 'solid' (some binary files do too, hence the size first).
-        if not data.lstrip()[:5].lower() == b"solid" or len(data) == 84 + 50 * claimed:
+        if data.lstrip()[:5].lower() != b"solid" or len(data) == 84 + 50 * claimed:
             if claimed > max_faces:
                 raise AssetError("the mesh has too many faces", where=where, value=claimed, accepted=f"at most {max_faces}")
             if len(data) < 84 + 50 * claimed:

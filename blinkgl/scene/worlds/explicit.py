@@ -10,20 +10,27 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.scene import ExplicitSceneConfig, KeyedMotionConfig, MaterialConfig, MeshConfig, PoseConfig, object_names
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    KeyedMotionConfig,
+    MaterialConfig,
+    MeshConfig,
+    PoseConfig,
+    object_names,
+)
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.motion.collision import resolve_collisions
-from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
-from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.geometry.meshes import transform_mesh
-from blinkgl.scene.motion.paths import KeyframePath, StaticPath
-from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.importing.mesh_files import Asset, load_asset
+from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
-from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.random_world import make_light
 
 _PROCEDURAL_SIZE = 1024

@@ -4,15 +4,15 @@
     scene = from_trimesh(trimesh.load_scene("room.obj"), camera, t0_ns, t1_ns)
     scene = from_pyrender(pyrender_scene, camera, t0_ns, t1_ns)
 
-``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along
--z with y up in all three, get OpenCV axes. glTF's world (y up) is turned z up.
+``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a
+node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up in all three, get OpenCV axes. glTF's world (y up) is turned z up.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Iterable
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,17 +20,17 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import CameraModel, PinHole, focal_length
 from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.importing import gltf
-from blinkgl.scene.worlds.explicit import motion_path
-from blinkgl.scene.surfaces.images import content_hash, shrink
-from blinkgl.scene.importing.mesh_files import piece_of_trimesh
 from blinkgl.scene.geometry.meshes import closed_together, make_mesh
-from blinkgl.scene.omissions import Omissions
+from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.mesh_files import piece_of_trimesh
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
-from blinkgl.scene.worlds.pool import resolve
+from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import reading
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.surfaces.images import content_hash, shrink
 from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.worlds.explicit import motion_path
+from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.random_world import make_light
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])    # its own inverse
@@ -243,7 +243,10 @@ def _channels(document: gltf.Document, animation: str | int | None) -> list[gltf
     return document.channels(index)
 
 
-def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0_ns: int, t1_ns: int, local: np.ndarray = np.eye(4)):
+_HERE = np.eye(4)
+
+
+def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0_ns: int, t1_ns: int, local: np.ndarray = _HERE):
     """(PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
     chain, step = set(), node
     while step is not None:

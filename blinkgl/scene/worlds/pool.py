@@ -8,19 +8,19 @@ primitives, …) with equal chances and then an entry, so that six photographs a
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Callable, Iterable
 
 import numpy as np
 
 from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, PoolConfig, TexturesConfig
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
-from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
 from blinkgl.scene.geometry.primitives import random_primitive, random_primitive_hash
+from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
 from blinkgl.scene.reading import MAX_BYTES, contents
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_hash, procedural_texture
 from blinkgl.scene.types import Material, Part, Texture
 

@@ -19,16 +19,16 @@ from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, Wall
 from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
-from blinkgl.scene.motion.collision import resolve_collisions
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, cube_faces, load_image, shrink, SKY_SIDES
 from blinkgl.scene.geometry.meshes import scale_mesh
-from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
 from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
+from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
 
 _PLACEMENTS = 300      # positions tried for an object before it is left out
 _CAMERA_PATHS = 6      # camera paths tried for one that runs into nothing; the last is cut where it does
@@ -103,7 +103,7 @@ def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
 
 
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
-_texture_pool = lru_cache(maxsize=4)(lambda config, base: texture_pool(config, base))
+_texture_pool = lru_cache(maxsize=4)(texture_pool)
 
 
 def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:

@@ -8,13 +8,13 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from blinkgl.camera import PinHole
-from blinkgl.scene.rig import Rig
 from blinkgl.config.lod import LodConfig
 from blinkgl.scene.geometry import lod, primitives
 from blinkgl.scene.geometry.lod import at_level_of_detail, bounding_sphere, faces_of_edge, largest_scale, level_of
 from blinkgl.scene.geometry.meshes import closedness, make_mesh, scale_mesh, weld
 from blinkgl.scene.geometry.nearest import incident_faces, walk_to_nearest
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Part, Scene, SceneObject
 
 SECOND = 1_000_000_000
@@ -51,7 +51,7 @@ def edges(mesh):
 def dense_points(mesh, per_face=6):
     """Points all over the surface, and their texture coordinates."""
     weights = np.random.default_rng(0).dirichlet(np.ones(3), (len(mesh.faces), per_face))
-    mix = lambda values: np.einsum("fkc,fcd->fkd", weights, values[mesh.faces].astype(float)).reshape(-1, values.shape[1])  # noqa: E731
+    mix = lambda values: np.einsum("fkc,fcd->fkd", weights, values[mesh.faces].astype(float)).reshape(-1, values.shape[1])
     return mix(mesh.vertices), mix(mesh.uvs)
 
 
@@ -174,7 +174,7 @@ def test_silhouettes_and_edges_in_the_image(distance, error_px):
     scene = one(mesh, at(distance))
     simple = drawn(at_level_of_detail(scene, config))
     assert len(simple.faces) < len(mesh.faces)
-    project = lambda v: 300 * v[:, :2] / (v[:, 2:] + distance)  # noqa: E731
+    project = lambda v: 300 * v[:, :2] / (v[:, 2:] + distance)
     a, b = project(dense_points(mesh, 8)[0]), project(dense_points(simple, 60)[0])
     hull_a, hull_b = (np.array([(p @ d).max() for d in np.stack([np.cos(t), np.sin(t)], 1)]) for p in (a, b)
                       for t in [np.linspace(0, 2 * np.pi, 90)])

@@ -5,8 +5,7 @@ import pytest
 import trimesh
 
 from blinkgl.errors import AssetError
-from blinkgl.scene.geometry import meshes as M
-from blinkgl.scene.geometry import primitives as P
+from blinkgl.scene.geometry import meshes as M, primitives as P
 
 CUBE = trimesh.creation.box()
 

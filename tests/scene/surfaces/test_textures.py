@@ -9,9 +9,9 @@ from PIL import Image
 
 from blinkgl.config.scene import TEXTURE_KINDS
 from blinkgl.errors import AssetError
-from blinkgl.srgb import linear_from_srgb, srgb_from_linear
 from blinkgl.scene.surfaces import images as I
 from blinkgl.scene.surfaces.textures import procedural_hash, procedural_texture
+from blinkgl.srgb import linear_from_srgb, srgb_from_linear
 from tests.shared_data import shared
 
 
@@ -82,7 +82,7 @@ def test_exif_orientation_is_applied(tmp_path):
 
 def test_hdr_is_linear_and_bounded():
     image = I.load_image(shared("data/assets/hdri/park.hdr"))
-    assert image.dtype == np.float32 and image.shape == (512, 1024, 3) and 0 <= image.min() and image.max() <= I.HDR_WHITE
+    assert image.dtype == np.float32 and image.shape == (512, 1024, 3) and image.min() >= 0 and image.max() <= I.HDR_WHITE
     assert np.percentile(image.max(axis=2), 90) == pytest.approx(0.8, rel=1e-3)
 
 

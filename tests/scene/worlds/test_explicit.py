@@ -11,8 +11,8 @@ from blinkgl.config.scene import ExplicitSceneConfig, PoseConfig
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.worlds.explicit import pose_matrix
 from blinkgl.scene.motion.paths import body_rate
+from blinkgl.scene.worlds.explicit import pose_matrix
 from tests.scene.gltf_files import GltfBuilder
 
 CAMERA = CameraConfig(width=64, height=48)
@@ -80,7 +80,7 @@ def test_collisions_are_found_when_asked_for(tmp_path):
     assert free.objects[1].path.pose(10**9)[0, 3] == pytest.approx(4) and free.log == ()
     stopped = build(tmp_path, objects=CRASH, collisions=True)
     assert stopped.objects[1].path.pose(10**9)[0, 3] == pytest.approx(2, abs=2e-3)
-    assert "moving" in stopped.log[0] and "t=0.4" in stopped.log[0] or "t=0.5" in stopped.log[0]
+    assert ("moving" in stopped.log[0] and "t=0.4" in stopped.log[0]) or "t=0.5" in stopped.log[0]
 
 
 def test_the_camera_is_stopped_by_a_solid(tmp_path):

@@ -13,10 +13,10 @@ from blinkgl.config.base import validate
 from blinkgl.config.scene import FileSceneConfig
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.importing import gltf
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.worlds.from_file import from_gltf, from_pyrender, from_trimesh, split_rigid
+from blinkgl.scene.importing import gltf
 from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.worlds.from_file import from_gltf, from_pyrender, from_trimesh, split_rigid
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
 
@@ -124,7 +124,7 @@ def test_materials(tmp_path):
     # uv (0, 0) is the image's first pixel, top left, and v grows downwards: as in the file
     for part, expected in ((first, np.array(uvs)), (second, np.array(uvs) * [2, 4] + [0.25, 0.5])):
         order = np.lexsort(part.mesh.vertices.T)
-        want = np.lexsort((gltf.Z_UP[:3, :3] @ np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float).T))
+        want = np.lexsort(gltf.Z_UP[:3, :3] @ np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float).T)
         np.testing.assert_allclose(part.mesh.uvs[order], expected[want], atol=1e-6)
     assert third.material.texture is None and third.material.base_color == (1, 1, 1)
 

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from blinkgl.config.base import validate
-from blinkgl.config.scene import ExplicitSceneConfig, LightConfig, ObjectsConfig, PoolConfig, RandomSceneConfig, RegionConfig, SkyConfig, TexturesConfig, WallsConfig
+from blinkgl.config.scene import (
+    ExplicitSceneConfig,
+    LightConfig,
+    ObjectsConfig,
+    PoolConfig,
+    RandomSceneConfig,
+    RegionConfig,
+    SkyConfig,
+    TexturesConfig,
+    WallsConfig,
+)
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
@@ -221,8 +231,8 @@ def test_assets_are_checked_before_work_starts(tmp_path):
 
 def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_path):
     """The first path is reported as cut; the world then draws another, and the scene's camera is not stopped."""
-    from blinkgl.scene.worlds import random_world as module
     from blinkgl.scene.motion.collision import Collision
+    from blinkgl.scene.worlds import random_world as module
 
     drawn, resolve = [], module.resolve_collisions
 

@@ -1,4 +1,4 @@
-"""From command-line options to an executor."""
+"""From the options of ``blinkgl generate`` to an executor."""
 
 from __future__ import annotations
 

@@ -1,0 +1,5 @@
+"""``python -m blinkgl`` is ``blinkgl``."""
+
+from blinkgl.cli import main
+
+main()

@@ -1,0 +1,20 @@
+"""``blinkgl convert``: one line about what was written."""
+
+from __future__ import annotations
+
+from blinkgl.errors import ConfigError
+from blinkgl.io.formats import convert
+from blinkgl.show.terminal import plain_console, say
+
+
+def run(source: str, target: str, *, size: str | None = None, **options) -> int:
+    """``options``: of :func:`~blinkgl.io.formats.convert`. size : "WIDTHxHEIGHT"."""
+    known = None
+    if size is not None:
+        width, cross, height = size.lower().partition("x")
+        if not (cross and width.isdigit() and height.isdigit() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536):
+            raise ConfigError("not a size", where="--size", value=size, accepted="WIDTHxHEIGHT, e.g. 640x480")
+        known = (int(height), int(width))
+    file, count = convert(source, target, size=known, **options)
+    say(plain_console(), f"{target}: {count:,} events, {file.width}x{file.height}, from {file.format}")
+    return 0

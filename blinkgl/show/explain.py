@@ -1,0 +1,36 @@
+"""``blinkgl explain``: what a run will model, leave out and cost, as three tables."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.explain import Explanation, explain
+from blinkgl.show.terminal import plain_console, say
+
+
+def run(config: str, *, sequence: int | None = None, seed: int | None = None, overrides: list[str] = ()) -> int:
+    """``sequence``: default the first of the run."""
+    show(explain(load_run(config, overrides, seed=seed), sequence), plain_console())
+    return 0
+
+
+def show(result: Explanation, console: Console) -> None:
+    """Three tables and the cost."""
+    scene = Table(title="what is modelled", title_justify="left", show_header=False)
+    for key, value in result.scene.items():
+        scene.add_row(key, value)
+    console.print(scene)
+    passes = Table(title=f"what is computed (timed on {result.machine})", title_justify="left")
+    for column, side in (("pass", "left"), ("why", "left"), ("variants", "left"), ("MB/frame", "right"), ("times", "right"), ("seconds", "right")):
+        passes.add_column(column, justify=side)
+    for p in result.passes:
+        passes.add_row(p.name, p.why, ", ".join(p.variants), f"{p.bytes / 1e6:.2f}" if p.bytes else "–", f"{p.count:,}", f"{p.seconds:.2f}")
+    console.print(passes)
+    left = Table(title="what is left out", title_justify="left", show_header=False)
+    for what, why in result.left_out:
+        left.add_row(what, why)
+    console.print(left)
+    say(console, f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
+                  f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video")

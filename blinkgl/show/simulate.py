@@ -1,0 +1,68 @@
+"""``blinkgl simulate``: a bar while it runs, then what was made and what was lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.errors import ConfigError
+from blinkgl.show.terminal import plain_column, plain_console, say
+
+
+def emulator_options(name: str, config: str | None, overrides: list[str], sensor: str | None = None) -> dict[str, Any]:
+    """``emulator`` and ``readout`` of :func:`blinkgl.simulate` from an emulator's name, an optional YAML mapping (it may name
+    the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where nothing else is said."""
+    data: dict[str, Any] = {}
+    if config is not None:
+        data = read_table(config, "emulator parameters, key: value")
+    data = {"emulator": name, **data}
+    for item in overrides:
+        key, equals, value = item.partition("=")
+        if not equals:
+            raise ConfigError("not key=value", where="--set", value=item)
+        data[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
+    if sensor is None:
+        return {"emulator": data, "readout": None}
+    from blinkgl.config.sensor import load_sensor
+    from blinkgl.recordings.simulation import emulator_config
+
+    camera = load_sensor(sensor)
+    return {"emulator": emulator_config({**camera.values(data["emulator"]), **data}), "readout": camera.readout}
+
+
+def run(source: str, target: str, *, emulator: str, sensor: str | None = None, config: str | None = None, overrides: list[str] = (),
+        quiet: bool = False, **options) -> int:
+    """``options``: of :func:`~blinkgl.recordings.simulation.simulate_file`."""
+    from blinkgl.machine.compiling import compiled_s, compiling_line
+    from blinkgl.recordings.simulation import simulate_file
+
+    console = plain_console(quiet=quiet)
+    bar = Progress(plain_column("{task.description}"), BarColumn(), plain_column("{task.fields[detail]}"), TimeElapsedColumn(),
+                   TimeRemainingColumn(), console=console, transient=True, disable=quiet or not console.is_terminal)
+    with bar:
+        task = bar.add_task(Path(target).name, total=None, detail="")
+
+        def progress(report, fraction) -> None:
+            bar.update(task, total=1.0 if fraction is not None else None, completed=fraction or 0.0,
+                       detail=f"{report.frames} frames, {report.events / 1e6:.2f} M events")
+
+        report = simulate_file(source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options)
+    rate = report.events / report.duration_s if report.duration_s else 0.0
+    say(console, f"{target}: {report.events:,} events in {report.duration_s:.6g} s ({rate / 1e6:.3g} M/s, "
+        f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator steps")
+    if report.displacement is not None:
+        say(console, str(report.displacement))
+    elif report.steps > report.frames:
+        say(console, f"{report.steps - report.frames} of the frames were interpolated, not recorded")
+    if line := compiling_line(compiled_s()):
+        say(console, line)
+    if report.lost:
+        say(console, f"{report.lost:,} events were lost in the sensor's read-out")
+    if report.late:
+        say(console, f"{report.late:,} events had not left the sensor's read-out when the frames ended")
+    if report.saturated:
+        say(console, f"warning: {report.saturated:,} events were cut by max_events_per_step")
+    return 0

@@ -1,0 +1,40 @@
+"""One pattern: a command is one module of blinkgl.show with ``run``, and nothing else in the package prints."""
+
+import ast
+import inspect
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import typer
+
+from blinkgl import cli
+
+PACKAGE = Path(cli.__file__).parent
+COMMANDS = sorted(name for name, command in typer.main.get_command(cli.app).commands.items() if name != "shader")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_its_module(name):
+    run = import_module(f"blinkgl.show.{name}").run
+    assert inspect.signature(run).return_annotation == "int", "the exit status"
+
+
+def test_no_other_room_prints():
+    """Benchmarks' and tools' own words are theirs; the compiler run by ``make`` says one line."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        place = path.relative_to(PACKAGE).as_posix()
+        if place.startswith("show/") or place in ("cli.py", "machine/compiling.py"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            printed = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+            rich = isinstance(node, (ast.Import, ast.ImportFrom)) and "rich" in [getattr(node, "module", "") or ""] + [n.name for n in node.names]
+            rich = rich or (isinstance(node, ast.ImportFrom) and (node.module or "").startswith(("rich.", "blinkgl.show")))
+            assert not printed and not rich, f"{place}:{node.lineno}"
+
+
+def test_the_package_runs_as_a_program():
+    done = subprocess.run([sys.executable, "-m", "blinkgl", "--version"], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout == f"blinkgl {cli.__version__}\n"

@@ -165,7 +165,8 @@ def test_reference_mip_level_of_a_facing_plane():
     points = np.array([[[-1, -1, depth], [1, -1, depth], [0, 1.5, depth]]])
     texels = points[:, :, :2] * per_unit
     ray = np.array([[0.02, -0.01, 1.0]])
-    assert moments.footprint(points, texels, ray, focal)[0] == pytest.approx(np.log2(per_unit * depth / 110.0), abs=1e-12)
+    slopes = np.array([[[1 / focal[0], 0.0], [0.0, 1 / focal[1]], [0.0, 0.0]]])
+    assert moments.footprint(points, texels, ray, slopes)[0] == pytest.approx(np.log2(per_unit * depth / 110.0), abs=1e-12)
     points[0, 2, 2] = 9.0
 
     def where(rx, ry):
@@ -176,7 +177,7 @@ def test_reference_mip_level_of_a_facing_plane():
     x = (where(0.02 + h, -0.01) - where(0.02 - h, -0.01)) / (2 * h) / focal[0]
     y = (where(0.02, -0.01 + h) - where(0.02, -0.01 - h)) / (2 * h) / focal[1]
     brute = np.log2(max(np.linalg.norm(x), np.linalg.norm(y)))
-    assert moments.footprint(points, texels, ray, focal)[0] == pytest.approx(brute, abs=1e-6)
+    assert moments.footprint(points, texels, ray, slopes)[0] == pytest.approx(brute, abs=1e-6)
 
 
 def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():

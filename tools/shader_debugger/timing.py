@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 

@@ -24,13 +24,13 @@ from blinkgl.config.base import validate
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, DisplacementTimeline, UniformTimeline
-from blinkgl.dataset.event_pass import EventPass
 from blinkgl.events import Events
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
+from blinkgl.sequence import Simulation, simulate_sequence
 from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors
 
 WIDTH, HEIGHT, DURATION_NS, LIMIT_US = 240, 180, 300_000_000, 5_000
@@ -94,7 +94,7 @@ def random_scene(seed: int, still_camera: bool = False) -> Scene:
         objects[fast] = replace(objects[fast], path=warp(objects[fast].path))
     else:
         objects = [replace(o, path=warp(o.path)) for o in objects]
-    return replace(scene, objects=tuple(objects), camera=replace(scene.camera, path=warp(scene.camera.path)), t1_ns=scene.t0_ns + DURATION_NS)
+    return replace(scene, objects=tuple(objects), t1_ns=scene.t0_ns + DURATION_NS).with_path(warp(scene.rig.path))
 
 
 @dataclass
@@ -104,9 +104,9 @@ class Run:
     info: dict
 
 
-def simulate(timeline, renderer: Renderer) -> tuple[Events, EventPass]:
-    run = EventPass(timeline, EMULATOR, renderer, seed=1)
-    return Events.concatenate([events for _, events in run]), run
+def simulate(timeline, renderer: Renderer) -> tuple[Events, Simulation]:
+    run = simulate_sequence(SequenceConfig(timeline=timeline, events=EMULATOR), labels=False, renderer=renderer)
+    return Events.concatenate([chunk.events for chunk in run]), run
 
 
 def measure(scene: Scene, gl, antialiasing: str, thin: int, say) -> dict[str, list[Run]]:
@@ -114,7 +114,7 @@ def measure(scene: Scene, gl, antialiasing: str, thin: int, say) -> dict[str, li
     with Renderer(gl, scene, RenderConfig(antialiasing=antialiasing)) as renderer:
         dense, run = simulate(DisplacementTimeline(max_px=1 / 32, percentile=99, min_step_us=5, max_step_us=2000, sample_every=6), renderer)
         times = np.linspace(scene.t0_ns, scene.t1_ns, 121).astype(np.int64)
-        speeds = SpeedMaps(times // 1000, np.stack([np.hypot(*np.moveaxis(renderer.velocity(int(t)), -1, 0)) for t in times]))
+        speeds = SpeedMaps(times // 1000, np.stack([np.hypot(*np.moveaxis(renderer.velocity(int(t)).read(), -1, 0)) for t in times]))
         say(f"  reference: {run.frames} frames, {len(dense):,} events")
         results: dict[str, list[Run]] = {}
         for name, settings in WAYS.items():

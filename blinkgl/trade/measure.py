@@ -1,7 +1,7 @@
 """Times settings and judges their events: the measurement behind ``blinkgl trade``.
 
-A clip of one sequence goes through pass 1 of ``blinkgl generate`` (:class:`~blinkgl.dataset.event_pass.EventPass`; nothing is written), once per setting and
-round. Rounds are interleaved, so that a busy moment of the machine falls on all settings alike.
+The events of a clip are simulated as ``blinkgl generate`` simulates them (:func:`~blinkgl.sequence.simulate.simulate_sequence`; nothing is
+written), once per setting and round. Rounds are interleaved, so that a busy moment of the machine falls on all settings alike.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
-from blinkgl.dataset.event_pass import EventPass
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
+from blinkgl.sequence import Simulation, simulate_sequence
 from blinkgl.trade.labels import flow_errors
 from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors, masked
 from blinkgl.trade.reference import FineTiles, lattice, mask_of, reference_events
@@ -120,7 +120,7 @@ class Bench:
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
-        # Labels and previews take no part in this; noise would drown the errors that are asked for.
+        # Labels and previews take no part in this; noise, and a bus that makes events late, would drown the errors that are asked for.
         self.emulator = emulator_of(base.events).noiseless(base.events)
         tree = apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])])
         self._template = RunTemplate({**tree, "events": self.emulator.model_dump()}, template.base)
@@ -179,16 +179,20 @@ class Bench:
         return results
 
     def _run(self, result: Measured, config: SequenceConfig, renderer: Renderer, first: bool) -> None:
-        clip = lambda end: EventPass(config.timeline, self.emulator, renderer, self.seed, window_ns=(self.t0_ns, end))
+        config = config.model_copy(update={"events": self.emulator, "readout": None})
+
+        def clip(end_ns: int) -> Simulation:
+            return simulate_sequence(config, self.options.sequence, labels=False, renderer=renderer, window_ns=(self.t0_ns, end_ns))
+
         for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # programs, targets, kernels: made the first time
             pass
         run, drawn = clip(self.t1_ns), renderer.stats.triangles
         chunks: list[Events] = []
         wall, cpu = time.perf_counter(), time.process_time()
-        for _, events in run:
+        for chunk in run:
             if first:
                 paused = time.perf_counter(), time.process_time()
-                chunks.append(masked(events, self.mask))
+                chunks.append(masked(chunk.events, self.mask))
                 wall += time.perf_counter() - paused[0]
                 cpu += time.process_time() - paused[1]
         result.wall_s.append((time.perf_counter() - wall) / self.duration_s)
@@ -205,7 +209,7 @@ class Bench:
         count = max(2, round(self.duration_s / 0.005) + 1)
         times = np.linspace(self.t0_ns, self.t1_ns, count).astype(np.int64)
         with Renderer(self.gl, self.scene, self.base.render) as renderer:
-            maps = [np.hypot(*np.moveaxis(renderer.velocity(int(t)), -1, 0)) for t in times]
+            maps = [np.hypot(*np.moveaxis(renderer.velocity(int(t)).read(), -1, 0)) for t in times]
         return SpeedMaps(times // 1000, np.stack(maps))
 
     def judge(self, results: list[Measured], speeds: SpeedMaps) -> list[Level]:
@@ -255,10 +259,4 @@ def _sized(config: SequenceConfig, factor: float) -> list[str]:
     """Overrides that shrink the image, its field of view kept."""
     if factor == 1:
         return []
-    camera = config.camera
-    scaled = {"width": max(1, round(camera.width * factor)), "height": max(1, round(camera.height * factor)), "near": camera.near}
-    for key in ("cx", "cy"):
-        if (value := getattr(camera, key)) is not None:
-            scaled[key] = (value + 0.5) * factor - 0.5
-    scaled |= {"focal": camera.focal * factor} if camera.focal is not None else {"fov": camera.fov} if camera.fov is not None else {}
-    return ["camera=" + json.dumps(scaled)]
+    return ["camera=" + json.dumps(config.camera.scaled(factor))]

@@ -408,7 +408,7 @@ class Reach:
         if path not in self._lines:
             tests = {}  # one object for each name
             by_line = self.data.contexts_by_lineno(str(ROOT / path)).items()
-            self._lines[path] = {line: sorted({tests.setdefault(c.split("|")[0], c.split("|")[0]) for c in contexts}) for line, contexts in by_line}
+            self._lines[path] = {line: sorted({tests.setdefault(c, c) for c in (c.rsplit("|", 1)[0] for c in contexts)}) for line, contexts in by_line}
             self._anywhere[path] = {c for contexts in self._lines[path].values() for c in contexts if c}
         return self._lines[path]
 
@@ -433,7 +433,7 @@ class Reach:
                 contexts = set().union(*(self.anywhere(path) for path in callers))
             else:
                 contexts = self._around(mutant)
-        ids = {c for c in contexts if c} - self.idle
+        ids = (set(contexts) & self.seconds.keys()) - self.idle
         chosen, together = [], 0.0
         for test in sorted(ids, key=lambda t: (self._distance(mutant, t), self.seconds.get(t, 1.0), t)):
             together += self.seconds.get(test, 1.0)
@@ -521,7 +521,8 @@ def serve() -> int:
 
 def _awaited(child: int, limit_s: float) -> str:
     handle = os.pidfd_open(child)
-    in_time = bool(select.select([handle], [], [], limit_s)[0])
+    ready = select.select([handle, sys.stdin], [], [], limit_s)[0]  # no order comes while one is carried out: readable is who gives them gone
+    in_time = handle in ready
     os.close(handle)
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # the child, if it still runs, and what it started

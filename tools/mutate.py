@@ -527,7 +527,7 @@ def _awaited(child: int, limit_s: float) -> str:
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # the child, if it still runs, and what it started
     _, status = os.waitpid(child, 0)
-    if not in_time or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
+    if not in_time or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF):
         return "time"
     return "passed" if os.WIFEXITED(status) and os.WEXITSTATUS(status) == 0 else "failed"
 
@@ -540,7 +540,6 @@ def _run_tests(order: dict) -> int:
     for old, new in ((nothing, 0), (output, 1), (output, 2)):
         os.dup2(old, new)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    resource.setrlimit(resource.RLIMIT_CPU, (int(order["processor_s"]), int(order["processor_s"]) + 30))
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]
@@ -551,17 +550,21 @@ def _run_tests(order: dict) -> int:
     import pytest
 
     status = pytest.main(["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *order["tests"]],
-                         plugins=[_Witness(Path(order["output"]).with_suffix(".failed"))])
+                         plugins=[_Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"])])
     sys.stdout.flush()
     sys.stderr.flush()
     return int(status)
 
 
 class _Witness:
-    """A plugin of pytest that writes down which test failed, or which file could not be collected."""
+    """A plugin of pytest that writes down which test failed, or which file could not be collected, and ends the process when a test takes
+    many times the processor time that it took once (``seconds``; ``spare_s`` more for kernels that have to be compiled)."""
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, seconds: dict[str, float], spare_s: float):
+        self.path, self.seconds, self.spare_s = path, seconds, spare_s
+
+    def pytest_runtest_logstart(self, nodeid, location) -> None:
+        signal.setitimer(signal.ITIMER_PROF, self.spare_s + 3 * self.seconds.get(nodeid, 10.0))
 
     def pytest_runtest_logreport(self, report) -> None:
         if report.failed:
@@ -587,15 +590,15 @@ class Copy:
         self.kernels = Kernels(folder)
         self.server = Server(folder)
 
-    def run(self, tests: list[str], processor_s: float, stale: set[str] = frozenset(), original: dict[str, str] | None = None) -> tuple[str, str]:
-        """("passed" | "failed" | "time", the test that failed, "" where the process died). ``original``: digests of the sources of files
-        that were edited outside of kernels."""
+    def run(self, tests: dict[str, float], spare_s: float, stale: set[str] = frozenset(), original: dict[str, str] | None = None) -> tuple[str, str]:
+        """("passed" | "failed" | "time", the test that failed, "" where the process died). ``tests``: with the seconds that each took.
+        ``original``: digests of the sources of files that were edited outside of kernels."""
         failed = self.folder / "output.failed"
         failed.unlink(missing_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
             self.kernels.cache(stale, Path(scratch))
-            outcome = self.server.ask({"tests": tests, "processor_s": processor_s, "limit_s": 60 + 3 * processor_s, "kernels": scratch,
-                                       "original": original or {}, "output": str(self.folder / "output.txt")})
+            outcome = self.server.ask({"tests": list(tests), "seconds": tests, "spare_s": spare_s, "limit_s": 10 * spare_s + 4 * sum(tests.values()),
+                                       "kernels": scratch, "original": original or {}, "output": str(self.folder / "output.txt")})
         return outcome, failed.read_text() if outcome == "failed" and failed.exists() else ""
 
     def leave_out_what_is_gone(self, reach: Reach) -> None:
@@ -611,11 +614,11 @@ class Copy:
     def passes(self, test: str) -> bool:
         """Whether a test passes here with the source as it is; asked about each test once."""
         if test not in self.sound | self.unfit:
-            (self.sound if self.run([test], 200)[0] == "passed" else self.unfit).add(test)
+            (self.sound if self.run({test: 60.0}, 60)[0] == "passed" else self.unfit).add(test)
         return test in self.sound
 
     def judge(self, mutant: Mutant, reach: Reach) -> dict:
-        tests = [t for t in reach.tests(mutant) if t not in self.unfit]
+        tests = {t: reach.seconds.get(t, 1.0) for t in reach.tests(mutant) if t not in self.unfit}
         result = {**asdict(mutant), "name": mutant.name, "tests": len(tests), "by": ""}
         if not tests:
             return {**result, "outcome": "no test"}
@@ -626,12 +629,12 @@ class Copy:
         started = time.monotonic()
         path.write_text(mutant.apply(source.decode()))
         try:
-            outcome, failed = self.run(tests, (60 if stale else 20) + 4 * sum(reach.seconds.get(t, 1.0) for t in tests), stale, original)
+            outcome, failed = self.run(tests, 60 if stale else 15, stale, original)
         finally:
             path.write_bytes(source)
         if outcome == "failed" and failed in tests and not self.passes(failed):
             return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
-        if outcome == "failed" and not failed and self.run(tests, 600)[0] != "passed":
+        if outcome == "failed" and not failed and self.run(tests, 60)[0] != "passed":
             return {**result, "outcome": "broken"}  # the process died, and does so without the mutant
         return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed,
                 "seconds": round(time.monotonic() - started, 1)}

@@ -8,7 +8,8 @@
 A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is made in a copy of
 the tree, so nothing here is touched. The tests that reached its line run, its module's own first, until one fails (killed), the time is up
 (killed: "time"), or all passed (survived). Lines that no test reaches are survivors without a run. What coverage cannot see is
-compiled: a numba kernel is given all tests of its module's callers, a shader those of ``tests/render`` and ``tests/extremes``.
+compiled: a numba kernel is given all tests of its module's callers, a shader those of ``tests/render`` and
+``tests/extremes``.
 
 What takes time is starting, not testing. So the tests of a mutant run in a child of a process (``--serve``, one per copy) that has imported
 what the tree stands on (numpy, numba, pytest, ...) and nothing of the tree itself. A kernel's machine code is taken from the cache unless
@@ -52,6 +53,8 @@ MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
 SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",
                "examples")
+DEBUGGERS = "shaders/include/lookup.glsl"
+"""the include that only the shader debugger asks for"""
 MOST_TESTS, MOST_S = 300, 120.0
 """of the tests that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
@@ -422,7 +425,8 @@ class Reach:
         if mutant.path in self.sources and self.sources[mutant.path] != (ROOT / mutant.path).read_text():
             raise SystemExit(f"{mutant.path} has changed since --map: run it again")
         if mutant.path.endswith(".glsl"):
-            contexts = [t for t in self.seconds if t.startswith(("tests/render/", "tests/extremes/")) and "pyrender" not in t and "cycles" not in t]
+            users = ("tests/tools/test_shader_",) if mutant.path == DEBUGGERS else ("tests/render/", "tests/extremes/")
+            contexts = [t for t in self.seconds if t.startswith(users) and "pyrender" not in t and "cycles" not in t]
         else:
             room = f"tests/{Path(mutant.path).parts[1]}/"
             reached = self.anywhere(mutant.path)

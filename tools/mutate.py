@@ -58,7 +58,7 @@ DEBUGGERS = "shaders/include/lookup.glsl"
 MOST_TESTS, MOST_S = 300, 120.0
 """of the tests that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
-"""bytes of address space: a mutant that never stops collecting must not take the machine with it"""
+"""bytes: a mutant that never stops collecting must not take the machine with it"""
 
 PRELOADED = ("numpy", "numba", "scipy.interpolate", "scipy.ndimage", "scipy.spatial.transform", "scipy.optimize", "scipy.special", "cv2", "h5py",
              "hdf5plugin", "pydantic", "yaml", "typer", "rich.console", "rich.table", "rich.progress", "PIL.Image", "imageio.v3", "moderngl", "trimesh",
@@ -543,7 +543,7 @@ def _run_tests(order: dict) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for old, new in ((nothing, 0), (output, 1), (output, 2)):
         os.dup2(old, new)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))  # not of address space, of which Ray maps more than it uses
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]

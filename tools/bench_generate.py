@@ -15,6 +15,7 @@ run are worth more than absolute times.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import tempfile
 from dataclasses import replace
@@ -29,7 +30,7 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.report import STAGES, Totals
-from blinkgl.events import make_emulator
+from blinkgl.events.camera import EventCamera, emulate
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import LabelRequest, Renderer
@@ -38,6 +39,7 @@ from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Camera, Material, Mesh, Part, Scene, SceneObject
+from blinkgl.sequence.rendered import drawn
 
 SECOND = 1_000_000_000
 
@@ -105,14 +107,9 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     for name in ("full redraw", "what moves"):
         with Renderer(gl, scene, PLAIN) as renderer:
             renderer._still = name == "what moves"  # noqa: SLF001 - what is measured cannot be switched from outside
-            emulator, out, moment = make_emulator(EsimConfig(), 480, 640, seed=1), np.empty((480, 640), np.float32), iter(range(1 << 30))
+            event_pass = emulate(drawn(renderer, itertools.count(0, 2_000_000)), EventCamera(EsimConfig(), None, 480, 640, seed=1))
             made = events[name] = []
-
-            def frame():
-                t = next(moment) * 2_000_000
-                renderer.luminance(t, out=out)
-                made.append(len(emulator.step(out, t, renderer.changed_rows)))
-
+            frame = lambda run=event_pass, made=made: made.append(len(next(run)[1]))
             result[name] = 1 / bench.seconds(frame, repeat, warm_up=8)["median"]
     assert events["full redraw"] == events["what moves"]
     result["ratio"] = result["what moves"] / result["full redraw"]

@@ -10,6 +10,7 @@ frames, each with its own renderer and ESIM emulator; times are medians, "mean" 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import time
 from dataclasses import replace
@@ -20,12 +21,15 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.events import EsimConfig
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, emulate
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.types import Scene
+from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.rendered import drawn
 from blinkgl.tools.bench_generate import PLAIN, SECOND, probe_scene
 
 WIDTH, HEIGHT = 640, 480
@@ -56,21 +60,21 @@ class Way:
     def __init__(self, gl, scene: Scene, still: bool):
         self.renderer = Renderer(gl, scene, PLAIN)
         self.renderer._still = still  # noqa: SLF001 - what is measured cannot be switched from outside
-        self.emulator = make_emulator(EsimConfig(), HEIGHT, WIDTH, seed=1)
-        self.frame = np.empty((HEIGHT, WIDTH), np.float32)
+        self.clock = StageClock()
+        camera = EventCamera(EsimConfig(), None, HEIGHT, WIDTH, seed=1)
+        self.event_pass = emulate(drawn(self.renderer, itertools.count(0, STEP_NS)), camera, self.clock)
         self.events: list[Events] = []
         self.stages: list[tuple[float, ...]] = []
         self.covered: list[float] = []
 
-    def step(self, t_ns: int) -> None:
+    def step(self) -> None:
         stats = self.renderer.stats
-        drawn, read = stats.render_s, stats.readback_s
+        draw, read, kernel = stats.render_s, stats.readback_s, self.clock.seconds.get("events", 0.0)
         wall, cpu = time.perf_counter(), time.process_time()
-        self.renderer.luminance(t_ns, out=self.frame)
-        done = time.perf_counter()
-        self.events.append(self.emulator.step(self.frame, t_ns, self.renderer.changed_rows))
+        self.events.append(next(self.event_pass)[1])
         end = time.perf_counter()
-        self.stages.append((stats.render_s - drawn, stats.readback_s - read, end - done, end - wall, time.process_time() - cpu))
+        self.stages.append((stats.render_s - draw, stats.readback_s - read, self.clock.seconds["events"] - kernel, end - wall,
+                            time.process_time() - cpu))
         if self.renderer.changed is not None:
             self.covered.append(sum(r.area for r in self.renderer.changed) / (WIDTH * HEIGHT))
 
@@ -81,10 +85,10 @@ STAGES = ("draw", "read-back", "kernel", "all", "cpu")
 def measure(gl, kind: str, coverage: float, rounds: int, warm_up: int = 10) -> dict:
     scene = one_mover(kind, coverage)
     ways = {"full redraw": Way(gl, scene, False), "what moves": Way(gl, scene, True)}
-    for start in range(0, rounds + warm_up, TURN):
+    for _ in range(0, rounds + warm_up, TURN):
         for way in ways.values():
-            for k in range(start, start + TURN):
-                way.step(k * STEP_NS)
+            for _ in range(TURN):
+                way.step()
     full, quick = (Events.concatenate(w.events) for w in ways.values())
     assert all(np.array_equal(getattr(full, name), getattr(quick, name)) for name in ("x", "y", "t", "p"))
     result = {"scene": kind, "triangles": ways["full redraw"].renderer.triangles, "events": len(full),

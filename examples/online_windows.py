@@ -22,7 +22,7 @@ BINS = 5
 
 
 def samples(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of every label: signed counts of the events until the next label (BINS, H, W), and the flow until then (2, H, W), px, with its mask (H, W)."""
+    """Of every label: signed counts of the events until the next one (BINS, H, W), the flow until then (2, H, W), px, and its mask (H, W)."""
     truth, window = None, []
     for item in simulate_sequence(scene, labels=["flow"]):
         if isinstance(item, EventChunk):
@@ -30,7 +30,8 @@ def samples(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]
         elif isinstance(item, GroundTruth):  # every event before its time has come, and no other
             if truth is not None:
                 flow = truth.frame.forward
-                yield counts(Events.concatenate(window), truth.t_ns // 1000, item.t_ns // 1000, flow.valid.shape), flow.flow.transpose(2, 0, 1), flow.valid
+                grid = counts(Events.concatenate(window), truth.t_ns // 1000, item.t_ns // 1000, flow.valid.shape)
+                yield grid, flow.flow.transpose(2, 0, 1), flow.valid
             truth, window = item, []
 
 

@@ -10,7 +10,6 @@ frames, each with its own renderer and ESIM emulator; times are medians, "mean" 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import time
 from dataclasses import replace
@@ -22,14 +21,12 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.events import Events
-from blinkgl.events.camera import EventCamera, emulate
+from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.types import Scene
-from blinkgl.sequence.clock import StageClock
-from blinkgl.sequence.rendered import drawn
 from blinkgl.tools.bench_generate import PLAIN, SECOND, probe_scene
 
 WIDTH, HEIGHT = 640, 480
@@ -42,41 +39,41 @@ TURN = 10
 def one_mover(kind: str, coverage: float) -> Scene:
     """The probe scene at rest, but for a ball that crosses the image in front of the others."""
     scene = probe_scene(kind, WIDTH, HEIGHT)
-    camera = scene.camera
-    at = camera.path.pose(0)
+    at = scene.camera_path.pose(0)
+    focal = scene.camera.jacobian(np.array([0.0, 0.0, 1.0]))[0, 0]  # px per unit and unit of depth
     mover = scene.objects[0]
     radius = float(np.linalg.norm(mover.parts[0].mesh.vertices, axis=1).max())
-    distance = 2 * radius * camera.fx / np.sqrt(coverage * WIDTH * HEIGHT)
-    speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / camera.fx  # units per second, across the image
+    distance = 2 * radius * focal / np.sqrt(coverage * WIDTH * HEIGHT)
+    speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / focal  # units per second, across the image
     seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]
     path = KeyframePath([0, 2 * SECOND], [seen(-speed / 4), seen(speed * 7 / 4)], [Rotation.identity().as_quat()] * 2, interpolation="linear")
     objects = tuple(replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
-    return replace(scene, objects=objects, camera=replace(camera, path=StaticPath(at)))
+    return replace(scene, objects=objects).with_path(StaticPath(at))
 
 
 class Way:
     """One way of drawing, from the scene to events; seconds of each stage and frame."""
 
     def __init__(self, gl, scene: Scene, still: bool):
-        self.renderer = Renderer(gl, scene, PLAIN)
-        self.renderer._still = still  # noqa: SLF001 - what is measured cannot be switched from outside
-        self.clock = StageClock()
-        camera = EventCamera(EsimConfig(), None, HEIGHT, WIDTH, seed=1)
-        self.event_pass = emulate(drawn(self.renderer, itertools.count(0, STEP_NS)), camera, self.clock)
+        self.renderer = Renderer(gl, scene, PLAIN, whole=not still)
+        self.camera = EventCamera(EsimConfig(), None, HEIGHT, WIDTH, seed=1)
+        self.frame = None
         self.events: list[Events] = []
         self.stages: list[tuple[float, ...]] = []
         self.covered: list[float] = []
 
-    def step(self) -> None:
+    def step(self, t_ns: int) -> None:
         stats = self.renderer.stats
-        draw, read, kernel = stats.render_s, stats.readback_s, self.clock.seconds.get("events", 0.0)
+        drawn, read = stats.render_s, stats.readback_s
         wall, cpu = time.perf_counter(), time.process_time()
-        self.events.append(next(self.event_pass)[1])
+        before, self.frame = self.frame, self.renderer.luminance(t_ns).read()
+        luminance = self.frame.view()
+        done = time.perf_counter()
+        self.events.append(self.camera.step(EventFrame(t_ns, luminance, rows=self.frame.rows_changed_since(before))))
         end = time.perf_counter()
-        self.stages.append((stats.render_s - draw, stats.readback_s - read, self.clock.seconds["events"] - kernel, end - wall,
-                            time.process_time() - cpu))
-        if self.renderer.changed is not None:
-            self.covered.append(sum(r.area for r in self.renderer.changed) / (WIDTH * HEIGHT))
+        self.stages.append((stats.render_s - drawn, stats.readback_s - read, end - done, end - wall, time.process_time() - cpu))
+        if self.frame.changed is not None:
+            self.covered.append(sum(r.area for r in self.frame.changed) / (WIDTH * HEIGHT))
 
 
 STAGES = ("draw", "read-back", "kernel", "all", "cpu")
@@ -85,10 +82,10 @@ STAGES = ("draw", "read-back", "kernel", "all", "cpu")
 def measure(gl, kind: str, coverage: float, rounds: int, warm_up: int = 10) -> dict:
     scene = one_mover(kind, coverage)
     ways = {"full redraw": Way(gl, scene, False), "what moves": Way(gl, scene, True)}
-    for _ in range(0, rounds + warm_up, TURN):
+    for start in range(0, rounds + warm_up, TURN):
         for way in ways.values():
-            for _ in range(TURN):
-                way.step()
+            for k in range(start, start + TURN):
+                way.step(k * STEP_NS)
     full, quick = (Events.concatenate(w.events) for w in ways.values())
     assert all(np.array_equal(getattr(full, name), getattr(quick, name)) for name in ("x", "y", "t", "p"))
     result = {"scene": kind, "triangles": ways["full redraw"].renderer.triangles, "events": len(full),

@@ -83,14 +83,15 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
             return draw(self, *args, **kwargs)
         monkeypatch.setattr(Renderer, name, spied)
 
-    for name in ("luminance", "colour", "labels", "velocity"):
+    for name in ("luminance", "colour", "labels", "velocity", "motion"):
         spy(name, getattr(Renderer, name))
     made = {}
     for name, wanted in (("everything", {"pictures_hz": 40}), ("events", {"labels": False}), ("labels", {"events": False})):
         drawn.clear()
         made[name] = list(simulate_sequence(config, 0, gl, **wanted))
-        expected = {"everything": {"luminance", "colour", "labels", "velocity"}, "events": {"luminance", "velocity"}, "labels": {"colour", "labels"}}
-        assert set(drawn) == expected[name], "velocity: the timeline looks at motion"
+        expected = {"everything": {"luminance", "motion", "colour", "labels", "velocity"}, "events": {"luminance", "motion"},
+                    "labels": {"colour", "labels"}}
+        assert set(drawn) == expected[name], "motion: what the timeline looks at"
     assert_same(events_of(made["everything"]), events_of(made["events"]))
     assert not events_of(made["labels"]).t.size
     for a, b in zip((i for i in made["everything"] if isinstance(i, GroundTruth)), made["labels"], strict=True):

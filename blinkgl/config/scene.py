@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -345,7 +346,7 @@ def _known(used, known, key: str, table: str, at=None) -> None:
                           accepted="one of: " + ", ".join(known) if known else f"a name under {table}")
 
 
-def object_names(names, meshes) -> list[str]:
+def object_names(names: Iterable[str | None], meshes: Iterable[str]) -> list[str]:
     """Names of an explicit scene's objects: as given (None: not), else the mesh's, with the object's number where that is taken."""
     made: list[str] = []
     for number, (name, mesh) in enumerate(zip(names, meshes)):

@@ -18,7 +18,7 @@ _F, _I, _D, _L = np.float32, np.int32, np.float64, np.int64
 
 
 
-def select(condition, a, b):
+def select(condition: bool, a: float, b: float) -> float:
     """``a`` where the condition holds, else ``b``; a conditional move inside a kernel."""
     return np.where(condition, a, b)
 
@@ -57,7 +57,7 @@ def _log1p_reduced(f):
 
 
 @register_jitable
-def log_q25(v):
+def log_q25(v: float) -> float:
     """ln(v) as int32 in units of 2^-25; v float32 in [2^-30, 2^30]. Absolute error < 1.3e-7.
 
     Fixed point because sums of thresholds are then exact: a brightness that returns to its old value returns
@@ -74,7 +74,7 @@ _LN2_32 = _F(np.log(2.0))
 
 
 @register_jitable
-def log_f32(v):
+def log_f32(v: float) -> float:
     """ln(v), float32 to float32, v normal and positive. Error < 1.3e-7 + 1.5 ulp of the result."""
     bits = _F(v).view(np.int32)
     exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)
@@ -92,7 +92,7 @@ _EXP_MIN_32, _BIAS_32 = _F(-87.0), _I(127)
 
 
 @register_jitable
-def exp_f32(v):
+def exp_f32(v: float) -> float:
     """exp(v) for float32 v <= 80, relative error < 2e-7; below -87 it stays at exp(-87) = 1.6e-38."""
     v = np.maximum(v, _EXP_MIN_32)
     n = _F(_F(v * _LOG2E_32 + _ROUND_32) - _ROUND_32)
@@ -115,7 +115,7 @@ _B0, _B1, _B2, _B3, _B4, _B5, _B6 = (_D(c) for c in (
 
 
 @register_jitable
-def log_f64(v):
+def log_f64(v: float) -> float:
     """ln(v), float64, v normal and positive; error < 4e-16 (1 + |ln v|)."""
     bits = _D(v).view(np.int64)
     exponent = _L(_L(bits - _SQRT_HALF_BITS_64) >> _EXP52)
@@ -152,7 +152,7 @@ def _exp_reduced(r):
 
 
 @register_jitable
-def exp_f64(v):
+def exp_f64(v: float) -> float:
     """exp(v) for float64 v <= 700, relative error < 5e-16; below -700 it stays at exp(-700) ~ 1e-304."""
     v = np.maximum(v, _EXP_MIN_64)
     n = (v * _LOG2E_64 + _ROUND_64) - _ROUND_64
@@ -162,7 +162,7 @@ def exp_f64(v):
 
 
 @register_jitable
-def fall_f64(x):
+def fall_f64(x: float) -> float:
     """e^-x for float64 x >= 0, scalars; without the range reduction where x <= 1/2."""
     return _exp_reduced(-x) if x <= 0.5 else exp_f64(-x)
 
@@ -177,7 +177,7 @@ _D4, _L1, _L2, _L3, _L0 = _D(4.0), _L(1), _L(2), _L(3), _L(0)
 
 
 @register_jitable
-def cos_sin_turn(u):
+def cos_sin_turn(u: float) -> tuple[float, float]:
     """(cos 2 pi u, sin 2 pi u) for u in [0, 1], float64, absolute error < 4e-16."""
     turns = u * _D4
     nearest = (turns + _ROUND_64) - _ROUND_64

@@ -73,7 +73,7 @@ class Interval(NamedTuple):
 
 
 @numba.njit(**JIT)
-def log_block(intensity, eps, out):
+def log_block(intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
     """ln(intensity + eps) into ``out``, int32, 2^-25."""
     for i in range(intensity.size):
         out[i] = log_q25(np.float32(intensity[i] + eps))
@@ -91,7 +91,7 @@ def _flag_block(level, upper, lower, flags):
 
 
 @register_jitable
-def crossing_ns(part, whole, dt_ns):
+def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
     """floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly, for any dt_ns < 2^52."""
     if dt_ns < _LONG_NS:
         return np.int64(np.uint64(part * dt_ns) // np.uint64(whole))

@@ -25,7 +25,7 @@ REBASE = 0.02
 
 # --- photoreceptor -----------------------------------------------------------------------------------------
 @register_jitable
-def lin_log(intensity):
+def lin_log(intensity: float) -> float:
     """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
     return select(intensity <= _JOINT, intensity * _SLOPE, log_f32(np.maximum(intensity, _JOINT)))
 
@@ -34,7 +34,7 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 
 
 
 @register_jitable
-def decay(k):
+def decay(k: float) -> tuple[float, float]:
     """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
     small = np.minimum(k, _HALF)
     p = _gentle_growth(small)
@@ -55,14 +55,14 @@ def _gentle_growth(k):
 
 
 @register_jitable
-def relax(lag, before, now, intensity_before, intensity_now, kappa):
+def relax(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
     """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
     a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
     return lag * a - (now - before) * g
 
 
 @register_jitable
-def relax_gently(lag, before, now, intensity_before, intensity_now, kappa):
+def relax_gently(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
     """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
     k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
     g = _gentle_growth(k)
@@ -71,7 +71,7 @@ def relax_gently(lag, before, now, intensity_before, intensity_now, kappa):
 
 # --- where the signal meets a level ------------------------------------------------------------------------
 @register_jitable
-def curve_of(base, drift, dx, lag, k):
+def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tuple[float, float, float]:
     """(c, rise, fall) of z(s) = c + rise s + fall e^{-k s} over an interval, s in [0, 1], float64.
 
     base: lin-log intensity and leak at the start; drift: change by leak and noise; dx: change of the lin-log
@@ -84,7 +84,7 @@ def curve_of(base, drift, dx, lag, k):
 
 
 @register_jitable
-def signal_at(s, c, rise, fall, k):
+def signal_at(s: float, c: float, rise: float, fall: float, k: float) -> float:
     """z at fraction s of the interval."""
     if k < 0:
         return c + rise * s
@@ -92,7 +92,7 @@ def signal_at(s, c, rise, fall, k):
 
 
 @register_jitable
-def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
+def crossing_fraction(start: float, target: float, polarity: int, c: float, rise: float, fall: float, k: float, end: float) -> float:
     """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
 
     The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
@@ -142,13 +142,13 @@ DARKEST = 1.0 - 0.75 * 20.0 / 275.0
 
 
 @register_jitable
-def shot_factor(intensity):
+def shot_factor(intensity: float) -> float:
     """Noise falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR 0.25)."""
     return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
 
 
 @register_jitable
-def shot_draw(seed, block, index, rate_per_ns):
+def shot_draw(seed: int, block: int, index: int, rate_per_ns: float) -> tuple[int, float]:
     """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
     u, v = uniform2(seed, block, _SHOT, index * _U2)
     return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), v
@@ -170,14 +170,14 @@ def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: flo
 
 # --- photoreceptor noise -----------------------------------------------------------------------------------
 @register_jitable
-def next_noise(noise, k, size, normal):
+def next_noise(noise: float, k: float, size: float, normal: float) -> float:
     """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
     a, _ = decay(k)
     return noise * a + size * np.sqrt(_ONE - a * a) * normal
 
 
 @register_jitable
-def noise_place(k):
+def noise_place(k: float) -> tuple[int, float]:
     """Place in the table of sizes: (entry below, fraction)."""
     place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
     below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))

@@ -49,7 +49,7 @@ MAX_DRAWS = 2**19
 
 
 @register_jitable
-def drift_and_noise(before, now, k1, k2, k3, k4_dt, k5_dt, k6, root_dt):
+def drift_and_noise(before: float, now: float, k1: float, k2: float, k3: float, k4_dt: float, k5_dt: float, k6: float, root_dt: float) -> tuple[float, float]:
     """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
     room = mean + k2
@@ -57,14 +57,14 @@ def drift_and_noise(before, now, k1, k2, k3, k4_dt, k5_dt, k6, root_dt):
 
 
 @register_jitable
-def move(v, drift):
+def move(v: float, drift: float) -> float:
     """V (int32, 2^-29) at the interval's end if nothing fires; a drift beyond 2.25 thresholds is cut to that."""
     cut = select(drift > _DRIFT_LIMIT, _DRIFT_LIMIT, select(drift < -_DRIFT_LIMIT, -_DRIFT_LIMIT, drift))
     return np.int32(v + np.int32(cut * _V_SCALE))
 
 
 @register_jitable
-def near_threshold(v, v_end, noise):
+def near_threshold(v: float, v_end: float, noise: float) -> bool:
     """Whether a threshold may be reached: 6.5 sigma sqrt(dt) around the path's extremes."""
     high, low = select(v > v_end, v, v_end), select(v > v_end, v_end, v)
     reach = FAR * noise
@@ -72,20 +72,20 @@ def near_threshold(v, v_end, noise):
 
 
 @register_jitable
-def in_reach(v, drift, noise):
+def in_reach(v: float, drift: float, noise: float) -> bool:
     """:func:`near_threshold` for the rest of an interval, float64, V in thresholds."""
     reach = _FAR_64 * noise
     return max(v, v + drift) + reach >= 1.0 or min(v, v + drift) - reach <= -1.0
 
 
 @register_jitable
-def one_minus_exp(x):
+def one_minus_exp(x: float) -> float:
     """1 - e^-x for x >= 0, to 1e-11 relative."""
     return x * (1.0 - x * (0.5 - x * (1.0 / 6.0))) if x < 1e-4 else 1.0 - exp_f64(-x)
 
 
 @register_jitable
-def on_first(to_on, to_off, mu, sigma):
+def on_first(to_on: float, to_off: float, mu: float, sigma: float) -> float:
     """P(+threshold before -threshold) for drift mu and diffusion sigma, at distances to_on and to_off > 0.
 
     (e^{2 mu b/s^2} - 1)/(e^{2 mu b/s^2} - e^{-2 mu a/s^2}) (Lin et al. 2022, eq. 9), arranged so that nothing
@@ -106,7 +106,7 @@ def on_first(to_on, to_off, mu, sigma):
 
 
 @register_jitable
-def hitting_time(distance, mu, sigma, normal, uniform):
+def hitting_time(distance: float, mu: float, sigma: float, normal: float, uniform: float) -> float:
     """Time to a threshold at ``distance`` > 0 that is reached: inverse Gaussian, mean distance/|mu|, shape
     distance^2/sigma^2; Levy's law without drift.
 

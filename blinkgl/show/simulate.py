@@ -34,7 +34,7 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
 
 
 def run(source: str, target: str, *, emulator: str, sensor: str | None = None, config: str | None = None, overrides: list[str] = (),
-        quiet: bool = False, **options) -> int:
+        quiet: bool = False, **options: Any) -> int:
     """``options``: of :func:`~blinkgl.recordings.simulation.simulate_file`."""
     from blinkgl.machine.compiling import compiled_s, compiling_line
     from blinkgl.recordings.simulation import simulate_file

@@ -61,7 +61,7 @@ class FineTiles:
     def __enter__(self) -> FineTiles:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._renderer.release()
 
     def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:

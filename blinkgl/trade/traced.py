@@ -27,7 +27,7 @@ class TracedFrames:
     def __enter__(self) -> TracedFrames:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._motion.__exit__()
 
     def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:

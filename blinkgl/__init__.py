@@ -20,7 +20,7 @@ _HOMES = {
     "blinkgl.front.sensors": ("DvsVoltmeter", "Esim", "V2e", "load_sensor"),
     "blinkgl.front.files": ("compare", "convert", "open_events", "read_events", "read_flow", "simulate", "simulate_file", "write_events", "write_flow"),
     "blinkgl.events.types": ("Events",),
-    "blinkgl.render.frames": ("Flow", "LabelFrame"),
+    "blinkgl.labels.frames": ("Flow", "LabelFrame"),
     "blinkgl.errors": ("AssetError", "BlinkGLError", "ConfigError", "EventDataError", "GLError", "OutputError"),
 }
 _HOME = {name: module for module, names in _HOMES.items() for name in names}
@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import Camera, Keyframes, Light, Material, Mesh, Pose, Primitive, Scene, look_at
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
-    from blinkgl.render.frames import Flow, LabelFrame
+    from blinkgl.labels.frames import Flow, LabelFrame
 
 __all__ = [
     "AssetError", "BlinkGLError", "Camera", "ConfigError", "DvsVoltmeter", "Esim", "EventDataError", "Events", "Flow", "GLError", "Keyframes",

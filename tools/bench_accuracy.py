@@ -24,7 +24,7 @@ from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.build import build_scene
 
-REQUEST = LabelRequest(depth=True, ids=True, velocity=True, flow_forward=True, flow_backward=True, occlusion=True)
+REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
 
 
 def compare(gl, template, index: int) -> dict[str, float]:

@@ -473,6 +473,7 @@ def _make_data_set(folder: Path) -> None:
     from blinkgl.dataset.run_folder import RunFolder
     from blinkgl.io.index import write_index
     from blinkgl.io.sequence_dir import SequenceWriter
+    from blinkgl.labels import Flow
 
     (folder / "recipe.yaml").write_text(to_yaml(_RECIPE))
     out = folder / "out"
@@ -482,8 +483,8 @@ def _make_data_set(folder: Path) -> None:
         writer.append_events(_events())
         for k in range(2):
             t = 20_000 * (k + 1)
-            writer.flow("forward", k, flow, valid, t, t + 20_000)
-            writer.depth(k, flow[..., 0] + 9)
+            writer.label("flow_forward", k, Flow(flow, valid), t, t + 20_000)
+            writer.label("depth", k, flow[..., 0] + 9, t)
         writer.poses(T_world_cam=np.tile(np.eye(4), (2, 1, 1)))
         writer.info.update(blinkgl="0", seed=11, sequence=0, split="train", labels=2, duration_us=60_000, emulator="esim", frames=30, group="a")
         writer.t_end_us = 60_000

@@ -182,6 +182,53 @@ class Family(Config):
         return handler(cls.members.adapter().core_schema if stands_for_many(cls) else schema)
 
 
+class Growing(Config):
+    """A model whose keys may be added to and taken away at any time. What keys it has is looked up when a value is validated, so that
+    models with a field of it (``labels: Labels = Field(default_factory=Labels)``) need not be made again."""
+
+    _made: ClassVar[bool] = False
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **more: Any) -> None:
+        super().__pydantic_init_subclass__(**more)
+        cls._made = True
+
+    @classmethod
+    def add_key(cls, name: str, annotation: Any, info: FieldInfo, before: str | None = None) -> None:
+        """before : key that it is to stand in front of; default: it is the last. Raises TypeError for a name that is taken, or that a model
+        cannot have as a key."""
+        if name in cls.model_fields or not name.isidentifier() or name.startswith("_") or hasattr(BaseModel, name):
+            raise TypeError(f"'{name}' " + ("is a key already" if name in cls.model_fields else "cannot be a key"))
+        fields = {**cls.model_fields, name: FieldInfo.from_annotated_attribute(annotation, info)}
+        later = list(cls.model_fields)[list(cls.model_fields).index(before):] if before in cls.model_fields else []
+        cls._regrown({key: fields[key] for key in (*(key for key in fields if key not in later), *later)})
+
+    @classmethod
+    def remove_key(cls, name: str) -> None:
+        """Raises KeyError where there is none."""
+        fields = dict(cls.model_fields)
+        del fields[name]
+        cls._regrown(fields)
+
+    @classmethod
+    def _regrown(cls, fields: dict[str, FieldInfo]) -> None:
+        cls.__pydantic_fields__, cls._made = fields, False
+        try:
+            cls.model_rebuild(force=True)
+        finally:
+            cls._made = True
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
+        if not vars(cls).get("_made", False):
+            return handler(source)
+        return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: core_schema.CoreSchema, handler: Any) -> dict[str, Any]:
+        return handler(cls.__pydantic_core_schema__ if schema["type"] == "function-plain" else schema)
+
+
 def tag_of(model: type[BaseModel]) -> tuple[str, str] | None:
     """Key and value that tell the model from the others of its union; None for a model that stands alone."""
     for key in ("kind", "emulator", "name"):

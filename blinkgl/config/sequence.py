@@ -23,6 +23,7 @@ from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
@@ -30,6 +31,7 @@ from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import ReadoutConfig, drain_us, fill_sensor, known_sensor, sensor_names
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.errors import ConfigError
+from blinkgl.labels import LABELS  # noqa: F401 - whose rows bring the keys of `labels:`
 
 NS_PER_S = 1_000_000_000
 MAX_LABELS = 1_000_000
@@ -146,19 +148,6 @@ class RenderConfig(Config):
     lod: LodConfig = Field(LodConfig(), description="level of detail of meshes")
 
 
-class LabelsConfig(Config):
-    """What is written at label times. A pass that nobody asks for is not compiled, allocated or run."""
-
-    images: bool = Field(True, description="sRGB PNG of the colour pass")
-    flow: tuple[Literal["forward", "backward"], ...] = Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG")
-    float_flow: tuple[Literal["npy", "flo", "h5"], ...] = Field((), description="float32 flow besides the PNG")
-    occlusion: bool = Field(True, description="masks of pixels that are not visible at the flow's other end")
-    depth: bool = Field(False, description="float32 .npy, world units along the optical axis")
-    ids: bool = Field(False, description="instance ids, 16-bit PNG")
-    normals: bool = Field(False, description="unit normals in camera axes, float32 .npy")
-    velocity: bool = Field(False, description="instantaneous image velocity, px/s, float32 .npy")
-
-
 class PreviewConfig(Config):
     """preview.mp4: frames, events and flow side by side."""
 
@@ -206,7 +195,7 @@ class SequenceConfig(Config):
                                "readout the camera's values; what is said beside it wins")
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
     readout: ReadoutConfig | None = Field(None, description="the sensor's bus: events above its rate are late, then lost; null: no limit")
-    labels: LabelsConfig = Field(LabelsConfig(), description="which ground truth is written")
+    labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 

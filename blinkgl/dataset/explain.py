@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import flow_files, folder_of, read_frame, used_images
+from blinkgl.dataset.frames import RECORDED, flow_files, folder_of, read_frame, used_images
 from blinkgl.events import emulator_of, make_emulator
 from blinkgl.gl import GLContext, create_context
+from blinkgl.labels import LABELS, asked_for
+from blinkgl.labels.label import BUFFERS
 from blinkgl.recordings.simulation import SimulationReport, simulate
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
@@ -102,14 +104,17 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     rate = report.events / ((len(probed) - 1) / frames.fps)
     result.passes.append(Pass("frames and event kernel", f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
                               (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
-    labels = config.labels
-    for name, on, why in (("images", labels.images, "labels.images: false"), ("forward flow", flows and "forward" in labels.flow, "frames.flow: null, or not in "
-                          "labels.flow"), ("occlusion masks", masks and labels.occlusion and "forward" in labels.flow, "no mask files, labels.occlusion: false, or no forward flow"),
+    request = asked_for(config.labels)
+    for name, on, why in (("images", "images" in request, "labels.images: false"),
+                          ("forward flow", flows and "flow_forward" in request, "frames.flow: null, or not in labels.flow"),
+                          ("occlusion masks", masks and "occlusion_forward" in request, "no mask files, labels.occlusion: false, or no forward flow"),
                           ("preview", config.preview.enabled, "preview.enabled: false"),
                           ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             result.left_out.append((name, why))
-    result.left_out.append(("backward flow, depth, ids, normals, velocity", "recorded frames bring none"))
+    brought = {LABELS[name].heading for name in RECORDED}
+    others = dict.fromkeys(label.heading for label in LABELS.values() if label.heading not in brought)
+    result.left_out.append((", ".join(others), "recorded frames bring none"))
     result.seconds = sum(p.seconds for p in result.passes)
     result.seconds_per_simulated_second = result.seconds / duration
     return result
@@ -176,18 +181,17 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         name = "brightness" if timeline.kind == "brightness" else "velocity"
         result.passes.append(Pass(name, f"decides the step; every {timeline.sample_every}. pixel", (name,),
                                   pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, small_s * count))
-    if config.labels.images:
+    if "images" in asked_for(config.labels):
         result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
                                   ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
                                   _timed(renderer.colour, times[:3]) * (labels + 1)))
-    request = _request(config)
-    wanted = [name for name in ("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward") if getattr(request, name)]
-    if wanted:
+    request = asked_for(config.labels)
+    request = request.without(*(name for name in request if LABELS[name].anti_aliased))
+    if request:
         interval = config.time.interval_ns
         each = _timed(lambda t: renderer.labels(t, request, t + interval, t - interval), config.time.label_times_ns[:3])
-        sizes = {"depth": 4, "ids": 4, "normals": 16, "velocity": 8, "flow_forward": 16, "flow_backward": 16}
-        result.passes.append(Pass("labels", ", ".join(wanted) + (", occlusion" if request.occlusion else ""), ("geometry",),
-                                  pixels * (sum(sizes[w] for w in wanted) + DEPTH_BYTES), labels, each * labels))
+        result.passes.append(Pass("labels", ", ".join(request), ("geometry",),
+                                  pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES), labels, each * labels))
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
         each = _timed(lambda t: (renderer.colour(t, antialiasing="none"), renderer.velocity(t)), times[:3])
@@ -211,22 +215,12 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
                               (config.events.emulator,), 0, result.frames, each * result.frames))
 
 
-def _request(config: SequenceConfig) -> LabelRequest:
-    labels = config.labels
-    return LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
-                        flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=labels.occlusion)
-
-
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
     add = lambda what, why: result.left_out.append((what, why))
-    labels = config.labels
-    for name, on, key in (("images", labels.images, "labels.images: false"), ("depth", labels.depth, "labels.depth: false"),
-                          ("instance ids", labels.ids, "labels.ids: false"), ("normals", labels.normals, "labels.normals: false"),
-                          ("velocity label", labels.velocity, "labels.velocity: false"),
-                          ("forward flow", "forward" in labels.flow, "not in labels.flow"),
-                          ("backward flow", "backward" in labels.flow, "not in labels.flow"),
-                          ("occlusion masks", labels.occlusion and labels.flow, "labels.occlusion: false, or no flow"),
-                          ("preview", config.preview.enabled, "preview.enabled: false"),
+    request = asked_for(config.labels)
+    there = {LABELS[name].heading for name in request}
+    labels = {label.heading: label.off or f"labels.{label.name}: false" for label in LABELS.values()}
+    for name, on, key in (*((heading, heading in there, why) for heading, why in labels.items()), ("preview", config.preview.enabled, "preview.enabled: false"),
                           ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
         if not on:
             add(name, key)

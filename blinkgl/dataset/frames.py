@@ -28,10 +28,13 @@ from blinkgl.io.frames import IMAGE, read_any_image
 from blinkgl.io.images import read_npy
 from blinkgl.io.preview import PreviewWriter
 from blinkgl.io.sequence_dir import SequenceWriter
+from blinkgl.labels import Flow, asked_for
 from blinkgl.recordings.simulation import Decoder, SimulationReport, simulate
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.worlds.pool import resolve
 
+RECORDED = ("images", "flow_forward", "occlusion_forward")
+"""Labels that recorded frames may bring."""
 _FLOW = (".npy", ".flo", ".png")
 
 
@@ -105,7 +108,7 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
                 if video[0].due(t_ns // 1000):
                     video[0].frame(t_ns // 1000, decode(luminance, "") if luminance.dtype == np.uint8 else luminance)
 
-    with SequenceWriter(path, height, width, config_yaml=config_yaml(resolved, index), float_flow=config.labels.float_flow) as writer:
+    with SequenceWriter(path, height, width, config_yaml=config_yaml(resolved, index), labels=config.labels) as writer:
         if config.preview.enabled:
             rate = min(config.preview.rate, frames.fps * 8)
             video.append(PreviewWriter(writer.path("preview.mp4"), height, width, flow=False, rate_hz=rate, fps=rate / config.preview.slowdown))
@@ -138,19 +141,20 @@ def convert_sequence(config: SequenceConfig, index: int, path: Path, *, base: Pa
 
 
 def _write_labels(config: SequenceConfig, files, flows, masks, time_of, size, writer: SequenceWriter, report: SequenceReport) -> None:
+    request = asked_for(config.labels)
     for k in range(1, len(files)):
-        if config.labels.images:
-            writer.image(k - 1, time_of(k) // 1000, read_frame(files[k]))
-        if k == len(files) - 1 or "forward" not in config.labels.flow:
+        times = (time_of(k) // 1000, time_of(k + 1) // 1000)
+        if "images" in request:
+            writer.label("images", k - 1, read_frame(files[k]), times[0])
+        if k == len(files) - 1 or "flow_forward" not in request:
             continue
         if flows:
-            flow, valid = _flow(flows[k], size)
-            writer.flow("forward", k - 1, flow, valid, time_of(k) // 1000, time_of(k + 1) // 1000)
-            if masks and config.labels.occlusion:
+            writer.label("flow_forward", k - 1, Flow(*_flow(flows[k], size)), *times)
+            if masks and "occlusion_forward" in request:
                 mask = read_npy(masks[k])
                 if mask.shape != size:
                     raise AssetError("mask and image differ in size", where=str(masks[k]), value=mask.shape, accepted=str(size))
-                writer.occlusion("forward", k - 1, mask != 0)
+                writer.label("occlusion_forward", k - 1, mask != 0, *times)
             report.labels += 1
 
 

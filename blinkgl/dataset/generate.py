@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import blinkgl
-from blinkgl.config.sequence import LabelsConfig, RunTemplate, SequenceConfig
+from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.dataset.clock import StageClock
 from blinkgl.dataset.event_pass import EventPass
 from blinkgl.dataset.frames import convert_sequence
@@ -24,7 +24,8 @@ from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.events.readout import Readout
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
@@ -71,7 +72,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
     with (
         Renderer(gl, scene, config.render) as renderer,
         SequenceWriter(report.path, scene.camera.height, scene.camera.width, config_yaml=config_yaml(config, index),
-                       t_offset_us=t0_ns // 1000, float_flow=config.labels.float_flow) as writer,
+                       t_offset_us=t0_ns // 1000, labels=config.labels) as writer,
     ):
         _simulate_events(config, index, scene, renderer, writer, clock, report, progress)
         _write_labels(config, renderer, writer, clock, report)
@@ -117,37 +118,20 @@ def _simulate_events(config: SequenceConfig, index: int, scene: Scene, renderer:
 
 def _write_labels(config: SequenceConfig, renderer: Renderer, writer: SequenceWriter, clock: StageClock,
                   report: SequenceReport) -> None:
-    """Pass 2: images at every label time, ground truth at every one but the last (whose flow has no end)."""
-    labels = config.labels
-    request = label_request(labels)
+    """Pass 2: ground truth at the label times; at the last one, from which nothing leads on, images alone."""
+    request = asked_for(config.labels)
+    at_last = LabelRequest(*(name for name in request if LABELS[name].at_last))
     times = config.time.label_times_ns
     interval = config.time.interval_ns
     for k, t_ns in enumerate(times):
-        if labels.images:
-            colour = renderer.colour(t_ns)
-            with clock("write"):
-                writer.image(k, t_ns // 1000, colour)
-        if k == len(times) - 1:
-            break
-        frame = renderer.labels(t_ns, request, t_ns + interval, t_ns - interval)
+        last = k == len(times) - 1
+        leads_to = {"forward": t_ns + interval, "backward": t_ns - interval}
+        frame = renderer.labels(t_ns, at_last if last else request, leads_to["forward"], leads_to["backward"])
         with clock("write"):
-            for direction, flow, t_other in (("forward", frame.forward, t_ns + interval),
-                                             ("backward", frame.backward, t_ns - interval)):
-                if flow is None:
-                    continue
-                writer.flow(direction, k, flow.flow, flow.valid, t_ns // 1000, t_other // 1000)
-                if flow.occluded is not None:
-                    writer.occlusion(direction, k, flow.occluded)
-            for name in ("depth", "ids", "normals", "velocity"):
-                if (array := getattr(frame, name)) is not None:
-                    getattr(writer, name)(k, array)
-        report.labels += 1
-
-
-def label_request(labels: LabelsConfig) -> LabelRequest:
-    """The buffers of pass 2 that ``labels:`` asks for; images are drawn by themselves."""
-    return LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
-                        flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=labels.occlusion)
+            for name, value in frame.values.items():
+                to_ns = leads_to.get(LABELS[name].towards)
+                writer.label(name, k, value, t_ns // 1000, None if to_ns is None else to_ns // 1000)
+        report.labels += not last
 
 
 def poses_of(scene: Scene, times_ns: list[int]) -> dict[str, np.ndarray]:

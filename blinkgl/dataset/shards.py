@@ -5,7 +5,8 @@ One sample per flow label, its files side by side under one key:
     flying_000017_000003.json        sequence, times in µs, size, polarity convention
     flying_000017_000003.old.npz     events of the interval before the label: x, y uint16, t int64 µs, p uint8
     flying_000017_000003.new.npz     events of the label's interval [from, to)
-    flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has them
+    flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has them: every label whose
+                                     row names a ``shard``
 
 The same data set, seed and shard size give the same bytes.
 """
@@ -27,8 +28,10 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.index import sequence_folders
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
+from blinkgl.labels import LABELS
 
-_EXTRAS = {"back.png": "flow/backward", "image.png": "images", "occlusion.png": "occlusion/forward"}
+_FLOW = LABELS["flow_forward"]
+"""What makes a sample: without it there is none."""
 
 
 def export_shards(root: str | Path, out: str | Path, *, shard_bytes: int = 512_000_000, seed: int = 0) -> dict[str, list[int]]:
@@ -46,7 +49,7 @@ def export_shards(root: str | Path, out: str | Path, *, shard_bytes: int = 512_0
         if problems := verify_sequence(folder, checksums=False):
             raise AssetError(f"damaged sequence: {problems[0]}", where=str(folder), accepted="a data set that 'blinkgl verify' passes")
         manifest = read_manifest(folder)
-        count = sum(name.startswith("flow/forward/") for name in manifest["files"])
+        count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
         labels.setdefault(str(manifest.get("split", "all")), []).extend((folder, k) for k in range(count))
     if not any(labels.values()):
         raise AssetError("no flow labels found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
@@ -77,7 +80,7 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
 def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     """(member name, bytes) of the ``k``-th label of a sequence."""
     key = f"{folder.name}_{k:06d}"
-    lines = [line for line in (folder / "flow/forward_timestamps.txt").read_text().splitlines() if not line.startswith("#")]
+    lines = [line for line in (folder / _FLOW.stamps).read_text().splitlines() if not line.startswith("#")]
     start, end = (int(v) for v in lines[k].split(","))
     manifest = read_manifest(folder)
     about: dict[str, Any] = {"sequence": folder.name, "label": k, "from_us": start, "to_us": end, "height": manifest["height"],
@@ -87,10 +90,9 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     yield f"{key}.json", json.dumps(about, sort_keys=True).encode()
     for name, events in windows.items():
         yield f"{key}.{name}.npz", _npz(events)
-    yield f"{key}.flow.png", (folder / f"flow/forward/{k:06d}.png").read_bytes()
-    for ending, where in _EXTRAS.items():
-        if (path := folder / where / f"{k:06d}.png").is_file():
-            yield f"{key}.{ending}", path.read_bytes()
+    for label in sorted((label for label in LABELS.values() if label.shard), key=lambda label: (label is not _FLOW, label.shard)):
+        if (path := folder / label.forms[0].file(k)).is_file():
+            yield f"{key}.{label.shard}", path.read_bytes()
 
 
 def _npz(events: Events) -> bytes:

@@ -26,20 +26,17 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.gl import GLContext, create_context
-from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.hdf5 import dataset, open_hdf5
-from blinkgl.io.images import read_image, read_npy
 from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
 from blinkgl.io.records import open_regular, shown
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest, verify_sequence
+from blinkgl.labels import LABELS, Label, asked_for
 
 _BLOCK = 1 << 20
 _REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "labels": int}
 _AT_TOP = {INDEX, "report.html"}
 _MOST_MISSING = 1000
 """Missing sequences that get a line each; the others are counted."""
-_FLOW_PX, _FLOW_SHARE = 2 / 128, 0.95
-"""Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the pixels. Silhouettes may fall on either side."""
 _SAME_ANYWHERE = ("split", "seed", "sequence", "emulator", "labels", "duration_us", "t_offset_us", "height", "width", "objects", "source")
 """Of a manifest: what no renderer and no library has a say in."""
 
@@ -175,22 +172,13 @@ def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[
 
 def _files_of(config: SequenceConfig) -> Iterator[str]:
     """Names of the files of a generated sequence, the manifest left out."""
-    labels, count = config.labels, config.time.label_count
-    numbered = lambda folder, ending, n=count: (f"{folder}/{k:06d}.{ending}" for k in range(n))
     yield from ("events.h5", "poses.npz", "config.yaml")
-    if labels.images:
-        yield "images/timestamps.txt"
-        yield from numbered("images", "png", count + 1)
-    for direction in set(labels.flow):
-        yield f"flow/{direction}_timestamps.txt"
-        yield from numbered(f"flow/{direction}", "png")
-        for form in labels.float_flow:
-            yield from (f"flow/{direction}.h5",) if form == "h5" else numbered(f"flow/{direction}_{form}", form)
-        if labels.occlusion:
-            yield from numbered(f"occlusion/{direction}", "png")
-    for kind, ending in (("depth", "npy"), ("velocity", "npy"), ("normals", "npy"), ("ids", "png")):
-        if getattr(labels, kind):
-            yield from numbered(kind, ending)
+    for name in asked_for(config.labels):
+        label = LABELS[name]
+        if label.stamps is not None:
+            yield label.stamps
+        for form in label.written(config.labels):
+            yield from form.files(config.time.label_count + label.at_last)
     if config.preview.enabled:
         yield "preview.mp4"
 
@@ -236,41 +224,48 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
 
 
 def _check_labels(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    """As many files as time stamps as labels; sizes as the manifest says; times inside the sequence and in order."""
+    """Of every label there is: as many files as time stamps as labels; times inside the sequence and in order; and in the first and the last
+    file an array of the manifest's size that holds what its row says it can."""
     problems = []
-    size = (manifest["height"], manifest["width"])
-    begin, end = manifest["t_offset_us"], manifest["t_offset_us"] + manifest["duration_us"]
-    names = manifest["files"]
-    stamps = "images/timestamps.txt"
-    if stamps in names:
-        times = [int(line) for line in (folder / stamps).read_text().split()]
-        pictures = sorted(n for n in names if n.startswith("images/") and n.endswith(".png"))
-        if len(times) != len(pictures):
-            problems.append(f"images: {len(pictures)} files, {len(times)} time stamps")
-        if sorted(set(times)) != times or (times and not begin <= times[0] <= times[-1] <= end):
-            problems.append(f"{stamps}: times are not in order inside {begin} … {end} µs")
-        for name in pictures[:1] + pictures[-1:]:
-            if read_image(folder / name).shape[:2] != size:
-                problems.append(f"{name}: not {size[1]}x{size[0]} px")
-    for direction in ("forward", "backward"):
-        stamps = f"flow/{direction}_timestamps.txt"
-        if stamps not in names:
-            continue
-        lines = [line for line in (folder / stamps).read_text().splitlines() if line and not line.startswith("#")]
-        pairs = [tuple(int(v) for v in line.split(",")) for line in lines]
-        flows = sorted(n for n in names if n.startswith(f"flow/{direction}/"))
-        if not len(flows) == len(pairs) == manifest["labels"]:
-            problems.append(f"flow/{direction}: {len(flows)} files, {len(pairs)} time stamps, manifest says {manifest['labels']} labels")
-        if any(not begin <= t <= end for pair in pairs for t in pair) or any((b > a) != (direction == "forward") for a, b in pairs):
-            problems.append(f"{stamps}: an interval leaves the sequence or runs the wrong way")
-        for name in flows[:1] + flows[-1:]:
-            if read_flow_png(folder / name)[0].shape[:2] != size:
-                problems.append(f"{name}: not {size[1]}x{size[0]} px")
-    for kind in ("depth", "velocity", "normals", "ids"):
-        files = [n for n in names if n.startswith(f"{kind}/")]
-        if files and len(files) != manifest["labels"]:
-            problems.append(f"{kind}: {len(files)} files, manifest says {manifest['labels']} labels")
+    for label in LABELS.values():
+        files = sorted(name for name in manifest["files"] if label.forms[0].holds(name))
+        if files or label.stamps in manifest["files"]:
+            problems += _check_times(folder, manifest, label, files)
+            for name in dict.fromkeys(files[:1] + files[-1:]):
+                problems += [f"{name}: {line}" for line in _check_value(folder / name, manifest, label)]
     return problems
+
+
+def _check_times(folder: Path, manifest: dict[str, Any], label: Label, files: list[str]) -> list[str]:
+    problems = []
+    where, begin, end = label.forms[0].folder, manifest["t_offset_us"], manifest["t_offset_us"] + manifest["duration_us"]
+    count = manifest["labels"]
+    if label.stamps is None or label.stamps not in manifest["files"]:
+        return [] if len(files) == count + label.at_last else [f"{where}: {len(files)} files, manifest says {count} labels"]
+    lines = [line for line in (folder / label.stamps).read_text().splitlines() if line and not line.startswith("#")]
+    if label.towards is None:
+        times = [int(line) for line in lines]
+        if len(times) != len(files):
+            problems.append(f"{where}: {len(files)} files, {len(times)} time stamps")
+        if sorted(set(times)) != times or (times and not begin <= times[0] <= times[-1] <= end):
+            problems.append(f"{label.stamps}: times are not in order inside {begin} … {end} µs")
+    else:
+        pairs = [tuple(int(v) for v in line.split(",")) for line in lines]
+        if not len(files) == len(pairs) == count:
+            problems.append(f"{where}: {len(files)} files, {len(pairs)} time stamps, manifest says {count} labels")
+        if any(not begin <= t <= end for pair in pairs for t in pair) or any((b > a) != (label.towards == "forward") for a, b in pairs):
+            problems.append(f"{label.stamps}: an interval leaves the sequence or runs the wrong way")
+    return problems
+
+
+def _check_value(path: Path, manifest: dict[str, Any], label: Label) -> list[str]:
+    try:
+        value = label.forms[0].read(path)
+        label.own(value, manifest["height"], manifest["width"])
+    except TypeError as error:
+        return [f"not {manifest['width']}x{manifest['height']} px: {error}"]
+    problem = label.problem(value)
+    return [] if problem is None else [problem]
 
 
 # ---- between sequences ------------------------------------------------------------------------------------------------
@@ -498,15 +493,9 @@ def _agrees(file: str, one: Path, other: Path) -> bool:
             return set(p.files) == set(q.files) and all(
                 p[k].shape == q[k].shape and (np.allclose(p[k], q[k], rtol=1e-9, atol=1e-9) if p[k].dtype.kind == "f" else np.array_equal(p[k], q[k]))
                 for k in p.files)
-    if re.fullmatch(r"flow/(forward|backward)/\d+\.png", file):
-        (u, valid), (v, also) = read_flow_png(a), read_flow_png(b)
-        if u.shape != v.shape:
-            return False
-        near = (np.abs(u - v).max(-1) <= _FLOW_PX) & (valid == also)
-        return bool(near.mean() >= _FLOW_SHARE)
-    if re.fullmatch(r"depth/\d+\.npy", file):
-        u, v = read_npy(a), read_npy(b)
-        return u.shape == v.shape and bool(np.isclose(u, v, rtol=1e-4).mean() >= _FLOW_SHARE)
+    for label in LABELS.values():
+        if label.forms[0].holds(file):
+            return label.agrees(label.forms[0].read(a), label.forms[0].read(b))
     return True
 
 

@@ -9,17 +9,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.dataset.event_pass import EventPass
-from blinkgl.dataset.generate import label_request
 from blinkgl.errors import ConfigError
 from blinkgl.events.readout import Readout
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import Emulator, Source, Timeline, configured, label_names
+from blinkgl.front.runs import Emulator, Source, Timeline, configured, labels_tree
 from blinkgl.front.scenes import Scene
 from blinkgl.gl import create_context
-from blinkgl.render.frames import LabelFrame, LabelRequest
+from blinkgl.labels import LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene import types as data
@@ -92,16 +92,16 @@ def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, 
     config, scene = _built(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
     times, interval = config.time.label_times_ns, config.time.interval_ns
     readout = Readout(config.readout) if config.readout is not None else None
-    request, images, frames, chunks = label_request(config.labels), [], [], []
+    request, images, frames, chunks = asked_for(config.labels), [], [], []
     with create_context(config.gl.backend, config.gl.device) as gl, SceneRenderer(gl, scene, config.render) as renderer:
         events = EventPass(config.timeline, config.events, renderer, kernel_seed(config.seed, index, Role.EVENTS))
         for t_ns, chunk in events:
             chunks.append(chunk if readout is None else readout.step(chunk, t_ns // 1000))
         for t_ns in times:
-            if config.labels.images:
+            if "images" in request:
                 images.append(to_srgb8(renderer.colour(t_ns)))
             if t_ns != times[-1]:
-                frames.append(renderer.labels(t_ns, request, t_ns + interval, t_ns - interval))
+                frames.append(renderer.labels(t_ns, request.without("images"), t_ns + interval, t_ns - interval))
     lost = events.emulator.saturated + (readout.dropped if readout is not None else 0)
     t_us = np.array(times, np.int64) // 1000
     return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames), t_us, np.stack(images) if images else None, config, events.frames, lost)
@@ -144,10 +144,8 @@ class Renderer:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
         labels : as of :func:`record`.   to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
-        wanted = label_names(labels)
+        request = asked_for(LabelsConfig.model_validate(labels_tree(labels)))
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
-        request = LabelRequest(colour="images" in wanted, flow_forward="flow" in wanted, flow_backward="flow_backward" in wanted,
-                               **{name: name in wanted for name in ("depth", "ids", "normals", "velocity", "occlusion")})
         return self._renderer.labels(t_ns, request, t_ns + interval if to is None else _ns(to, "to"),
                                      t_ns - interval if back_to is None else _ns(back_to, "back_to"))
 

@@ -12,12 +12,11 @@ from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.scenes import Scene
+from blinkgl.labels import LABELS
 
 if TYPE_CHECKING:
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
-
-LABELS = ("images", "flow", "flow_backward", "occlusion", "depth", "ids", "normals", "velocity")
 
 Source = Scene | RunTemplate
 Emulator = str | Mapping[str, Any] | Config
@@ -96,7 +95,7 @@ def configured(source: Source, *, emulator: Emulator | None = None, sensor: str 
     if timeline is not None:
         own["timeline"] = check.one_of(timeline, "timeline", Timeline, "a Timeline").tree
     if labels is not None:
-        own["labels"] = _labels_tree(labels)
+        own["labels"] = labels_tree(labels)
     for key in ("sensor", "quality"):
         if key in own:
             validate_field(SequenceConfig, key, own[key])
@@ -115,15 +114,22 @@ def events_tree(emulator: Emulator) -> dict[str, Any]:
 
 
 def label_names(labels: Sequence[str]) -> set[str]:
-    """Raises ConfigError: not of :data:`LABELS`."""
+    """Raises ConfigError: no such label (:mod:`blinkgl.labels`)."""
+    known = list(dict.fromkeys(label.said for label in LABELS.values()))
     wanted = check.one_of(labels, "labels", (list, tuple, set, frozenset), "a list of names of labels")
     for name in wanted:
-        if name not in LABELS:
-            raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(LABELS))
+        if name not in known:
+            raise ConfigError("unknown label", where="labels", value=name, accepted=", ".join(known))
     return set(wanted)
 
 
-def _labels_tree(labels: Sequence[str]) -> dict[str, Any]:
+def labels_tree(labels: Sequence[str]) -> dict[str, Any]:
+    """``labels:`` that asks for these and no others. Raises ConfigError as :func:`label_names`."""
     wanted = label_names(labels)
-    flow = [direction for name, direction in (("flow", "forward"), ("flow_backward", "backward")) if name in wanted]
-    return {"flow": flow, **{name: name in wanted for name in LABELS if not name.startswith("flow")}}
+    everything: dict[str, Any] = {}
+    asked: dict[str, Any] = {}
+    for label in LABELS.values():
+        label.ask(everything)
+        if label.said in wanted:
+            label.ask(asked)
+    return {key: asked.get(key, [] if isinstance(value, list) else False) for key, value in everything.items()}

@@ -52,6 +52,14 @@ def encode_ids(ids: np.ndarray) -> bytes:
     return encode_png(ids.astype(np.uint16))
 
 
+def read_ids(path: str | os.PathLike) -> np.ndarray:
+    """(H, W) integers as stored. Raises AssetError."""
+    image = read_png(path)
+    if image.ndim != 2:
+        raise AssetError("not a picture of ids", where=str(path), value=image.shape, accepted="one channel")
+    return image
+
+
 def encode_npy(array: np.ndarray) -> bytes:
     """.npy bytes; object arrays are refused (they would be pickled)."""
     buffer = io.BytesIO()

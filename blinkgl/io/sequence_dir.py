@@ -2,7 +2,8 @@
 
     <sequence>/
       events.h5                      DSEC layout (blinkgl.io.dsec)
-      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line
+      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line   (these and all below that
+                                     are labels: as their rows say, blinkgl.labels)
       flow/forward/%06d.png          DSEC 16-bit flow;                  flow/forward_timestamps.txt   from_us,to_us
       flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
       flow/forward_flo/%06d.flo, flow/forward.h5                        (on request)
@@ -23,6 +24,7 @@ import shutil
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,16 +32,14 @@ import h5py
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
+from blinkgl.config.labels import LabelsConfig
 from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
-from blinkgl.io import images
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
-from blinkgl.io.flo import encode_flo
-from blinkgl.io.flow import encode_flow_npy
-from blinkgl.io.flow_png import encode_flow_png
 from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
+from blinkgl.labels import Form, Label, label_of
 
 MANIFEST = "manifest.json"
 _LARGEST = 2**62
@@ -60,7 +60,7 @@ class SequenceWriter:
     height, width : sensor size, px.
     config_yaml : resolved configuration, stored as ``config.yaml``.
     t_offset_us : time of the sequence's start, µs; events before it are refused by the DSEC format.
-    float_flow : additional float32 flow: any of "npy", "flo", "h5".
+    labels : ``labels:``, which says in which forms labels are written; None: each in its first.
     events : False makes no ``events.h5``.
 
     Attributes
@@ -75,20 +75,18 @@ class SequenceWriter:
     """
 
     def __init__(self, final: str | os.PathLike, height: int, width: int, *, config_yaml: str, t_offset_us: int = 0,
-                 float_flow: tuple[str, ...] = (), events: bool = True):
+                 labels: LabelsConfig | None = None, events: bool = True):
         self.final = Path(final)
         self.height, self.width, self.config_yaml, self.t_offset_us = int(height), int(width), config_yaml, int(t_offset_us)
-        if unknown := set(float_flow) - {"npy", "flo", "h5"}:
-            raise ValueError(f"unknown float flow format {sorted(unknown)}")
-        self.float_flow = tuple(float_flow)
+        self.labels = labels
         self.info: dict[str, Any] = {}
         self.t_end_us: int | None = None
-        self.flow_lost: dict[str, int] = {}
+        self.lost: dict[str, int] = {}
         self._with_events = events
         self._files: dict[str, dict[str, Any]] = {}
         self._promised = {"events.h5"} if events else set()
         self._timestamps: dict[str, list[str]] = {}
-        self._flow_h5: dict[str, h5py.File] = {}
+        self._row_files: dict[str, h5py.File] = {}
         self._failure: list[BaseException] = []
 
     def __enter__(self) -> SequenceWriter:
@@ -130,55 +128,20 @@ class SequenceWriter:
         self._check()
         self._events.append(events)
 
-    def image(self, index: int, t_us: int, image: np.ndarray) -> None:
-        """Frame: (H, W[, 3]) float linear light in [0, 1], or uint8 sRGB."""
-        image = self._owned(image)
-        self._stamp("images/timestamps.txt", str(int(t_us)))
-        self._write(f"images/{index:06d}.png", lambda: images.encode_image(image))
-
-    def flow(self, direction: str, index: int, flow: np.ndarray, valid: np.ndarray, from_us: int, to_us: int) -> None:
-        """direction "forward" | "backward"; flow (H, W, 2) float32 px from ``from_us`` to ``to_us``; valid (H, W) bool.
-        Valid pixels beyond DSEC's ±256 px become invalid in the PNG (not in the float forms) and are counted in
-        ``flow_lost`` and the manifest."""
-        if direction not in ("forward", "backward"):
-            raise ValueError(f"flow direction {direction!r}")
-        flow, valid = self._owned(flow, 2), self._owned(valid).astype(bool)
-        self._stamp(f"flow/{direction}_timestamps.txt", f"{int(from_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
-
-        def png() -> bytes:
-            data, lost = encode_flow_png(flow, valid)
-            self.flow_lost[direction] = self.flow_lost.get(direction, 0) + lost
-            return data
-
-        self._write(f"flow/{direction}/{index:06d}.png", png)
-        if "npy" in self.float_flow:
-            self._write(f"flow/{direction}_npy/{index:06d}.npy", lambda: encode_flow_npy(flow, valid))
-        if "flo" in self.float_flow:
-            self._write(f"flow/{direction}_flo/{index:06d}.flo", lambda: encode_flo(flow, valid))
-        if "h5" in self.float_flow:
-            self._submit(lambda: self._append_flow_h5(direction, flow, valid))
-
-    def occlusion(self, direction: str, index: int, occluded: np.ndarray) -> None:
-        """(H, W) bool: the point seen here is hidden at the other end of ``direction``'s flow."""
-        occluded = self._owned(occluded)
-        self._write(f"occlusion/{direction}/{index:06d}.png", lambda: images.encode_mask(occluded))
-
-    def depth(self, index: int, depth: np.ndarray) -> None:
-        """(H, W) float32 scene units along +z of the camera, inf where nothing is hit."""
-        self._array("depth", index, self._owned(depth))
-
-    def velocity(self, index: int, velocity: np.ndarray) -> None:
-        """(H, W, 2) float32 px/s at the label's time."""
-        self._array("velocity", index, self._owned(velocity, 2))
-
-    def normals(self, index: int, normals: np.ndarray) -> None:
-        """(H, W, 3) float32 unit normals, camera axes (OpenCV)."""
-        self._array("normals", index, self._owned(normals, 3))
-
-    def ids(self, index: int, ids: np.ndarray) -> None:
-        """(H, W) integer instance ids, 0…65535."""
-        ids = self._owned(ids)
-        self._write(f"ids/{index:06d}.png", lambda: images.encode_ids(ids))
+    def label(self, name: str, index: int, value: Any, t_us: int, to_us: int | None = None) -> None:
+        """The ``index``-th value of a label (:mod:`blinkgl.labels`) of ``t_us``; ``to_us``: where it leads, of those that lead to another time.
+        Pixels that a form cannot hold are counted in ``lost`` and the manifest. Raises TypeError: a value of another shape or kind of number."""
+        label = label_of(name)
+        value = label.own(value, self.height, self.width)
+        if label.stamps is not None and label.towards is None:
+            self._stamp(label.stamps, str(int(t_us)))
+        elif label.stamps is not None:
+            self._stamp(label.stamps, f"{int(t_us)}, {int(to_us)}", "# from_timestamp_us, to_timestamp_us")
+        for form in label.forms[:1] if self.labels is None else label.written(self.labels):
+            if form.rows is None:
+                self._write(form.file(index), partial(self._encoded, label, form, value))
+            else:
+                self._submit(partial(self._append_rows, form, value))
 
     def poses(self, **arrays: np.ndarray) -> None:
         """``poses.npz``: named numeric arrays (camera and object poses, times, intrinsics)."""
@@ -213,15 +176,13 @@ class SequenceWriter:
 
     # ---- machinery -------------------------------------------------------------------------------------------
 
-    def _owned(self, array: np.ndarray, channels: int | None = None) -> np.ndarray:
-        array = np.array(array)
-        expected = (self.height, self.width) + ((channels,) if channels else ())
-        if array.shape[: len(expected)] != expected:
-            raise ValueError(f"label of shape {array.shape}, expected {expected}")
-        return array
-
-    def _array(self, folder: str, index: int, array: np.ndarray) -> None:
-        self._write(f"{folder}/{index:06d}.npy", lambda: images.encode_npy(array.astype(np.float32, copy=False)))
+    def _encoded(self, label: Label, form: Form, value: Any) -> bytes:
+        data = form.encode(value)
+        if isinstance(data, tuple):
+            data, lost = data
+            way = label.towards or label.name
+            self.lost[way] = self.lost.get(way, 0) + lost
+        return data
 
     def _stamp(self, name: str, line: str, header: str | None = None) -> None:
         self._timestamps.setdefault(name, [header] if header else []).append(line)
@@ -251,17 +212,18 @@ class SequenceWriter:
         if self._failure:
             raise self._failure[0]
 
-    def _append_flow_h5(self, direction: str, flow: np.ndarray, valid: np.ndarray) -> None:
-        path = self.path(f"flow/{direction}.h5")
+    def _append_rows(self, form: Form, value: Any) -> None:
+        name, rows = form.file(0), form.rows(value)
+        path = self.path(name)
         with output_errors(path):
-            if direction not in self._flow_h5:
-                self._promised.add(f"flow/{direction}.h5")
-                file = self._flow_h5[direction] = h5py.File(path, "w", rdcc_nbytes=0)
-                for name, array in (("flow", flow), ("valid", valid)):
-                    blosc_dataset(file, name, (0, *array.shape), np.float32 if name == "flow" else np.uint8, (1, *array.shape))
-            file = self._flow_h5[direction]
-            for name, array in (("flow", np.where(valid[..., None], flow, np.float32(0))), ("valid", valid)):
-                write_rows(file[name], len(file[name]), array[None])
+            if name not in self._row_files:
+                self._promised.add(name)
+                file = self._row_files[name] = h5py.File(path, "w", rdcc_nbytes=0)
+                for key, array in rows.items():
+                    blosc_dataset(file, key, (0, *array.shape), array.dtype, (1, *array.shape))
+            file = self._row_files[name]
+            for key, array in rows.items():
+                write_rows(file[key], len(file[key]), array[None])
 
     def _finish(self) -> None:
         self._check()
@@ -273,7 +235,7 @@ class SequenceWriter:
         self._pool.shutdown(wait=True)
         self._check()
         with output_errors(self.final):
-            for file in self._flow_h5.values():
+            for file in self._row_files.values():
                 file.close()
             self._check_untouched()
             for path in sorted(self._tmp.rglob("*")):
@@ -283,7 +245,7 @@ class SequenceWriter:
                     self._files[name] = _digest(path)
             manifest = {"format": "blinkgl-sequence", "format_version": 1, "height": self.height, "width": self.width,
                         "t_offset_us": self.t_offset_us, "events": self._events.count if self._events is not None else 0,
-                        "flow_pixels_out_of_range": self.flow_lost, **self.info, "files": self._files}
+                        "flow_pixels_out_of_range": self.lost, **self.info, "files": self._files}
             path = self._tmp / MANIFEST
             path.write_text(json.dumps(manifest, indent=1, sort_keys=True, default=_plain) + "\n", encoding="utf-8")
             fsync(path)
@@ -305,7 +267,7 @@ class SequenceWriter:
         self._pool.shutdown(wait=True, cancel_futures=True)
         if getattr(self, "_events", None) is not None:
             self._events.abort()
-        for file in self._flow_h5.values():
+        for file in self._row_files.values():
             try:
                 file.close()
             except Exception:  # noqa: BLE001 - a full disk refuses the flush; the file is deleted anyway

@@ -2,7 +2,7 @@
 
     with create_context() as gl, Renderer(gl, scene, RenderConfig()) as renderer:
         frame = renderer.luminance(t_ns)                       # (H, W) float32, linear light
-        labels = renderer.labels(t_ns, LabelRequest(flow_forward=True, depth=True), t_forward_ns=t1_ns)
+        labels = renderer.labels(t_ns, LabelRequest("flow_forward", "depth"), t_forward_ns=t1_ns)
 
 Poses are composed in float64 relative to the camera (``matrices.py``); vertices stay object-local. Programs and
 targets are made the first time something asks for them, and only in the variants the scene's materials need.
@@ -15,11 +15,18 @@ from dataclasses import dataclass, replace
 import moderngl
 import numpy as np
 
+from blinkgl.labels import Flow, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import Samples, samples_of
-from blinkgl.render.frames import Flow, LabelFrame, LabelRequest, RenderStats
+from blinkgl.render.frames import RenderStats
 from blinkgl.render.matrices import (
-    cam_from_obj, cam_from_obj_rate, frustum_planes, inverse_depth_bits, mat4_bytes, projection, rows_xyw_bytes,
+    cam_from_obj,
+    cam_from_obj_rate,
+    frustum_planes,
+    inverse_depth_bits,
+    mat4_bytes,
+    projection,
+    rows_xyw_bytes,
 )
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.resources import DrawItem, SceneResources
@@ -81,7 +88,7 @@ class Renderer:
         self._frustum = frustum_planes(scene.camera)
         self._whole = Rectangle(0, 0, self.width, self.height)
 
-    def __enter__(self) -> "Renderer":
+    def __enter__(self) -> Renderer:
         return self
 
     def __exit__(self, *_) -> None:
@@ -186,34 +193,37 @@ class Renderer:
                t_backward_ns: int | None = None) -> LabelFrame:
         """Ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns."""
         result: dict = {}
-        if request.colour:
-            result["colour"] = self.colour(t_ns)
+        if "images" in request:
+            result["images"] = self.colour(t_ns)
         outputs = []
-        needs_occlusion = request.occlusion and (request.flow_forward or request.flow_backward)
+        needs_occlusion = "occlusion_forward" in request or "occlusion_backward" in request
         for name, wanted, fmt in (
-            ("DEPTH", request.depth, "R32F"),
-            ("ID", request.ids or needs_occlusion, "R32UI"),
-            ("NORMAL", request.normals, "RGBA32F"),
-            ("VELOCITY", request.velocity, "RG32F"),
-            ("FLOW_FORWARD", request.flow_forward, "RGBA32F"),
-            ("FLOW_BACKWARD", request.flow_backward, "RGBA32F"),
+            ("DEPTH", "depth" in request, "R32F"),
+            ("ID", "ids" in request or needs_occlusion, "R32UI"),
+            ("NORMAL", "normals" in request, "RGBA32F"),
+            ("VELOCITY", "velocity" in request, "RG32F"),
+            ("FLOW_FORWARD", "flow_forward" in request, "RGBA32F"),
+            ("FLOW_BACKWARD", "flow_backward" in request, "RGBA32F"),
         ):
             if wanted:
                 outputs.append((name, fmt))
         if outputs:
             buffers = self._geometry(t_ns, outputs, t_forward_ns, t_backward_ns)
-            if request.depth:
+            if "depth" in request:
                 result["depth"] = np.where(buffers["DEPTH"] > 0, buffers["DEPTH"], np.float32(np.inf))
-            if request.ids:
+            if "ids" in request:
                 result["ids"] = buffers["ID"]
-            if request.normals:
+            if "normals" in request:
                 result["normals"] = np.ascontiguousarray(buffers["NORMAL"][..., :3])
-            if request.velocity:
+            if "velocity" in request:
                 result["velocity"] = buffers["VELOCITY"]
             for name, key, t_other in (("FLOW_FORWARD", "forward", t_forward_ns), ("FLOW_BACKWARD", "backward", t_backward_ns)):
                 if name in buffers:
-                    result[key] = self._flow(buffers[name], buffers.get("ID"), t_other, needs_occlusion)
-        return LabelFrame(t_ns, **result)
+                    flow = self._flow(buffers[name], buffers.get("ID"), t_other, f"occlusion_{key}" in request)
+                    result[f"flow_{key}"] = Flow(flow.flow, flow.valid)
+                    if flow.occluded is not None:
+                        result[f"occlusion_{key}"] = flow.occluded
+        return LabelFrame(t_ns, result)
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """What is seen at the centre of pixel (x, y) at t_ns, in words, for messages."""

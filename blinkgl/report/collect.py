@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from blinkgl.config.draw import is_distribution
@@ -17,13 +16,15 @@ from blinkgl.dataset.verify import plan_of
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
-from blinkgl.io.images import read_image, read_npy
+from blinkgl.io.images import read_image
 from blinkgl.io.index import entry, sequence_folders
 from blinkgl.io.records import shown
 from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.labels import LABELS
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
 MAX_CONFIGS = 5000
+_FLOW = LABELS["flow_forward"]
 
 
 @dataclass
@@ -107,21 +108,21 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
         line = found.sequences[number]
         folder = found.root / line["path"]
         try:
-            flows = sorted((folder / "flow/forward").glob("*.png"))
+            flows = sorted((folder / _FLOW.forms[0].folder).glob("*.png"))
             if not flows:
                 continue
-            pairs = _pairs(folder / "flow/forward_timestamps.txt")
+            pairs = _pairs(folder / _FLOW.stamps)
             picks = sorted(rng.permutation(len(flows))[:LABELS_EACH])
             for k in picks:
                 flow, valid = read_flow_png(flows[k])
                 displacement = np.hypot(flow[..., 0], flow[..., 1])[::PIXEL_STEP, ::PIXEL_STEP][valid[::PIXEL_STEP, ::PIXEL_STEP]]
                 values["displacement"].append(displacement)
                 values["speed"].append(displacement / ((pairs[k][1] - pairs[k][0]) * 1e-6))
-                if (path := folder / f"depth/{flows[k].stem}.npy").is_file():
-                    depth = read_npy(path)[::PIXEL_STEP, ::PIXEL_STEP]
+                if (depth := _value(folder, "depth", flows[k])) is not None:
+                    depth = depth[::PIXEL_STEP, ::PIXEL_STEP]
                     values["depth"].append(depth[np.isfinite(depth)])
-                if (path := folder / f"ids/{flows[k].stem}.png").is_file():
-                    ids, counts = np.unique(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), return_counts=True)
+                if (ids := _value(folder, "ids", flows[k])) is not None:
+                    ids, counts = np.unique(ids, return_counts=True)
                     counts = counts[ids > 0]
                     values["objects"].append([len(counts)])
                     values["share"].append(counts / (line["height"] * line["width"]))
@@ -131,6 +132,13 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
             found.unreadable.append(f"{line['path']}: {' '.join(str(error).split())[:160]}")
     found.examples.sort(key=lambda e: e.name)
     found.quantities.update({k: np.concatenate(v).astype(float) for k, v in values.items() if v})
+
+
+def _value(folder: Path, name: str, flow: Path) -> Any:
+    """What a label holds beside a file of flow; None where the sequence has no such label. Raises AssetError."""
+    form = LABELS[name].forms[0]
+    path = folder / form.file(int(flow.stem))
+    return form.read(path) if path.is_file() else None
 
 
 def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> list[int]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
 
 PIXELS = 300
@@ -24,7 +25,7 @@ def flow_errors(scene: Scene, renderer: Renderer, t_ns: int, t_next_ns: int, see
     ids = hits.instance.reshape(PIXELS, len(_AROUND))
     exact = reference.flow_to(scene, hits, t_next_ns)
     flow, valid = exact.flow.reshape(PIXELS, len(_AROUND), 2)[:, 0], exact.valid.reshape(PIXELS, -1)[:, 0]
-    ours = renderer.labels(t_ns, LabelRequest(ids=True, flow_forward=True), t_next_ns)
+    ours = renderer.labels(t_ns, LabelRequest("ids", "flow_forward"), t_next_ns)
     x, y = xy.T
     counts = (ids == ids[:, :1]).all(axis=1) & (ids[:, 0] > 0) & (ours.ids[y, x] == ids[:, 0]) & valid & ours.forward.valid[y, x]
     error = np.hypot(*(ours.forward.flow[y, x] - flow)[counts].T)

@@ -11,6 +11,7 @@ from blinkgl.events.types import Events
 from blinkgl.io.dsec import DsecEventWriter, identity_rectify_map, write_rectify_map
 from blinkgl.io.flow_png import write_flow_png
 from blinkgl.io.sequence_dir import SequenceWriter
+from blinkgl.labels import Flow
 
 SPAN = 100_000
 
@@ -39,9 +40,9 @@ def blinkgl_set(root: Path, sequences: int = 2, labels: int = 3, height: int = 1
                 t = SPAN * (k + 1)
                 valid = np.ones((height, width), bool)
                 valid[:4] = False
-                writer.flow("forward", k, constant_flow(height, width, velocity), valid, t, t + SPAN)
+                writer.label("flow_forward", k, Flow(constant_flow(height, width, velocity), valid), t, t + SPAN)
                 if backward:
-                    writer.flow("backward", k, constant_flow(height, width, velocity, -1), valid, t, t - SPAN)
+                    writer.label("flow_backward", k, Flow(constant_flow(height, width, velocity, -1), valid), t, t - SPAN)
             writer.t_end_us = SPAN * (labels + 1)
     return root
 

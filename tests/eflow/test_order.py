@@ -137,12 +137,13 @@ def test_unlabelled_data_cannot_be_trained_on(tmp_path):
 
 def test_windows_without_events(tmp_path):
     from blinkgl.io.sequence_dir import SequenceWriter
+    from blinkgl.labels import Flow
     from flow_data import SPAN, constant_flow, moving_events
 
     with SequenceWriter(tmp_path / "still", 128, 128, config_yaml="") as writer:
         writer.append_events(moving_events(128, 128, 0, 2 * SPAN))
         for k in range(3):
-            writer.flow("forward", k, constant_flow(128, 128), np.ones((128, 128), bool), SPAN * (k + 1), SPAN * (k + 2))
+            writer.label("flow_forward", k, Flow(constant_flow(128, 128), np.ones((128, 128), bool)), SPAN * (k + 1), SPAN * (k + 2))
         writer.t_end_us = 4 * SPAN
     source = open_source(tmp_path)
     with pytest.raises(BlinkGLError, match=r"still/000001: no events in the new window \[200000, 300000\) µs"):

@@ -13,7 +13,7 @@ from blinkgl.render.renderer import LabelFrame, LabelRequest, Renderer
 from tests.render.render_scenes import LEVEL, SECOND, camera, drift
 
 FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
-MOTION = LabelRequest(depth=True, ids=True, velocity=True, flow_forward=True)
+MOTION = LabelRequest("depth", "ids", "velocity", "flow_forward")
 
 
 @dataclass(frozen=True)

@@ -122,7 +122,7 @@ def test_what_is_seen_from_its_edge_is_not_seen(gl, seed):
     """Snapped corners cover pixels; before there was a guard a third of 60 such pixels were NaN and most others at no depth of the mesh."""
     world = scene([thing("edges", 1, sheet(edge_on(np.random.default_rng(seed), 3000)), still())], camera(near=0.01))
     with Renderer(gl, world, RenderConfig()) as renderer:
-        assert not renderer.labels(0, LabelRequest(ids=True)).ids.any() and not renderer.luminance(0).any()
+        assert not renderer.labels(0, LabelRequest("ids")).ids.any() and not renderer.luminance(0).any()
 
 
 @pytest.mark.parametrize("unlit", [True, False])
@@ -182,7 +182,7 @@ def test_the_renderer_drops_lines_and_says_so(gl, lod):
         assert renderer.scene.objects[0].parts[0].mesh is renderer.scene.objects[1].parts[0].mesh or lod
         assert all(faces_in_float32(p.mesh).all() for o in renderer.scene.objects for p in o.parts)
         assert "without width in float32" in renderer.scene.log[-1] and (lod or renderer.scene.log[-1].startswith("3 triangles"))
-        assert set(np.unique(renderer.labels(0, LabelRequest(ids=True)).ids)) == {0, 1, 2}
+        assert set(np.unique(renderer.labels(0, LabelRequest("ids")).ids)) == {0, 1, 2}
     with Renderer(gl, scene([thing("ball", 1, ball, still((0, 4, 0)))]), RenderConfig()) as renderer:
         assert not renderer.scene.log
 

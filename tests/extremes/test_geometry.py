@@ -64,7 +64,7 @@ def test_order_of_surfaces_close_behind_one_another(gl, promise):
         pair = [thing("far", 1, quad(z, z, 3), still((0, z * (1 + 1e-6), 0), tilt)), thing("near", 2, quad(z, z, 5), still((0, z, 0), tilt))]
         world = scene(pair, camera(96, 72, 90.0, near=1e-3))
         with Renderer(gl, world, RenderConfig()) as renderer:
-            ids = renderer.labels(0, LabelRequest(ids=True)).ids
+            ids = renderer.labels(0, LabelRequest("ids")).ids
         wrong += (ids != reference.cast(world, 0).instance.reshape(ids.shape)).sum()
     promise("surfaces a relative 1e-6 apart, 0.01 to 1e6 units: wrong pixels", wrong, 0)
 
@@ -176,7 +176,7 @@ def test_large_images(gl, promise, side):
     the flow does."""
     world = sized(side, side)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        labels = renderer.labels(300 * MS, LabelRequest(ids=True, flow_forward=True), 310 * MS)
+        labels = renderer.labels(300 * MS, LabelRequest("ids", "flow_forward"), 310 * MS)
     xy = np.random.default_rng(0).integers(0, side, (3000, 2))
     hits = reference.cast(world, 300 * MS, xy)
     true = reference.flow_to(world, hits, 310 * MS).flow

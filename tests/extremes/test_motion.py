@@ -164,7 +164,7 @@ def test_surfaces_crossing_the_camera_plane(gl, promise, name):
 def test_everything_behind_the_camera_is_invalid_and_zero(gl):
     world = scene([thing("wall", 1, quad(9, 9), drift((0, 2, 0), (0, -2, 0), FACING))])
     with Renderer(gl, world, RenderConfig()) as renderer:
-        flow = renderer.labels(0, LabelRequest(flow_forward=True, occlusion=True), SECOND).forward
+        flow = renderer.labels(0, LabelRequest("flow_forward", "occlusion_forward"), SECOND).forward
     assert not flow.valid.any() and (flow.flow == 0).all() and not flow.occluded.any()
 
 

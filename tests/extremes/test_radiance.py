@@ -30,7 +30,7 @@ def test_radiance_of_twenty_one_decades(gl, promise, antialiasing):
     """Float32 targets keep 2^-24 of any radiance; the luma weights' sum and the box filter round a few times more."""
     world = scene(bars(unlit=True), camera(90, 24, 80.0))
     with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
-        luminance, colour = renderer.luminance(0), renderer.labels(0, LabelRequest(colour=True, ids=True))
+        luminance, colour = renderer.luminance(0), renderer.labels(0, LabelRequest("images", "ids"))
     worst = 0.0
     for k, v in enumerate(RADIANCES):
         inside = np.zeros(luminance.shape, bool)

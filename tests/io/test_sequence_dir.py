@@ -15,11 +15,13 @@ import numpy as np
 import pytest
 
 from blinkgl import srgb
+from blinkgl.config.sequence import LabelsConfig
 from blinkgl.errors import BlinkGLError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io import flo, images
 from blinkgl.io.atomic import atomic_file, machine_token, remove_stale
 from blinkgl.io.sequence_dir import SequenceWriter, read_manifest, verify_sequence
+from blinkgl.labels import Flow
 
 H, W = 24, 32
 
@@ -37,17 +39,17 @@ def fill(writer: SequenceWriter, labels: int = 3, reuse: bool = True) -> None:
         t = 100_000 * i
         writer.append_events(events_between(t, t + 100_000, 5000, i))
         buffer[:] = rng.random((H, W, 3))
-        writer.image(i, t, buffer)
+        writer.label("images", i, buffer, t)
         flow = rng.normal(size=(H, W, 2)).astype(np.float32)
         flow[0, 0] = 300
         valid = np.ones((H, W), bool)
-        writer.flow("forward", i, flow, valid, t, t + 100_000)
-        writer.flow("backward", i, -flow, valid, t + 100_000, t)
-        writer.occlusion("forward", i, flow[..., 0] > 0)
-        writer.depth(i, np.full((H, W), i + 1.0, np.float32))
-        writer.velocity(i, flow * 10)
-        writer.normals(i, buffer)
-        writer.ids(i, np.full((H, W), i))
+        writer.label("flow_forward", i, Flow(flow, valid), t, t + 100_000)
+        writer.label("flow_backward", i, Flow(-flow, valid), t + 100_000, t)
+        writer.label("occlusion_forward", i, flow[..., 0] > 0, t)
+        writer.label("depth", i, np.full((H, W), i + 1.0, np.float32), t)
+        writer.label("velocity", i, flow * 10, t)
+        writer.label("normals", i, buffer, t)
+        writer.label("ids", i, np.full((H, W), i), t)
     writer.poses(T_world_cam=np.eye(4)[None], times_ns=np.arange(3))
     writer.info["seed"] = np.int64(0)
     writer.t_end_us = 100_000 * labels
@@ -63,7 +65,7 @@ def tree(folder) -> dict[str, bytes]:
 
 
 def test_contents_read_back_independently(tmp_path):
-    make(tmp_path / "a" / "b", float_flow=("npy", "flo", "h5"))
+    make(tmp_path / "a" / "b", labels=LabelsConfig(float_flow=("npy", "flo", "h5"), flow=("forward", "backward")))
     seq = tmp_path / "a" / "b"
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["b"]
     assert (seq / "images/timestamps.txt").read_text() == "0\n100000\n200000\n"
@@ -92,9 +94,9 @@ def test_contents_read_back_independently(tmp_path):
 
 
 def test_same_input_same_bytes(tmp_path):
-    make(tmp_path / "a", float_flow=("h5",))
+    make(tmp_path / "a", labels=LabelsConfig(float_flow=("h5",)))
     time.sleep(1.1)  # a time stamp of seconds would show
-    make(tmp_path / "b", float_flow=("h5",))
+    make(tmp_path / "b", labels=LabelsConfig(float_flow=("h5",)))
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
@@ -180,7 +182,7 @@ def test_full_disk_is_one_clear_error_and_leaves_nothing(small_disk, what):
                     writer.append_events(Events(rng.integers(0, 320, n).astype(np.uint16), rng.integers(0, 240, n).astype(np.uint16),
                                                 np.sort(rng.integers(i * 10**6, (i + 1) * 10**6, n)), rng.integers(0, 2, n).astype(np.uint8)))
                 if what != "events":
-                    writer.depth(i, rng.random((240, 320), dtype=np.float32))
+                    writer.label("depth", i, rng.random((240, 320), dtype=np.float32), 0)
     assert "blinkgl-tmp" not in str(caught.value) and "\n" not in str(caught.value)
     assert list(small_disk.iterdir()) == []
 
@@ -212,7 +214,7 @@ def test_kill_leaves_no_final_name_and_the_next_run_cleans_up(tmp_path):
 import time, numpy as np
 from blinkgl.io.sequence_dir import SequenceWriter
 with SequenceWriter({str(tmp_path / 'a')!r}, 24, 32, config_yaml='') as w:
-    w.depth(0, np.zeros((24, 32)))
+    w.label('depth', 0, np.zeros((24, 32)), 0)
     print('ready', flush=True)
     time.sleep(60)
 """

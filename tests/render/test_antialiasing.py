@@ -80,7 +80,7 @@ def test_resolving_equal_samples_changes_nothing(gl):
 
 def test_labels_are_never_filtered(gl):
     world = mixed_scene()
-    request = LabelRequest(depth=True, ids=True, flow_forward=True)
+    request = LabelRequest("depth", "ids", "flow_forward")
     frames = []
     for antialiasing in ("none", "msaa4", "ssaa4"):
         with Renderer(gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing="msaa4")) as renderer:

@@ -41,9 +41,7 @@ from render_scenes import (
 
 MS = 1_000_000
 T0, T1, T_BACK = 300 * MS, 400 * MS, 200 * MS
-EVERYTHING = LabelRequest(
-    colour=True, depth=True, ids=True, normals=True, velocity=True, flow_forward=True, flow_backward=True, occlusion=True
-)
+EVERYTHING = LabelRequest("images", "depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
 FLAT_WAY = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 
 
@@ -146,7 +144,7 @@ def test_magnified_texture_is_the_bilinear_one(gl):
     paint = Material(texture=texture, uv_scale=(0.5, 0.75), base_color=(1.0, 0.7, 0.4))
     world = scene([thing("picture", 1, quad(4, 3), drift((0, 4, 0), (0.2, 4, 0), FLAT_WAY), paint)])
     ref = reference.render(world, T0)
-    labels, luminance = drawn(gl, world, request=LabelRequest(colour=True))
+    labels, luminance = drawn(gl, world, request=LabelRequest("images"))
     # 8-bit weights are what OpenGL asks of a GPU's bilinear filter: half of 1/256 per axis
     np.testing.assert_allclose(labels.colour, ref.colour, atol=1 / 256)
     np.testing.assert_allclose(luminance, ref.luminance, atol=1 / 256)
@@ -224,7 +222,7 @@ def test_velocity_is_the_limit_of_flow(gl):
     """Order one in the step while the motion curves; and at a microsecond still right to float32."""
     world = mixed_scene(80, 60)
     steps = np.array([8 * MS, 4 * MS, 2 * MS, MS])
-    ask = LabelRequest(velocity=True, flow_forward=True)
+    ask = LabelRequest("velocity", "flow_forward")
     with Renderer(gl, world, RenderConfig()) as renderer:
         velocity = renderer.labels(T0, ask, T0 + MS).velocity
         errors = [
@@ -382,7 +380,7 @@ def test_random_world_of_real_meshes_and_photographs(gl):
     t = world.t0_ns + 400 * MS
     ref = reference.render(world, t, forward_ns=t + 100 * MS)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        labels = renderer.labels(t, LabelRequest(depth=True, ids=True, velocity=True, flow_forward=True, occlusion=True), t + 100 * MS)
+        labels = renderer.labels(t, LabelRequest("depth", "ids", "velocity", "flow_forward", "occlusion_forward"), t + 100 * MS)
     assert len(np.unique(ref.instance)) >= 4
     band = reference.silhouette_band(ref.instance, ref.depth)
     flips = labels.ids != ref.instance

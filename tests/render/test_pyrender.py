@@ -52,7 +52,7 @@ def test_depth_ids_and_colour_agree(gl, world, peer, moment):
     t = TIMES[moment]
     true = reference.render(world, t)
     with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
-        ours = renderer.labels(t, LabelRequest(colour=True, depth=True, ids=True))
+        ours = renderer.labels(t, LabelRequest("images", "depth", "ids"))
     assert true.depth.min() > NEAR
     band = reference.silhouette_band(true.instance, true.depth)
     assert band.mean() < 0.15 and len(np.unique(true.instance)) == 5

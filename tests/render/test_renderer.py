@@ -5,10 +5,11 @@ import pytest
 
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import renderer as module
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid, projection
 from blinkgl.render.occlusion import occlusion_mask
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObject, Texture
@@ -31,7 +32,7 @@ def world(width=96, height=72, objects=12, light=Light()):
     return Scene(tuple(made), camera, 0, SECOND, light, background=0.25)
 
 
-ALL = LabelRequest(True, True, True, True, True, True, True, True)
+ALL = LabelRequest(*LABELS)
 
 
 def buffers(frame):
@@ -111,10 +112,10 @@ def test_only_what_is_asked_for_is_made(gl):
         assert {name for name, _ in gl.shaders._programs} == {"luminance.glsl"}
         assert len(renderer._targets) == 1
         assert all(key[0] == "luminance" for key in renderer._resources._textures), "no colour texture without a colour pass"
-        renderer.labels(0, LabelRequest(depth=True))
+        renderer.labels(0, LabelRequest("depth"))
         defines = [dict(d) for name, d in gl.shaders._programs if name == "label.glsl"]
         assert defines and all(not any(k.startswith("OUT_") and k != "OUT_DEPTH" for k in d) for d in defines)
-        frame = renderer.labels(0, LabelRequest(depth=True))
+        frame = renderer.labels(0, LabelRequest("depth"))
         assert frame.ids is None and frame.forward is None and frame.colour is None
 
 
@@ -127,7 +128,7 @@ def test_frames_and_labels_are_drawn_from_the_same_level_of_detail(gl):
     with Renderer(gl, scene, PLAIN) as full, Renderer(gl, scene, PLAIN.model_copy(update={"lod": LodConfig(enabled=True)})) as coarse:
         assert coarse.triangles < full.triangles / 4 and full.scene is scene
         for renderer in (full, coarse):
-            np.testing.assert_array_equal(renderer.luminance(0) > 0, renderer.labels(0, LabelRequest(ids=True)).ids == 1)
+            np.testing.assert_array_equal(renderer.luminance(0) > 0, renderer.labels(0, LabelRequest("ids")).ids == 1)
         assert np.abs((coarse.luminance(0) > 0).sum() / (full.luminance(0) > 0).sum() - 1) < 0.05
 
 

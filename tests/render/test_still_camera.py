@@ -109,7 +109,7 @@ def test_another_camera_takes_nothing_from_the_first(gl):
     """look_through: luminance, what has changed in it, and the surfaces that hide points at t' are the other camera's."""
     world = mixed_scene(48, 36, camera_moves=False)
     other = replace(world.camera, cx=world.camera.cx - 20, fx=world.camera.fx * 1.3)
-    request = LabelRequest(flow_forward=True, occlusion=True)
+    request = LabelRequest("flow_forward", "occlusion_forward")
     with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, replace(world, camera=other), PLAIN) as fresh:
         out = np.empty((36, 48), np.float32)
         for t in (0, SECOND // 9):

@@ -51,7 +51,7 @@ def test_displacement_over_whole_intervals(gl, world, config, inside):
         for a, b in zip(times[:-1:3].tolist(), times[1::3].tolist()):
             if b - a <= config.min_step_us * 1000:
                 continue
-            flow = renderer.labels(a, LabelRequest(flow_forward=True), b).forward
+            flow = renderer.labels(a, LabelRequest("flow_forward"), b).forward
             moved = np.linalg.norm(flow.flow, axis=-1)[flow.valid]
             for percent, bound in inside:
                 assert np.percentile(moved[moved > 0], percent) <= bound * 1.05
@@ -76,7 +76,7 @@ def test_brightness_bound_holds_between_frames(gl, world, fraction, percent):
         times = times_of(config, renderer).tolist()
         worst = 0.0
         for a, b in zip(times[:-1:4], times[1::4]):
-            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t) + 1e-3), renderer.labels(t, LabelRequest(ids=True)).ids) for t in (a, b)))
+            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t) + 1e-3), renderer.labels(t, LabelRequest("ids")).ids) for t in (a, b)))
             change = np.abs(lb - la)[(ia == ib)]
             worst = max(worst, np.percentile(change[change > 0], percent))
         assert 0.4 * fraction * 0.2 < worst <= 1.1 * fraction * 0.2

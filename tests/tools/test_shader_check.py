@@ -63,7 +63,7 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
         renderer.brightness(t, variants.EVERY)
         for count in range(1, 7):
             for names in combinations(fields, count):
-                renderer.labels(t, LabelRequest(**dict.fromkeys(names, True)), t + 10**8, t - 10**8)
+                renderer.labels(t, LabelRequest(*names), t + 10**8, t - 10**8)
     gl.shaders.clear()
     table = {(name, normalised(defines)) for name in PRODUCTION for defines in variants.variants(name)}
     assert asked <= table

@@ -50,7 +50,7 @@ def written(config, tmp_path_factory):
 def test_passes_writes_every_buffer_that_generation_renders(written, world):
     config, scene = world
     arrays = {name: np.load(written / f"{name}.npy") for name in moments.PASSES}
-    ask = LabelRequest(depth=True, ids=True, normals=True, velocity=True, flow_forward=True, flow_backward=True, occlusion=True)
+    ask = LabelRequest("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
     with create_context() as gl, Renderer(gl, scene, config.render) as renderer:
         labels = renderer.labels(T, ask, T_NEXT, T_LAST)
         luminance, colour = renderer.luminance(T), renderer.colour(T)

@@ -132,7 +132,7 @@ class GpuMoment(_Lazy):
 
     def _labels(self):
         when = self.when
-        ask = LabelRequest(depth=True, ids=True, normals=True, velocity=True, flow_forward=True, flow_backward=True, occlusion=True)
+        ask = LabelRequest("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
         labels = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
         out = {"depth": labels.depth, "id": labels.ids, "normals": labels.normals, "velocity": labels.velocity}
         for way in ("forward", "backward"):

@@ -24,8 +24,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.renderer import LabelRequest
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.session import DebugRenderer, Subject, When, open_renderer
 
@@ -51,7 +51,7 @@ class Draws:
     draws: int = 0
     triangles: int = 0
     fragments: int = 0
-    variants: dict[str, "Draws"] = field(default_factory=dict)
+    variants: dict[str, Draws] = field(default_factory=dict)
 
 
 class Stopwatch:
@@ -150,7 +150,7 @@ class TimedRenderer(DebugRenderer):
 def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
     """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that generation runs for this configuration."""
     config = subject.config
-    labels, render = config.labels, config.render
+    asked, render = asked_for(config.labels), config.render
     rate = np.empty((config.camera.height, config.camera.width), np.float32) if config.timeline.reconstruction == "hermite" else None
     out = {"luminance" + (" and rate" if rate is not None else ""): (lambda r: r.luminance(when.t_ns, rate=rate), samples_of(render.antialiasing).grid)}
     if config.timeline.kind != "uniform":
@@ -159,17 +159,15 @@ def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
             out["brightness (timeline)"] = (lambda r: r.brightness(when.t_ns, every), 1 / every)
         else:
             out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, every), 1 / every)
-    if labels.images or config.preview.enabled:
+    if "images" in asked or config.preview.enabled:
         out["colour"] = (lambda r: r.colour(when.t_ns), samples_of(render.image_antialiasing).grid)
-    request = LabelRequest(depth=labels.depth, ids=labels.ids, normals=labels.normals, velocity=labels.velocity,
-                           flow_forward="forward" in labels.flow, flow_backward="backward" in labels.flow, occlusion=False)
-    occlusion = labels.occlusion and (request.flow_forward or request.flow_backward)
-    if occlusion:
-        request = replace(request, ids=True)
-    if any(vars(request).values()):
+    request = LabelRequest(*asked.buffers)
+    if request:
         out["labels"] = (lambda r: r.labels(when.t_ns, request, when.forward_ns, when.backward_ns), 1)
-    if occlusion:
-        out["occlusion, per direction"] = (lambda r: r.raw(when.forward_ns, "DEPTH", "ID"), 1)
+    if asked.there:
+        there = LabelRequest(*asked.there)
+        who = ", ".join(dict.fromkeys(LABELS[name].said for name in asked if LABELS[name].there))
+        out[f"{who}, per direction"] = (lambda r: r.labels(when.forward_ns, there), 1)
     return out
 
 

@@ -1,0 +1,22 @@
+"""Ground truth, one row per label: what :mod:`blinkgl.config` reads of it, what is drawn, what lies on disk, how it is judged.
+
+Rows come in by :func:`register`; configuration, renderer, writer, verification, reports and the shader debugger read :data:`LABELS`. Begin with
+``label.py``, which says what a row holds, and ``depth.py``, the plainest of them. Neither OpenGL nor a compiler is imported here: a YAML is read by it.
+"""
+
+from blinkgl.labels.depth import Depth
+from blinkgl.labels.files import Form
+from blinkgl.labels.flow import FlowTo
+from blinkgl.labels.frames import Flow, LabelFrame, LabelRequest
+from blinkgl.labels.ids import Ids
+from blinkgl.labels.images import Images
+from blinkgl.labels.label import Label
+from blinkgl.labels.normals import Normals
+from blinkgl.labels.occlusion import OcclusionAt
+from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
+from blinkgl.labels.velocity import Velocity
+
+for _row in (Images(), Depth(), Ids(), Normals(), Velocity(), FlowTo("forward"), FlowTo("backward"), OcclusionAt("forward"), OcclusionAt("backward")):
+    register(_row)
+
+__all__ = ["LABELS", "Flow", "Form", "Label", "LabelFrame", "LabelRequest", "asked_for", "label_of", "register", "unregister"]

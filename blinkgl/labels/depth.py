@@ -1,0 +1,33 @@
+"""Z along the optical axis."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.labels import grading
+from blinkgl.labels.label import Drawn, Label
+
+_SHARE = 0.95
+"""Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
+
+
+class Depth(Label):
+    """(H, W) float32 world units along the optical axis; inf: nothing hit."""
+
+    name, about = "depth", "float32 .npy, world units along the optical axis"
+    unit, kind = "world units", "depth"
+    buffer = "R32F"
+    judged_in, tolerance, error = "relative", 1e-5, staticmethod(grading.relative)
+
+    def finish(self, drawn: Drawn) -> np.ndarray:
+        raw = drawn.raw("depth")
+        return np.where(raw > 0, raw, np.float32(np.inf))
+
+    def problem(self, value: np.ndarray) -> str | None:
+        return None if (value > 0).all() else "a depth that is not above 0"
+
+    def agrees(self, one: np.ndarray, other: np.ndarray) -> bool:
+        return one.shape == other.shape and bool(np.isclose(one, other, rtol=1e-4).mean() >= _SHARE)
+
+    def reference(self, scene, frame) -> np.ndarray:
+        return frame.depth

@@ -1,0 +1,68 @@
+"""The forms in which labels lie on disk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Form:
+    """``FOLDER/000000.ENDING``, one file a label, or ``FOLDER.ENDING``, one file for all of them.
+
+    encode : a value as the bytes of a file, or as (bytes, number of its pixels that the form cannot hold).   read : the value in a file;
+    raises AssetError.   rows : of one file for all, name -> (H, W[, C]) array that is appended to the dataset of that name."""
+
+    folder: str
+    ending: str
+    encode: Callable[[Any], bytes | tuple[bytes, int]] | None = None
+    read: Callable[[str | os.PathLike], Any] | None = None
+    rows: Callable[[Any], dict[str, np.ndarray]] | None = None
+
+    def file(self, index: int) -> str:
+        """Name of the ``index``-th label's file below the sequence."""
+        return f"{self.folder}.{self.ending}" if self.rows else f"{self.folder}/{index:06d}.{self.ending}"
+
+    def files(self, count: int) -> Iterator[str]:
+        """Names of the files of so many labels."""
+        yield from (self.file(k) for k in range(1 if self.rows and count else count))
+
+    def holds(self, name: str) -> bool:
+        """Whether ``name`` is one of its files."""
+        if self.rows:
+            return name == self.file(0)
+        return name.startswith(self.folder + "/") and name.endswith("." + self.ending) and "/" not in name[len(self.folder) + 1:]
+
+
+def npy(folder: str) -> Form:
+    """Any array of numbers as .npy."""
+    return Form(folder, "npy", _images("encode_npy"), _images("read_npy"))
+
+
+def mask_png(folder: str) -> Form:
+    """(H, W) bool as 8-bit PNG, 255 and 0."""
+    return Form(folder, "png", _images("encode_mask"), _images("read_mask"))
+
+
+def ids_png(folder: str) -> Form:
+    """(H, W) numbers from 0 to 65535 as 16-bit PNG."""
+    return Form(folder, "png", _images("encode_ids"), _images("read_ids"))
+
+
+def image_png(folder: str) -> Form:
+    """(H, W[, 3]) linear light or sRGB codes as sRGB PNG; read as codes."""
+    return Form(folder, "png", _images("encode_image"), _images("read_image"))
+
+
+def _images(name: str) -> Callable[[Any], Any]:
+    """A function of :mod:`blinkgl.io.images`, which is imported when it is first used: configuration reads this module."""
+    def call(value: Any) -> Any:
+        from blinkgl.io import images
+
+        return getattr(images, name)(value)
+
+    return call

@@ -1,0 +1,114 @@
+"""Where the surface is at another label's time."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from blinkgl.labels import grading
+from blinkgl.labels.files import Form
+from blinkgl.labels.frames import Flow
+from blinkgl.labels.label import Drawn, Instant, Key, Label, Towards, View
+
+_KEYS = {
+    "flow": Key(tuple[Literal["forward", "backward"], ...], Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"), "depth"),
+    "float_flow": Key(tuple[Literal["npy", "flo", "h5"], ...], Field((), description="float32 flow besides the PNG"), "depth"),
+}
+_PX, _SHARE = 2 / 128, 0.95
+"""Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the pixels. Silhouettes may fall on either side."""
+
+
+class FlowTo(Label):
+    """:class:`Flow` to the next label's time or to the one before; valid pixels beyond DSEC's ±256 px become invalid in the PNG, not in the float forms."""
+
+    unit, kind = "px", "motion"
+    buffer, varyings = "RGBA32F", ("local",)
+
+    def __init__(self, towards: Towards):
+        self.towards, self.name, self.title = towards, f"flow_{towards}", f"{towards} flow"
+        self.about, self.off = f"optical flow {towards}", "not in labels.flow"
+        self.stamps, self.shard = f"flow/{towards}_timestamps.txt", "flow.png" if towards == "forward" else "back.png"
+
+    keys = property(lambda self: _KEYS)
+    said = property(lambda self: "flow" if self.towards == "forward" else self.name)
+
+    def asked(self, labels) -> bool:
+        return self.towards in labels.flow
+
+    def ask(self, tree: dict[str, Any]) -> None:
+        tree["flow"] = [*tree.get("flow", ()), self.towards]
+
+    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
+        return {f"difference_{self.towards}": (at.mvp_there(self.towards) - at.mvp)[:, [0, 1, 3]]}
+
+    def finish(self, drawn: Drawn) -> Flow:
+        raw = drawn.raw(self.name)
+        valid = (raw[..., 3] > 0) & (raw[..., 2] > 0)
+        return Flow(np.where(valid[..., None], raw[..., :2], np.float32(0)), valid)
+
+    def own(self, value: Flow, height: int, width: int) -> Flow:
+        flow, valid = np.array(value.flow), np.array(value.valid)
+        if flow.shape != (height, width, 2) or valid.shape != (height, width):
+            raise TypeError(f"label '{self.name}': {flow.shape} and valid {valid.shape}, not {(height, width, 2)} and {(height, width)}")
+        return Flow(flow, valid.astype(bool))
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        folder = f"flow/{self.towards}"
+        # Float forms have folders of their own: DSEC loaders take every file of flow/forward for a PNG.
+        return (Form(folder, "png", _png, _read), Form(folder + "_npy", "npy", _npy, _read), Form(folder + "_flo", "flo", _flo, _read),
+                Form(folder, "h5", rows=_rows))
+
+    def written(self, labels) -> tuple[Form, ...]:
+        return (self.forms[0], *(form for form in self.forms[1:] if form.ending in labels.float_flow))
+
+    def problem(self, value: Flow) -> str | None:
+        return None if np.isfinite(value.flow).all() else "a flow that is no finite number"
+
+    def agrees(self, one: Flow, other: Flow) -> bool:
+        if one.flow.shape != other.flow.shape:
+            return False
+        near = (np.abs(one.flow - other.flow).max(-1) <= _PX) & (one.valid == other.valid)
+        return bool(near.mean() >= _SHARE)
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        way = self.towards
+        return (View(self.name, self.title, "px", "motion", lambda value: value.flow, lambda scene, frame: self._of(frame, "flow"), "px", 1e-2, grading.motion),
+                View(f"valid_{way}", f"valid, {way}", "", "mask", lambda value: value.valid, lambda scene, frame: self._of(frame, "valid"), "mismatch", 0.0,
+                     grading.different))
+
+    def _of(self, frame, what: str) -> np.ndarray:
+        true = getattr(frame, self.towards)
+        return true.valid if what == "valid" else np.where(true.valid[..., None], true.flow, 0.0)
+
+
+def _png(value: Flow) -> tuple[bytes, int]:
+    from blinkgl.io.flow_png import encode_flow_png
+
+    return encode_flow_png(value.flow, value.valid)
+
+
+def _npy(value: Flow) -> bytes:
+    from blinkgl.io.flow import encode_flow_npy
+
+    return encode_flow_npy(value.flow, value.valid)
+
+
+def _flo(value: Flow) -> bytes:
+    from blinkgl.io.flo import encode_flo
+
+    return encode_flo(value.flow, value.valid)
+
+
+def _rows(value: Flow) -> dict[str, np.ndarray]:
+    return {"flow": np.where(value.valid[..., None], value.flow, np.float32(0)), "valid": value.valid.astype(np.uint8)}
+
+
+def _read(path: str | os.PathLike) -> Flow:
+    from blinkgl.io.flow import read_flow
+
+    return Flow(*read_flow(path))

@@ -1,0 +1,101 @@
+"""What the renderer is asked for, and what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from blinkgl.labels.table import LABELS, label_of
+
+
+class LabelRequest:
+    """Which labels :meth:`Renderer.labels` returns, by name: ``LabelRequest("depth", "flow_forward")``; what is not asked for is not computed.
+
+    Iterating gives the names in the order of the table. Raises KeyError: no such label."""
+
+    def __init__(self, *names: str):
+        asked = {label_of(name).name for name in names}
+        self.names = tuple(name for name in LABELS if name in asked)
+
+    @property
+    def buffers(self) -> tuple[str, ...]:
+        """Labels whose shader outputs have to be drawn for it, in the order of the table."""
+        drawn = {other for name in self.names for other in (name, *LABELS[name].needs)}
+        return tuple(name for name, label in LABELS.items() if name in drawn and label.buffer)
+
+    @property
+    def there(self) -> tuple[str, ...]:
+        """Labels whose shader outputs have to be drawn at the other times."""
+        drawn = {other for name in self.names for other in LABELS[name].there}
+        return tuple(name for name in LABELS if name in drawn)
+
+    def without(self, *names: str) -> LabelRequest:
+        return LabelRequest(*(name for name in self.names if name not in names))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.names
+
+    def __bool__(self) -> bool:
+        return bool(self.names)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, LabelRequest) and self.names == other.names
+
+    def __hash__(self) -> int:
+        return hash(self.names)
+
+    def __repr__(self) -> str:
+        return f"LabelRequest({', '.join(map(repr, self.names))})"
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """flow : (H, W, 2) float32 px, +x right, +y down, from t to t' at reference t; 0 where not valid.
+    valid : (H, W) bool, something is hit and it is in front of the camera at t'.
+    occluded : (H, W) bool or None, valid but not visible at t' (hidden by a surface, or outside the image)."""
+
+    flow: np.ndarray
+    valid: np.ndarray
+    occluded: np.ndarray | None = None
+
+
+class LabelFrame:
+    """Ground truth at t_ns. Every label that was asked for is an attribute of its name; those that were not are None.
+
+    colour : (H, W, 3) float32 linear radiance (label "images").     depth : (H, W) float32 Z along the optical axis; inf: nothing hit.
+    ids : (H, W) uint32; 0: nothing hit.            normals : (H, W, 3) float32 unit, camera axes (OpenCV), facing the camera.
+    velocity : (H, W, 2) float32 px/s at t.         forward, backward : :class:`Flow`, with the occlusion mask where that was asked for.
+    values : all of them by the name of the label."""
+
+    def __init__(self, t_ns: int, values: dict[str, Any]):
+        self.t_ns, self.values = t_ns, values
+
+    def __getattr__(self, name: str) -> Any:
+        if name in LABELS:
+            return self.values.get(name)
+        raise AttributeError(f"no label '{name}'; there are {', '.join(LABELS)}")
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *LABELS]
+
+    @property
+    def colour(self) -> np.ndarray | None:
+        return self.values.get("images")
+
+    @property
+    def forward(self) -> Flow | None:
+        return self._flow("forward")
+
+    @property
+    def backward(self) -> Flow | None:
+        return self._flow("backward")
+
+    def _flow(self, towards: str) -> Flow | None:
+        flow = self.values.get(f"flow_{towards}")
+        return None if flow is None else Flow(flow.flow, flow.valid, self.values.get(f"occlusion_{towards}"))

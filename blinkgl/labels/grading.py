@@ -1,0 +1,38 @@
+"""How far a drawn label is from the float64 reference: (drawn, true, label interval in s) -> (H, W) float64 >= 0."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def length(difference: np.ndarray) -> np.ndarray:
+    """(H, W) of (H, W) or (H, W, C)."""
+    return np.linalg.norm(difference, axis=-1) if difference.ndim == 3 else np.abs(difference)
+
+
+def absolute(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarray:
+    """In the label's unit. Infinite where both are: no error."""
+    both = np.isinf(drawn) & (drawn == true)
+    return length(np.where(both, 0.0, drawn.astype(np.float64) - np.where(both, 0.0, true)))
+
+
+def relative(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarray:
+    """Of (H, W)."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = np.abs(drawn / true - 1.0)
+    return np.where(np.isinf(drawn) & np.isinf(true), 0.0, error)
+
+
+def different(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarray:
+    """1 where they are not equal."""
+    return (drawn != true).astype(np.float64)
+
+
+def motion(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarray:
+    """px; of motions longer than 100 px, px per 100 px: float32 rounds them in proportion."""
+    return length(drawn.astype(np.float64) - true) / np.maximum(1.0, length(true) / 100.0)
+
+
+def motion_per_interval(drawn: np.ndarray, true: np.ndarray, interval_s: float) -> np.ndarray:
+    """:func:`motion` of px/s over a label interval."""
+    return motion(drawn * interval_s, true * interval_s, interval_s)

@@ -1,0 +1,33 @@
+"""Which object is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.labels import files, grading
+from blinkgl.labels.label import Instant, Label, View
+
+
+class Ids(Label):
+    """(H, W) uint32 instance ids; 0: nothing hit."""
+
+    name, about = "ids", "instance ids, 16-bit PNG"
+    title, unit, kind = "instance ids", "0: nothing hit", "ids"
+    buffer, dtype = "R32UI", np.uint32
+
+    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
+        return {"instance_id": np.array([thing.instance_id for thing in at.scene.objects], np.uint32)}
+
+    @property
+    def forms(self):
+        return (files.ids_png("ids"),)
+
+    def problem(self, value: np.ndarray) -> str | None:
+        return None if value.dtype == np.uint16 else f"{value.dtype} and not uint16"
+
+    def reference(self, scene, frame) -> np.ndarray:
+        return frame.instance
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        return (View("id", "instance id", self.unit, self.kind, lambda value: value, self.reference, "mismatch", 0.0, grading.different, same_triangle=False),)

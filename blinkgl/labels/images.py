@@ -1,0 +1,24 @@
+"""What the scene looks like."""
+
+from __future__ import annotations
+
+from blinkgl.labels import files
+from blinkgl.labels.label import Label, View
+
+
+class Images(Label):
+    """(H, W, 3) float32 linear radiance, anti-aliased as ``render.image_antialiasing`` says."""
+
+    name, about = "images", "sRGB PNG of the colour pass"
+    title, unit, kind, default = "images", "linear radiance", "light", True
+    anti_aliased, at_last = True, True
+    channels, dtype = None, None
+    stamps, shard = "images/timestamps.txt", "image.png"
+
+    @property
+    def forms(self):
+        return (files.image_png("images"),)
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        return ()  # the debugger follows the colour pass step by step, beginning with what it looks up

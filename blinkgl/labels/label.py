@@ -1,0 +1,241 @@
+"""What a label is: everything that is known of one kind of ground truth, in one class.
+
+A row of the table is an instance. What it has to say is listed in :class:`Label`, in the order of its way: configuration, shader, the CPU,
+files, the reference. docs/extending.md has the whole of one; :func:`blinkgl.labels.register` names what is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from blinkgl.labels import files, grading
+from blinkgl.labels.files import Form
+
+if TYPE_CHECKING:
+    from blinkgl.config.labels import LabelsConfig
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
+
+Towards = Literal["forward", "backward"]
+
+
+class Buffer(NamedTuple):
+    """A pixel of a shader's output: GLSL's type, components, dtype as read back."""
+
+    glsl: str
+    components: int
+    dtype: np.dtype
+
+    @property
+    def bytes(self) -> int:
+        return self.components * self.dtype.itemsize
+
+
+BUFFERS = {"R32F": Buffer("float", 1, np.dtype(np.float32)), "RG32F": Buffer("vec2", 2, np.dtype(np.float32)),
+           "RGBA32F": Buffer("vec4", 4, np.dtype(np.float32)), "R32UI": Buffer("uint", 1, np.dtype(np.uint32))}
+VARYINGS = ("local", "normal")
+_NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
+KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
+
+
+@dataclass(frozen=True)
+class Key:
+    """A key of ``labels:``: its type, and default and description as pydantic has them.   before : key that it stands in front of."""
+
+    annotation: Any
+    info: Any
+    before: str | None = None
+
+
+@dataclass(frozen=True)
+class View:
+    """One array of a label that is shown and judged by itself; of most labels the only one.
+
+    name, title, unit, kind : as of :class:`Label`.   of : the array (H, W[, C]) in a value.   reference : what it should be, of a scene and a
+    :class:`~blinkgl.render.reference.ReferenceFrame`.   judged_in, tolerance : unit of its error, and the most that is let pass.
+    error : (drawn, true, label interval in s) -> (H, W) >= 0.   statistic : "max" of the pixels' errors, or their "mean".
+    same_triangle : judged only where both sides see the same triangle.   band_there : not judged where the point lands beside a silhouette at
+    the time that the label leads to.   note : said beside the figure."""
+
+    name: str
+    title: str
+    unit: str
+    kind: str
+    of: Any
+    reference: Any
+    judged_in: str
+    tolerance: float
+    error: Any = grading.absolute
+    statistic: Literal["max", "mean"] = "max"
+    same_triangle: bool = True
+    band_there: bool = False
+    note: str = ""
+
+
+class Instant(Protocol):
+    """What :meth:`Label.uniforms` is given: all objects of a scene at one time. Matrices are float64, (n, 4, 4) for n objects.
+
+    scene : as it is drawn.   t_ns : the time.   T_world_cam : (4, 4).   T_world_obj, T_cam_obj.   mvp : to clip space.   mvp_rate : its derivative, 1/s.
+    mvp_there(towards) : at the time that labels lead to in that direction."""
+
+    scene: Scene
+    t_ns: int
+    T_world_cam: np.ndarray
+    T_world_obj: np.ndarray
+    T_cam_obj: np.ndarray
+    mvp: np.ndarray
+
+    @property
+    def mvp_rate(self) -> np.ndarray: ...
+
+    def mvp_there(self, towards: Towards) -> np.ndarray: ...
+
+
+class Drawn(Protocol):
+    """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
+
+    scene : as it is drawn.   raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
+    there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
+
+    scene: Scene
+
+    def raw(self, name: str) -> np.ndarray: ...
+
+    def value(self, name: str) -> Any: ...
+
+    def there(self, name: str) -> np.ndarray: ...
+
+
+class Label:
+    """One kind of ground truth. ``name``, ``about``, ``reference`` and ``tolerance`` have to be said; a label of the shader says ``buffer``, and ``glsl``.
+
+    What it is called
+        name : key of ``labels:`` (unless it says other ``keys``), folder, attribute of a :class:`~blinkgl.labels.LabelFrame`.
+        about : what it is and how it is written, for the page of keys.   default : written when nothing is said.
+        title, unit : for tables.   kind : how a picture shows it, one of KINDS.   off : what ``explain`` says of it when it is not asked for.
+
+    What is drawn
+        buffer : a key of BUFFERS; None: no output of the label shader.
+        glsl : source of ``TYPE label_NAME()``, TYPE being the buffer's, with uniforms of its own and, by name, ``local`` (object-local
+        position) and ``facing()`` (the surface's normal, object axes, on the camera's side), where ``varyings`` names "local" or "normal",
+        and ``#include``; None: it stands in ``shaders/include/labels/NAME.glsl``.
+        needs : labels whose buffers are drawn with it.   there : labels whose buffers it reads at the other time.
+        towards : "forward" or "backward": it leads from one label's time to the next or the one before; None: it is of one time.
+        anti_aliased : drawn by the colour pass instead, by the configuration's filter.   at_last : there at the end of the last interval, too.
+
+    What it is
+        channels : 0 for (H, W), n for (H, W, n); None: either (H, W) or (H, W, 3).   dtype : None: any.
+
+    Files
+        forms : how it lies on disk; the first is always written.   stamps : file of times, a line per label; None: none.
+        shard : ending of its file in a shard; None: not there.
+
+    The reference
+        tolerance, judged_in, error … : as of :class:`View`."""
+
+    name: str
+    about: str
+    title: str = ""
+    unit: str = ""
+    kind: str = "scalar"
+    default: bool = False
+    off: str = ""
+
+    buffer: str | None = None
+    glsl: str | None = None
+    varyings: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
+    there: tuple[str, ...] = ()
+    towards: Towards | None = None
+    anti_aliased: bool = False
+    at_last: bool = False
+
+    channels: int | None = 0
+    dtype: Any = np.float32
+
+    stamps: str | None = None
+    shard: str | None = None
+
+    tolerance: float
+    judged_in: str = ""
+    error = staticmethod(grading.absolute)
+
+    @property
+    def heading(self) -> str:
+        return self.title or self.name
+
+    # ---- configuration -------------------------------------------------------------------------------------------
+
+    @property
+    def keys(self) -> Mapping[str, Key]:
+        """Its keys of ``labels:``. Several labels may share one: then it is the same object."""
+        return {self.name: Key(bool, Field(self.default, description=self.about))}
+
+    def asked(self, labels: LabelsConfig) -> bool:
+        """Whether ``labels:`` asks for it."""
+        return bool(getattr(labels, self.name))
+
+    @property
+    def said(self) -> str:
+        """Its name in Python calls, ``labels=["depth", …]``."""
+        return self.name
+
+    def ask(self, tree: dict[str, Any]) -> None:
+        """Asks for it in a tree of ``labels:``."""
+        tree[self.name] = True
+
+    # ---- the shader and the CPU ----------------------------------------------------------------------------------
+
+    def uniforms(self, at: Instant) -> Mapping[str, np.ndarray]:
+        """Values of the uniforms in ``glsl``, once a frame: name -> array whose first axis counts the scene's objects. Of matrices, (n, rows, columns)."""
+        return {}
+
+    def finish(self, drawn: Drawn) -> Any:
+        """The label's value, of ``channels`` and ``dtype``, from the buffers."""
+        raw = drawn.raw(self.name)
+        return np.ascontiguousarray(raw[..., : self.channels]) if self.channels else raw
+
+    def own(self, value: Any, height: int, width: int) -> Any:
+        """A copy of a value. Raises TypeError for one of another shape or kind of number."""
+        array = np.array(value)
+        shapes = [(height, width), (height, width, 3)] if self.channels is None else [(height, width, self.channels) if self.channels else (height, width)]
+        kind = "" if self.dtype is None else np.dtype(self.dtype).kind
+        if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):
+            said = f" {np.dtype(self.dtype)}" if kind else ""
+            raise TypeError(f"label '{self.name}': {array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{said}")
+        return array.astype(self.dtype, copy=False) if kind == "f" else array
+
+    # ---- files ---------------------------------------------------------------------------------------------------
+
+    @property
+    def forms(self) -> tuple[Form, ...]:
+        return (files.npy(self.name),)
+
+    def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
+        """Those of ``forms`` that ``labels:`` asks for; the label itself is asked for."""
+        return self.forms
+
+    def problem(self, value: Any) -> str | None:
+        """What cannot be in a value that was read back; None: nothing."""
+        return None
+
+    def agrees(self, one: Any, other: Any) -> bool:
+        """Whether two machines may have drawn these for one moment. True: a renderer may change every pixel."""
+        return True
+
+    # ---- the reference -------------------------------------------------------------------------------------------
+
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
+        """(H, W[, C]) float64: what it should be, of the float64 reference's hits; 0 or inf where nothing is hit, as ``finish`` has it."""
+        raise NotImplementedError
+
+    @property
+    def views(self) -> tuple[View, ...]:
+        """What the shader debugger shows and judges."""
+        return (View(self.name, self.heading, self.unit, self.kind, lambda value: value, self.reference, self.judged_in or self.unit,
+                     self.tolerance, self.error),)

@@ -1,0 +1,27 @@
+"""Which way the surface faces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.labels.label import Instant, Label
+
+
+class Normals(Label):
+    """(H, W, 3) float32 unit, camera axes (OpenCV), facing the camera; 0 where nothing is hit."""
+
+    name, about = "normals", "unit normals in camera axes, float32 .npy"
+    unit, kind = "camera axes", "unit"
+    buffer, varyings, channels = "RGBA32F", ("normal",), 3
+    judged_in, tolerance = "of a unit vector", 1e-3
+
+    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
+        return {"camera_from_local": at.T_cam_obj[:, :3, :3]}
+
+    def problem(self, value: np.ndarray) -> str | None:
+        # A mesh's own normals may be of no length, and are then no direction here either.
+        return None if (np.linalg.norm(value, axis=-1) < 1 + 1e-3).all() else "a normal longer than 1"
+
+    def reference(self, scene, frame) -> np.ndarray:
+        rotation = scene.camera.path.pose(frame.t_ns)[:3, :3]
+        return np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)

@@ -1,0 +1,26 @@
+"""How fast the surface moves in the image."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from blinkgl.labels import grading
+from blinkgl.labels.label import Instant, Label
+
+
+class Velocity(Label):
+    """(H, W, 2) float32 px/s at the label's time; 0 where nothing is hit."""
+
+    name, about = "velocity", "instantaneous image velocity, px/s, float32 .npy"
+    title, unit, kind = "velocity label", "px/s", "motion"
+    buffer, varyings, channels = "RG32F", ("local",), 2
+    judged_in, tolerance, error = "px per label interval", 1e-2, staticmethod(grading.motion_per_interval)
+
+    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
+        return {"rate": at.mvp_rate[:, [0, 1, 3]]}
+
+    def problem(self, value: np.ndarray) -> str | None:
+        return None if np.isfinite(value).all() else "a velocity that is no finite number"
+
+    def reference(self, scene, frame) -> np.ndarray:
+        return np.where(frame.hit[..., None], frame.velocity, 0.0)

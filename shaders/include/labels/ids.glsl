@@ -1,0 +1,7 @@
+// Instance id; 0: nothing hit.
+uniform uint instance_id;
+
+uint label_ids()
+{
+    return instance_id;
+}

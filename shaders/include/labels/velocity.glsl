@@ -1,0 +1,8 @@
+// Image velocity, px/s.
+#include "motion.glsl"
+uniform mat4x3 rate;
+
+vec2 label_velocity()
+{
+    return velocity(rate, local, image_size);
+}

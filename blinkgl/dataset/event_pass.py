@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from blinkgl.config.base import Config
 from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.timeline import TimelineConfig
 from blinkgl.dataset.clock import StageClock
 from blinkgl.errors import EventDataError
 from blinkgl.events import Emulator, Events, emulator_of, make_emulator
@@ -23,7 +23,7 @@ class EventPass:
 
     emulator : Emulator.   timeline : Timeline, with what it achieved in ``info()``.   frames : drawn so far."""
 
-    def __init__(self, timeline: Config, events: EmulatorConfig, renderer: Renderer, seed: int, clock: StageClock | None = None,
+    def __init__(self, timeline: TimelineConfig, events: EmulatorConfig, renderer: Renderer, seed: int, clock: StageClock | None = None,
                  window_ns: tuple[int, int] | None = None):
         self.renderer, self._clock = renderer, clock or StageClock()
         self.emulator: Emulator = make_emulator(events, renderer.height, renderer.width, seed, timeline.reconstruction)

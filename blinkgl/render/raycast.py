@@ -183,7 +183,7 @@ def _local_ray(axes, rx, ry, d):
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_tree(
     triangles: np.ndarray, face: np.ndarray, lower: np.ndarray, upper: np.ndarray, child: np.ndarray, count: np.ndarray, root: np.ndarray, first: np.ndarray, size: np.ndarray, cull: np.ndarray, extent: np.ndarray,
-    origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: float, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
+    origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: np.ndarray, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
 ) -> None:  # fmt: skip
     """Nearest hit of each ray through the hierarchy.
 
@@ -256,7 +256,7 @@ def nearest_tree(
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_exhaustive(
     triangles: np.ndarray, face: np.ndarray, lower: np.ndarray, upper: np.ndarray, child: np.ndarray, count: np.ndarray, root: np.ndarray, first: np.ndarray, size: np.ndarray, cull: np.ndarray, extent: np.ndarray,
-    origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: float, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
+    origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: np.ndarray, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
 ) -> None:  # fmt: skip
     """The slow twin of :func:`nearest_tree`: every triangle against every ray; the same arguments and answer."""
     d = np.empty(3)

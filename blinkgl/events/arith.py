@@ -45,7 +45,7 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (_F(c) for c in (
 @register_jitable
 def _log1p_reduced(f):
     """log(1 + f) for f in [sqrt(1/2) - 1, sqrt(2) - 1], float32, absolute error < 5e-8."""
-    p = f * _A8 + _A7
+    p = f * _A8 + _A7  # Horner: log(1 + f) = f + f^2 p(f), so that small f keep all their digits
     p = p * f + _A6
     p = p * f + _A5
     p = p * f + _A4
@@ -64,6 +64,7 @@ def log_q25(v: float) -> float:
     to its old level, a reference never drifts, and ties are decided by numbers rather than by rounding. In
     float32 the same four bytes would resolve 5e-7 at ln v = -6.
     """
+    # sqrt(1/2) taken off the bits, the exponent field changes at sqrt(1/2) 2^n instead of at 2^n: the reduced interval lies round 1.
     bits = _F(v).view(np.int32)
     exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)  # v = m 2^exponent with m in [sqrt(1/2), sqrt(2))
     f = _F(_I(bits - _I(exponent << _EXP23)).view(np.float32) - _F1)
@@ -95,6 +96,7 @@ _EXP_MIN_32, _BIAS_32 = _F(-87.0), _I(127)
 def exp_f32(v: float) -> float:
     """exp(v) for float32 v <= 80, relative error < 2e-7; below -87 it stays at exp(-87) = 1.6e-38."""
     v = np.maximum(v, _EXP_MIN_32)
+    # e^v = 2^n e^r with |r| <= ln(2)/2. n ln 2 in two parts (Cody and Waite): the first has so few bits that n times it is exact.
     n = _F(_F(v * _LOG2E_32 + _ROUND_32) - _ROUND_32)
     r = _F(_F(v - n * _LN2_HI_32) - n * _LN2_LO_32)
     p = r * _E32_6 + _E32_5
@@ -103,7 +105,7 @@ def exp_f32(v: float) -> float:
     p = p * r + _E32_2
     p = p * r + _E32_1
     p = p * r + _E32_0
-    return _F(p * _I((_I(n) + _BIAS_32) << _EXP23).view(np.float32))
+    return _F(p * _I((_I(n) + _BIAS_32) << _EXP23).view(np.float32))  # 2^n written as an exponent field
 
 
 # --- double precision ------------------------------------------------------------------------------------
@@ -120,7 +122,7 @@ def log_f64(v: float) -> float:
     bits = _D(v).view(np.int64)
     exponent = _L(_L(bits - _SQRT_HALF_BITS_64) >> _EXP52)
     m = _L(bits - _L(exponent << _EXP52)).view(np.float64)
-    s = (m - _D1) / (m + _D1)
+    s = (m - _D1) / (m + _D1)  # ln m = 2 artanh(s) = 2 s + s^3 p(s^2): odd, so half as many terms
     z = s * s
     p = z * _B6 + _B5
     p = p * z + _B4

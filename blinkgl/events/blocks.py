@@ -13,18 +13,21 @@ from blinkgl.events.packing import JIT
 
 @numba.njit(**JIT)
 def copy_block(source: np.ndarray, target: np.ndarray) -> None:
+    """``target[:] = source``."""
     for i in range(source.size):
         target[i] = source[i]
 
 
 @numba.njit(**JIT)
 def scale_block(frame: np.ndarray, scale: float, out: np.ndarray) -> None:
+    """``out[:] = frame * scale``."""
     for i in range(frame.size):
         out[i] = frame[i] * scale
 
 
 @numba.njit(**JIT)
 def lookup_block(codes: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
+    """``out[:] = table[codes]``."""
     for i in range(codes.size):
         out[i] = table[codes[i]]
 

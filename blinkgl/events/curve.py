@@ -82,9 +82,9 @@ def curve_time(y: float, alpha: float, beta: float, low: float) -> float:
     bracket that shrinks at every step, bisection where it would leave it; error 1e-15 where the curve is not flat."""
     if y >= 1.0:
         return 1.0
-    a, b = alpha + beta - 2.0, 3.0 - 2.0 * alpha - beta
+    a, b = alpha + beta - 2.0, 3.0 - 2.0 * alpha - beta  # y(s) = ((a s + b) s + alpha) s
     high = 1.0
-    s = min(max(y, low), 1.0)
+    s = min(max(y, low), 1.0)  # where the straight line meets it
     for _ in range(100):
         value = ((a * s + b) * s + alpha) * s - y
         if value > 0.0:
@@ -92,7 +92,7 @@ def curve_time(y: float, alpha: float, beta: float, low: float) -> float:
         else:
             low = s
         slope = (3.0 * a * s + 2.0 * b) * s + alpha
-        new = 0.5 * (low + high)
+        new = 0.5 * (low + high)  # unless Newton's step stays inside
         if slope > 0.0:
             newton = s - value / slope
             if low <= newton <= high:

@@ -36,6 +36,7 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 
 @register_jitable
 def decay(k: float) -> tuple[float, float]:
     """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
+    # ``select`` computes both sides: each is held to the range in which it is right.
     small = np.minimum(k, _HALF)
     p = _gentle_growth(small)
     large = np.maximum(k, _HALF)
@@ -57,6 +58,8 @@ def _gentle_growth(k):
 @register_jitable
 def relax(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
     """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
+    # The low-pass y' = (x - y) / tau with x on a straight line: lag(1) = lag(0) e^-k - (x1 - x0) (1 - e^-k) / k. Its corner frequency is
+    # f_c (I + 20) / 275 (v2e, ``low_pass_filter``), at the interval's mean intensity.
     a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
     return lag * a - (now - before) * g
 
@@ -79,7 +82,7 @@ def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tupl
     """
     if k < 0:
         return base, drift + dx, 0.0
-    behind = dx / k
+    behind = dx / k  # how far a low-pass stays behind a ramp in the end
     return base - behind, drift + dx, lag + behind
 
 
@@ -99,7 +102,7 @@ def crossing_fraction(start: float, target: float, polarity: int, c: float, rise
     1e-6 of the interval unless the curve is flat there."""
     if k < 0:
         return min(max((target - c) / rise, start), 1.0)
-    sign = 1.0 if polarity else -1.0
+    sign = 1.0 if polarity else -1.0  # an OFF crossing is an ON crossing of -z
     low, high = start, 1.0
     e_low = 1.0 if start == 0.0 else fall_f64(k * start)
     f_low = sign * (c + rise * start + fall * e_low - target)
@@ -110,9 +113,9 @@ def crossing_fraction(start: float, target: float, polarity: int, c: float, rise
     v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
     width, height = high - low, f_high - f_low
     u = -f_low / height
-    s = low + width * u
+    s = low + width * u  # where the chord meets the level
     if v_low > 0 and v_high > 0:
-        stretch = height / (width * v_low * v_high)
+        stretch = height / (width * v_low * v_high)  # s as a cubic of z: slopes 1 / z' at both ends
         guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
         if 0.0 < guess < 1.0:
             s = low + width * guess
@@ -151,6 +154,7 @@ def shot_factor(intensity: float) -> float:
 def shot_draw(seed: int, block: int, index: int, rate_per_ns: float) -> tuple[int, float]:
     """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
     u, v = uniform2(seed, block, _SHOT, index * _U2)
+    # Exponential waiting time, at least 1 ns so that the clock goes on; 1e18 ns are 30 years.
     return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), v
 
 
@@ -172,7 +176,7 @@ def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: flo
 @register_jitable
 def next_noise(noise: float, k: float, size: float, normal: float) -> float:
     """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
-    a, _ = decay(k)
+    a, _ = decay(k)  # Ornstein-Uhlenbeck: n(k) = n e^-k + size sqrt(1 - e^-2k) N(0, 1), of any step
     return noise * a + size * np.sqrt(_ONE - a * a) * normal
 
 

@@ -148,7 +148,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
 
     def variants(name: str) -> tuple[str, ...]:
         return tuple(sorted({"+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
-                             for program, defines in gl.shaders._programs if program == name}))
+                             for program, defines in gl.shaders.compiled if program == name}))
 
     timeline, rejected = config.timeline, 1.0
     luminance = np.empty((renderer.height, renderer.width), np.float32)
@@ -218,6 +218,6 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     if config.timeline.reconstruction != "hermite":
         add("rates of change in the event frames", f"timeline.reconstruction: {config.timeline.reconstruction}")
     for name, value in config.events.model_dump().items():
-        if value in (0, 0.0, False) and name not in ("seed",):
+        if value in (0, 0.0, False) and name != "seed":
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
     add("shadows, inter-reflection, motion blur, depth of field", "BlinkGL does not model them")

@@ -188,6 +188,11 @@ class ShaderLoader:
             self._programs[key] = self._compile(name, defines)
         return self._programs[key]
 
+    @property
+    def compiled(self) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
+        """(file, its defines as (name, value) pairs) of every program there is so far."""
+        return tuple(self._programs)
+
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in STAGES}
         try:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 from dataclasses import replace
 from importlib import resources
@@ -25,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import PinHole, focal_length
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
@@ -36,8 +38,9 @@ from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.textures import procedural_texture
-from blinkgl.scene.types import Camera, Material, Mesh, Part, Scene, SceneObject
+from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject
 
 SECOND = 1_000_000_000
 
@@ -73,10 +76,8 @@ def probe_scene(kind: str, width: int, height: int, lit: bool = False) -> Scene:
     level = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     keys = np.linspace(0, 2 * SECOND, 4).astype(np.int64)
     turns = Rotation.concatenate([level * Rotation.from_rotvec(rng.normal(0, 0.05, 3)) for _ in keys])
-    focal = 0.5 * width / np.tan(np.radians(30))
-    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2,
-                    SplinePath(keys, rng.normal(0, 0.2, (4, 3)), turns))
-    return Scene(tuple(objects), camera, 0, 2 * SECOND)
+    camera = PinHole.centred(width, height, focal_length(width, math.radians(60)))
+    return Scene(tuple(objects), Rig.alone(camera, SplinePath(keys, rng.normal(0, 0.2, (4, 3)), turns)), 0, 2 * SECOND)
 
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -85,9 +86,8 @@ PLAIN = RenderConfig(image_antialiasing="none")
 def event_pass(gl, kind: str, width: int, height: int, lit: bool, repeat: int) -> dict:
     """Frames/s of Renderer.luminance over moments spread across two seconds."""
     with Renderer(gl, probe_scene(kind, width, height, lit), PLAIN) as renderer:
-        out = np.empty((height, width), np.float32)
         moment = iter(range(1 << 30))
-        timed = bench.seconds(lambda: renderer.luminance(next(moment) * 7_000_000 % (2 * SECOND), out=out), repeat, warm_up=8)
+        timed = bench.seconds(lambda: renderer.luminance(next(moment) * 7_000_000 % (2 * SECOND)).view(), repeat, warm_up=8)
         floor = FLOOR.get((kind, width, height), (None, None))
         fps = 1 / timed["median"]
         return {"scene": kind, "lit": lit, "width": width, "height": height, "triangles": renderer.triangles, "fps": fps,
@@ -99,19 +99,19 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     """Full redraw against redrawing only what moves: luminance and ESIM together, the same events."""
     scene = probe_scene(kind, 640, 480)
     objects = tuple(o if i < movers else replace(o, path=StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
-    scene = replace(scene, objects=objects, camera=replace(scene.camera, path=StaticPath(scene.camera.path.pose(0))))
+    scene = replace(scene, objects=objects).with_path(StaticPath(scene.camera_path.pose(0)))
     result = {"scene": kind, "movers": movers}
     events = {}
     for name in ("full redraw", "what moves"):
-        with Renderer(gl, scene, PLAIN) as renderer:
-            renderer._still = name == "what moves"  # noqa: SLF001 - what is measured cannot be switched from outside
-            emulator, out, moment = make_emulator(EsimConfig(), 480, 640, seed=1), np.empty((480, 640), np.float32), iter(range(1 << 30))
+        with Renderer(gl, scene, PLAIN, whole=name == "full redraw") as renderer:
+            emulator, moment, last = make_emulator(EsimConfig(), 480, 640, seed=1), iter(range(1 << 30)), [None]
             made = events[name] = []
 
             def frame():
                 t = next(moment) * 2_000_000
-                renderer.luminance(t, out=out)
-                made.append(len(emulator.step(out, t, renderer.changed_rows)))
+                image = renderer.luminance(t).read()
+                made.append(len(emulator.step(image.view(), t, image.rows_changed_since(last[0]))))
+                last[0] = image
 
             result[name] = 1 / bench.seconds(frame, repeat, warm_up=8)["median"]
     assert events["full redraw"] == events["what moves"]
@@ -147,7 +147,7 @@ def peer(gl, quick: bool) -> dict:
             renderer.labels(t, LabelRequest("images", "depth"))
 
         ours = bench.seconds(both, 10 if quick else 40)["median"]
-        luminance = bench.seconds(lambda: renderer.luminance(next(moments)), 10 if quick else 40)["median"]
+        luminance = bench.seconds(lambda: renderer.luminance(next(moments)).read(), 10 if quick else 40)["median"]
     return {"pyrender_s_per_frame": theirs["seconds_per_frame"], "blinkgl_colour_depth_s_per_frame": ours,
             "blinkgl_luminance_s_per_frame": luminance, "ratio_colour_depth": theirs["seconds_per_frame"] / ours,
             "ratio_luminance": theirs["seconds_per_frame"] / luminance}

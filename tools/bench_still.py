@@ -38,26 +38,25 @@ TURN = 10
 def one_mover(kind: str, coverage: float) -> Scene:
     """The probe scene at rest, but for a ball that crosses the image in front of the others."""
     scene = probe_scene(kind, WIDTH, HEIGHT)
-    camera = scene.camera
-    at = camera.path.pose(0)
+    at = scene.camera_path.pose(0)
+    focal = scene.camera.jacobian(np.array([0.0, 0.0, 1.0]))[0, 0]  # px per unit and unit of depth
     mover = scene.objects[0]
     radius = float(np.linalg.norm(mover.parts[0].mesh.vertices, axis=1).max())
-    distance = 2 * radius * camera.fx / np.sqrt(coverage * WIDTH * HEIGHT)
-    speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / camera.fx  # units per second, across the image
+    distance = 2 * radius * focal / np.sqrt(coverage * WIDTH * HEIGHT)
+    speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / focal  # units per second, across the image
     seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]
     path = KeyframePath([0, 2 * SECOND], [seen(-speed / 4), seen(speed * 7 / 4)], [Rotation.identity().as_quat()] * 2, interpolation="linear")
     objects = tuple(replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
-    return replace(scene, objects=objects, camera=replace(camera, path=StaticPath(at)))
+    return replace(scene, objects=objects).with_path(StaticPath(at))
 
 
 class Way:
     """One way of drawing, from the scene to events; seconds of each stage and frame."""
 
     def __init__(self, gl, scene: Scene, still: bool):
-        self.renderer = Renderer(gl, scene, PLAIN)
-        self.renderer._still = still  # noqa: SLF001 - what is measured cannot be switched from outside
+        self.renderer = Renderer(gl, scene, PLAIN, whole=not still)
         self.emulator = make_emulator(EsimConfig(), HEIGHT, WIDTH, seed=1)
-        self.frame = np.empty((HEIGHT, WIDTH), np.float32)
+        self.frame = None
         self.events: list[Events] = []
         self.stages: list[tuple[float, ...]] = []
         self.covered: list[float] = []
@@ -66,13 +65,14 @@ class Way:
         stats = self.renderer.stats
         drawn, read = stats.render_s, stats.readback_s
         wall, cpu = time.perf_counter(), time.process_time()
-        self.renderer.luminance(t_ns, out=self.frame)
+        before, self.frame = self.frame, self.renderer.luminance(t_ns).read()
+        luminance = self.frame.view()
         done = time.perf_counter()
-        self.events.append(self.emulator.step(self.frame, t_ns, self.renderer.changed_rows))
+        self.events.append(self.emulator.step(luminance, t_ns, self.frame.rows_changed_since(before)))
         end = time.perf_counter()
         self.stages.append((stats.render_s - drawn, stats.readback_s - read, end - done, end - wall, time.process_time() - cpu))
-        if self.renderer.changed is not None:
-            self.covered.append(sum(r.area for r in self.renderer.changed) / (WIDTH * HEIGHT))
+        if self.frame.changed is not None:
+            self.covered.append(sum(r.area for r in self.frame.changed) / (WIDTH * HEIGHT))
 
 
 STAGES = ("draw", "read-back", "kernel", "all", "cpu")

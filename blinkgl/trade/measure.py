@@ -16,6 +16,7 @@ import numpy as np
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
+from blinkgl.gl import GLContext
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
@@ -111,7 +112,7 @@ class Level:
 class Bench:
     """One sequence at one image size: its scenes, its clip, its judged pixels."""
 
-    def __init__(self, gl, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
+    def __init__(self, gl: GLContext, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
         self.gl, self.options, self.say = gl, options, say
         if options.reference == "cycles":
             from blinkgl.tools import peer_cycles
@@ -209,7 +210,7 @@ class Bench:
         count = max(2, round(self.duration_s / 0.005) + 1)
         times = np.linspace(self.t0_ns, self.t1_ns, count).astype(np.int64)
         with Renderer(self.gl, self.scene, self.base.render) as renderer:
-            maps = [np.hypot(*np.moveaxis(renderer.velocity(int(t)), -1, 0)) for t in times]
+            maps = [np.hypot(*np.moveaxis(renderer.velocity(int(t)).read(), -1, 0)) for t in times]
         return SpeedMaps(times // 1000, np.stack(maps))
 
     def judge(self, results: list[Measured], speeds: SpeedMaps) -> list[Level]:
@@ -259,10 +260,4 @@ def _sized(config: SequenceConfig, factor: float) -> list[str]:
     """Overrides that shrink the image, its field of view kept."""
     if factor == 1:
         return []
-    camera = config.camera
-    scaled = {"width": max(1, round(camera.width * factor)), "height": max(1, round(camera.height * factor)), "near": camera.near}
-    for key in ("cx", "cy"):
-        if (value := getattr(camera, key)) is not None:
-            scaled[key] = (value + 0.5) * factor - 0.5
-    scaled |= {"focal": camera.focal * factor} if camera.focal is not None else {"fov": camera.fov} if camera.fov is not None else {}
-    return ["camera=" + json.dumps(scaled)]
+    return ["camera=" + json.dumps(config.camera.scaled(factor))]

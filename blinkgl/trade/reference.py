@@ -8,7 +8,6 @@ regular grid; at that rate mip maps are hardly touched any more, so this converg
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -17,9 +16,11 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
+from blinkgl.gl import GLContext
+from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.still import Rectangle
-from blinkgl.scene.types import Camera, Scene
+from blinkgl.render.statistics import largest_speed
+from blinkgl.scene.types import Scene
 from blinkgl.timeline.sampling import displacement_times
 from blinkgl.trade.metrics import masked
 
@@ -51,11 +52,11 @@ class FineTiles:
 
     cost = None
 
-    def __init__(self, gl, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
+    def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._tiles, self._scale = tiles, scale
         self._shape = (scene.camera.height, scene.camera.width)
-        self._cameras = [_zoomed(scene.camera, tile, scale) for tile in tiles]
-        self._renderer = Renderer(gl, replace(scene, camera=self._cameras[0]), RenderConfig())
+        self._cameras = [scene.camera.part(r.x0, r.y0, r.x1, r.y1, scale) for r in tiles]
+        self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), RenderConfig())
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
     def __enter__(self) -> FineTiles:
@@ -69,7 +70,7 @@ class FineTiles:
         for t_ns in times:
             for r, camera in zip(self._tiles, self._cameras):
                 self._renderer.look_through(camera)
-                self._renderer.luminance(t_ns, out=self._fine)
+                self._renderer.luminance(t_ns).read(out=self._fine)
                 # INTER_AREA at a whole-numbered ratio is the mean.
                 frame[r.y0:r.y1, r.x0:r.x1] = cv2.resize(self._fine, (r.x1 - r.x0, r.y1 - r.y0), interpolation=cv2.INTER_AREA)
             yield frame
@@ -79,7 +80,7 @@ class FineTiles:
         largest = 0.0
         for camera in self._cameras:
             self._renderer.look_through(camera)
-            largest = max(largest, self._renderer.speed(t_ns, self._scale) / self._scale)
+            largest = max(largest, largest_speed(self._renderer.motion(t_ns, self._scale).read()) / self._scale)
         return largest
 
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
@@ -95,10 +96,3 @@ def reference_events(source: FrameSource, times: Iterable[int], config: Emulator
     camera, times = EventCamera(config, None, height, width, seed), list(times)
     chunks = [masked(events, mask) for _, events in emulate(map(EventFrame, times, source(times)), camera)]
     return Events.concatenate(chunks), camera.frames
-
-
-def _zoomed(camera: Camera, tile: Rectangle, scale: int) -> Camera:
-    """The camera of one rectangle, ``scale`` times finer. Pixel centres are at integers: pixel x is [x - 0.5, x + 0.5)."""
-    place = lambda c, start: (c - start + 0.5) * scale - 0.5
-    return replace(camera, width=(tile.x1 - tile.x0) * scale, height=(tile.y1 - tile.y0) * scale, fx=camera.fx * scale, fy=camera.fy * scale,
-                   cx=place(camera.cx, tile.x0), cy=place(camera.cy, tile.y0))

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from blinkgl.render.still import Rectangle
+from blinkgl.gl import GLContext
+from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.types import Scene
 from blinkgl.tools import peer_cycles
 from blinkgl.trade.reference import FineTiles
@@ -19,7 +20,7 @@ class TracedFrames:
 
     cost : seconds per frame, filled as frames are drawn. Raises BlinkGLError when Blender is not there or stops."""
 
-    def __init__(self, gl, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
+    def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._motion = FineTiles(gl, scene, tiles, 1)
         self.cost = peer_cycles.Cost()
         self._frames = peer_cycles.source(scene, peer_cycles.CyclesSettings(samples=scale * scale), self.cost)

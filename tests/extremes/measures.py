@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelFrame, LabelRequest, Renderer
-from tests.render.render_scenes import LEVEL, SECOND, camera, drift
+from tests.render.render_scenes import LEVEL, SECOND, drift, rig
 
 FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 MOTION = LabelRequest("depth", "ids", "velocity", "flow_forward")
@@ -48,13 +48,13 @@ def length(v) -> np.ndarray:
 
 def moving_camera(near=0.05, step=1.0, **keys):
     turn = Rotation.from_rotvec(np.array([0.02, -0.01, 0.03]) * min(step, 1.0))
-    return camera(near=near, path=drift((0, 0, 0), np.array([0.02, 0.01, -0.01]) * step, LEVEL, LEVEL * turn), **keys)
+    return rig(near=near, path=drift((0, 0, 0), np.array([0.02, 0.01, -0.01]) * step, LEVEL, LEVEL * turn), **keys)
 
 
 def compare(gl, world, t_ns: int = 0, to_ns: int = SECOND) -> Errors:
     true = reference.render(world, t_ns, forward_ns=to_ns)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        frame, luminance = renderer.labels(t_ns, MOTION, to_ns), renderer.luminance(t_ns)
+        frame, luminance = renderer.labels(t_ns, MOTION, to_ns), renderer.luminance(t_ns).read()
     clear = true.hit & ~reference.silhouette_band(true.instance, true.depth)
     wrong = clear & (frame.ids != true.instance)
     np.testing.assert_array_equal(frame.forward.valid[clear & ~wrong], true.forward.valid[clear & ~wrong])

@@ -20,13 +20,13 @@ from tests.extremes.measures import FACING, MOTION, compare, length, moving_came
 from tests.render.render_scenes import (
     LEVEL,
     SECOND,
-    camera,
     cube,
     curve,
     drift,
     mixed_scene,
     moved_scene,
     quad,
+    rig,
     scene,
     sphere,
     still,
@@ -47,7 +47,7 @@ def movers(px: float):
             thing("ball", 3, sphere(1.0, 4), drift((0.2, 4, 0.1), (0.2 - s, 4 + s, 0.1 + s / 2), turn, turn * spin)),
             thing("wall", 4, quad(30, 30, 8), drift((0, 9, 0), (s, 9 - 0.3 * s, 0), FACING)),
         ],
-        camera(path=drift((0, 0, 0), (0.3 * s, 0, 0.2 * s), LEVEL, pan)),
+        rig(path=drift((0, 0, 0), (0.3 * s, 0, 0.2 * s), LEVEL, pan)),
     )  # fmt: skip
 
 
@@ -87,7 +87,7 @@ def test_intervals_from_a_nanosecond_to_100_seconds(gl, promise, interval_ns):
     seconds = interval_ns / SECOND
     pan = LEVEL * Rotation.from_rotvec([0.0, 0.01, 0.02])
     path = drift((0, 4, 0), (1.0, 4.5, -0.4), FACING, FACING * Rotation.from_rotvec([0.1, 0.2, 0.1]), seconds=max(seconds, 1.0))
-    world = scene([thing("wall", 1, quad(9, 9, 4), path)], camera(path=drift((0, 0, 0), (0.1, 0, 0), LEVEL, pan, max(seconds, 1.0))))
+    world = scene([thing("wall", 1, quad(9, 9, 4), path)], rig(path=drift((0, 0, 0), (0.1, 0, 0), LEVEL, pan, max(seconds, 1.0))))
     e = compare(gl, world, 0, interval_ns)
     name = f"flow over {seconds:g} s"
     promise(f"{name}: largest, relative", e.worst, WORST)
@@ -108,7 +108,7 @@ def test_a_clock_at_a_million_seconds_changes_no_bit(gl, promise):
     for t0 in (0, late):
         with Renderer(gl, world(t0), RenderConfig()) as renderer:
             t = t0 + 123_456_789
-            both.append((renderer.labels(t, MOTION, t + 1), renderer.luminance(t)))
+            both.append((renderer.labels(t, MOTION, t + 1), renderer.luminance(t).read()))
     (a, la), (b, lb) = both
     for one, other in ((a.forward.flow, b.forward.flow), (a.velocity, b.velocity), (a.depth, b.depth), (la, lb)):
         np.testing.assert_array_equal(one, other)
@@ -124,7 +124,7 @@ def test_a_million_pixels_per_second(gl, promise, speed):
     promise(f"{speed:g} px/s: velocity, largest, relative", e.velocity.max(), WORST)
     promise(f"{speed:g} px/s: flow over a microsecond, largest, relative", e.worst, WORST)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        fastest = lambda t: largest_speed(renderer.velocity(t, 4))
+        fastest = lambda t: largest_speed(renderer.velocity(t, 4).read())
         ten_px = int(10 / speed * SECOND)
         times = np.array(list(displacement_times(0.5, 1, 20_000_000, 0, ten_px, fastest)))
         slow = np.array(list(displacement_times(0.5, 100_000, 20_000_000, 0, 400_000, fastest)))

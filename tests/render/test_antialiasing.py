@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
+from blinkgl.camera import PinHole
 from blinkgl.config.base import validate
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.render.antialiasing import ANTIALIASING, samples_of
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene.types import Camera, Material, Scene, Texture
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Material, Scene, Texture
 from render_scenes import LEVEL, SECOND, mesh, mixed_scene, quad, scene, still, thing
 
 FACING = LEVEL.as_matrix() @ np.diag([1.0, -1.0, -1.0])  # a quad's +z towards the camera at the origin
@@ -24,7 +26,7 @@ def half_plane(angle: float, offset: float, size: int = 48) -> tuple[Scene, np.n
     depth = 10.0
     points = np.column_stack([corners * depth / size, np.full(4, depth)])  # camera axes; fx = size
     plane = thing("edge", 1, mesh(points, [[0, 1, 2], [0, 2, 3]]), still(), Material(unlit=True, double_sided=True))
-    camera = Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2, still())
+    camera = Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still())
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     return Scene((plane,), camera, 0, SECOND), half_plane_area(normal, offset - x * normal[0] - y * normal[1])
 
@@ -56,7 +58,7 @@ def test_an_edge_is_as_bright_as_it_covers_the_pixel(gl, antialiasing):
         for offset in (0.0, 0.21, 0.37):
             world, coverage = half_plane(angle, offset)
             with Renderer(gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing=antialiasing)) as renderer:
-                luminance, colour = renderer.luminance(0), renderer.colour(0)
+                luminance, colour = renderer.luminance(0).read(), renderer.colour(0).read()
             np.testing.assert_allclose(luminance * count, np.rint(luminance * count), atol=1e-5)
             np.testing.assert_allclose(colour[..., 1], luminance, atol=1e-6)
             assert (luminance[coverage < 1e-9] == 0).all() and (luminance[coverage > 1 - 1e-9] == 1).all()
@@ -66,7 +68,7 @@ def test_an_edge_is_as_bright_as_it_covers_the_pixel(gl, antialiasing):
     assert np.abs(errors).max() < worst
     assert abs(errors.mean()) < 0.01
     with Renderer(gl, world, RenderConfig()) as renderer:
-        single = (renderer.luminance(0) - coverage)[band]
+        single = (renderer.luminance(0).read() - coverage)[band]
     assert errors.std() < 0.62 * single.std()
 
 
@@ -84,7 +86,7 @@ def test_labels_are_never_filtered(gl):
     frames = []
     for antialiasing in ("none", "msaa4", "ssaa4"):
         with Renderer(gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing="msaa4")) as renderer:
-            renderer.luminance(0)
+            renderer.luminance(0).read()
             frames.append(renderer.labels(0, request, SECOND // 10))
     for other in frames[1:]:
         np.testing.assert_array_equal(frames[0].ids, other.ids)
@@ -103,7 +105,7 @@ def stripes(period_texels: int, distance: float, size: int = 64) -> Scene:
     flat = quad(32.0, 32.0)
     flat = type(flat)(flat.vertices, flat.faces, flat.normals, (flat.vertices[:, :2] * 64 / 1024).astype(np.float32))
     body = thing("stripes", 1, flat, still((0, distance, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(image), unlit=True, double_sided=True))
-    return scene([body], Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2, still((0, 0, 0), LEVEL)))
+    return scene([body], Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still((0, 0, 0), LEVEL)))
 
 
 @pytest.mark.parametrize("bias", [-2.0, -1.0, 0.0, 1.0])
@@ -113,7 +115,7 @@ def test_mip_bias_moves_the_level_by_that_much(gl, bias):
     contrast = {}
     for name, scene_distance, config in (("biased", distance, RenderConfig(mip_bias=bias)), ("plain", distance, RenderConfig())):
         with Renderer(gl, stripes(period, scene_distance), config) as renderer:
-            contrast[name] = float(renderer.luminance(0)[8:-8, 8:-8].std())
+            contrast[name] = float(renderer.luminance(0).read()[8:-8, 8:-8].std())
     expected = {}
     for level in (0, 1, 2, 3, 4):  # the texture's own levels, sampled by hand at the pixels' centres
         n = 2**level
@@ -129,9 +131,9 @@ def test_four_taps_of_a_linear_texture_are_one(gl):
     """The mean of four places around the centre is the value at the centre where the texture is linear, and unlit flat colours do not change."""
     ramp = np.repeat(np.linspace(0.1, 0.9, 256, dtype=np.float32)[None, :, None], 256, 0).repeat(3, 2)
     body = thing("ramp", 1, quad(1.0, 1.0), still((0, 2.0, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(ramp), unlit=True, double_sided=True))
-    world = scene([body], Camera(64, 64, 150, 150, 31.5, 31.5, still((0, 0, 0), LEVEL)))
+    world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
     with Renderer(gl, world, RenderConfig()) as one, Renderer(gl, world, RenderConfig(antialiasing="taps4")) as four:
-        np.testing.assert_allclose(four.luminance(0)[8:-8, 8:-8], one.luminance(0)[8:-8, 8:-8], atol=2e-3)
+        np.testing.assert_allclose(four.luminance(0).read()[8:-8, 8:-8], one.luminance(0).read()[8:-8, 8:-8], atol=2e-3)
 
 
 def test_four_taps_are_nearer_to_the_finer_image(gl):
@@ -140,7 +142,7 @@ def test_four_taps_are_nearer_to_the_finer_image(gl):
     images = {}
     for antialiasing in ("none", "taps4", "ssaa4"):
         with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
-            images[antialiasing] = renderer.luminance(0)
+            images[antialiasing] = renderer.luminance(0).read()
     error = {name: float(np.sqrt(np.mean((image - images["ssaa4"]) ** 2))) for name, image in images.items()}
     assert error["taps4"] < 0.6 * error["none"]
 
@@ -174,11 +176,11 @@ def test_anisotropy_keeps_stripes_that_run_into_the_distance(gl, antialiasing, b
     image = np.zeros((64, 64, 3), np.float32)
     image[:, (np.arange(64) // 8) % 2 == 0] = 1.0
     ground = thing("ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True))
-    world = scene([ground], Camera(96, 64, 90.0, 90.0, 47.5, 8.0, still(rotation=LEVEL)))
+    world = scene([ground], Rig.alone(PinHole(96, 64, 90.0, 90.0, 47.5, 8.0), still(rotation=LEVEL)))
     contrast = {}
     for anisotropy in (1.0, 4.0):
         config = RenderConfig(anisotropy=anisotropy, antialiasing=antialiasing, image_antialiasing="none")
         with Renderer(gl, world, config) as renderer:
-            contrast[anisotropy] = renderer.luminance(0)[14].std(), renderer.colour(0)[14, :, 1].std()
+            contrast[anisotropy] = renderer.luminance(0).read()[14].std(), renderer.colour(0).read()[14, :, 1].std()
     assert contrast[1.0][0] < blurred and contrast[1.0][1] < 0.01
     assert contrast[4.0][0] > 0.3 and contrast[4.0][1] > 0.3

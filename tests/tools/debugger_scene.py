@@ -78,7 +78,7 @@ _UV = "float luminance = texture(albedo, uv).r;"
 LOOKUP_MISTAKES = {
     # name: ([(file, right, wrong), …], the first buffer that is wrong, words of the suspicion, the objects)
     "noperspective varying": (
-        [("luminance.glsl", "out vec2 uv;", "noperspective out vec2 uv;"), ("luminance.glsl", "in vec2 uv;", "noperspective in vec2 uv;")],
+        [("include/vertex.glsl", "out vec2 uv;", "noperspective out vec2 uv;"), ("include/vertex.glsl", "in vec2 uv;", "noperspective in vec2 uv;")],
         "luminance_uv", "without perspective", {"floor"}),
     "sRGB decoded twice": (
         [("label.glsl", "radiance *= texture(albedo, uv).rgb;", "radiance *= pow(texture(albedo, uv).rgb, vec3(2.2));")],
@@ -116,6 +116,6 @@ class LatePath:
 def with_stale_pose(scene, name: str, late_ns: int):
     """The scene with one object (or "camera") where it was ``late_ns`` ago."""
     if name == "camera":
-        return replace(scene, camera=replace(scene.camera, path=LatePath(scene.camera.path, late_ns)))
+        return scene.with_path(LatePath(scene.rig.path, late_ns))
     late = [replace(o, path=LatePath(o.path, late_ns)) if o.name == name else o for o in scene.objects]
     return replace(scene, objects=tuple(late))

@@ -4,10 +4,10 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-KERNELS_ALONE = {"tools/bench_events.py", "tools/bench_load.py"}
+KERNELS_ALONE = {"tools/bench_events.py", "tools/bench_load.py", "tools/draws.py"}
 THE_DOOR = {"blinkgl/front/sensors.py"}  # hands an emulator to a person who steps it
 OWN = {"make_emulator": {"blinkgl/events/camera.py", "blinkgl/events/table.py", "blinkgl/events/__init__.py"} | KERNELS_ALONE | THE_DOOR,
-       "Readout": {"blinkgl/events/camera.py"}, "make_timeline": {"blinkgl/sequence/rendered.py", "blinkgl/timeline/__init__.py"}}
+       "Readout": {"blinkgl/events/camera.py", "tools/draws.py"}, "make_timeline": {"blinkgl/sequence/rendered.py", "blinkgl/timeline/__init__.py"}}
 
 
 def test_nobody_else_makes_an_emulator_a_read_out_or_a_timeline():

@@ -74,8 +74,9 @@ def _examples(examples: list[Example]) -> str:
     for e in examples:
         pictures = "".join(f'<img alt="{label}" src="{_picture(array)}">' if array is not None else "<span class=none>no frame</span>"
                            for label, array in (("frame", e.image), ("events", e.events), ("flow", e.flow)))
+        pictures += "".join(f'<span><img alt="{escape(title)}" src="{_picture(array)}"><small>{escape(title)}</small></span>' for title, array in e.others)
         rows.append(f"<figure><div class=triple>{pictures}</div><figcaption><b>{escape(e.name)}</b> {escape(e.caption)}</figcaption></figure>")
-    return ("<h2>Examples</h2><p class=dim>Frame, events (ON blue, OFF red) and optical flow (hue is direction, saturation is speed) of one label each.</p>"
+    return ("<h2>Examples</h2><p class=dim>Frame, events (ON blue, OFF red) and optical flow (hue is direction, saturation is speed) of one label each, then the other labels that there are.</p>"
             f"<div class=figures>{''.join(rows)}</div>")
 
 

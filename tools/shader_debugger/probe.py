@@ -12,8 +12,6 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment
 
-PX = ("flow_forward", "flow_backward")
-
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
     """Largest |gpu - ref| in units of float32's spacing at ref (per component); inf where one is not finite."""
@@ -62,12 +60,12 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
     g, r = gpu[name][y, x], ref[name][y, x]
     row = {"name": name, "title": PASSES[name].title, "unit": PASSES[name].unit, "gpu": g.tolist(), "reference": r.tolist(),
            "error": None, "error_unit": "", "ulps": None, "ok": None, "note": ""}
-    if g.dtype == bool or name in ("id", "triangle"):
+    if PASSES[name].kind in ("mask", "ids"):
         row |= {"error": float(g != r), "error_unit": "mismatch"}
     else:
         row["ulps"] = ulps(g, r)
         row |= {"error": float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if row["ulps"] else 0.0,
-                "error_unit": "px" if name in PX else PASSES[name].unit}
+                "error_unit": PASSES[name].unit}
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])

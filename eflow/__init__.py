@@ -1,0 +1,6 @@
+"""Optical flow from events: networks, training, scores. Reads what ``blinkgl.io`` wrote; never imports render or scene.
+
+In:    data sets, a YAML of eflow.config.
+Out:   a trained network, its scores, files for benchmarks.
+Start: train.py; evaluate.py, infer.py, cli.py.
+"""

@@ -119,11 +119,6 @@ def _guarded(check: Callable[[], list[str]]) -> list[str]:
         return [f"cannot be checked: {type(error).__name__}: {shown(' '.join(str(error).split()))}"]
 
 
-def check_sequence(folder: Path) -> list[str]:
-    """Problems of one sequence by itself. Checksums first; contents only where those hold."""
-    return _look(folder, ".")[0]
-
-
 def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
     """``name``: path below the data set, "." where the sequence is looked at alone and may be called anything."""
     found: list[_Known] = []

@@ -1,4 +1,9 @@
-"""Event emulators: frames and times in, events out. They know nothing of scenes or OpenGL."""
+"""Event emulators. They know nothing of scenes or OpenGL.
+
+In:    frames (linear luminance, float32) and times (int64 ns).
+Out:   :class:`~blinkgl.events.types.Events`, columnar, in order of time.
+Start: esim.py, the simplest; emulator.py is the contract, table.py names them all.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""OpenGL without a window: context, programs, render targets. The only package that talks to drivers."""
+"""OpenGL without a window. The only package that talks to drivers.
+
+In:    a backend and a device, GLSL text, names of formats.
+Out:   a context, compiled programs, render targets.
+Start: context.py (``create_context``); shader.py, framebuffer.py.
+"""
 
 from blinkgl.gl.context import GLContext, create_context, egl_devices
 from blinkgl.gl.framebuffer import FORMATS, Target

@@ -1,6 +1,6 @@
-"""Files in and out: one module per format, the reader beside the writer.
+"""Files in and out: one module per format, the reader beside the writer. Nothing here knows about scenes, GL or emulators.
 
-Nothing here knows about scenes, GL or emulators. Event files of any supported format are opened with
-:func:`blinkgl.io.formats.open_events` and written with :func:`blinkgl.io.formats.write_events`; a generated
-sequence is written by :class:`blinkgl.io.sequence_dir.SequenceWriter`.
+In:    events, pictures and labels as arrays, or files of strangers.
+Out:   files that appear whole or not at all, or arrays, or one line that names the file.
+Start: formats.py (``open_events``, ``write_events``); sequence_dir.py writes a generated sequence.
 """

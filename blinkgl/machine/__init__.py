@@ -1,5 +1,6 @@
 """The machine that BlinkGL runs on.
 
-In: nothing but the machine. Out: what it can do, what is missing and the command that mends it, how long kernels have compiled.
-Start in doctor.py (``examine``); cpu.py, extras.py, compiling.py and bench.py answer one question each, for every other room.
+In:    nothing.
+Out:   what it can do, what is missing and the command that mends it, how long kernels have compiled.
+Start: doctor.py (``examine``); cpu.py, extras.py, compiling.py and bench.py answer one question each, for every other room.
 """

@@ -1,6 +1,6 @@
-"""What the commands print.
+"""What the commands print. Nothing here makes a result, and no other room prints.
 
-In: a command's options. Out: one call into the library behind a display, then words and tables for people, and the command's exit status.
-Start in generate.py. One module per command of the same name, each with ``run(...) -> status`` and nothing that makes a result; ``terminal.py`` makes every
-console of the project.
+In:    a command's options.
+Out:   one call into the library behind a display, words and tables for people, the command's exit status.
+Start: generate.py; one module per command, of its name, with ``run``. terminal.py makes every console of the project.
 """

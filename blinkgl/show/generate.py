@@ -56,7 +56,7 @@ class Display:
         self._notes: set[str] = set()
 
     def begin(self, plan: Plan, outcome: Outcome) -> None:
-        self._todo, self._outcome, self._started = len(plan.tasks) - outcome.found, outcome, time.monotonic()
+        self._todo, self._started = len(plan.tasks) - outcome.found, time.monotonic()
         if outcome.found:
             self._say(f"{outcome.found} of {len(plan.tasks)} sequences are whole already")
         for name, problem in outcome.damaged.items():

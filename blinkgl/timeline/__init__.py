@@ -1,4 +1,9 @@
-"""When to draw the next event frame."""
+"""When to draw the next event frame.
+
+In:    a configuration, small pictures of image velocity or luminance.
+Out:   frame times, int64 ns, increasing.
+Start: strategy.py (``make_timeline``); sampling.py has the arithmetic, budget.py measures the error, interpolate.py invents frames of a video.
+"""
 
 from blinkgl.timeline.sampling import bounded_times, displacement_times, uniform_times
 from blinkgl.timeline.strategy import Timeline, make_timeline

@@ -87,7 +87,6 @@ class Budget(Timeline):
         self.error = TimeError(config.reconstruction, config.max_time_error_px if in_px else config.max_time_error_us * 1e-6, in_px,
                                config.percentile)
         self._speeds: dict[int, np.ndarray] = {}
-        self._probing = False
 
     def __iter__(self) -> Iterator[int]:
         last = None

@@ -1,1 +1,6 @@
-"""What accuracy costs: settings timed and judged against a converged reference (``blinkgl trade``)."""
+"""What accuracy costs (``blinkgl trade``).
+
+In:    one configuration, settings to try.
+Out:   their cost and error against a reference that is refined until it stands still.
+Start: run.py (``trade``); measure.py times, matching.py and metrics.py judge.
+"""

@@ -14,8 +14,3 @@ def front(rows: Sequence[dict], cost: str, error: str) -> list[dict]:
         if not result or row[error] < result[-1][error]:
             result.append(row)
     return result
-
-
-def dominating(row: dict, rows: Sequence[dict], cost: str, error: str, margin: float = 0.0) -> list[dict]:
-    """Rows that beat ``row`` in cost and in error, in both by more than the relative ``margin``."""
-    return [r for r in rows if r[cost] < row[cost] * (1 - margin) and r[error] < row[error] * (1 - margin)]

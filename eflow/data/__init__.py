@@ -1,1 +1,6 @@
-"""Event windows and ground truth: sources (files), representation (events to tensors), augmentation, order, batches."""
+"""Event windows and ground truth.
+
+In:    folders of BlinkGL, DSEC, MVSEC or BlinkFlow.
+Out:   batches of tensors, in an order that a resumed run repeats.
+Start: sources.py (files); representation.py (events to tensors), window.py, dataset.py.
+"""

@@ -1,4 +1,9 @@
-"""The networks behind one contract (:mod:`eflow.models.contract`): ``build_model(config)``."""
+"""The networks behind one contract (:mod:`eflow.models.contract`).
+
+In:    a model configuration; tensors of events.
+Out:   flow.
+Start: contract.py, then ev_flownet.py, the smallest.
+"""
 
 from __future__ import annotations
 

@@ -1,1 +1,6 @@
-"""Kernels of the networks, each fast path beside a slow, obvious twin it is tested against."""
+"""Kernels of the networks, each fast path beside a slow, obvious twin it is tested against.
+
+In:    tensors.
+Out:   tensors.
+Start: warp.py; correlation.py, voxel.py.
+"""

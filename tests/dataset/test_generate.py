@@ -20,7 +20,7 @@ from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset import generate as generate_module
 from blinkgl.dataset.generate import generate_run
-from blinkgl.dataset.verify import check_sequence
+from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.sequence_dir import verify_sequence
 
@@ -154,7 +154,7 @@ def test_a_clock_between_microseconds(tmp_path):
         manifest = json.loads((folder / "manifest.json").read_text())
         last = int((folder / "images/timestamps.txt").read_text().split()[-1])
         assert manifest["t_offset_us"] + manifest["duration_us"] == last
-        assert check_sequence(folder) == []
+        assert verify_dataset(folder).clean
 
 
 def test_events_that_leave_the_bus_late_are_no_part_of_the_recording(tmp_path):
@@ -162,7 +162,7 @@ def test_events_that_leave_the_bus_late_are_no_part_of_the_recording(tmp_path):
     free = json.loads((generate(tmp_path, out="free")[0] / "manifest.json").read_text())
     folder = generate(tmp_path, out="slow", readout={"events_per_second": 4000, "queue_events": 40})[0]
     slow = json.loads((folder / "manifest.json").read_text())
-    assert check_sequence(folder) == []
+    assert verify_dataset(folder).clean
     assert slow["events_late_in_readout"] > 0 and slow["events_lost_in_readout"] > 0
     assert slow["events"] + slow["events_late_in_readout"] + slow["events_lost_in_readout"] == free["events"]
     with DsecEventReader(folder / "events.h5") as reader:

@@ -11,7 +11,6 @@ import yaml
 
 from blinkgl.config.quality import QUALITIES, load_quality
 from blinkgl.config.sequence import RunTemplate, apply_overrides, load_run
-from blinkgl.trade.front import dominating
 from blinkgl.trade.measure import Bench, Options
 from blinkgl.trade.settings import Setting
 
@@ -27,6 +26,11 @@ def tables(overrides) -> dict:
     """timeline and render that overrides mean, every value filled in."""
     config = RunTemplate(apply_overrides({}, overrides), None).sequence(0)
     return {"timeline": config.timeline.model_dump(), "render": config.render.model_dump()}
+
+
+def dominating(row: dict, rows: list[dict], cost: str, error: str, margin: float = 0.0) -> list[dict]:
+    """Rows that beat ``row`` in cost and in error, in both by more than the relative ``margin``."""
+    return [r for r in rows if r[cost] < row[cost] * (1 - margin) and r[error] < row[error] * (1 - margin)]
 
 
 def row_of(name: str, rows: list[dict]) -> dict:

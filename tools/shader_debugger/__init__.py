@@ -1,5 +1,9 @@
 """The shader debugger: ``blinkgl shader passes | probe | diff | check | show | time | serve``.
 
+In:    a configuration, a moment of one of its sequences, a folder of shaders.
+Out:   what every pass wrote there beside what a float64 reference says, as pictures, words and a page.
+Start: cli.py (the commands), then session.py:
+
     session.py    one moment of the scene that a generation run would render; the shader folder; the OpenGL side
     moments.py    every buffer of that moment, from the GPU and from the float64 reference, by the same names
     compare.py    one against the other, with tolerances and the silhouette band

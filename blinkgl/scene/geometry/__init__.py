@@ -1,5 +1,6 @@
 """Triangles.
 
-In: arrays, parameters, triangles of files. Out: :class:`~blinkgl.scene.types.Mesh`, checked, at the level of detail that is asked for.
-Start in meshes.py (``make_mesh``); primitives.py builds, lod.py and nearest.py simplify.
+In:    arrays, parameters, triangles of files.
+Out:   :class:`~blinkgl.scene.types.Mesh`, checked, at the level of detail that is asked for.
+Start: meshes.py (``make_mesh``); primitives.py builds, lod.py and nearest.py simplify.
 """

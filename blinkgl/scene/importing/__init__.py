@@ -1,5 +1,6 @@
 """Mesh files of strangers.
 
-In: glTF, OBJ, PLY, STL, ... of unknown goodness. Out: :class:`~blinkgl.scene.importing.mesh_files.Asset` objects, or one line that names the file.
-Start in mesh_files.py (``load_asset``); gltf.py reads what gltf_schema.py has checked.
+In:    glTF, OBJ, PLY and STL of unknown goodness.
+Out:   :class:`~blinkgl.scene.importing.mesh_files.Asset`, or one line that names the file.
+Start: mesh_files.py (``load_asset``); gltf.py reads what gltf_schema.py has checked.
 """

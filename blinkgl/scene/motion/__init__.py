@@ -1,5 +1,6 @@
 """What moves where.
 
-In: way-points, key frames, bounds of free space. Out: :class:`~blinkgl.scene.types.PosePath` implementations that do not run into each other.
-Start in paths.py; trajectories.py draws random ones, collision.py keeps them apart.
+In:    way-points, key frames, bounds of free space.
+Out:   :class:`~blinkgl.scene.types.PosePath` objects that do not run into each other.
+Start: paths.py; trajectories.py draws random ones, collision.py keeps them apart.
 """

@@ -103,16 +103,6 @@ def resolve_collisions(objects: tuple[SceneObject, ...] | list[SceneObject], cam
                            search.distance_queries)
 
 
-def overlaps(objects: tuple[SceneObject, ...] | list[SceneObject], t_ns: int, camera_path: PosePath | None = None,
-             camera_radius: float = 0.05, tolerance: float = 1e-3) -> list[Collision]:
-    """Which bodies touch or enclose each other at t_ns, for checking placements: static ones included; resting on the
-    ground, and sky, walls and ground meeting each other, are not reported."""
-    bodies = [_Body.of_object(o) for o in objects if any(len(p.mesh.faces) for p in o.parts)]
-    if camera_path is not None:
-        bodies.append(_Body.of_camera(camera_path, camera_radius))
-    return _Search(bodies, int(t_ns), int(t_ns), tolerance, 0.01).at_start(static_too=True)
-
-
 @dataclass(eq=False)
 class _Body:
     """What the search knows about a body. vertices (V, 3), faces (F, 3): all parts, local; probes: (K, 3) one vertex
@@ -200,11 +190,10 @@ class _Search:
             elif later < self.t1:
                 heapq.heappush(queue, (later, i, j))
 
-    def at_start(self, static_too: bool = False) -> list[Collision]:
-        """Contacts and containments at t0; notes who rests on what and stops what moves. ``static_too``: among static
-        bodies as well, and nothing is stopped."""
+    def at_start(self) -> list[Collision]:
+        """Contacts and containments at t0; notes who rests on what and stops what moves."""
         found = []
-        for i, j in self._pairs(static_too):
+        for i, j in self._pairs():
             a, b = self.bodies[i], self.bodies[j]
             Ta, Tb = a.path.pose(self.t0), b.path.pose(self.t0)
             if self._ball_gap(a, b, Ta, Tb) > self._tol(a, b):
@@ -218,16 +207,14 @@ class _Search:
                 if separation <= self._tol(a, b):
                     found.append((a, b, "contact", max(separation, 0.0)))
         # Stopped only now: every pair is judged by the same scene.
-        return [Collision(self.t0, a.name, b.name, kind, separation, () if static_too else self._stop(self.t0, a, b))
-                for a, b, kind, separation in found]
+        return [Collision(self.t0, a.name, b.name, kind, separation, self._stop(self.t0, a, b)) for a, b, kind, separation in found]
 
-    def _pairs(self, static_too: bool = False):
+    def _pairs(self):
         for i, a in enumerate(self.bodies):
             for j in range(i + 1, len(self.bodies)):
                 b = self.bodies[j]
                 surroundings = a.category in ("sky", *_SUPPORTS) and b.category in ("sky", *_SUPPORTS)
-                watched = static_too or CAMERA in (a.category, b.category)
-                if not surroundings and (watched or not (a.is_static and b.is_static)):
+                if not surroundings and (CAMERA in (a.category, b.category) or not (a.is_static and b.is_static)):
                     yield i, j
 
     def _tol(self, a: _Body, b: _Body) -> float:

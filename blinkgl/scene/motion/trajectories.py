@@ -5,7 +5,6 @@
     path = random_path(rng, t0_ns, t1_ns, ObjectMotion(speed=(0.5, 1)), space, radius=0.3, start_pose=T_world_obj)
     sliding = random_path(rng, t0_ns, t1_ns, ObjectMotion(), space, radius=0.3, start_pose=T_world_obj, on_ground=True)
     camera = random_camera_path(rng, t0_ns, t1_ns, CameraMotion(), space, radius=0.2, target=(0, 0, 0.5))
-    print(statistics(path, t0_ns, t1_ns))          # mean and peak speed and angular rate
 
 How the configured speed is met: way-points are a random walk whose legs have about the right length, so that they
 can be rejected one by one; the spline through them is a fixed curve in space, and the *time* it takes is then
@@ -30,7 +29,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from blinkgl.config.trajectory import CameraMotion, MotionConfig, ObjectMotion
 from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import SplinePath, StaticPath, body_rate, rigid
+from blinkgl.scene.motion.paths import SplinePath, StaticPath, rigid
 from blinkgl.scene.types import PosePath
 
 _REDRAWS = 6  # whole paths; the one that leaves free space least is kept
@@ -98,30 +97,6 @@ class FreeSpace:
             raise ConfigError(f"no free space for a body of radius {radius:.3g} in {tries} tries", where="scene",
                               accepted="fewer or smaller objects, or a larger world")
         return points[free[0]]
-
-
-@dataclass(frozen=True)
-class PathStatistics:
-    """mean_speed, peak_speed in units/s; mean_rate, peak_rate in rad/s. The peaks are upper bounds (tight to ~1 %)."""
-
-    mean_speed: float
-    peak_speed: float
-    mean_rate: float
-    peak_rate: float
-
-
-def statistics(path: PosePath, t0_ns: int, t1_ns: int, samples: int = 512) -> PathStatistics:
-    """What a path really does over [t0, t1]: midpoint rule and interval bounds on ``samples`` intervals."""
-    edges = np.linspace(0, t1_ns - t0_ns, samples + 1).astype(np.int64) + t0_ns
-    speed, rate = 0.0, 0.0
-    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist()):
-        mid = (a + b) // 2
-        D = path.derivative(mid)
-        speed += (b - a) * float(np.linalg.norm(D[:3, 3]))
-        rate += (b - a) * float(np.linalg.norm(body_rate(path.pose(mid), D)))
-    bounds = np.array([path.speed_bound(a, b) for a, b in zip(edges[:-1].tolist(), edges[1:].tolist())])
-    length = max(t1_ns - t0_ns, 1)
-    return PathStatistics(speed / length, float(bounds[:, 0].max()), rate / length, float(bounds[:, 1].max()))
 
 
 def random_path(rng: np.random.Generator, t0_ns: int, t1_ns: int, config: ObjectMotion, space: FreeSpace, radius: float,

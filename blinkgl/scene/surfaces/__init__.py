@@ -1,5 +1,6 @@
 """What surfaces look like.
 
-In: image files, names of procedural patterns. Out: :class:`~blinkgl.scene.types.Texture` images and hashes of what they are made of.
-Start in images.py (``load_image``); textures.py draws patterns.
+In:    image files, names of procedural patterns.
+Out:   :class:`~blinkgl.scene.types.Texture` images, and hashes of what they are made of.
+Start: images.py (``load_image``); textures.py draws patterns.
 """

@@ -10,7 +10,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
-from blinkgl.scene.motion.collision import overlaps, resolve_collisions
+from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.paths import CutPath, KeyframePath, SplinePath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, random_camera_path, random_path
 from blinkgl.scene.types import Material, Mesh, Part, SceneObject
@@ -224,13 +224,6 @@ def test_the_camera_may_be_in_the_sky_but_in_no_object():
     for path in (camera, StaticPath()):  # standing still in there is as bad
         event = only(resolve([body("cube", trimesh.creation.box((3, 3, 3)), StaticPath())], path))
         assert event.kind == "inside" and event.first == "camera" and event.t_ns == 0
-
-
-def test_overlaps_checks_static_placements():
-    objects = [body("a", BOX, StaticPath(at(z=0.5))), body("b", BOX, StaticPath(at(0.9, 0, 0.5))), body("c", BOX, StaticPath(at(5, 0, 0.5))),
-               ground(), body("wall", trimesh.creation.box((0.1, 9, 9)), StaticPath(at(8)), "wall")]
-    found = overlaps(objects, 0, StaticPath(at(5, 0, 0.5)), 0.1)
-    assert {(e.first, e.second) for e in found} == {("a", "b"), ("camera", "c")}
 
 
 # ---- random scenes against brute force -------------------------------------------------------------------------------

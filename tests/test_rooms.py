@@ -1,0 +1,54 @@
+"""The house, as docs/architecture.md draws it: every room says what it is for."""
+
+import ast
+import graphlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ROOMS = sorted(p.parent for folder in ("blinkgl", "eflow", "shaders", "configs", "tools") for p in (ROOT / folder).rglob("__init__.py")
+               if p.parent != ROOT / "blinkgl")
+
+
+@pytest.mark.parametrize("room", ROOMS, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_a_room_says_what_comes_in_what_goes_out_and_where_to_start(room):
+    said = ast.get_docstring(ast.parse((room / "__init__.py").read_text(encoding="utf-8"))) or ""
+    lines = dict(re.findall(r"^(In|Out|Start):\s+(.+)$", said, re.M))
+    assert list(lines) == ["In", "Out", "Start"], f"{room}/__init__.py: one line each of 'In:', 'Out:', 'Start:'"
+    named = re.findall(r"\b[\w/]+\.(?:py|glsl|yaml)\b", lines["Start"])
+    assert named, "a file to start with"
+    for name in named:
+        assert (room / name).is_file(), name
+
+
+def test_every_room_is_installed():
+    """setup.cfg names packages one by one; a forgotten one is missing from the wheel only."""
+    text = (ROOT / "setup.cfg").read_text(encoding="utf-8")
+    named = set(re.search(r"\npackages =\n((?:    .+\n)+)", text).group(1).split())
+    here = {p.relative_to(ROOT).as_posix().replace("/", ".") for p in ROOMS}
+    assert named == {"blinkgl"} | {name if name.startswith(("blinkgl", "eflow")) else f"blinkgl.{name}" for name in here}
+
+
+def _room(module: str) -> str:
+    """scene's files at the top are rooms of their own: types.py comes before the rooms inside, build.py after them."""
+    parts = module.split(".")
+    return ".".join(parts[:3] if parts[1] == "scene" else parts[:2])
+
+
+def test_data_flows_one_way():
+    """What is imported when a module is imported never leads back to the room it came from. (``blinkgl.tools`` reads what it likes;
+    the front door fetches its names when they are first used.)"""
+    arrows: dict[str, set[str]] = {}
+    for path in sorted((ROOT / "blinkgl").rglob("*.py")):
+        module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")
+        if module in ("blinkgl", "blinkgl.cli", "blinkgl.__main__"):
+            continue
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("blinkgl."):
+                names = [f"{node.module}.{name.name}" for name in node.names]
+                there = {_room(n if (ROOT / (n.replace(".", "/") + ".py")).is_file() or (ROOT / n.replace(".", "/")).is_dir() else node.module) for n in names}
+                arrows.setdefault(_room(module), set()).update(there - {_room(module)})
+    graphlib.TopologicalSorter(arrows).prepare()  # raises CycleError, which names the circle
+    assert not arrows["blinkgl.events"] & {"blinkgl.scene", "blinkgl.gl", "blinkgl.render"} and not arrows["blinkgl.io"] & {"blinkgl.render", "blinkgl.gl"}

@@ -238,7 +238,7 @@ def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:
             continue
         file, number = source.locate(line)
         where = f"{file}:{number}" if file else f"{name} (generated line {line}: {_line(source.text, line)})"
-        blocks.append(f"{where}: {kind}: {text}\n{_excerpt(source.files.get(file, ""), number)}")
+        blocks.append(f"{where}: {kind}: {text}\n{_excerpt(source.files.get(file, ''), number)}")
         if first is None and kind == "error":
             first = ShaderError(f"{text} [{stage} stage]", where=where)
     if first is None:

@@ -1,5 +1,6 @@
 # make demo    install into .venv, check OpenGL, generate the demo sequence into out/demo
 # make test    install into .venv, check OpenGL, run the tests
+# make docs    install into .venv, build the documentation into out/site
 # make slow    the tests that take long       make bench   the benchmarks
 # make fuzz    damaged files and strange configurations (an hour)      make mutate   are there tests that notice a wrong line?
 # make clean   remove what was built (not .venv, not out/)
@@ -12,7 +13,7 @@ PIP = .venv/bin/python -m pip --disable-pip-version-check
 INSTALL = PYTHONWARNINGS=ignore $(PIP) install --quiet --no-build-isolation -c constraints.txt
 INPUTS = setup.cfg pyproject.toml constraints.txt tools/setup.sh Makefile
 
-.PHONY: demo test slow bench fuzz mutate doctor setup opengl clean
+.PHONY: demo test docs slow bench fuzz mutate doctor setup opengl clean
 .DELETE_ON_ERROR:
 
 demo: .venv/.kernels opengl
@@ -20,8 +21,11 @@ demo: .venv/.kernels opengl
 	.venv/bin/blinkgl generate configs/demo.yaml --out out/demo
 	@echo "beside it: events.h5, flow/, images/ in DSEC's layout; README.md says what to do next"
 
-test: .venv/.installed-dev .venv/.kernels opengl
+test: .venv/.installed-dev .venv/.installed-docs .venv/.kernels opengl
 	.venv/bin/python -m pytest -q -n $(JOBS) --maxprocesses 4 --dist worksteal
+
+docs: .venv/.installed-docs
+	.venv/bin/python -m blinkgl.tools.site --out out/site
 
 slow: .venv/.installed-dev opengl
 	.venv/bin/python -m pytest -q -m slow
@@ -63,6 +67,12 @@ setup: .venv/.installed-dev opengl
 	@$(INSTALL) -e '.[cluster]' || echo "Ray could not be installed: the tests of the Ray executor will be skipped"
 	@$(INSTALL) --no-deps pyrender PyOpenGL==3.1.10 freetype-py pyglet six \
 		|| echo "pyrender could not be installed: the comparisons with it will be skipped"
+	@touch $@
+
+# The tests build the site, too: a dead link is an error.
+.venv/.installed-docs: .venv/.installed-core
+	@echo "installing what the documentation is built with into .venv"
+	@$(INSTALL) -e '.[docs]' || echo "Zensical could not be installed: the documentation will not be built, nor its tests run"
 	@touch $@
 
 # Once per machine instead of in somebody's first run; where it fails, the first run compiles.

@@ -77,7 +77,7 @@ def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> li
     rows, below = [], []
     for name, info in model.model_fields.items():
         inner = f"{path}.{name}" if path else name
-        meaning = (info.description or _about(info)).replace("``", "`")
+        meaning = (info.description or _about(info)).replace("``", "`").replace("|", "\\|")
         rows.append(f"| `{name}` | {_type(info)} | {_default(info)} | {meaning} |\n")
         children = _models(info.annotation)
         tagged = [c for c in children if tag_of(c)]

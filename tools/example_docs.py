@@ -39,7 +39,7 @@ Each is a program of its own in `examples/`, does one thing, and ends with a che
 .venv/bin/python examples/scene_in_python.py        # writes below out/examples/
 ```
 
-This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit. [demo.ipynb](../examples/demo.ipynb) is a notebook that
+This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit. `examples/demo.ipynb` is a notebook that
 walks through the demo. All names come from `import blinkgl`; what they take is in their docstrings (`help(blinkgl.Scene)`).
 """
 

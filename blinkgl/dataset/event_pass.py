@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import numpy as np
-
 from blinkgl.dataset.clock import StageClock
 from blinkgl.errors import EventDataError
 from blinkgl.events import Emulator, Events, emulator_of, make_emulator
@@ -30,15 +28,14 @@ class EventPass:
         self.frames = 0
 
     def __iter__(self) -> Iterator[tuple[int, Events]]:
-        emulator, renderer = self.emulator, self.renderer
-        luminance = np.empty((renderer.height, renderer.width), np.float32)
-        rate = np.empty_like(luminance) if emulator.needs_rate else None
+        emulator, frame = self.emulator, None
         for t_ns in self.timeline:
-            renderer.luminance(t_ns, out=luminance, rate=rate)
+            before, frame = frame, self.renderer.luminance(t_ns, rate=emulator.needs_rate)
+            luminance, rate = frame.view(), frame.view("rate") if emulator.needs_rate else None
             self.timeline.observe(t_ns, luminance, rate)
             with self._clock("events"):
                 try:
-                    events = emulator.step(luminance, t_ns, renderer.changed_rows, rate)
+                    events = emulator.step(luminance, t_ns, frame.rows_changed_since(before), rate)
                 except EventDataError as error:
                     raise self._explained(error, t_ns) from error
             self.frames += 1

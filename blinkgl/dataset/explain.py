@@ -156,12 +156,16 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
 
     def variants(name: str) -> tuple[str, ...]:
         return tuple(sorted({"+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
-                             for program, defines in gl.shaders._programs if program == name}))
+                             for program, defines in gl.shaders.compiled if program == name}))
 
     timeline, rejected = config.timeline, 1.0
-    luminance = np.empty((renderer.height, renderer.width), np.float32)
-    rate = np.empty_like(luminance) if timeline.reconstruction == "hermite" else None
-    event_s = _timed(lambda t: renderer.luminance(t, out=luminance, rate=rate), times)
+    rates = timeline.reconstruction == "hermite"
+
+    def drawn(t: int) -> tuple[np.ndarray, np.ndarray | None]:
+        frame = renderer.luminance(t, rate=rates)
+        return frame.view(), frame.view("rate") if rates else None
+
+    event_s = _timed(drawn, times)
     fine = samples_of(config.render.antialiasing).stored
     if timeline.kind == "uniform":
         result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
@@ -169,12 +173,12 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         strategy = make_timeline(timeline, t0, t1, renderer, emulator_of(config.events).response(config.events))
         if timeline.kind == "budget":  # a short stretch, for the first measurements of the error
             for t in islice(strategy, 2 * PROBES):
-                strategy.observe(t, renderer.luminance(t, out=luminance, rate=rate), rate)
+                strategy.observe(t, *drawn(t))
         steps = np.clip([1 / max(strategy.pace(t), 1e-12) for t in times], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
         result.frames = int(duration * np.mean(1 / steps)) + 1
         rejected = 1.1  # a step is cut again now and then
-    result.passes.append(Pass("event frames" + (" with rates" if rate is not None else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
-                              variants("luminance.glsl"), pixels * fine * ((4 if rate is None else 8) + DEPTH_BYTES), result.frames,
+    result.passes.append(Pass("event frames" + (" with rates" if rates else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
+                              variants("luminance.glsl"), pixels * fine * ((8 if rates else 4) + DEPTH_BYTES), result.frames,
                               event_s * result.frames))
     if timeline.kind != "uniform":
         small_s, count = _timed(strategy.pace, times), int(result.frames * rejected)
@@ -184,7 +188,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     if "images" in asked_for(config.labels):
         result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
                                   ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
-                                  _timed(renderer.colour, times[:3]) * (labels + 1)))
+                                  _timed(lambda t: renderer.colour(t).read(), times[:3]) * (labels + 1)))
     request = asked_for(config.labels)
     request = request.without(*(name for name in request if LABELS[name].anti_aliased))
     if request:
@@ -194,20 +198,18 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
                                   pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES), labels, each * labels))
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
-        each = _timed(lambda t: (renderer.colour(t, antialiasing="none"), renderer.velocity(t)), times[:3])
+        each = _timed(lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times[:3])
         result.passes.append(Pass("preview", f"{config.preview.rate:g} pictures per simulated second", ("colour", "velocity"),
                                   pixels * (16 + 8 + DEPTH_BYTES), pictures, each * pictures))
     emulator = make_emulator(config.events, renderer.height, renderer.width, kernel_seed(config.seed, index, Role.EVENTS), timeline.reconstruction)
     step = max(1, round((t1 - t0) / result.frames))
     moments = [t0 + k * step for k in range(min(PROBES, result.frames))]
-    frames, rates = [], []
-    for t in moments:
-        frames.append(renderer.luminance(t, out=luminance, rate=rate).copy())
-        rates.append(rate if rate is None else rate.copy())
-    emulator.step(frames[0], moments[0], None, rates[0])
-    started, events = time.perf_counter(), 0
-    for frame, t, r in zip(frames[1:], moments[1:], rates[1:]):
-        events += len(emulator.step(frame, t, None, r))
+    frames = [(t, *(None if picture is None else picture.copy() for picture in drawn(t))) for t in moments]
+    started, events = 0.0, 0
+    for k, (t, luminance, rate) in enumerate(frames):
+        events += len(emulator.step(luminance, t, None, rate))
+        if k == 0:
+            started = time.perf_counter()
     events += len(emulator.flush())
     each = (time.perf_counter() - started) / max(1, len(moments) - 1)
     rate = events / max(1, len(moments) - 1)

@@ -36,8 +36,8 @@ class PreviewRecorder:
 
     def frame(self, t_ns: int) -> None:
         """The picture at t_ns: colour and flow are drawn for it."""
-        colour = self._renderer.colour(t_ns, antialiasing="none")
-        velocity = self._renderer.velocity(t_ns)
+        colour = self._renderer.colour(t_ns, antialiasing="none").read()
+        velocity = self._renderer.velocity(t_ns).read()
         with self._clock("preview"):
             self._video.set_flow(velocity * self._interval_s)
             self._video.frame(t_ns // 1000, colour)

@@ -99,7 +99,7 @@ def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, 
             chunks.append(chunk if readout is None else readout.step(chunk, t_ns // 1000))
         for t_ns in times:
             if "images" in request:
-                images.append(to_srgb8(renderer.colour(t_ns)))
+                images.append(to_srgb8(renderer.colour(t_ns).read()))
             if t_ns != times[-1]:
                 frames.append(renderer.labels(t_ns, request.without("images"), t_ns + interval, t_ns - interval))
     lost = events.emulator.saturated + (readout.dropped if readout is not None else 0)
@@ -134,11 +134,11 @@ class Renderer:
 
     def luminance(self, t: float) -> np.ndarray:
         """(H, W) float32 linear luminance at t s: what emulators take."""
-        return self._renderer.luminance(_ns(t, "t"))
+        return self._renderer.luminance(_ns(t, "t")).read()
 
     def image(self, t: float) -> np.ndarray:
         """(H, W, 3) uint8 sRGB at t s."""
-        return to_srgb8(self._renderer.colour(_ns(t, "t")))
+        return to_srgb8(self._renderer.colour(_ns(t, "t")).read())
 
     def frame(self, t: float, labels: Sequence[str] = ("images",), *, to: float | None = None, back_to: float | None = None) -> LabelFrame:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.

@@ -17,7 +17,7 @@ from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import load_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.still import Rectangle
+from blinkgl.render.rectangles import Rectangle
 from blinkgl.show.trade import show
 from blinkgl.tools import peer_cycles
 from blinkgl.trade.front import front

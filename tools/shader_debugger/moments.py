@@ -16,7 +16,8 @@ from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.session import LOOKUP_PROGRAMS, DebugRenderer, Subject, When
+from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES
+from blinkgl.tools.shader_debugger.session import DebugRenderer, Subject, When
 
 _T = TypeVar("_T")
 
@@ -50,9 +51,9 @@ _BEFORE = (
     Pass("local", "local position", "object axes", "scalar", "debug.glsl OUT_LOCAL"),
 )
 _SHADED = (
-    *_lookups("luminance", LOOKUP_PROGRAMS["luminance"]),
+    *_lookups("luminance", LOOKUP_PASSES["luminance"].program),
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
-    *_lookups("colour", LOOKUP_PROGRAMS["colour"]),
+    *_lookups("colour", LOOKUP_PASSES["colour"].program),
     Pass("colour", "colour", "linear radiance", "light", "label.glsl OUT_COLOUR"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
@@ -98,7 +99,7 @@ def view_of(name: str) -> tuple[Label, View] | None:
 def lookup_of(name: str) -> tuple[str, str]:
     """("luminance", "uv") of "luminance_uv"; ("", "") of what is no look-up."""
     pass_name, _, what = name.rpartition("_")
-    return (pass_name, what) if pass_name in LOOKUP_PROGRAMS and what in LOOKUPS else ("", "")
+    return (pass_name, what) if pass_name in LOOKUP_PASSES and what in LOOKUPS else ("", "")
 
 
 def check_pass(name: str, known=PASSES, where: str = "--pass") -> str:
@@ -138,13 +139,13 @@ class GpuMoment(_Lazy):
     def _make(self, name):
         draw, when = self.renderer, self.when
         if name == "colour":
-            return {name: draw.colour(when.t_ns)}
+            return {name: draw.colour(when.t_ns).read()}
         if name == "luminance":
-            return {name: draw.luminance(when.t_ns)}
+            return {name: draw.luminance(when.t_ns).read()}
         if name == "log_luminance":
             return {name: np.log(self["luminance"] + np.float32(self.log_eps))}
         if name == "dL_dt":
-            change = draw.luminance(when.after_ns) - draw.luminance(when.before_ns)
+            change = draw.luminance(when.after_ns).read() - draw.luminance(when.before_ns).read()
             return {name: change / np.float32(when.step_s)}
         if name in ("triangle", "part", "local", "window"):
             return self._inspect()

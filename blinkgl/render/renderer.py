@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from blinkgl.labels import Flow, LabelFrame, LabelRequest
+from blinkgl.labels import LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.canvas import Canvas, Frame

@@ -14,7 +14,8 @@ from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, Displace
 from blinkgl.dataset.event_pass import EventPass
 from blinkgl.events import Esim, Events, emulator_of
 from blinkgl.events.v2e_model import lin_log
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LabelRequest
+from blinkgl.render.renderer import Renderer
 from blinkgl.timeline import make_timeline
 from blinkgl.timeline.budget import TimeError, contraharmonic_mean, weighted_percentile
 from blinkgl.timeline.strategy import PROBE_EVERY

@@ -54,7 +54,7 @@ _SHADED = (
     *_lookups("luminance", LOOKUP_PASSES["luminance"].program),
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
     *_lookups("colour", LOOKUP_PASSES["colour"].program),
-    Pass("colour", "colour", "linear radiance", "light", "label.glsl OUT_COLOUR"),
+    Pass("colour", "colour", "linear radiance", "light", "colour.glsl"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
 )
@@ -155,8 +155,8 @@ class GpuMoment(_Lazy):
             return {f"{of}_{key}": shown[key] for key in (*LOOKUPS, "count")}
         if name.startswith("next_depth_"):
             way = name.removeprefix("next_depth_")
-            raw = draw.raw(when.t_ns, f"FLOW_{way.upper()}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
-            return {name: raw[f"FLOW_{way.upper()}"][..., 2]}
+            raw = draw.raw(when.t_ns, f"flow_{way}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
+            return {name: raw[f"flow_{way}"][..., 2]}
         return self._labels()
 
     def _inspect(self):

@@ -159,11 +159,11 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
         return f"outside the image at t' (x' = {xt:.3f}, y' = {yt:.3f})"
     if w < renderer.scene.camera.near:
         return f"in front of the near plane at t' (Z' = {w:.6g} < {renderer.scene.camera.near:g})"
-    there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "DEPTH", "ID")
+    there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "depth", "ids")
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
-    other = int(there["ID"][yn, xn])
+    other = int(there["ids"][yn, xn])
     names = {thing.instance_id: thing.name for thing in renderer.scene.objects}
-    return (f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth {there['DEPTH'][yn, xn]:.6g}, "
+    return (f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth {there['depth'][yn, xn]:.6g}, "
             f"the point is at Z' = {w:.6g}")
 
 

@@ -291,7 +291,7 @@ class DebugRenderer(Renderer):
                 "count": albedo[..., 3]}
 
     def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
-        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth: DEPTH, ID, FLOW_FORWARD …"""
+        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
         frame = self.draw(Geometry(names), t_ns, ends)
         return {name: frame.read(name) for name in names}

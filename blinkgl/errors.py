@@ -77,9 +77,10 @@ class OutputError(BlinkGLError):
 class EventDataError(BlinkGLError):
     """Frames or events outside the emulator's or a format's contract (time order, range, shape).
 
-    pixel : (x, y) of the pixel of a frame that is at fault, where it is one."""
+    pixel : (x, y) of the pixel of a frame that is at fault, where it is one.   t_ns : time of the frame that is, where it is known."""
 
     pixel: tuple[int, int] | None = None
+    t_ns: int | None = None
 
 
 _MACHINE_TROUBLE = frozenset({errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EBUSY,

@@ -24,13 +24,13 @@ from blinkgl.config.base import validate
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, DisplacementTimeline, UniformTimeline
-from blinkgl.dataset.event_pass import EventPass
 from blinkgl.events import Events
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
+from blinkgl.sequence import Simulation, simulate_sequence
 from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors
 
 WIDTH, HEIGHT, DURATION_NS, LIMIT_US = 240, 180, 300_000_000, 5_000
@@ -104,9 +104,9 @@ class Run:
     info: dict
 
 
-def simulate(timeline, renderer: Renderer) -> tuple[Events, EventPass]:
-    run = EventPass(timeline, EMULATOR, renderer, seed=1)
-    return Events.concatenate([events for _, events in run]), run
+def simulate(timeline, renderer: Renderer) -> tuple[Events, Simulation]:
+    run = simulate_sequence(SequenceConfig(timeline=timeline, events=EMULATOR), labels=False, renderer=renderer)
+    return Events.concatenate([chunk.events for chunk in run]), run
 
 
 def measure(scene: Scene, gl, antialiasing: str, thin: int, say) -> dict[str, list[Run]]:

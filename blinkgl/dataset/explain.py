@@ -16,18 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import RECORDED, flow_files, folder_of, read_frame, used_images
-from blinkgl.events import emulator_of, make_emulator
 from blinkgl.gl import GLContext, create_context
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.labels.label import BUFFERS
-from blinkgl.recordings.simulation import SimulationReport, simulate
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
-from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
-from blinkgl.timeline import make_timeline
+from blinkgl.sequence import simulate_sequence
+from blinkgl.sequence.recorded import RECORDED
 
 PROBES = 12
 DEPTH_BYTES = 4
@@ -79,29 +76,24 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
     """A sequence that is converted from recorded frames: nothing is rendered; the first few frames are converted and timed."""
     frames = config.frames
-    folder = folder_of(frames, index, base)
-    files = used_images(frames, folder)
-    flows, masks = flow_files(folder, frames, len(files))
-    height, width = read_frame(files[0]).shape[:2]
+    probe = simulate_sequence(config, index, base=base, labels=False)
+    files, flows, masks = probe.files, probe.flows, probe.masks
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
     between = {"linear": "no frames in between", "cubic": f"{frames.factor - 1} frames in between, monotone cubics",
                "motion": f"at most {frames.max_px:g} px per step, dense-flow warp"}[frames.interpolate]
     result.scene = {
-        "frames": f"{len(files)} of {folder}, {width}x{height}, {frames.fps:g} Hz: {duration:.6g} s", "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
+        "frames": f"{len(files)} of {probe.folder}, {probe.width}x{probe.height}, {frames.fps:g} Hz: {duration:.6g} s", "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
         "flow": f"{len(flows)} files, {len(masks)} masks of occluded pixels" if flows else "none: no flow labels",
         "not used": "camera, time, timeline, scene and render: nothing is rendered"}
-    report = SimulationReport()
-    probed = files[:PROBES]
-    started = time.perf_counter()
-    for _ in simulate(((read_frame(f), round(k * 1e9 / frames.fps), str(f)) for k, f in enumerate(probed)), emulator=config.events, gamma=frames.gamma,
-                      interpolate=frames.interpolate, factor=frames.factor, max_px=frames.max_px, report=report,
-                      seed=kernel_seed(config.seed, index, Role.EVENTS), readout=config.readout):
-        pass
-    each = (time.perf_counter() - started) / (len(probed) - 1)
-    scale = (len(files) - 1) / (len(probed) - 1)
-    result.frames = 1 + round((report.steps - 1) * scale)
-    rate = report.events / ((len(probed) - 1) / frames.fps)
+    count = min(PROBES, len(files)) - 1
+    until_ns, started, steps = round(count * 1e9 / frames.fps), time.perf_counter(), 0
+    for chunk in probe:
+        steps += 1
+        if chunk.t_ns >= until_ns:
+            break
+    each, rate = (time.perf_counter() - started) / count, probe.events / (1e-9 * until_ns)
+    result.frames = 1 + round((steps - 1) * (len(files) - 1) / count)
     result.passes.append(Pass("frames and event kernel", f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
                               (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
     request = asked_for(config.labels)
@@ -167,21 +159,19 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
 
     event_s = _timed(drawn, times)
     fine = samples_of(config.render.antialiasing).stored
+    probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
+    seen = [chunk.t_ns for chunk in islice(probe, 2 * PROBES)]  # a short stretch of it, as it will be
     if timeline.kind == "uniform":
         result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:
-        strategy = make_timeline(timeline, t0, t1, renderer, emulator_of(config.events).response(config.events))
-        if timeline.kind == "budget":  # a short stretch, for the first measurements of the error
-            for t in islice(strategy, 2 * PROBES):
-                strategy.observe(t, *drawn(t))
-        steps = np.clip([1 / max(strategy.pace(t), 1e-12) for t in times], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
+        steps = np.clip([1 / max(probe.timeline.pace(t), 1e-12) for t in times], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
         result.frames = int(duration * np.mean(1 / steps)) + 1
         rejected = 1.1  # a step is cut again now and then
     result.passes.append(Pass("event frames" + (" with rates" if rates else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
                               variants("luminance.glsl"), pixels * fine * ((8 if rates else 4) + DEPTH_BYTES), result.frames,
                               event_s * result.frames))
     if timeline.kind != "uniform":
-        small_s, count = _timed(strategy.pace, times), int(result.frames * rejected)
+        small_s, count = _timed(probe.timeline.pace, times), int(result.frames * rejected)
         name = "brightness" if timeline.kind == "brightness" else "velocity"
         result.passes.append(Pass(name, f"decides the step; every {timeline.sample_every}. pixel", (name,),
                                   pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, small_s * count))
@@ -201,19 +191,8 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         each = _timed(lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times[:3])
         result.passes.append(Pass("preview", f"{config.preview.rate:g} pictures per simulated second", ("colour", "velocity"),
                                   pixels * (16 + 8 + DEPTH_BYTES), pictures, each * pictures))
-    emulator = make_emulator(config.events, renderer.height, renderer.width, kernel_seed(config.seed, index, Role.EVENTS), timeline.reconstruction)
-    step = max(1, round((t1 - t0) / result.frames))
-    moments = [t0 + k * step for k in range(min(PROBES, result.frames))]
-    frames = [(t, *(None if picture is None else picture.copy() for picture in drawn(t))) for t in moments]
-    started, events = 0.0, 0
-    for k, (t, luminance, rate) in enumerate(frames):
-        events += len(emulator.step(luminance, t, None, rate))
-        if k == 0:
-            started = time.perf_counter()
-    events += len(emulator.flush())
-    each = (time.perf_counter() - started) / max(1, len(moments) - 1)
-    rate = events / max(1, len(moments) - 1)
-    result.passes.append(Pass("event kernel", f"{config.events.emulator}; about {rate * result.frames / duration / 1e6:.1f} M events per simulated second",
+    each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - t0), 1e-9)
+    result.passes.append(Pass("event kernel", f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
                               (config.events.emulator,), 0, result.frames, each * result.frames))
 
 

@@ -18,13 +18,13 @@ from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
-from blinkgl.dataset.frames import matching_folders, used_images
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
 from blinkgl.scene.importing.mesh_files import dependencies
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below, resolve
 from blinkgl.scene.worlds.random_world import pools
+from blinkgl.sequence.recorded import matching_folders, used_images
 
 
 @dataclass(frozen=True)

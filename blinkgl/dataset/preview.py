@@ -1,29 +1,27 @@
-"""Feeds the preview while events are being made."""
+"""Feeds the preview while a sequence happens."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from blinkgl.config.sequence import SequenceConfig
-from blinkgl.dataset.clock import StageClock
+from blinkgl.config.sequence import PreviewConfig
 from blinkgl.events import Events
 from blinkgl.io.preview import PreviewWriter
 from blinkgl.io.sequence_dir import SequenceWriter
-from blinkgl.render.renderer import Renderer
+from blinkgl.sequence import Picture, Simulation
 
 
 class PreviewRecorder:
-    """Context manager; does nothing when the configuration wants no preview. The flow panel shows the instantaneous
-    velocity times the label interval, which is what the flow labels look like for small motions."""
+    """Context manager; does nothing where the sequence gives no pictures. The flow panel shows the instantaneous velocity times the
+    label interval, which is what the flow labels look like for small motions; recorded frames have none."""
 
-    def __init__(self, config: SequenceConfig, renderer: Renderer, writer: SequenceWriter, clock: StageClock):
-        self._renderer, self._clock = renderer, clock
-        self._interval_s = np.float32(config.time.interval_ns * 1e-9)
+    def __init__(self, config: PreviewConfig, sequence: Simulation, writer: SequenceWriter):
+        self._clock, rate = sequence.clock, sequence.pictures_hz
+        self._interval_s = np.float32(sequence.config.time.interval_ns * 1e-9)
         self._video: PreviewWriter | None = None
-        if config.preview.enabled:
-            self._video = PreviewWriter(
-                writer.path("preview.mp4"), renderer.height, renderer.width, t0_us=config.time.t0_ns // 1000,
-                rate_hz=config.preview.rate, fps=config.preview.rate / config.preview.slowdown)
+        if rate is not None:
+            self._video = PreviewWriter(writer.path("preview.mp4"), sequence.height, sequence.width, t0_us=sequence.t0_ns // 1000,
+                                        flow=sequence.config.frames is None, rate_hz=rate, fps=rate / config.slowdown)
 
     def add_events(self, events: Events) -> None:
         """Every chunk, in order."""
@@ -31,16 +29,12 @@ class PreviewRecorder:
             with self._clock("preview"):
                 self._video.add_events(events)
 
-    def due(self, t_ns: int) -> bool:
-        return self._video is not None and self._video.due(t_ns // 1000)
-
-    def frame(self, t_ns: int) -> None:
-        """The picture at t_ns: colour and flow are drawn for it."""
-        colour = self._renderer.colour(t_ns, antialiasing="none").read()
-        velocity = self._renderer.velocity(t_ns).read()
+    def show(self, picture: Picture) -> None:
+        """Every picture, after the events up to then."""
         with self._clock("preview"):
-            self._video.set_flow(velocity * self._interval_s)
-            self._video.frame(t_ns // 1000, colour)
+            if picture.velocity is not None:
+                self._video.set_flow(picture.velocity * self._interval_s)
+            self._video.frame(picture.t_ns // 1000, picture.image)
 
     def __enter__(self) -> PreviewRecorder:
         return self

@@ -6,10 +6,14 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import blinkgl
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.sequence import SequenceConfig
+
+if TYPE_CHECKING:
+    from blinkgl.sequence import Simulation
 
 STAGES = ("scene", "render", "read-back", "events", "write", "preview")
 """What the seconds of a sequence are told apart by; the rest is "other"."""
@@ -37,6 +41,10 @@ class SequenceReport:
     """what an adaptive timeline says it achieved"""
     omissions: tuple[str, ...] = ()
     """what files of the scene ask for and is not drawn, a line per file"""
+
+    def count(self, sequence: Simulation) -> None:
+        """What there is of it so far."""
+        self.frames, self.events, self.labels, self.seconds = sequence.frames, sequence.events, sequence.labels, sequence.seconds
 
 
 def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:

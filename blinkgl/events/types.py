@@ -51,3 +51,9 @@ class Events:
         """Events of the half-open window [t0_us, t1_us); views, no copy."""
         i, j = np.searchsorted(self.t, (t0_us, t1_us), side="left")
         return Events(self.x[i:j], self.y[i:j], self.t[i:j], self.p[i:j])
+
+    def split(self, t_us: int) -> tuple[Events, Events]:
+        """Those before t_us, and the rest; views, no copy."""
+        cut = int(np.searchsorted(self.t, t_us, side="left"))
+        return (Events(self.x[:cut], self.y[:cut], self.t[:cut], self.p[:cut]),
+                Events(self.x[cut:], self.y[cut:], self.t[cut:], self.p[cut:]))

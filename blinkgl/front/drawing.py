@@ -11,9 +11,7 @@ import numpy as np
 
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.dataset.event_pass import EventPass
 from blinkgl.errors import ConfigError
-from blinkgl.events.readout import Readout
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
 from blinkgl.front.runs import Emulator, Source, Timeline, configured, labels_tree
@@ -21,9 +19,9 @@ from blinkgl.front.scenes import Scene
 from blinkgl.gl import create_context
 from blinkgl.labels import LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
-from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene import types as data
 from blinkgl.scene.build import build_scene
+from blinkgl.sequence import EventChunk, simulate as core
 from blinkgl.srgb import to_srgb8
 
 _LATEST_S = 1e7
@@ -90,21 +88,20 @@ def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, 
     labels : of images, flow, flow_backward, occlusion, depth, ids, normals, velocity; default: the source's (images, flow, occlusion).
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config, scene = _built(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
-    times, interval = config.time.label_times_ns, config.time.interval_ns
-    readout = Readout(config.readout) if config.readout is not None else None
-    request, images, frames, chunks = asked_for(config.labels), [], [], []
-    with create_context(config.gl.backend, config.gl.device) as gl, SceneRenderer(gl, scene, config.render) as renderer:
-        events = EventPass(config.timeline, config.events, renderer, kernel_seed(config.seed, index, Role.EVENTS))
-        for t_ns, chunk in events:
-            chunks.append(chunk if readout is None else readout.step(chunk, t_ns // 1000))
-        for t_ns in times:
-            if "images" in request:
-                images.append(to_srgb8(renderer.colour(t_ns).read()))
-            if t_ns != times[-1]:
-                frames.append(renderer.labels(t_ns, request.without("images"), t_ns + interval, t_ns - interval))
-    lost = events.emulator.saturated + (readout.dropped if readout is not None else 0)
-    t_us = np.array(times, np.int64) // 1000
-    return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames), t_us, np.stack(images) if images else None, config, events.frames, lost)
+    images, frames, chunks, times = [], [], [], []
+    with core.simulate_sequence(config, index, scene=scene) as sequence:
+        for item in sequence:
+            if isinstance(item, EventChunk):
+                chunks.append(item.events)
+                continue
+            times.append(item.t_ns // 1000)
+            if (image := item.frame.values.pop("images", None)) is not None:
+                images.append(to_srgb8(image))
+            if item.forward_ns is not None:
+                frames.append(item.frame)
+    t_us, camera = np.array(times, np.int64), sequence.camera
+    return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames), t_us, np.stack(images) if images else None, config, sequence.frames,
+                     camera.saturated + camera.dropped)
 
 
 class Renderer:

@@ -120,6 +120,11 @@ class GLContext:
             raise GLError("this context is in use by another thread", where=self.renderer, accepted="a context per thread")
         _thread.current = weakref.ref(self)
 
+    def resume(self) -> None:
+        """:meth:`make_current` where another context has been made so in this thread since. For whoever goes on after somebody else's turn."""
+        if getattr(_thread, "current", lambda: None)() is not self:
+            self.make_current()
+
     @contextlib.contextmanager
     def borrowed(self) -> Iterator[None]:
         """Current inside the block; afterwards the one that was current in this thread before is so again. Releasing needs it:

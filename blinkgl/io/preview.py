@@ -12,6 +12,7 @@ from blinkgl.events.types import Events
 from blinkgl.io.colour import count_events, event_colour, flow_colour, flow_wheel
 from blinkgl.io.video import VideoWriter
 from blinkgl.srgb import to_srgb8
+from blinkgl.timeline.sampling import Ticks
 
 _BAR = 30
 _GAP = 4
@@ -45,7 +46,7 @@ class PreviewWriter:
         if height < 200:
             factor = 2.0
         self._panel = (max(2, round(width * factor / 2) * 2), max(2, round(height * factor / 2) * 2))  # (w, h), even
-        self._period_us, self._next_us, self._t0_us = 1e6 / rate_hz, float(t0_us), t0_us
+        self._ticks, self._t0_us = Ticks(t0_us, rate_hz), t0_us
         self._slow = rate_hz / fps
         self._names = [label, "events", "optical flow"][: 3 if flow else 2]
         w, h = self._panel
@@ -81,7 +82,7 @@ class PreviewWriter:
 
     def due(self, t_us: int) -> bool:
         """Whether :meth:`frame` at this time would be shown."""
-        return t_us >= self._next_us
+        return self._ticks.due(t_us)
 
     def frame(self, t_us: int, image: np.ndarray) -> None:
         """Composes and encodes one picture (several times when more than one period has passed). image: (H, W[, 3]) float
@@ -96,9 +97,8 @@ class PreviewWriter:
         self._caption(1, f"ON blue, OFF red   {self._pending:,}")
         self._counts[:] = 0
         self._pending = 0
-        while self.due(t_us):
+        for _ in range(self._ticks.passed(t_us)):
             self._video.write(self._canvas)
-            self._next_us += self._period_us
 
     def close(self) -> None:
         self._video.close()

@@ -15,6 +15,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -23,8 +24,8 @@ from blinkgl.config.base import validate
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
-from blinkgl.events import Events, make_emulator
-from blinkgl.events.readout import Readout
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
+from blinkgl.events.types import Events
 from blinkgl.io.frames import open_frames
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.timeline import interpolate as between
@@ -62,7 +63,7 @@ class SimulationReport:
 
 def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | EmulatorConfig = EmulatorConfig.members.default, gamma: str | float | None = None,
              interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, readout: ReadoutConfig | None = None,
-             report: SimulationReport | None = None, on_frame: Callable[[np.ndarray, int, Events], None] | None = None) -> Iterator[Events]:
+             report: SimulationReport | None = None) -> Iterator[Events]:
     """Events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
 
     Parameters
@@ -73,37 +74,61 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | Emul
     gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: srgb for integers, linear for floats.
     interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1`` frames in between
         by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
-    seed : of the emulator. readout : the sensor's bus (``load_sensor(name).readout``); None: no limit. report : filled as it goes. on_frame : called with (luminance or uint8 frame, t_ns, events) per step.
+    seed : of the emulator. readout : the sensor's bus (``load_sensor(name).readout``); None: no limit. report : filled as it goes.
 
     Raises
     ------
     EventDataError : NaN, infinite or negative intensities, non-increasing times, a changed size, fewer than two frames; names the frame.
     ConfigError : unknown emulator, gamma or interpolation.
     """
+    report = report if report is not None else SimulationReport()
+    steps = simulated_steps(frames, fps=fps, emulator=emulator, gamma=gamma, interpolate=interpolate, factor=factor, max_px=max_px, seed=seed,
+                            readout=readout, report=report)
+    return (step.events for step in steps if len(step.events))
+
+
+class Step(NamedTuple):
+    """One step of an emulator. events : before t_ns, not given before.   frame : (H, W) float32 linear luminance or uint8 codes, at t_ns."""
+
+    t_ns: int
+    events: Events
+    frame: np.ndarray
+
+
+def simulated_steps(frames: Iterable, *, report: SimulationReport, fps: float | None = None,
+                    emulator: str | EmulatorConfig = EmulatorConfig.members.default, gamma: str | float | None = None,
+                    interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
+                    readout: ReadoutConfig | None = None) -> Iterator[Step]:
+    """As :func:`simulate`, every step of it."""
     config = emulator_config(emulator)
     if interpolate not in INTERPOLATIONS:
         raise ConfigError("unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS))
-    report = report if report is not None else SimulationReport()
-    return _run(_timed(frames, fps), config, _checked_gamma(gamma), interpolate, factor, max_px, seed, readout, report, on_frame)
+    return _run(timed(frames, fps), config, _checked_gamma(gamma), interpolate, factor, max_px, seed, readout, report)
 
 
-def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, report, on_frame) -> Iterator[Events]:
+def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, report) -> Iterator[Step]:
     first = next(frames, None)
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
-    height, width = first[0].shape[:2]
-    model = make_emulator(config, height, width, seed)
-    bus = Readout(readout) if readout is not None else None
+    camera = EventCamera(config, readout, *first[0].shape[:2], seed)
+    yield from stepped(itertools.chain([first], frames), camera, gamma=gamma, interpolate=interpolate, factor=factor, max_px=max_px,
+                       report=report)
+
+
+def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, *, gamma: str | float | None, interpolate: str, factor: int,
+            max_px: float, report: SimulationReport | None = None) -> Iterator[Step]:
+    """Frames (array, t_ns, name), those in between included, through an event camera. Raises EventDataError as :func:`simulate`."""
+    report = report if report is not None else SimulationReport()
+    first = next(frames)
     decode = Decoder(gamma)
     table = interpolate == "linear" and first[0].dtype == np.uint8 and first[0].ndim == 2
     if table:
-        model.set_decode(decode.table(np.uint8))
+        camera.emulator.set_decode(decode.table(np.uint8))
 
     def luminances() -> Iterator[tuple[np.ndarray, int]]:
         shape = first[0].shape
-        frame, t_ns, name = first
         last = None
-        while True:
+        for frame, t_ns, name in itertools.chain([first], frames):
             if frame.shape != shape:
                 raise EventDataError("frame size changed", where=name, value=frame.shape, accepted=f"{shape} as the first frame")
             if last is not None and t_ns <= last:
@@ -111,10 +136,6 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
             last = t_ns
             report.frames += 1
             yield (frame if table and frame.dtype == np.uint8 else decode(frame, name)), t_ns
-            following = next(frames, None)
-            if following is None:
-                break
-            frame, t_ns, name = following
         if report.frames < 2:
             raise EventDataError("events need at least two frames", where=name, value="1 frame")
 
@@ -124,22 +145,21 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
     elif interpolate == "motion":
         report.displacement = between.Displacement()
         stream = between.motion(stream, max_px, displacement=report.displacement)
-    for luminance, t_ns in stream:
-        if report.steps == 0:
-            report.first_ns = t_ns
-        events = model.step(luminance, t_ns)
-        if bus is not None:
-            events = bus.step(events, t_ns // 1000)
-            report.lost, report.late = bus.dropped, bus.late
+    seen: list[np.ndarray] = [first[0]]
+
+    def shown() -> Iterator[EventFrame]:
+        for luminance, t_ns in stream:
+            seen[0] = luminance
+            yield EventFrame(t_ns, luminance)
+
+    for t_ns, events in emulate(shown(), camera):
+        report.first_ns = t_ns if report.steps == 0 else report.first_ns
         report.steps += 1
         report.last_ns = t_ns
         report.events += len(events)
         report.on += int(np.count_nonzero(events.p))
-        report.saturated = getattr(model, "saturated", 0)
-        if on_frame is not None:
-            on_frame(luminance, t_ns, events)
-        if len(events):
-            yield events
+        report.saturated, report.lost, report.late = camera.saturated, camera.dropped, camera.late
+        yield Step(t_ns, events, seen[0])
 
 
 def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None,
@@ -172,22 +192,19 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
 
     with contextlib.ExitStack() as stack:
         out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us if kind == "dsec" else 0, overwrite=overwrite))
-        if preview is None:
-            on_frame = None
-        else:
+        video = None
+        if preview is not None:
             rate = min(1e9 / gap_ns, 100.0)
             video = stack.enter_context(PreviewWriter(stack.enter_context(atomic_file(preview, overwrite=overwrite)), height, width,
                                                       t0_us=start_us, flow=False, rate_hz=rate, fps=min(rate, 25.0)))
-            decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
-
-            def on_frame(luminance, t_ns, events) -> None:
-                video.add_events(events)
-                if video.due(t_ns // 1000):
-                    video.frame(t_ns // 1000, decode(luminance, "") if luminance.dtype == np.uint8 else luminance)
-
+        decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
         done = 0
-        for events in simulate(given(), report=report, on_frame=on_frame, **options):
-            out.append(events)
+        for step in simulated_steps(given(), report=report, **options):
+            if video is not None:
+                video.add_events(step.events)
+                if video.due(step.t_ns // 1000):
+                    video.frame(step.t_ns // 1000, decode(step.frame, "") if step.frame.dtype == np.uint8 else step.frame)
+            out.append(step.events)
             if progress is not None and report.frames > done:
                 done = report.frames
                 progress(report, min(done / frames.count, 1.0) if frames.count else None)
@@ -268,7 +285,7 @@ def _checked_gamma(gamma: str | float | None) -> str | float | None:
     raise ConfigError("unknown transfer curve", where="gamma", value=gamma, accepted="srgb, linear or an exponent up to 10")
 
 
-def _timed(frames: Iterable, fps: float | None) -> Iterator[tuple[np.ndarray, int, str]]:
+def timed(frames: Iterable, fps: float | None = None) -> Iterator[tuple[np.ndarray, int, str]]:
     """(frame, t_ns, name) from the three kinds of iterables :func:`simulate` takes."""
     for i, item in enumerate(frames):
         if isinstance(item, tuple):

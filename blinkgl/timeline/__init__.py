@@ -5,7 +5,7 @@ Out:   frame times, int64 ns, increasing.
 Start: strategy.py (``make_timeline``); sampling.py has the arithmetic, budget.py measures the error, interpolate.py invents frames of a video.
 """
 
-from blinkgl.timeline.sampling import bounded_times, displacement_times, uniform_times
+from blinkgl.timeline.sampling import Ticks, bounded_times, displacement_times, uniform_times
 from blinkgl.timeline.strategy import Timeline, make_timeline
 
-__all__ = ["Timeline", "bounded_times", "displacement_times", "make_timeline", "uniform_times"]
+__all__ = ["Ticks", "Timeline", "bounded_times", "displacement_times", "make_timeline", "uniform_times"]

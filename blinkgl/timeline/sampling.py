@@ -63,3 +63,24 @@ def _step(steps: float, pace: float, low: int, high: int) -> int:
     if pace * high <= steps * NS_PER_S:
         return high
     return max(low, int(steps / pace * NS_PER_S))
+
+
+class Ticks:
+    """Which of the times that come by are the first at or after each multiple of 1 / rate_hz since t0_us: when a picture of a video is due.
+
+    In float µs, each period added to the last."""
+
+    def __init__(self, t0_us: int, rate_hz: float):
+        self._period_us, self._next_us = 1e6 / rate_hz, float(t0_us)
+
+    def due(self, t_us: int) -> bool:
+        """Whether a multiple has come since the last that was passed."""
+        return t_us >= self._next_us
+
+    def passed(self, t_us: int) -> int:
+        """How many multiples have come, up to and with t_us; from now on they are over."""
+        count = 0
+        while self.due(t_us):
+            self._next_us += self._period_us
+            count += 1
+        return count

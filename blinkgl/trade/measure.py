@@ -1,7 +1,7 @@
 """Times settings and judges their events: the measurement behind ``blinkgl trade``.
 
-A clip of one sequence goes through pass 1 of ``blinkgl generate`` (:class:`~blinkgl.dataset.event_pass.EventPass`; nothing is written), once per setting and
-round. Rounds are interleaved, so that a busy moment of the machine falls on all settings alike.
+The events of a clip are simulated as ``blinkgl generate`` simulates them (:func:`~blinkgl.sequence.simulate.simulate_sequence`; nothing is
+written), once per setting and round. Rounds are interleaved, so that a busy moment of the machine falls on all settings alike.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
-from blinkgl.dataset.event_pass import EventPass
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
+from blinkgl.sequence import Simulation, simulate_sequence
 from blinkgl.trade.labels import flow_errors
 from blinkgl.trade.metrics import EventErrors, SpeedMaps, event_errors, masked
 from blinkgl.trade.reference import FineTiles, lattice, mask_of, reference_events
@@ -120,7 +120,7 @@ class Bench:
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
-        # Labels and previews take no part in this; noise would drown the errors that are asked for.
+        # Labels and previews take no part in this; noise, and a bus that makes events late, would drown the errors that are asked for.
         self.emulator = emulator_of(base.events).noiseless(base.events)
         tree = apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])])
         self._template = RunTemplate({**tree, "events": self.emulator.model_dump()}, template.base)
@@ -179,16 +179,20 @@ class Bench:
         return results
 
     def _run(self, result: Measured, config: SequenceConfig, renderer: Renderer, first: bool) -> None:
-        clip = lambda end: EventPass(config.timeline, self.emulator, renderer, self.seed, window_ns=(self.t0_ns, end))
+        config = config.model_copy(update={"events": self.emulator, "readout": None})
+
+        def clip(end_ns: int) -> Simulation:
+            return simulate_sequence(config, self.options.sequence, labels=False, renderer=renderer, window_ns=(self.t0_ns, end_ns))
+
         for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # programs, targets, kernels: made the first time
             pass
         run, drawn = clip(self.t1_ns), renderer.stats.triangles
         chunks: list[Events] = []
         wall, cpu = time.perf_counter(), time.process_time()
-        for _, events in run:
+        for chunk in run:
             if first:
                 paused = time.perf_counter(), time.process_time()
-                chunks.append(masked(events, self.mask))
+                chunks.append(masked(chunk.events, self.mask))
                 wall += time.perf_counter() - paused[0]
                 cpu += time.process_time() - paused[1]
         result.wall_s.append((time.perf_counter() - wall) / self.duration_s)

@@ -15,10 +15,10 @@ import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.events import make_emulator
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
-from blinkgl.render.renderer import Renderer
 from blinkgl.render.rectangles import Rectangle
+from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.types import Camera, Scene
 from blinkgl.timeline.sampling import displacement_times
@@ -93,13 +93,9 @@ def reference_events(source: FrameSource, times: Iterable[int], config: Emulator
     """Events (of the masked pixels) of the frames of a source, linear in time between them; and the number of frames.
 
     Linear, because the times are so dense that it does not matter, and no scheme that is judged should judge."""
-    emulator = make_emulator(config, height, width, seed)
-    chunks, frames = [], 0
-    times = list(times)
-    for t_ns, frame in zip(times, source(times)):
-        frames += 1
-        chunks.append(masked(emulator.step(frame, t_ns), mask))
-    return Events.concatenate(chunks), frames
+    camera, times = EventCamera(config, None, height, width, seed), list(times)
+    chunks = [masked(events, mask) for _, events in emulate(map(EventFrame, times, source(times)), camera)]
+    return Events.concatenate(chunks), camera.frames
 
 
 def _zoomed(camera: Camera, tile: Rectangle, scale: int) -> Camera:

@@ -144,7 +144,7 @@ def test_the_shipped_recipe_takes_frames(tmp_path, tartan):
 
 
 def test_asset_errors_name_the_file(tmp_path, tartan):
-    from blinkgl.dataset.frames import _flow
+    from blinkgl.sequence.recorded import _flow
 
     np.save(tmp_path / "f.npy", np.zeros((3, 4, 5), np.float32))
     with pytest.raises(AssetError, match="not a flow field"):

@@ -21,9 +21,9 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset import generate as generate_module
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import verify_dataset
-from blinkgl.render.passes import Luminance
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.render.passes import Luminance
 
 SMALL = {
     "seed": 4,

@@ -217,14 +217,15 @@ def test_a_mesh_with_a_number_that_is_none_is_refused(gl):
                                                      ((0.5, 0.5, 0.5), np.inf, "the background")])
 def test_the_message_names_what_is_seen_where_and_when(gl, color, background, seen):
     from blinkgl.config.events import EsimConfig
+    from blinkgl.config.sequence import SequenceConfig
     from blinkgl.config.timeline import UniformTimeline
-    from blinkgl.dataset.event_pass import EventPass
+    from blinkgl.sequence import simulate_sequence
 
     wall = thing("wall", 7, quad(0.5, 0.5), still((0, 3, 0), FACING), Material(base_color=color, unlit=True))
     world = replace(scene([wall], background=background), t0_ns=250 * MS, t1_ns=500 * MS)
     with Renderer(gl, world, RenderConfig()) as renderer:
         with pytest.raises(EventDataError, match=rf"^frame 0 at 0\.25 s: intensity at pixel x=\d+, y=\d+ cannot be used: it shows {seen} \(got .*\); expected a finite value") as caught:
-            list(EventPass(UniformTimeline(fps=100), EsimConfig(), renderer, 1))
+            list(simulate_sequence(SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()), labels=False, renderer=renderer))
     assert "\n" not in str(caught.value)
     x, y = caught.value.pixel
     assert (abs(x - 78) < 27 and abs(y - 60) < 27) == (background == 0.0)

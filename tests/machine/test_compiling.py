@@ -9,10 +9,10 @@ import numba
 import numpy as np
 from rich.console import Console
 
-from blinkgl.dataset.clock import StageClock
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.run import Outcome
 from blinkgl.machine import compiling
+from blinkgl.sequence.clock import StageClock
 from blinkgl.show.generate import show_outcome
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.sequence import RenderConfig
+from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, DisplacementTimeline, UniformTimeline
-from blinkgl.dataset.event_pass import EventPass
 from blinkgl.events import Esim, Events, emulator_of
 from blinkgl.events.v2e_model import lin_log
 from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
+from blinkgl.sequence import simulate_sequence
 from blinkgl.timeline import make_timeline
 from blinkgl.timeline.budget import TimeError, contraharmonic_mean, weighted_percentile
 from blinkgl.timeline.strategy import PROBE_EVERY
@@ -103,15 +103,19 @@ def test_response_is_the_emulators_own_slope():
     assert Esim.response(EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2)).threshold == 0.2
 
 
+def run_of(timeline, renderer):
+    return simulate_sequence(SequenceConfig(timeline=timeline, events=ESIM), labels=False, renderer=renderer)
+
+
 @pytest.mark.parametrize("reconstruction", ["linear", "pchip", "hermite"])
 def test_budget_keeps_to_its_target_and_its_estimate_to_the_truth(gl, world, reconstruction):
     """Against a much denser run: the promised percentile is within a factor 2 of the estimate and of the target, the median within 3."""
     target = 200.0
     config = BudgetTimeline(max_time_error_us=target, reconstruction=reconstruction, min_step_us=50, sample_every=2)
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="none")) as renderer:
-        dense = Events.concatenate([e for _, e in EventPass(UniformTimeline(fps=8000), ESIM, renderer, 1)])
-        run = EventPass(config, ESIM, renderer, 1)
-        events = Events.concatenate([e for _, e in run])
+        dense = Events.concatenate([chunk.events for chunk in run_of(UniformTimeline(fps=8000), renderer)])
+        run = run_of(config, renderer)
+        events = Events.concatenate([chunk.events for chunk in run])
     matching = match_events(dense, events, 72, 96, 3_000)
     true, median = (np.percentile(np.abs(matching.dt_us[matching.matched]), q) for q in (75, 50))
     said = run.timeline.info()["time_error"]
@@ -125,7 +129,7 @@ def test_less_error_takes_more_frames(gl, world):
     with Renderer(gl, world, PLAIN) as renderer:
         counts = []
         for px in (0.02, 0.08, 0.32):
-            run = EventPass(BudgetTimeline(max_time_error_px=px, min_step_us=20), ESIM, renderer, 1)
+            run = run_of(BudgetTimeline(max_time_error_px=px, min_step_us=20), renderer)
             list(run)
             counts.append(run.frames)
     assert counts[0] > 1.5 * counts[1] > 2 * counts[2]

@@ -16,8 +16,7 @@ from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES
-from blinkgl.tools.shader_debugger.session import DebugRenderer, Subject, When
+from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
 
 _T = TypeVar("_T")
 

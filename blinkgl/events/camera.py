@@ -1,0 +1,102 @@
+"""An event camera, emulator and read-out together, and the one loop that frames go through it in.
+
+Whoever turns frames into events does it here: a generated sequence, converted frames, a video, a reference, a benchmark. So what
+stands between an emulator and the outside (the read-out, a path between frames that is one frame late) is never left out by one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from typing import NamedTuple
+
+import numpy as np
+
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.errors import EventDataError
+from blinkgl.events.readout import Readout
+from blinkgl.events.table import make_emulator
+from blinkgl.events.types import Events
+
+
+class EventFrame(NamedTuple):
+    """What an emulator is given of one moment; valid until the next one is asked for, so that a source may reuse its arrays.
+
+    luminance : (H, W) float32, linear, or uint8 codes.   rate : (H, W) float32, d(luminance)/dt per second, or None.
+    rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere. As of ``Emulator.step``."""
+
+    t_ns: int
+    luminance: np.ndarray
+    rate: np.ndarray | None = None
+    rows: tuple[int, int] | None = None
+
+
+class EventCamera:
+    """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
+
+    readout : None: no limit.   seed : of the emulator's draws.   reconstruction : the path between frames, see :class:`Emulator`.
+    emulator : the :class:`Emulator` itself.   Raises EventDataError: size, or a path that the emulator cannot follow."""
+
+    def __init__(self, config: EmulatorConfig, readout: ReadoutConfig | None, height: int, width: int, seed: int,
+                 reconstruction: str = "linear"):
+        self.emulator = make_emulator(config, height, width, seed, reconstruction)
+        self._readout = None if readout is None else Readout(readout)
+
+    @property
+    def frames(self) -> int:
+        """Taken so far."""
+        return self.emulator.frames
+
+    @property
+    def done_ns(self) -> int | None:
+        """All events before this time's microsecond have been given; None before the first frame."""
+        return self.emulator.done_ns
+
+    @property
+    def saturated(self) -> int:
+        """Events cut by the emulator's ``max_events_per_step`` so far."""
+        return self.emulator.saturated
+
+    @property
+    def dropped(self) -> int:
+        """Events that found the read-out's queue full, so far."""
+        return 0 if self._readout is None else self._readout.dropped
+
+    @property
+    def late(self) -> int:
+        """Events on the read-out's bus that have not left it yet."""
+        return 0 if self._readout is None else self._readout.late
+
+    def step(self, frame: EventFrame) -> Events:
+        """The events that are out by :attr:`done_ns` and were not before. Raises EventDataError as ``Emulator.step``; ``t_ns`` is then
+        the frame's."""
+        try:
+            events = self.emulator.step(frame.luminance, frame.t_ns, frame.rows, frame.rate)
+        except EventDataError as error:
+            error.t_ns = frame.t_ns
+            raise
+        return self._read_out(events)
+
+    def flush(self) -> Events:
+        """What a path that lags holds back after the last frame; empty for the others."""
+        return self._read_out(self.emulator.flush())
+
+    def _read_out(self, events: Events) -> Events:
+        return events if self._readout is None else self._readout.step(events, self.done_ns // 1000)
+
+
+def emulate(frames: Iterable[EventFrame], camera: EventCamera,
+            clock: Callable[[str], AbstractContextManager] = lambda _: nullcontext()) -> Iterator[tuple[int, Events]]:
+    """(t_ns, events) frame by frame: all events before t_ns's microsecond that have not been given before.
+
+    The loop asks for a frame, takes its events and gives them away before it asks for the next.
+    clock : ``clock("events")`` is entered around the camera's work."""
+    for frame in frames:
+        with clock("events"):
+            events = camera.step(frame)
+        yield camera.done_ns, events
+    if camera.emulator.lags and camera.frames:
+        with clock("events"):
+            events = camera.flush()
+        yield camera.done_ns, events

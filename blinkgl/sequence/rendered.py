@@ -1,0 +1,142 @@
+"""A sequence of a scene: frames are drawn at the times the timeline asks for and go through the emulator; ground truth at label times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.config.sequence import SequenceConfig
+from blinkgl.errors import EventDataError
+from blinkgl.events import emulator_of
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
+from blinkgl.events.types import Events
+from blinkgl.gl import GLContext, create_context
+from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.render.renderer import Renderer
+from blinkgl.rng import Role, kernel_seed
+from blinkgl.scene.build import build_scene
+from blinkgl.scene.types import Scene
+from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.items import GroundTruth, Picture
+from blinkgl.sequence.simulate import Simulation
+from blinkgl.timeline import Timeline, make_timeline
+
+
+def drawn(renderer: Renderer, times: Iterable[int], rates: bool = False) -> Iterator[EventFrame]:
+    """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one. rates : with d(luminance)/dt."""
+    observe, frame = times.observe if isinstance(times, Timeline) else None, None
+    for t_ns in times:
+        before, frame = frame, renderer.luminance(t_ns, rate=rates)
+        luminance, rate = frame.view(), frame.view("rate") if rates else None
+        if observe is not None:
+            observe(t_ns, luminance, rate)
+        yield EventFrame(t_ns, luminance, rate, frame.rows_changed_since(before))
+
+
+class RenderedSequence(Simulation):
+    """See :func:`~blinkgl.sequence.simulate.simulate_sequence`.
+
+    scene : as it was built.   renderer : what draws it, at its level of detail."""
+
+    def __init__(self, config: SequenceConfig, index: int, gl: GLContext | None, *, base: Path, events: bool, labels: bool,
+                 pictures_hz: float | None, scene: Scene | None, renderer: Renderer | None, window_ns: tuple[int, int] | None):
+        clock = StageClock()
+        scene = scene or (renderer.scene if renderer is not None else None)
+        if scene is None:
+            with clock("scene"):
+                scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
+                                    seed=config.seed, sequence=index, base=base)
+        with ExitStack() as stack:
+            if renderer is None:
+                gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))
+                renderer = stack.enter_context(Renderer(gl, scene, config.render))
+            size, span_ns = (renderer.height, renderer.width), window_ns or (scene.t0_ns, scene.t1_ns)
+            self.scene, self.renderer, self.omissions = scene, renderer, scene.omissions
+            self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
+            camera = None
+            if events:
+                camera = EventCamera(config.events, config.readout, *size, kernel_seed(config.seed, index, Role.EVENTS),
+                                     config.timeline.reconstruction)
+                self.timeline = make_timeline(config.timeline, *span_ns, renderer, emulator_of(config.events).response(config.events))
+            super().__init__(config, index, clock, size=size, span_ns=span_ns, pictures_hz=pictures_hz, camera=camera, labels=labels,
+                             stack=stack.pop_all())
+
+    def _resume(self) -> None:
+        self.renderer.gl.resume()
+
+    def _event_pass(self) -> Iterator[tuple[int, Events]]:
+        try:
+            yield from emulate(drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate), self.camera, self.clock)
+        except EventDataError as error:
+            raise self._explained(error) from error
+
+    def _explained(self, error: EventDataError) -> EventDataError:
+        """The error with the time and, where a pixel is at fault, what is seen there."""
+        if error.pixel is None:
+            return error
+        seen = self.renderer.shown_at(*error.pixel, error.t_ns)
+        explained = EventDataError(f"{error.problem}: it shows {seen}", where=f"{error.where} at {error.t_ns * 1e-9:.9g} s", value=error.value,
+                                   accepted=error.accepted)
+        explained.pixel, explained.t_ns = error.pixel, error.t_ns
+        return explained
+
+    def _label_times(self) -> Iterator[tuple[int, int]]:
+        return ((k, t) for k, t in enumerate(self.config.time.label_times_ns) if self.t0_ns <= t <= self.t1_ns)
+
+    def _truth(self, k: int, t_ns: int) -> GroundTruth:
+        request, interval = asked_for(self.config.labels), self.config.time.interval_ns
+        last = k == self.config.time.label_count
+        if last:
+            request = LabelRequest(*(name for name in request if LABELS[name].at_last))
+        frame = self.renderer.labels(t_ns, request, t_ns + interval, t_ns - interval)
+        camera, objects = poses_at(self.scene, [t_ns])
+        leads_to = (None, None) if last else (t_ns + interval, t_ns - interval)
+        return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
+
+    def _picture(self, t_ns: int) -> Picture:
+        return Picture(t_ns, self.renderer.colour(t_ns, antialiasing="none").read(), self.renderer.velocity(t_ns).read())
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        stats, (render_s, readback_s) = self.renderer.stats, self._before
+        return {**self.clock.seconds, "render": stats.render_s - render_s, "read-back": stats.readback_s - readback_s}
+
+    def poses(self) -> dict[str, np.ndarray]:
+        """t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M, 4, 4) float64 in the
+        order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near."""
+        scene, times = self.scene, [self.config.time.t0_ns, *self.config.time.label_times_ns]
+        T_world_cam, T_world_obj = poses_at(scene, times)
+        return {
+            "t_ns": np.asarray(times, np.int64),
+            "T_world_cam": T_world_cam,
+            "T_world_obj": T_world_obj,
+            "object_ids": np.array([o.instance_id for o in scene.objects], np.int64),
+            "object_names": np.array([o.name for o in scene.objects], dtype=str),
+            "object_categories": np.array([o.category for o in scene.objects], dtype=str),
+            "K": scene.camera.K,
+            "resolution": np.array([scene.camera.width, scene.camera.height], np.int64),
+            "near": np.array(scene.camera.near),
+        }
+
+    def facts(self) -> dict[str, Any]:
+        gl, scene, timeline = self.renderer.gl, self.renderer.scene, self.config.timeline
+        return {
+            "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
+            "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
+            "triangles": self.triangles,
+            "objects": [{"name": o.name, "id": o.instance_id, "category": o.category,
+                         "source_hashes": sorted({p.mesh.source_hash for p in o.parts})} for o in scene.objects],
+            "scene_log": list(scene.log),
+            "not_drawn": list(scene.omissions),
+        }
+
+
+def poses_at(scene: Scene, times_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """T_world_cam (M, 4, 4) and T_world_obj (n, M, 4, 4), float64, at M times."""
+    t = np.asarray(times_ns, np.int64)
+    return (scene.camera.path.poses(t),
+            np.stack([o.path.poses(t) for o in scene.objects]) if scene.objects else np.zeros((0, len(t), 4, 4)))

@@ -1,0 +1,167 @@
+"""``simulate_sequence``: what happens in a sequence, in the order of time. Writing it down is one consumer of many.
+
+    with simulate_sequence(config, index, gl) as sequence:
+        for item in sequence:
+            match item:
+                case EventChunk(t_ns, events): ...
+                case GroundTruth(): ...
+
+Events come in chunks, one a frame, cut where a label's time lies between two frames; ground truth comes at its time, between them. So
+whoever trains on a window of events and the flow over it holds one window, and nobody holds a sequence. (Files would not mind all
+events first, as it used to be: they are the same, byte for byte. An online consumer would then have to keep every event.)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from blinkgl.config.sequence import SequenceConfig
+from blinkgl.errors import ConfigError
+from blinkgl.events.camera import EventCamera
+from blinkgl.events.types import Events
+from blinkgl.gl import GLContext
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.types import Scene
+from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.items import EventChunk, GroundTruth, Item, Picture
+from blinkgl.timeline import Ticks, Timeline
+
+
+def simulate_sequence(config: SequenceConfig, index: int = 0, gl: GLContext | None = None, *, base: Path = Path("."), events: bool = True,
+                      labels: bool = True, pictures_hz: float | None = None, scene: Scene | None = None, renderer: Renderer | None = None,
+                      window_ns: tuple[int, int] | None = None) -> Simulation:
+    """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth` and :class:`Picture` in time order.
+
+    gl : context to draw with; None: one of its own, where something is drawn at all.
+    base : folder that relative paths in the configuration start from.
+    events, labels : False leaves them out; what ``labels:`` does not ask for is left out anyway. Nothing is drawn that nobody asked for.
+    pictures_hz : pictures per second of simulated time, at the frames of the event pass; None: none.
+    scene : made already, instead of the configuration's.   renderer : made already, and not released at the end; its scene is drawn.
+    window_ns : first and last time, ns, instead of all of the sequence. (These three: of what is drawn, not of recorded frames.)
+    Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
+    # They import this module, for what they share.
+    from blinkgl.sequence.recorded import RecordedSequence
+    from blinkgl.sequence.rendered import RenderedSequence
+
+    wanted = dict(events=events, labels=labels, pictures_hz=pictures_hz)
+    if config.frames is None:
+        return RenderedSequence(config, index, gl, base=base, scene=scene, renderer=renderer, window_ns=window_ns, **wanted)
+    if scene is not None or renderer is not None or window_ns is not None:
+        raise ConfigError("nothing is drawn of recorded frames", where="frames", accepted="neither scene, renderer nor window_ns")
+    return RecordedSequence(config, index, base=base, **wanted)
+
+
+_NO_LABEL = (0, None)
+
+
+class Simulation(ABC):
+    """One sequence in time: iterate over it once. It holds OpenGL until its end, however the loop ends, or that of its ``with`` block.
+
+    config : every value as drawn.   index : number of the sequence.   height, width : px.
+    t0_ns, t1_ns : first and last time, ns.   pictures_hz : that it gives, or None.
+    clock : wall seconds per stage.   camera : emulator and read-out, None when no events were asked for.
+    events, labels : given so far.   triangles : of all that is drawn; 0 for recorded frames.
+    timeline : the :class:`Timeline` that says when event frames are drawn; None for recorded frames, and without events.
+    omissions : what files of the scene ask for and is not drawn, a line per file."""
+
+    triangles = 0
+    timeline: Timeline | None = None
+    omissions: tuple[str, ...] = ()
+
+    def __init__(self, config: SequenceConfig, index: int, clock: StageClock, *, size: tuple[int, int], span_ns: tuple[int, int],
+                 pictures_hz: float | None, camera: EventCamera | None, labels: bool, stack: ExitStack | None = None):
+        self.config, self.index, self.clock, self.camera = config, index, clock, camera
+        (self.height, self.width), (self.t0_ns, self.t1_ns) = size, span_ns
+        self.pictures_hz, self.events, self.labels = pictures_hz, 0, 0
+        self._labels, self._stack, self._begun = labels, stack or ExitStack(), False
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Lets go of OpenGL. Harmless when repeated."""
+        self._stack.close()
+
+    def __iter__(self) -> Iterator[Item]:
+        if self._begun:
+            raise ConfigError("a simulation is iterated over once", where="simulate_sequence", accepted="a new one")
+        self._begun = True
+        return self._items()
+
+    def _items(self) -> Iterator[Item]:
+        with self:
+            self._resume()
+            for item in self._in_order():
+                yield item
+                self._resume()
+
+    def _in_order(self) -> Iterator[Item]:
+        moments = iter(self._label_times() if self._labels else ())
+        k, label_ns = next(moments, _NO_LABEL)
+        ticks = None if self.pictures_hz is None else Ticks(self.t0_ns // 1000, self.pictures_hz)
+        for t_ns, events in self._event_pass() if self.camera is not None else ():
+            self.events += len(events)
+            while label_ns is not None and label_ns <= t_ns:
+                before, events = events.split(label_ns // 1000)
+                yield EventChunk(label_ns, before)
+                yield self._counted(k, label_ns)
+                k, label_ns = next(moments, _NO_LABEL)
+            yield EventChunk(t_ns, events)
+            if ticks is not None and ticks.passed(t_ns // 1000):
+                yield self._picture(t_ns)
+        while label_ns is not None:
+            yield self._counted(k, label_ns)
+            k, label_ns = next(moments, _NO_LABEL)
+
+    def _counted(self, k: int, t_ns: int) -> GroundTruth:
+        truth = self._truth(k, t_ns)
+        self.labels += truth.forward_ns is not None
+        return truth
+
+    @property
+    def frames(self) -> int:
+        """That the emulator has seen so far."""
+        return 0 if self.camera is None else self.camera.frames
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """Wall seconds per stage so far."""
+        return dict(self.clock.seconds)
+
+    @property
+    def achieved(self) -> dict[str, Any]:
+        """What an adaptive timeline says it has achieved so far; empty for the others."""
+        return {} if self.timeline is None else self.timeline.info()
+
+    @abstractmethod
+    def facts(self) -> dict[str, Any]:
+        """Plain values for the manifest about where it came from; complete when the iteration is."""
+
+    @abstractmethod
+    def poses(self) -> dict[str, np.ndarray]:
+        """What poses.npz holds; empty where nobody knows."""
+
+    def _resume(self) -> None:
+        """Called when it is its turn again: the receiver may have used OpenGL meanwhile."""
+
+    @abstractmethod
+    def _label_times(self) -> Iterable[tuple[int, int]]:
+        """Number and time, ns, of every label."""
+
+    @abstractmethod
+    def _event_pass(self) -> Iterator[tuple[int, Events]]: ...
+
+    @abstractmethod
+    def _truth(self, k: int, t_ns: int) -> GroundTruth: ...
+
+    @abstractmethod
+    def _picture(self, t_ns: int) -> Picture: ...

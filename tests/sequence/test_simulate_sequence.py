@@ -1,0 +1,179 @@
+"""One generator of what happens in time, and what its consumers may count on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset.generate import generate_run
+from blinkgl.errors import ConfigError
+from blinkgl.events import Events
+from blinkgl.gl import create_context
+from blinkgl.io.formats import open_events
+from blinkgl.render.renderer import Renderer
+from blinkgl.sequence import EventChunk, GroundTruth, Picture, simulate_sequence
+
+SMALL = {
+    "seed": 4, "camera": {"width": 48, "height": 36}, "time": {"duration": 0.1, "label_rate": 30, "start": 0.25},
+    "scene": {"kind": "random", "objects": {"count": 3, "distance": [2, 4]}, "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+              "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64}},
+    "labels": {"flow": ["forward", "backward"], "depth": True}, "preview": {"enabled": False},
+}
+
+
+def config_of(tmp_path: Path, **changes):
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump({**SMALL, **changes}))
+    return load_run(path).sequence(0)
+
+
+def events_of(items) -> Events:
+    return Events.concatenate([item.events for item in items if isinstance(item, EventChunk)])
+
+
+def assert_same(a: Events, b: Events) -> None:
+    assert len(a) == len(b) > 0
+    for column in "xytp":
+        np.testing.assert_array_equal(getattr(a, column), getattr(b, column))
+
+
+# --- order ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("changes", [
+    {}, {"timeline": {"kind": "uniform", "fps": 47, "reconstruction": "pchip"}}, {"timeline": {"kind": "uniform", "fps": 47, "reconstruction": "hermite"}},
+    {"events": {"emulator": "v2e", "preset": "noisy"}, "readout": {"events_per_second": 200_000, "queue_events": 200}},
+], ids=["default", "pchip", "hermite", "read-out"])
+def test_ground_truth_comes_between_the_events_before_and_after_its_time(tmp_path, gl, changes):
+    """The label rate and the frames' have no common divisor, so most labels lie inside a chunk."""
+    config = config_of(tmp_path, **changes)
+    with simulate_sequence(config, 0, gl, pictures_hz=50) as sequence:
+        items = list(sequence)
+    last_us, done_us, inside = None, config.time.t0_ns // 1000, 0
+    for item in items:
+        if isinstance(item, EventChunk):
+            assert item.t_ns // 1000 >= done_us
+            if len(item.events):
+                assert (np.diff(item.events.t) >= 0).all()
+                assert item.events.t[0] >= done_us, "what a chunk gives was not promised to be over"
+                last_us = int(item.events.t[-1])
+            done_us = item.t_ns // 1000
+        else:
+            assert item.t_ns // 1000 == done_us and (last_us is None or isinstance(item, Picture) or last_us < done_us)
+        inside += isinstance(item, GroundTruth)
+    truths = [item for item in items if isinstance(item, GroundTruth)]
+    assert [t.t_ns for t in truths] == list(config.time.label_times_ns) and [t.k for t in truths] == list(range(len(truths)))
+    assert [t.forward_ns is not None for t in truths] == [True] * config.time.label_count + [False] and sequence.labels == config.time.label_count
+    assert len([item for item in items if isinstance(item, Picture)]) > 3
+    assert done_us == config.time.t1_ns // 1000 and sequence.events == len(events_of(items)) > 100
+
+
+def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
+    """And it changes nothing of the rest: events are the same with and without labels and pictures between them."""
+    config = config_of(tmp_path)
+    drawn = []
+    for name in ("luminance", "colour", "labels", "velocity", "motion"):
+        def spied(self, *args, _name=name, _draw=getattr(Renderer, name), **kwargs):
+            drawn.append(_name)
+            return _draw(self, *args, **kwargs)
+        monkeypatch.setattr(Renderer, name, spied)
+    made = {}
+    for name, wanted in (("everything", {"pictures_hz": 40}), ("events", {"labels": False}), ("labels", {"events": False})):
+        drawn.clear()
+        made[name] = list(simulate_sequence(config, 0, gl, **wanted))
+        expected = {"everything": {"luminance", "motion", "colour", "labels", "velocity"}, "events": {"luminance", "motion"},
+                    "labels": {"colour", "labels"}}
+        assert set(drawn) == expected[name], "motion: what the timeline looks at"
+    assert_same(events_of(made["everything"]), events_of(made["events"]))
+    assert not events_of(made["labels"]).t.size
+    for a, b in zip((i for i in made["everything"] if isinstance(i, GroundTruth)), made["labels"], strict=True):
+        assert a.frame.values.keys() == b.frame.values.keys() and a.frame.values
+        for name in ("images", "depth"):
+            np.testing.assert_array_equal(getattr(a.frame, name), getattr(b.frame, name))
+        assert a.frame.backward is b.frame.backward is None or np.array_equal(a.frame.backward.flow, b.frame.backward.flow)
+
+
+# --- its consumers see one and the same -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("changes", [
+    {"timeline": {"kind": "uniform", "fps": 110, "reconstruction": "pchip"}, "events": {"emulator": "esim", "refractory_us": 2000},
+     "readout": {"events_per_second": 3000, "queue_events": 16}},
+    {"sensor": "davis346", "events": {"emulator": "v2e"}, "readout": {"events_per_second": 3000, "queue_events": 16}},
+], ids=["refractory, pchip, read-out", "sensor, v2e, read-out"])
+def test_files_hold_what_happens(tmp_path, gl, changes):
+    config = config_of(tmp_path, **changes)
+    (report,) = generate_run(load_run(tmp_path / "run.yaml"), tmp_path / "out")
+    with simulate_sequence(config, 0, gl) as sequence:
+        items = list(sequence)
+    assert_same(events_of(items), open_events(report.path / "events.h5").read())
+    assert sequence.camera.dropped > 0 and (report.events, report.frames, report.labels) == (sequence.events, sequence.frames, sequence.labels)
+    with np.load(report.path / "poses.npz") as poses:
+        truths = [item for item in items if isinstance(item, GroundTruth)]
+        np.testing.assert_array_equal(poses["T_world_cam"][1:], [t.T_world_cam for t in truths])
+        np.testing.assert_array_equal(poses["T_world_obj"][:, 1:], np.stack([t.T_world_obj for t in truths], axis=1))
+
+
+# --- its end ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["break", "error", "never begun", "exhausted"])
+def test_opengl_is_let_go_however_it_ends(tmp_path, how, monkeypatch):
+    released = []
+    monkeypatch.setattr(Renderer, "release", lambda self, _release=Renderer.release: (released.append(self), _release(self)))
+    config = config_of(tmp_path)
+
+    def consume():
+        if how == "never begun":
+            with simulate_sequence(config, 0) as sequence:
+                return sequence
+        sequence = simulate_sequence(config, 0)
+        for k, _ in enumerate(sequence):
+            if how == "break" and k == 5:
+                break
+            if how == "error" and k == 5:
+                raise RuntimeError("the consumer's own")
+        return sequence
+
+    if how == "error":
+        with pytest.raises(RuntimeError, match="the consumer's own"):
+            consume()
+        assert len(released) == 1
+    else:
+        sequence = consume()
+        assert released == [sequence.renderer] and sequence.renderer.gl.released
+
+
+def test_a_renderer_that_is_lent_is_not_released(tmp_path, gl):
+    config = config_of(tmp_path)
+    with simulate_sequence(config, 0, gl) as sequence:
+        scene = sequence.scene
+    with Renderer(gl, scene, config.render) as renderer:
+        first, second = (list(simulate_sequence(config, 0, labels=False, renderer=renderer)) for _ in range(2))
+        assert_same(events_of(first), events_of(second))
+
+
+def test_it_is_iterated_over_once(tmp_path, gl):
+    sequence = simulate_sequence(config_of(tmp_path), 0, gl, events=False)
+    assert len(list(sequence)) == 4
+    with pytest.raises(ConfigError, match="^simulate_sequence: a simulation is iterated over once"):
+        iter(sequence)
+
+
+def test_two_at_once_are_as_one_after_the_other(tmp_path):
+    """Each has a context of its own, and draws in it, whoever drew last."""
+    config = config_of(tmp_path, labels={"flow": ["forward"]})
+    alone = list(simulate_sequence(config, 0))
+    other = create_context()
+    with other, simulate_sequence(config, 0) as a, simulate_sequence(config, 0) as b:
+        together = []
+        for x, _ in zip(a, b, strict=True):
+            together += [x]
+            other.make_current()
+        truths = [(x, y) for x, y in zip(together, alone, strict=True) if isinstance(x, GroundTruth)]
+        assert_same(events_of(together), events_of(alone))
+        assert truths and all(np.array_equal(x.frame.images, y.frame.images) for x, y in truths)

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 
 KEPT = 3
 """Times whose buffers are kept for others: neighbouring labels look at the same moments."""
-_SURFACE = ("depth", "ids")
 
 
 class Labels:
@@ -61,7 +60,7 @@ class Labels:
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """See :meth:`Renderer.shown_at`."""
-        number = int(self._buffers(t_ns, _SURFACE)["ids"][y, x])
+        number = int(self._buffers(t_ns, LabelRequest("ids").buffers)["ids"][y, x])
         names = [f"object '{o.name}' (id {number})" for o in self._renderer.scene.objects if number and o.instance_id == number]
         return names[0] if names else "the background"
 

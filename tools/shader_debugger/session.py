@@ -187,7 +187,7 @@ class Snapshot:
 def files_of(folder) -> list[Path]:
     """Every shader file below ``folder``, for watching and for messages."""
     root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
-    return sorted([*root.glob("*.glsl"), *(root / "include").glob("*.glsl")])
+    return sorted([*root.glob("*.glsl"), *(root / "include").rglob("*.glsl")])
 
 
 class _Nothing:

@@ -32,9 +32,10 @@ def test_every_room_is_installed():
 
 
 def _room(module: str) -> str:
-    """scene's files at the top are rooms of their own: types.py comes before the rooms inside, build.py after them."""
+    """The files at the top of scene/ and config/ are looked at one by one: scene/types.py comes before the rooms inside and scene/build.py after
+    them, config/labels.py before the table of labels and config/sequence.py after it."""
     parts = module.split(".")
-    return ".".join(parts[:3] if parts[1] == "scene" else parts[:2])
+    return ".".join(parts[:3] if parts[1] in ("scene", "config") else parts[:2])
 
 
 def test_data_flows_one_way():

@@ -1,7 +1,8 @@
 """Ground truth, one row per label: what :mod:`blinkgl.config` reads of it, what is drawn, what lies on disk, how it is judged.
 
-Rows come in by :func:`register`; configuration, renderer, writer, verification, reports and the shader debugger read :data:`LABELS`. Begin with
-``label.py``, which says what a row holds, and ``depth.py``, the plainest of them. Neither OpenGL nor a compiler is imported here: a YAML is read by it.
+In:    rows (:func:`register`).
+Out:   :data:`LABELS`, which configuration, renderer, writer, verification, reports and the shader debugger read.
+Start: label.py, which says what a row holds, and depth.py, the plainest of them. Neither OpenGL nor a compiler is imported here: a YAML is read by it.
 """
 
 from blinkgl.labels.depth import Depth

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, frustum_planes, inverse_depth_bits, projection
+from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, inverse_depth_bits
 
 if TYPE_CHECKING:
+    from blinkgl.camera import CameraModel
     from blinkgl.render.resources import DrawItem
-    from blinkgl.scene.types import Camera, PosePath, Scene
+    from blinkgl.scene.types import PosePath, Scene
 
 KEPT = 4
 """Moments in memory: a label looks at its own time and at those of its neighbours, which look at it."""
@@ -27,13 +28,13 @@ KEPT = 4
 class View(NamedTuple):
     """What drawing needs of a camera. projection : (4, 4) float64 clip_from_cam.   frustum : (5, 3) inward unit normals, camera axes."""
 
-    camera: Camera
+    camera: CameraModel
     projection: np.ndarray
     frustum: np.ndarray
 
     @classmethod
-    def of(cls, camera: Camera) -> View:
-        return cls(camera, projection(camera), frustum_planes(camera))
+    def of(cls, camera: CameraModel) -> View:
+        return cls(camera, camera.clip_from_cam(), camera.frustum_planes())
 
 
 class Rates(NamedTuple):
@@ -113,7 +114,7 @@ class Stage:
 
     def __init__(self, scene: Scene, items: Sequence[DrawItem]):
         self.items = items
-        self.camera_path: PosePath = scene.camera.path
+        self.camera_path: PosePath = scene.camera_path
         self.paths: list[PosePath] = [o.path for o in scene.objects]
         self.moving = [i for i, path in enumerate(self.paths) if not path.is_static]
         self.item_object = np.array([i.object_index for i in items], np.intp)
@@ -142,7 +143,7 @@ class Moments:
             self._kept.popitem(last=False)
         return moment
 
-    def look_through(self, camera: Camera) -> None:
+    def look_through(self, camera: CameraModel) -> None:
         """From now on through another camera on the same path."""
         self.view = View.of(camera)
         for t_ns, moment in self._kept.items():

@@ -31,9 +31,10 @@ from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.geometry.meshes import without_collapsed_faces
 
 if TYPE_CHECKING:
+    from blinkgl.camera import CameraModel
     from blinkgl.config.sequence import RenderConfig
     from blinkgl.gl import GLContext
-    from blinkgl.scene.types import Camera, Scene
+    from blinkgl.scene.types import Scene
 
 
 class Renderer:
@@ -56,7 +57,7 @@ class Renderer:
         self._labels = Labels(self)
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         some_stand = any(o.path.is_static for o in scene.objects)
-        self.whole = whole or not (scene.camera.path.is_static and some_stand)
+        self.whole = whole or not (scene.camera_path.is_static and some_stand)
 
     def __enter__(self) -> Renderer:
         return self
@@ -79,7 +80,7 @@ class Renderer:
         self._labels.forget()
         self._painter.forget()
 
-    def look_through(self, camera: Camera) -> None:
+    def look_through(self, camera: CameraModel) -> None:
         """From now on draws with another camera of the same size and path: another part of the picture at the same cost.
         Nothing of what was drawn before is used again, and frames are drawn whole."""
         self._moments.look_through(camera)

@@ -17,6 +17,7 @@ from blinkgl.render.canvas import Canvas, Frame
 from blinkgl.render.rectangles import Rectangle, merged
 
 if TYPE_CHECKING:
+    from blinkgl.camera import CameraModel
     from blinkgl.gl import Target
     from blinkgl.render.passes.base import Shot
     from blinkgl.render.resources import DrawItem
@@ -25,19 +26,13 @@ _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9
 _COLOUR_AND_DEPTH, _NEAREST = 0x4000 | 0x0100, 0x2600
 
 
-def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera) -> Rectangle | None:
-    """Pixels that the item can touch: its bounding box's corners projected, one pixel added on every side. All pixels
-    when a corner is nearer than the near plane; None when it is out of the image."""
+def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
+    """Pixels that the item can touch, by its bounding box; None when it is out of the image."""
     low, high = item.low, item.high
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     points = corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
-    if points[:, 2].min() <= camera.near:
-        return Rectangle(0, 0, camera.width, camera.height) if points[:, 2].max() > camera.near else None
-    x = camera.fx * points[:, 0] / points[:, 2] + camera.cx
-    y = camera.fy * points[:, 1] / points[:, 2] + camera.cy
-    x0, x1 = max(0, int(np.floor(x.min())) - 1), min(camera.width, int(np.ceil(x.max())) + 2)
-    y0, y1 = max(0, int(np.floor(y.min())) - 1), min(camera.height, int(np.ceil(y.max())) + 2)
-    return Rectangle(x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+    bounds = camera.bounds(points)
+    return None if bounds is None else Rectangle(*bounds)
 
 
 class StillCanvas(Canvas):

@@ -1,5 +1,6 @@
-"""WebDataset shards, read back with tarfile alone and compared with the sequences."""
+"""WebDataset shards, read back with tarfile alone and by webdataset itself, and compared with the sequences."""
 
+import errno
 import io
 import itertools
 import json
@@ -11,6 +12,7 @@ import pytest
 
 from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
+from blinkgl.dataset import shards
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.shards import export_shards
 from blinkgl.errors import AssetError, OutputError
@@ -57,6 +59,33 @@ def test_shards_hold_every_label_once(data, tmp_path):
                         expected = reader.slice(start, start + span)
                         for column in "xytp":
                             np.testing.assert_array_equal(given[column], getattr(expected, column))
+
+
+def test_webdataset_reads_them(data, tmp_path):
+    webdataset = pytest.importorskip("webdataset")
+    export_shards(data, tmp_path / "a", shard_bytes=60_000)
+    written = members(tmp_path / "a", "train")
+    paths = [str(p) for p in sorted((tmp_path / "a").glob("train-*.tar"))]
+    samples = list(webdataset.WebDataset(paths, shardshuffle=False))
+    assert len(paths) > 1 and [s["__key__"] for s in samples] == list(dict.fromkeys(name.partition(".")[0] for name, _ in written))
+    assert {f"{s['__key__']}.{ending}": s[ending] for s in samples for ending in s if ending[0] != "_"} == dict(written)
+
+
+def test_a_shard_that_could_not_be_finished_is_not_there(data, tmp_path, monkeypatch):
+    """What webdataset's own writer does not give: it closes and leaves what it has."""
+    given, counted = shards.sample, itertools.count()
+
+    def full(folder, k):
+        if next(counted) == 5:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return given(folder, k)
+
+    monkeypatch.setattr(shards, "sample", full)
+    with pytest.raises(OutputError, match="no space"):
+        export_shards(data / "train", tmp_path / "a", shard_bytes=60_000)
+    left = [p.name for p in (tmp_path / "a").iterdir()]
+    assert left and all(name.startswith("train-") for name in left), "those before it are whole"
+    assert len({name.partition(".")[0] for name, _ in members(tmp_path / "a", "train")}) < 5
 
 
 def test_the_same_bytes_again_and_shards_of_the_size_asked_for(data, tmp_path):

@@ -2,12 +2,12 @@
 
 import base64
 import json
-import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
 import cv2
+import jinja2
 import numpy as np
 import pytest
 import yaml
@@ -15,7 +15,8 @@ import yaml
 from blinkgl.cli import run
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.run import run_dataset
-from blinkgl.report.charts import bars, histogram, number, stacked
+from blinkgl.report import markup
+from blinkgl.report.charts import histogram, number, size
 from blinkgl.report.collect import collect
 
 RECIPE = {
@@ -120,11 +121,34 @@ def test_no_data_set(tmp_path, capsys):
 
 
 def test_charts():
-    chart = histogram(np.array([1.0] * 10 + [2.0] * 5), bins=2, span=(0.5, 2.5))
-    heights = [float(h) for h in re.findall(r'class=bar .*? height="([\d.]+)"', chart)]
-    assert len(heights) == 2 and heights[0] == pytest.approx(2 * heights[1], abs=0.2)
-    assert "no values" in histogram(np.array([])) and "no values" in histogram(np.array([-1.0, 0.0]), log=True)
-    assert histogram(np.array([3.0, 3.0])).count("class=bar") == 1
-    assert "&lt;b&gt;" in bars([("<b>", 1.0, 2.0)]) and "left:100.0%" in bars([("a", 1.0, 2.0)])
-    assert "75 %" in stacked([("a", 3.0), ("b", 1.0)])
+    two = histogram(np.array([1.0] * 10 + [2.0] * 5), bins=2, span=(0.5, 2.5))
+    assert len(two.bars) == 2 and two.bars[0][1] == pytest.approx(2 * two.bars[1][1]) and two.median_x == pytest.approx(6 + 288 / 4)
+    assert histogram(np.array([])) is None and histogram(np.array([-1.0, 0.0]), log=True) is None
+    assert len(histogram(np.array([3.0, 3.0])).bars) == 1
     assert [number(v) for v in (0.01234, 12.34, 1234.5, 12345, 2.5e6, 3e9, float("nan"))] == ["0.0123", "12.3", "1234", "12.3 k", "2.5 M", "3 G", "-"]
+    assert [size(v) for v in (1234, 5.6e7, 1e9)] == ["0.00123 MB", "56 MB", "1 GB"]
+
+
+@pytest.fixture
+def draw():
+    """A macro of charts.html, as a template uses it."""
+    def drawn(call, **values):
+        template = markup._environment().from_string('{% import "report/charts.html" as charts %}{{ charts.' + call + " }}")
+        return template.render(values)
+
+    return drawn
+
+
+def test_charts_are_drawn_and_strangers_words_are_escaped(draw):
+    evil = "<b title=\"x\" onload='y'>"
+    for drawn in (draw("bars(rows)", rows=[(evil, 1.0, 2.0)]), draw("stacked(parts)", parts=[(evil, 3.0), ("b", 1.0)]), draw("tiles(t)", t=[(evil, evil)]),
+                  draw("histogram(h, unit)", h=histogram(np.array([1.0, 2.0])), unit=evil)):
+        assert "<b title" not in drawn and "&lt;b title=&#34;x&#34;" in drawn and "onload='" not in drawn
+    assert "left:100.0%" in draw("bars(rows)", rows=[("a", 1.0, 2.0)]) and "tick" not in draw("bars(rows)", rows=[("a", 1.0, None)])
+    assert "75 %" in draw("stacked(parts)", parts=[("a", 3.0), ("b", 1.0)]) and "no values" in draw("histogram(h)", h=None)
+    assert draw("histogram(h)", h=histogram(np.arange(9.0))).count('class="bar"') == 9
+
+
+def test_a_forgotten_value_is_an_error():
+    with pytest.raises(jinja2.UndefinedError, match="title"):
+        markup.render("report/page.html")

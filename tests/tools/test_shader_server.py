@@ -307,9 +307,10 @@ def test_include_cycle_and_a_vanished_file_while_serving(served):
 def test_an_edit_that_drops_a_uniform_is_drawn(served):
     """Commenting out what used a uniform is what people do; the renderer still sets it."""
     server, folder = served
-    label, good = folder / "include/labels/depth.glsl", (folder / "include/labels/depth.glsl").read_text()
+    label = folder / "include/labels/flow_forward.glsl"
+    good = label.read_text()
     state = as_json(server, "/state")
-    edit(label, "flow_forward = vec4(displacement(difference_forward, local, image_size), 1.0);", "flow_forward = vec4(1.0, 2.0, 3.0, 1.0);")
+    edit(label, "return vec4(displacement(difference_forward, local, image_size), 1.0);", "return vec4(1.0, 2.0, 3.0, 1.0);")
     now = next_version(server, state["version"])
     assert now["errors"] == []
     row = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "flow_forward")

@@ -30,9 +30,7 @@ from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.gl import ShaderError, create_context
 from blinkgl.io.formats import open_events
-from blinkgl.labels import LABELS, Form, Label, LabelRequest
-from blinkgl.labels import register as register_label
-from blinkgl.labels import unregister as unregister_label
+from blinkgl.labels import LABELS, Form, Label, LabelRequest, register as register_label, unregister as unregister_label
 from blinkgl.labels.files import npy
 from blinkgl.labels.label import Key
 from blinkgl.recordings.simulation import simulate

@@ -29,7 +29,16 @@ from blinkgl.labels.label import Label, View
 from blinkgl.render import reference
 from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, OfLabels, ReferenceMoment, check_pass, lookup_of, luma_of, view_of
+from blinkgl.tools.shader_debugger.moments import (
+    PASSES,
+    GpuMoment,
+    OfLabels,
+    ReferenceMoment,
+    check_pass,
+    lookup_of,
+    luma_of,
+    view_of,
+)
 from blinkgl.tools.shader_debugger.poses import displaced, pose_suspicions
 from blinkgl.tools.shader_debugger.suspicions import suspicions
 

@@ -76,9 +76,9 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "BlinkGL", ""
     timeout = SEND_S
-    server: "_Server"
+    server: _Server
 
-    def __init__(self, header: bytes, connection: socket.socket, address, server: "_Server"):
+    def __init__(self, header: bytes, connection: socket.socket, address, server: _Server):
         self._header = header
         super().__init__(connection, address, server)
 

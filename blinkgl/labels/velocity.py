@@ -11,6 +11,8 @@ from blinkgl.labels.label import Label
 
 if TYPE_CHECKING:
     from blinkgl.render.passes import Shot
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
 
 
 class Velocity(Label):
@@ -27,5 +29,5 @@ class Velocity(Label):
     def problem(self, value: np.ndarray) -> str | None:
         return None if np.isfinite(value).all() else "a velocity that is no finite number"
 
-    def reference(self, scene, frame) -> np.ndarray:
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return np.where(frame.hit[..., None], frame.velocity, 0.0)

@@ -35,7 +35,8 @@ from blinkgl.dataset.report import STAGES, Totals
 from blinkgl.events.camera import EventCamera, emulate
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LabelRequest
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath

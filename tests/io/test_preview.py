@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+
 from blinkgl.events.types import Events
 from blinkgl.io import preview as module
 from blinkgl.io.colour import INVALID, count_events, event_colour, flow_colour, flow_wheel
@@ -86,6 +87,14 @@ def test_large_frames_are_averaged_in_linear_light():
     stripes[::2] = 1.0
     made.frame(0, stripes)
     assert (made._video.pictures[0][30:, :20] == to_srgb8(np.float32([0.5]))[0]).all()
+
+
+def test_a_panel_of_as_many_rows_but_fewer_columns_is_averaged():
+    made = PreviewWriter("p.mp4", 200, 301, flow=False)
+    image = np.random.default_rng(2).random((200, 301)).astype(np.float32)
+    made.frame(0, image)
+    shown = to_srgb8(cv2.resize(image, (300, 200), interpolation=cv2.INTER_AREA))
+    np.testing.assert_array_equal(made._video.pictures[0][30:, :300, 0], shown)
 
 
 def test_the_clock():

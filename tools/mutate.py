@@ -48,7 +48,7 @@ from typing import ClassVar
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("render", "timeline", "events", "scene", "io", "dataset")
+ROOMS = ("render", "timeline", "events", "scene", "io", "dataset", "sequence", "camera", "labels", "recordings")
 MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
 SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",

@@ -29,8 +29,8 @@ PICTURES = {
     "event_tensors": ("tensors.png", "example_tensors.png", "a time surface and the five bins of a voxel grid"),
 }
 """Of an example: the picture it makes, its name in docs/images, and what it shows."""
-ORDER = ("scene_in_python", "frame_with_labels", "own_label", "own_trajectory", "video_to_events", "events_over_frame", "event_tensors", "dataset_from_yaml",
-         "torch_dataloader", "compare_recordings", "convert_formats", "sensors")
+ORDER = ("scene_in_python", "frame_with_labels", "own_label", "own_trajectory", "video_to_events", "events_over_frame", "event_tensors",
+         "dataset_from_yaml", "torch_dataloader", "online_windows", "compare_recordings", "convert_formats", "sensors")
 
 HEADER = """# Examples
 

@@ -15,7 +15,7 @@ from blinkgl.scene.types import PosePath
 class Sensor:
     """One camera of a rig.
 
-    camera : its model.   T_rig_cam : (4, 4) float64 rigid, its place; camera axes as OpenCV has them, from camera to rig."""
+    camera : its model.   T_rig_cam : (4, 4) float64 rigid, its place: from camera axes (OpenCV's) to the rig's."""
 
     camera: CameraModel
     T_rig_cam: np.ndarray = field(default_factory=lambda: np.eye(4))

@@ -22,7 +22,7 @@ from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import scene_of
 
 REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
 
@@ -30,8 +30,7 @@ REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backwar
 def compare(gl, template, index: int) -> dict[str, float]:
     """Errors of one label of one sequence; pixels are counted in the whole image."""
     config = template.sequence(index)
-    scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
-                        seed=config.seed, sequence=index, base=template.base)
+    scene = scene_of(config, index, template.base)
     times = config.time.label_times_ns
     now, interval = times[len(times) // 2 - 1], config.time.interval_ns
     with Renderer(gl, scene, config.render) as renderer:

@@ -20,7 +20,7 @@ from blinkgl.gl import create_context
 from blinkgl.labels import LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.scene import types as data
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import scene_of
 from blinkgl.sequence import EventChunk, simulate as core
 from blinkgl.srgb import to_srgb8
 
@@ -34,8 +34,7 @@ def _built(source: Source, index: int, **sections) -> tuple[SequenceConfig, data
         raise ConfigError("nothing to draw: it converts recorded frames", where="source", accepted="use generate()")
     if isinstance(source, Scene):
         return config, source.build(config)
-    return config, build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split, seed=config.seed,
-                               sequence=index, base=source.base)
+    return config, scene_of(config, index, source.base)
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ def build_scene(config: SceneConfig, camera: CameraConfig, t0_ns: int, t1_ns: in
     return scene_from_file(config, camera.model, t0_ns, t1_ns, base)
 
 
-def scene_of(config: SequenceConfig, index: int, base: Path | str = ".") -> Scene:
+def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -> Scene:
     """The scene of sequence ``index`` of a run, with the sensor that records what the configuration asks for.
 
     base : folder that the configuration's relative paths start from. Raises ConfigError and AssetError."""

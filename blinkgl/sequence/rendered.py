@@ -18,7 +18,7 @@ from blinkgl.gl import GLContext, create_context
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.build import recording, scene_of
+from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.items import GroundTruth, Picture
@@ -49,7 +49,7 @@ class RenderedSequence(Simulation):
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
             with clock("scene"):
-                scene = scene_of(config, index, base)
+                scene = sequence_scene(config, index, base)
         with ExitStack() as stack:
             if renderer is None:
                 gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))

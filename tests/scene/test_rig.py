@@ -15,7 +15,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import recording, scene_of
+from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.geometry.primitives import cuboid, grid
 from blinkgl.scene.motion.paths import KeyframePath, OffsetPath, StaticPath
 from blinkgl.scene.rig import Rig, Sensor
@@ -68,7 +68,7 @@ def stereo(T_right=None):
 
 
 def test_a_configuration_makes_one_sensor_in_the_rigs_origin(tmp_path):
-    scene = scene_of(CONFIG, 0, tmp_path)
+    scene = sequence_scene(CONFIG, 0, tmp_path)
     (sensor,) = scene.sensors
     assert sensor.camera == CONFIG.camera.model == scene.camera and sensor.folder == ""
     np.testing.assert_array_equal(sensor.T_rig_cam, np.eye(4))

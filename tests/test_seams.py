@@ -22,7 +22,7 @@ from blinkgl.events import Emulator, Esim, Events, emulator_of, make_emulator, r
 from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.io.formats import open_events
-from blinkgl.recordings.simulation import simulate
+from blinkgl.recordings.simulation import frames_to_events
 from blinkgl.tools import fuzz_configs
 from blinkgl.tools.config_docs import page
 from blinkgl.trade.measure import Options
@@ -131,8 +131,8 @@ def test_a_toy_emulator_simulates(toy, tmp_path, capsys):
 
     assert emulator_options("toy", None, [], "davis346")["emulator"] == Toy.Config(contrast_threshold=0.2, dead_us=500)
     frames = [np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)]
-    assert sum(len(e) for e in simulate(frames, fps=1000, emulator="toy")) == 24
-    assert sum(len(e) for e in simulate(frames, fps=1000, emulator=Toy.Config(dead_us=1500))) == 12
+    assert sum(len(e) for e in frames_to_events(frames, fps=1000, emulator="toy")) == 24
+    assert sum(len(e) for e in frames_to_events(frames, fps=1000, emulator=Toy.Config(dead_us=1500))) == 12
 
 
 def test_a_sensor_sets_a_toy_emulator(toy, tmp_path):

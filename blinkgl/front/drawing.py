@@ -14,7 +14,7 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import Emulator, Source, Timeline, configured, labels_tree
+from blinkgl.front.runs import EmulatorSettings, Source, Timeline, configured, labels_tree
 from blinkgl.front.scenes import Scene
 from blinkgl.gl import create_context
 from blinkgl.labels import LabelFrame, asked_for
@@ -77,7 +77,7 @@ class Recording:
         return self.labels
 
 
-def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, sensor: str | None = None, timeline: Timeline | None = None,
+def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None,
            quality: str | None = None, labels: Sequence[str] | None = None) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 

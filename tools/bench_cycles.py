@@ -49,11 +49,9 @@ ANTIALIASINGS = ("none", "ssaa2", "ssaa4")
 
 
 def smaller(scene: Scene, width: int) -> Scene:
-    """The same view on ``width`` columns; pixel centres are at integers."""
+    """The same view on ``width`` columns."""
     camera = scene.camera
-    f = width / camera.width
-    return replace(scene, camera=replace(camera, width=width, height=max(1, round(camera.height * f)), fx=camera.fx * f, fy=camera.fy * f,
-                                         cx=(camera.cx + 0.5) * f - 0.5, cy=(camera.cy + 0.5) * f - 0.5))
+    return scene.with_camera(camera.resized(width, max(1, round(camera.height * width / camera.width))))
 
 
 def rasterised(gl, scene: Scene, times: list[int], antialiasing: str, cost: Cost) -> Iterator[np.ndarray]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from dataclasses import replace
 from importlib import resources
 from itertools import islice
 
@@ -53,9 +52,7 @@ SETTINGS = {name: RenderConfig(image_antialiasing="none", **changes) for name, c
 
 def finer(scene: Scene, factor: int) -> Scene:
     """The same view with factor x factor samples per pixel."""
-    c = scene.camera
-    return replace(scene, camera=replace(c, width=c.width * factor, height=c.height * factor, fx=c.fx * factor, fy=c.fy * factor,
-                                         cx=(c.cx + 0.5) * factor - 0.5, cy=(c.cy + 0.5) * factor - 0.5))
+    return scene.with_camera(scene.camera.resized(scene.camera.width * factor, scene.camera.height * factor))
 
 
 class Judged:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import tempfile
 from dataclasses import replace
 from importlib import resources
@@ -25,6 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import PinHole, focal_length
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
@@ -36,8 +38,9 @@ from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.textures import procedural_texture
-from blinkgl.scene.types import Camera, Material, Mesh, Part, Scene, SceneObject
+from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject
 
 SECOND = 1_000_000_000
 
@@ -73,10 +76,8 @@ def probe_scene(kind: str, width: int, height: int, lit: bool = False) -> Scene:
     level = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     keys = np.linspace(0, 2 * SECOND, 4).astype(np.int64)
     turns = Rotation.concatenate([level * Rotation.from_rotvec(rng.normal(0, 0.05, 3)) for _ in keys])
-    focal = 0.5 * width / np.tan(np.radians(30))
-    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2,
-                    SplinePath(keys, rng.normal(0, 0.2, (4, 3)), turns))
-    return Scene(tuple(objects), camera, 0, 2 * SECOND)
+    camera = PinHole.centred(width, height, focal_length(width, math.radians(60)))
+    return Scene(tuple(objects), Rig.alone(camera, SplinePath(keys, rng.normal(0, 0.2, (4, 3)), turns)), 0, 2 * SECOND)
 
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -99,7 +100,7 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     """Full redraw against redrawing only what moves: luminance and ESIM together, the same events."""
     scene = probe_scene(kind, 640, 480)
     objects = tuple(o if i < movers else replace(o, path=StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
-    scene = replace(scene, objects=objects, camera=replace(scene.camera, path=StaticPath(scene.camera.path.pose(0))))
+    scene = replace(scene, objects=objects).with_path(StaticPath(scene.camera_path.pose(0)))
     result = {"scene": kind, "movers": movers}
     events = {}
     for name in ("full redraw", "what moves"):

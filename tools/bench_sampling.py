@@ -94,7 +94,7 @@ def random_scene(seed: int, still_camera: bool = False) -> Scene:
         objects[fast] = replace(objects[fast], path=warp(objects[fast].path))
     else:
         objects = [replace(o, path=warp(o.path)) for o in objects]
-    return replace(scene, objects=tuple(objects), camera=replace(scene.camera, path=warp(scene.camera.path)), t1_ns=scene.t0_ns + DURATION_NS)
+    return replace(scene, objects=tuple(objects), t1_ns=scene.t0_ns + DURATION_NS).with_path(warp(scene.rig.path))
 
 
 @dataclass

@@ -38,16 +38,16 @@ TURN = 10
 def one_mover(kind: str, coverage: float) -> Scene:
     """The probe scene at rest, but for a ball that crosses the image in front of the others."""
     scene = probe_scene(kind, WIDTH, HEIGHT)
-    camera = scene.camera
-    at = camera.path.pose(0)
+    at = scene.camera_path.pose(0)
+    focal = scene.camera.jacobian(np.array([0.0, 0.0, 1.0]))[0, 0]  # px per unit and unit of depth
     mover = scene.objects[0]
     radius = float(np.linalg.norm(mover.parts[0].mesh.vertices, axis=1).max())
-    distance = 2 * radius * camera.fx / np.sqrt(coverage * WIDTH * HEIGHT)
-    speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / camera.fx  # units per second, across the image
+    distance = 2 * radius * focal / np.sqrt(coverage * WIDTH * HEIGHT)
+    speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / focal  # units per second, across the image
     seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]
     path = KeyframePath([0, 2 * SECOND], [seen(-speed / 4), seen(speed * 7 / 4)], [Rotation.identity().as_quat()] * 2, interpolation="linear")
     objects = tuple(replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
-    return replace(scene, objects=objects, camera=replace(camera, path=StaticPath(at)))
+    return replace(scene, objects=objects).with_path(StaticPath(at))
 
 
 class Way:

@@ -414,7 +414,7 @@ def _make_glb(folder: Path) -> list[str]:
 def _judge_scene(name: str) -> Callable[[Path], str | None]:
     """As an object of a pool, and as a whole scene with its camera and animation."""
     def judge(folder: Path) -> str | None:
-        from blinkgl.config.sequence import CameraConfig
+        from blinkgl.camera import PinHole
         from blinkgl.errors import BlinkGLError
         from blinkgl.scene.worlds.from_file import from_gltf
 
@@ -422,9 +422,9 @@ def _judge_scene(name: str) -> Callable[[Path], str | None]:
             problem = _judge_asset(name)(folder)
         except BlinkGLError:
             problem = None
-        scene = from_gltf(folder / name, CameraConfig(width=32, height=24), 0, 200_000_000, intrinsics="file")
+        scene = from_gltf(folder / name, PinHole.centred(32, 24, 28.0), 0, 200_000_000, intrinsics="file")
         for t in (0, 100_000_000, 200_000_000):
-            for path in (scene.camera.path, *(o.path for o in scene.objects)):
+            for path in (scene.camera_path, *(o.path for o in scene.objects)):
                 T = path.pose(t)
                 if not np.isfinite(T).all() or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6):
                     return "a pose that is not rigid or not finite"

@@ -39,9 +39,10 @@ from pathlib import Path
 
 import numpy as np
 
+from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render.colour import LUMA, decode_image
-from blinkgl.scene.types import Camera, Material, Scene
+from blinkgl.scene.types import Material, Scene
 
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 WORKER = Path(__file__).with_name("cycles_worker.py")
@@ -203,7 +204,7 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
             parts.append([k, m])
         bodies.append({"name": thing.name, "picture_only": thing.category == "sky", "parts": parts})
 
-    origin = camera.path.pose(int(times_ns[0]))[:3, 3] if len(times_ns) else np.zeros(3)
+    origin = scene.camera_path.pose(int(times_ns[0]))[:3, 3] if len(times_ns) else np.zeros(3)
 
     def poses(path):
         stack = path.poses(times_ns).copy()
@@ -211,7 +212,7 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
         return stack
 
     arrays["poses"] = np.array([poses(thing.path) for thing in scene.objects]).reshape(-1, len(times_ns), 4, 4)
-    arrays["camera_poses"] = poses(camera.path) @ CV_FROM_BLENDER
+    arrays["camera_poses"] = poses(scene.camera_path) @ CV_FROM_BLENDER
     light = scene.light
     job = {
         "size": [camera.width, camera.height], "blender_camera": blender_camera(camera), "near": float(camera.near),
@@ -223,7 +224,7 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     (folder / "job.json").write_text(json.dumps(job))
 
 
-def blender_camera(camera: Camera) -> dict[str, float | str]:
+def blender_camera(camera: PinHole) -> dict[str, float | str]:
     """Blender's parameters of the same pin-hole.
 
     With horizontal fit the sensor's width is W px; a pixel is as wide as the sensor / W, and pixel_aspect_y / pixel_aspect_x times as

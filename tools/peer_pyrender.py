@@ -88,7 +88,7 @@ def export(scene: Scene, times_ns, near: float | None = None, double: bool = Tru
             arrays[f"texture{k}"] = _linear_bytes(paint.texture.image)
     times_ns = np.asarray(times_ns, np.int64)
     # relative to the first camera: pyrender multiplies its matrices in float32
-    origin = camera.path.pose(int(times_ns[0]))[:3, 3]
+    origin = scene.camera_path.pose(int(times_ns[0]))[:3, 3]
 
     def poses(path):
         stack = path.poses(times_ns).copy()
@@ -100,7 +100,7 @@ def export(scene: Scene, times_ns, near: float | None = None, double: bool = Tru
         **more,
         "ids": np.array([thing.instance_id for thing, _ in parts], np.uint32),
         "poses": np.array([poses(thing.path) for thing, _ in parts]),
-        "camera_poses": poses(camera.path) @ _GL_CAMERA,
+        "camera_poses": poses(scene.camera_path) @ _GL_CAMERA,
         "intrinsics": np.array([camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5, near or camera.near]),
         "size": np.array([camera.width, camera.height]),
         "background": np.array(float(scene.background)),

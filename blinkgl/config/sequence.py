@@ -11,12 +11,13 @@ import copy
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
+from blinkgl.camera import CameraModel, PinHole, focal_length
 from blinkgl.config.base import Config, Refused, rule, validate, validate_field
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
@@ -55,30 +56,24 @@ class CameraConfig(Config):
             raise Refused("give fov or focal, not both")
 
     @property
-    def fx(self) -> float:
-        if self.focal is not None:
-            return self.focal
-        return 0.5 * self.width / math.tan(math.radians(self.fov if self.fov is not None else 60.0) / 2)
+    def model(self) -> PinHole:
+        """The camera that the keys describe."""
+        focal = self.focal
+        if focal is None:
+            focal = focal_length(self.width, math.radians(60.0 if self.fov is None else self.fov))
+        centred = PinHole.centred(self.width, self.height, focal, near=self.near)
+        return replace(centred, **{key: value for key in ("cx", "cy") if (value := getattr(self, key)) is not None})
 
-    fy = fx
+    def scaled(self, factor: float) -> dict[str, Any]:
+        """The keys of a camera that sees the same with ``factor`` times the pixels in x and y, as near as whole pixels come to it."""
+        said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
+        said |= {"focal": self.focal * factor} if self.focal is not None else {"fov": self.fov} if self.fov is not None else {}
+        return {"width": max(1, round(self.width * factor)), "height": max(1, round(self.height * factor)), "near": self.near, **said}
 
-    @property
-    def principal_point(self) -> tuple[float, float]:
-        return (self.cx if self.cx is not None else (self.width - 1) / 2,
-                self.cy if self.cy is not None else (self.height - 1) / 2)
 
-
-def camera_radius(camera: Any, clearance: float) -> float:
+def camera_radius(camera: CameraModel, clearance: float) -> float:
     """How far a random world's camera keeps from everything: its clearance, or a little more than the near plane's corners."""
-    return max(clearance, 1.01 * near_corner(camera))
-
-
-def near_corner(camera: Any) -> float:
-    """Distance from the camera centre to the farthest corner of the near rectangle."""
-    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
-    x = max(cx + 0.5, camera.width - 0.5 - cx) / camera.fx
-    y = max(cy + 0.5, camera.height - 0.5 - cy) / camera.fy
-    return camera.near * math.sqrt(1 + x * x + y * y)
+    return max(clearance, 1.01 * camera.near_corner)
 
 
 class TimeConfig(Config):
@@ -222,7 +217,7 @@ class SequenceConfig(Config):
     def _room_for_the_camera(kind, height, clearance, camera):
         if kind != "random":
             return
-        least = camera_radius(camera, clearance)
+        least = camera_radius(camera.model, clearance)
         if least > height:
             raise Refused("the region is too low for a camera that keeps this far from everything", where="scene.region.height", value=height,
                           accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near plane's corners: camera.near "

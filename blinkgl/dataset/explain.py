@@ -121,8 +121,7 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
     lit = sum(not p.material.unlit for p in parts)
     return {
         "bodies": ", ".join(f"{n} {k}{'s' if n > 1 and k != 'sky' else ''}" for k, n in kinds.items() if n) + f"; {moving} move",
-        "camera": f"{scene.camera.width}x{scene.camera.height}, fx {scene.camera.fx:.0f} px, "
-                  + ("still" if scene.camera.path.is_static else "moving"),
+        "camera": f"{scene.camera.summary}, " + ("still" if scene.camera_path.is_static else "moving"),
         "triangles": f"{renderer.triangles:,}" + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
         "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit" if lit else "none: every surface is unlit",

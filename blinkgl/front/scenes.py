@@ -302,4 +302,4 @@ class Scene(_Piece):
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """What the renderer draws. Raises ConfigError and AssetError: files."""
-        return explicit_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, Path.cwd(), self._memory)
+        return explicit_scene(config.scene, config.camera.model, config.time.t0_ns, config.time.t1_ns, Path.cwd(), self._memory)

@@ -23,5 +23,5 @@ class Normals(Label):
         return None if (np.linalg.norm(value, axis=-1) < 1 + 1e-3).all() else "a normal longer than 1"
 
     def reference(self, scene, frame) -> np.ndarray:
-        rotation = scene.camera.path.pose(frame.t_ns)[:3, :3]
+        rotation = scene.camera_path.pose(frame.t_ns)[:3, :3]
         return np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)

@@ -2,28 +2,13 @@
 
 Clip space: x right, y DOWN, w = Z along the optical axis, reversed-Z with the far plane at infinity
 (depth = near / Z in [0, 1], 1 at the near plane). Because y points down in clip space already, row 0 of every
-image is the top row and ``gl_FragCoord.xy - 0.5`` is the user's pixel: no image is ever flipped.
+image is the top row and ``gl_FragCoord.xy - 0.5`` is the user's pixel: no image is ever flipped. The matrix from camera axes to it is
+the camera model's (:meth:`blinkgl.camera.CameraModel.clip_from_cam`).
 """
 
 from __future__ import annotations
 
 import numpy as np
-
-from blinkgl.scene.types import Camera
-
-
-def projection(camera: Camera) -> np.ndarray:
-    """(4, 4) float64 clip_from_cam for OpenCV camera axes.
-
-    A point (X, Y, Z) lands on pixel x = fx X/Z + cx, i.e. window coordinate x + 0.5, i.e.
-    ndc 2 (x + 0.5) / W - 1."""
-    w, h = camera.width, camera.height
-    return np.array([
-        [2 * camera.fx / w, 0.0, 2 * (camera.cx + 0.5) / w - 1, 0.0],
-        [0.0, 2 * camera.fy / h, 2 * (camera.cy + 0.5) / h - 1, 0.0],
-        [0.0, 0.0, 0.0, camera.near],
-        [0.0, 0.0, 1.0, 0.0],
-    ])
 
 
 def invert_rigid(T: np.ndarray) -> np.ndarray:
@@ -68,14 +53,6 @@ def mat4_bytes(matrices: np.ndarray) -> bytes:
 def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
     """GLSL mat4x3 (4 columns of 3) with the x, y, w rows of a (4, 4) clip-space matrix."""
     return np.ascontiguousarray(matrix[[0, 1, 3]].T, dtype=np.float32).tobytes()
-
-
-def frustum_planes(camera) -> np.ndarray:
-    """(5, 3) inward unit normals, camera axes, of left, right, top, bottom and the plane through the centre."""
-    left, right = (-0.5 - camera.cx) / camera.fx, (camera.width - 0.5 - camera.cx) / camera.fx
-    top, bottom = (-0.5 - camera.cy) / camera.fy, (camera.height - 0.5 - camera.cy) / camera.fy
-    planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
-    return planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
 
 DEPTH_ROOM = 2.0

@@ -1,17 +1,18 @@
 """The float64 reference renderer: what every buffer of every pass should hold, by casting rays on the CPU.
 
-It shares nothing with the rasteriser but :mod:`blinkgl.scene.types`: no GLSL, no clip space, no projection matrix.
+It shares nothing with the rasteriser but :mod:`blinkgl.scene.types` and the camera models: no GLSL, no clip space, no projection matrix.
+It sees through any camera model whose rays point forward (Z > 0).
 Tests and the shader debugger compare the GPU with it. One ray goes through each pixel centre (or any other image
 point); it hits the nearest triangle, and everything else follows from the object-local point of the hit.
 
 Flow and its rounding
 ---------------------
 With ``M(t) = inv(T_world_cam(t)) @ T_world_obj(t)``, the point p is at ``M p`` in camera coordinates, and
-``X1 = X0 + (M1 - M0) p``. Because ``X0 = Z0 (rx, ry, 1)`` with ``rx = (x - cx) / fx`` exact,
+``X1 = X0 + (M1 - M0) p``. For a pin-hole camera ``X0 = Z0 (rx, ry, 1)`` with ``rx = (x - cx) / fx`` exact, so
 
     flow_x = fx (dX - rx dZ) / Z1,    (dX, dY, dZ) = (M1 - M0) p,    Z1 = Z0 + dZ,
 
-without subtracting two projections. ``M1 - M0`` is formed from the differences of the poses, so a pose that does not
+without subtracting two projections (:meth:`blinkgl.camera.CameraModel.displacement`). ``M1 - M0`` is formed from the differences of the poses, so a pose that does not
 change contributes exactly nothing. What is left is about 1e-15 of the flow, plus the resolution of the poses themselves:
 a translation of size 1e6 units is stored to 1e-10 units, i.e. fx * 1e-10 / Z px.
 
@@ -28,8 +29,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from scipy import ndimage
 
+from blinkgl.camera import CameraModel
 from blinkgl.render.raycast import Forest, build_tree, join_trees, nearest_exhaustive, nearest_tree
-from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject, Texture
+from blinkgl.scene.types import Material, Part, Scene, SceneObject, Texture
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
 # A visibility ray ends this much (relative) before the point it aims at, so that the point does not hide itself:
@@ -132,7 +134,7 @@ def scene_parts(scene: Scene) -> list[tuple[SceneObject, Part]]:
     return [(thing, part) for thing in scene.objects for part in thing.parts]
 
 
-def pixel_grid(camera: Camera) -> np.ndarray:
+def pixel_grid(camera: CameraModel) -> np.ndarray:
     """(H * W, 2) float64 pixel centres, row by row."""
     y, x = np.mgrid[0 : camera.height, 0 : camera.width]
     return np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
@@ -145,7 +147,7 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: b
     exhaustive : test every triangle (the slow twin of the hierarchy; the same answer bit for bit).
     """
     xy = pixel_grid(scene.camera) if xy is None else np.atleast_2d(np.asarray(xy, np.float64))
-    hit, bary, depth = _nearest(scene, t_ns, _rays(scene.camera, xy), exhaustive=exhaustive)
+    hit, bary, depth = _nearest(scene, t_ns, _rays(scene.camera, xy)[:, :2], exhaustive=exhaustive)
     parts = scene_parts(scene)
     found = hit[:, 0] >= 0
     ids = np.array([thing.instance_id for thing, _ in parts] + [0], np.int32)
@@ -157,8 +159,10 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: b
     return Hits(xy, int(t_ns), found, depth, ids[hit[:, 0]], hit[:, 0], hit[:, 1], hit[:, 2] == 1, bary, local)
 
 
-def _rays(camera: Camera, xy: np.ndarray) -> np.ndarray:
-    return (xy - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+def _rays(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
+    """(N, 3) rays of length 1 along the optical axis; nan for a pixel without one that points forward."""
+    rays = camera.rays(xy)
+    return rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
 
 
 def _forest(scene: Scene) -> Forest:
@@ -175,7 +179,7 @@ def _forest(scene: Scene) -> Forest:
 def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
     """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`."""
     forest = _forest(scene)
-    camera_pose = scene.camera.path.pose(t_ns)
+    camera_pose = scene.camera_path.pose(t_ns)
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
     relative = [_relative_pose(camera_pose, thing.path.pose(t_ns)) for thing, _ in scene_parts(scene)]
     axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
@@ -211,7 +215,7 @@ def _relative_pose(camera: np.ndarray, body: np.ndarray) -> np.ndarray:
 
 def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -> np.ndarray:
     """(3, 4) M(t1) - M(t0) with M the pose in the camera's frame, from the differences of the poses."""
-    c0, c1 = scene.camera.path.pose(t0_ns), scene.camera.path.pose(t1_ns)
+    c0, c1 = scene.camera_path.pose(t0_ns), scene.camera_path.pose(t1_ns)
     b0, b1 = thing.path.pose(t0_ns), thing.path.pose(t1_ns)
     turn = (c1[:3, :3] - c0[:3, :3]).T
     shift = (b1[:3, 3] - b0[:3, 3]) - (c1[:3, 3] - c0[:3, 3])
@@ -223,7 +227,7 @@ def _relative_change(scene: Scene, thing: SceneObject, t0_ns: int, t1_ns: int) -
 
 def _relative_rate(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
     """(3, 4) dM/dt in 1/s: the analytic twist of the body as the moving camera sees it."""
-    c, dc = scene.camera.path.pose(t_ns), scene.camera.path.derivative(t_ns)
+    c, dc = scene.camera_path.pose(t_ns), scene.camera_path.derivative(t_ns)
     b, db = thing.path.pose(t_ns), thing.path.derivative(t_ns)
     rate = np.empty((3, 4))
     rate[:, :3] = dc[:3, :3].T @ b[:3, :3] + c[:3, :3].T @ db[:3, :3]
@@ -243,13 +247,11 @@ def _apply(scene: Scene, hits: Hits, matrix_of) -> np.ndarray:
 def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     """Displacement of every hit point from ``hits.t_ns`` to t_ns, and whether it is seen there."""
     camera = scene.camera
-    f = np.array([camera.fx, camera.fy])
-    rays = _rays(camera, hits.xy)
     change = _apply(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
     depth = hits.depth + change[:, 2]
     valid = hits.hit & (depth > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        flow = np.where(valid[:, None], f * (change[:, :2] - rays * change[:, 2:]) / depth[:, None], np.nan)
+        flow = np.where(valid[:, None], camera.displacement(_rays(camera, hits.xy), hits.depth, change), np.nan)
         there = hits.xy + flow
         inside = valid & ((there >= -0.5) & (there < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)
 
@@ -270,15 +272,15 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
 
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
-    f = np.array([scene.camera.fx, scene.camera.fy])
     rate = _apply(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
     with np.errstate(invalid="ignore"):
-        return f * (rate[:, :2] - _rays(scene.camera, hits.xy) * rate[:, 2:]) / hits.depth[:, None]
+        points = _rays(scene.camera, hits.xy) * hits.depth[:, None]
+        return np.einsum("nij,nj->ni", scene.camera.jacobian(points), rate)
 
 
 def relative_pose_at(scene: Scene, thing: SceneObject, t_ns: int) -> np.ndarray:
     """(4, 4) T_cam_obj at t_ns."""
-    return _relative_pose(scene.camera.path.pose(t_ns), thing.path.pose(t_ns))
+    return _relative_pose(scene.camera_path.pose(t_ns), thing.path.pose(t_ns))
 
 
 def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.ndarray:

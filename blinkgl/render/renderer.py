@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import moderngl
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.labels import Flow, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
 from blinkgl.render.antialiasing import Samples, samples_of
@@ -22,10 +23,8 @@ from blinkgl.render.frames import RenderStats
 from blinkgl.render.matrices import (
     cam_from_obj,
     cam_from_obj_rate,
-    frustum_planes,
     inverse_depth_bits,
     mat4_bytes,
-    projection,
     rows_xyw_bytes,
 )
 from blinkgl.render.occlusion import occlusion_mask
@@ -64,7 +63,7 @@ class Renderer:
         self.gl, self.scene, self.config = gl, scene, config
         self.width, self.height = scene.camera.width, scene.camera.height
         self.stats = RenderStats()
-        self._projection = projection(scene.camera)
+        self._projection = scene.camera.clip_from_cam()
         self._paths: list[PosePath] = [o.path for o in scene.objects]
         self._moving = [i for i, p in enumerate(self._paths) if not p.is_static]
         self._T_world_obj = np.stack([p.pose(scene.t0_ns) for p in self._paths]) if self._paths else np.zeros((0, 4, 4))
@@ -73,7 +72,7 @@ class Renderer:
         self._last_moment: tuple[int, _Moment] | None = None
         self._moves = np.array([not p.is_static for p in self._paths], bool)
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
-        self._still = scene.camera.path.is_static and not self._moves.all()
+        self._still = scene.camera_path.is_static and not self._moves.all()
         self._backdrops: dict[str, Backdrop] = {}
         self._held: tuple[Backdrop, np.ndarray, np.ndarray | None] | None = None  # whose last frame is in which arrays
         self.changed: list[Rectangle] | None = None
@@ -85,7 +84,7 @@ class Renderer:
         self._item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
         self._item_radius = np.array([i.radius for i in items])
         self._item_layer = np.array([i.layer for i in items])
-        self._frustum = frustum_planes(scene.camera)
+        self._frustum = scene.camera.frustum_planes()
         self._whole = Rectangle(0, 0, self.width, self.height)
 
     def __enter__(self) -> Renderer:
@@ -103,10 +102,10 @@ class Renderer:
             self._targets = {}
             self._resources.release()
 
-    def look_through(self, camera) -> None:
+    def look_through(self, camera: CameraModel) -> None:
         """From now on draws with another camera of the same size and path: another part of the picture at the same cost.
         Nothing of what was drawn before is used again."""
-        self._projection, self._frustum = projection(camera), frustum_planes(camera)
+        self._projection, self._frustum = camera.clip_from_cam(), camera.frustum_planes()
         if self._last_moment is not None:
             t_ns, moment = self._last_moment
             self._last_moment = (t_ns, replace(moment, mvp=self._projection @ moment.T_cam_obj))
@@ -377,7 +376,7 @@ class Renderer:
         T_world_obj = self._T_world_obj.copy()
         for i in self._moving:
             T_world_obj[i] = self._paths[i].pose(t_ns)
-        T_world_cam = self.scene.camera.path.pose(t_ns)
+        T_world_cam = self.scene.camera_path.pose(t_ns)
         T_cam_obj = cam_from_obj(T_world_cam, T_world_obj)
         T = T_cam_obj[self._item_object]
         centres = (T[:, :3, :3] @ self._item_centre[..., None])[..., 0] + T[:, :3, 3]
@@ -391,7 +390,7 @@ class Renderer:
         dT_world_obj = np.zeros_like(moment.T_world_obj)
         for i in self._moving:
             dT_world_obj[i] = self._paths[i].derivative(t_ns)
-        return self._projection @ cam_from_obj_rate(moment.T_world_cam, self.scene.camera.path.derivative(t_ns),
+        return self._projection @ cam_from_obj_rate(moment.T_world_cam, self.scene.camera_path.derivative(t_ns),
                                                     moment.T_world_obj, dT_world_obj), dT_world_obj
 
     def _visible(self, moment: _Moment) -> list[DrawItem]:

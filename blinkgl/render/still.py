@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.render.resources import DrawItem
 
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9
@@ -41,19 +42,13 @@ class Rectangle:
         return Rectangle(self.x0 * factor, self.y0 * factor, self.x1 * factor, self.y1 * factor)
 
 
-def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera) -> Rectangle | None:
-    """Pixels that the item can touch: its bounding box's corners projected, one pixel added on every side. All pixels
-    when a corner is nearer than the near plane; None when it is out of the image."""
+def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
+    """Pixels that the item can touch, by its bounding box; None when it is out of the image."""
     low, high = item.low, item.high
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     points = corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
-    if points[:, 2].min() <= camera.near:
-        return Rectangle(0, 0, camera.width, camera.height) if points[:, 2].max() > camera.near else None
-    x = camera.fx * points[:, 0] / points[:, 2] + camera.cx
-    y = camera.fy * points[:, 1] / points[:, 2] + camera.cy
-    x0, x1 = max(0, int(np.floor(x.min())) - 1), min(camera.width, int(np.ceil(x.max())) + 2)
-    y0, y1 = max(0, int(np.floor(y.min())) - 1), min(camera.height, int(np.ceil(y.max())) + 2)
-    return Rectangle(x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+    bounds = camera.bounds(points)
+    return None if bounds is None else Rectangle(*bounds)
 
 
 def merged(rectangles: list[Rectangle]) -> list[Rectangle]:

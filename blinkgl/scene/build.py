@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
+from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.types import Scene
 from blinkgl.scene.worlds.explicit import explicit_scene, primitive_mesh
@@ -13,11 +14,11 @@ from blinkgl.scene.worlds.pool import SPLITS, resolve
 from blinkgl.scene.worlds.random_world import pools, random_world
 
 
-def build_scene(config: SceneConfig, camera, t0_ns: int, t1_ns: int, *, split: str = "train", seed: int = 0, sequence: int = 0,
+def build_scene(config: SceneConfig, camera: CameraConfig, t0_ns: int, t1_ns: int, *, split: str = "train", seed: int = 0, sequence: int = 0,
                 base: Path | str = ".") -> Scene:
     """The scene over [t0_ns, t1_ns].
 
-    camera : anything with width, height, fx, fy, near and principal_point (or cx, cy): a CameraConfig.
+    camera : what it is seen by; a file's own may take its place (``scene.intrinsics``).
     split : 'train' or 'test', which side of the pools random scenes draw from.
     seed, sequence : random scenes are a function of these and the configuration; the same twice gives identical arrays.
     base : folder that the configuration's relative paths start from.
@@ -29,10 +30,10 @@ def build_scene(config: SceneConfig, camera, t0_ns: int, t1_ns: int, *, split: s
         raise ValueError("build_scene: t0_ns must be before t1_ns")
     base = Path(base)
     if isinstance(config, RandomSceneConfig):
-        return random_world(config, camera, t0_ns, t1_ns, split, seed, sequence, base)
+        return random_world(config, camera.model, t0_ns, t1_ns, split, seed, sequence, base)
     if isinstance(config, ExplicitSceneConfig):
-        return explicit_scene(config, camera, t0_ns, t1_ns, base)
-    return scene_from_file(config, camera, t0_ns, t1_ns, base)
+        return explicit_scene(config, camera.model, t0_ns, t1_ns, base)
+    return scene_from_file(config, camera.model, t0_ns, t1_ns, base)
 
 
 def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "train") -> None:

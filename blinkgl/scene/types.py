@@ -1,22 +1,25 @@
-"""A scene is data: meshes, materials, poses over time, one camera, one light. No OpenGL and no YAML here.
+"""A scene is data: meshes, materials, poses over time, what looks at them, one light. No OpenGL and no YAML here.
 
 Frames and units
 ----------------
 World: right-handed, z up, units of the user's choice (metres in the shipped configs).
 Camera: OpenCV axes (x right, y down, z forward). ``T_world_cam`` maps camera to world coordinates.
-Pixels: (x, y) with (0, 0) the centre of the top-left pixel; a point at camera coordinates (X, Y, Z) is seen at
-``x = fx * X / Z + cx``, ``y = fy * Y / Z + cy``.
+Pixels: (x, y) with (0, 0) the centre of the top-left pixel; where a point is seen is :mod:`blinkgl.camera`'s affair.
 Time: int64 nanoseconds. Poses: 4x4 float64, rigid (scale is baked into the vertices).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
+from blinkgl.camera import CameraModel
 from blinkgl.config.scene import LightConfig
+
+if TYPE_CHECKING:
+    from blinkgl.scene.rig import Rig
 
 
 @runtime_checkable
@@ -117,25 +120,6 @@ class SceneObject:
         return max((part.mesh.radius for part in self.parts), default=0.0)
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """Pin-hole camera. fx, fy, cx, cy in px by the pixel convention above; ``near`` in world units."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    path: PosePath
-    near: float = 0.05
-
-    @property
-    def K(self) -> np.ndarray:
-        """(3, 3) float64 intrinsic matrix."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-
-
 @dataclass(frozen=True)
 class Light:
     """White sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E.
@@ -154,6 +138,7 @@ class Light:
 class Scene:
     """Everything that is rendered over [t0_ns, t1_ns].
 
+    rig        : what looks at it, on its way.
     background : linear radiance where nothing is hit.
     log        : one line per decision worth keeping (collisions cut, objects dropped), for the manifest.
     omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and
@@ -161,10 +146,28 @@ class Scene:
     """
 
     objects: tuple[SceneObject, ...]
-    camera: Camera
+    rig: Rig
     t0_ns: int
     t1_ns: int
     light: Light = Light()
     background: float = 0.0
     log: tuple[str, ...] = field(default=())
     omissions: tuple[str, ...] = field(default=())
+
+    @property
+    def camera(self) -> CameraModel:
+        """Of the rig's first sensor: what pictures of the scene are drawn with."""
+        return self.rig.sensors[0].camera
+
+    @property
+    def camera_path(self) -> PosePath:
+        """T_world_cam of that camera over time."""
+        return self.rig.path_of(self.rig.sensors[0])
+
+    def with_camera(self, camera: CameraModel) -> Scene:
+        """The scene seen by another camera from the same place."""
+        return replace(self, rig=self.rig.with_camera(camera))
+
+    def with_path(self, path: PosePath) -> Scene:
+        """The scene with its rig on another way."""
+        return replace(self, rig=replace(self.rig, path=path))

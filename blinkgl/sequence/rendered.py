@@ -139,5 +139,5 @@ class RenderedSequence(Simulation):
 def poses_at(scene: Scene, times_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """T_world_cam (M, 4, 4) and T_world_obj (n, M, 4, 4), float64, at M times."""
     t = np.asarray(times_ns, np.int64)
-    return (scene.camera.path.poses(t),
+    return (scene.camera_path.poses(t),
             np.stack([o.path.poses(t) for o in scene.objects]) if scene.objects else np.zeros((0, len(t), 4, 4)))

@@ -259,10 +259,4 @@ def _sized(config: SequenceConfig, factor: float) -> list[str]:
     """Overrides that shrink the image, its field of view kept."""
     if factor == 1:
         return []
-    camera = config.camera
-    scaled = {"width": max(1, round(camera.width * factor)), "height": max(1, round(camera.height * factor)), "near": camera.near}
-    for key in ("cx", "cy"):
-        if (value := getattr(camera, key)) is not None:
-            scaled[key] = (value + 0.5) * factor - 0.5
-    scaled |= {"focal": camera.focal * factor} if camera.focal is not None else {"fov": camera.fov} if camera.fov is not None else {}
-    return ["camera=" + json.dumps(scaled)]
+    return ["camera=" + json.dumps(config.camera.scaled(factor))]

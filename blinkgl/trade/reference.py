@@ -8,7 +8,6 @@ regular grid; at that rate mip maps are hardly touched any more, so this converg
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.still import Rectangle
-from blinkgl.scene.types import Camera, Scene
+from blinkgl.scene.types import Scene
 from blinkgl.timeline.sampling import displacement_times
 from blinkgl.trade.metrics import masked
 
@@ -54,8 +53,8 @@ class FineTiles:
     def __init__(self, gl, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._tiles, self._scale = tiles, scale
         self._shape = (scene.camera.height, scene.camera.width)
-        self._cameras = [_zoomed(scene.camera, tile, scale) for tile in tiles]
-        self._renderer = Renderer(gl, replace(scene, camera=self._cameras[0]), RenderConfig())
+        self._cameras = [scene.camera.part(r.x0, r.y0, r.x1, r.y1, scale) for r in tiles]
+        self._renderer = Renderer(gl, scene.with_camera(self._cameras[0]), RenderConfig())
         self._fine = np.empty((self._cameras[0].height, self._cameras[0].width), np.float32)
 
     def __enter__(self) -> FineTiles:
@@ -95,10 +94,3 @@ def reference_events(source: FrameSource, times: Iterable[int], config: Emulator
     camera, times = EventCamera(config, None, height, width, seed), list(times)
     chunks = [masked(events, mask) for _, events in emulate(map(EventFrame, times, source(times)), camera)]
     return Events.concatenate(chunks), camera.frames
-
-
-def _zoomed(camera: Camera, tile: Rectangle, scale: int) -> Camera:
-    """The camera of one rectangle, ``scale`` times finer. Pixel centres are at integers: pixel x is [x - 0.5, x + 0.5)."""
-    place = lambda c, start: (c - start + 0.5) * scale - 0.5
-    return replace(camera, width=(tile.x1 - tile.x0) * scale, height=(tile.y1 - tile.y0) * scale, fx=camera.fx * scale, fy=camera.fy * scale,
-                   cx=place(camera.cx, tile.x0), cy=place(camera.cy, tile.y0))

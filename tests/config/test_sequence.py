@@ -5,6 +5,7 @@ from importlib import resources
 
 import pytest
 
+from blinkgl.camera import PinHole
 from blinkgl.config.recipe import all_groups
 from blinkgl.config.sequence import CameraConfig, SequenceConfig, TimeConfig, load_run
 from blinkgl.errors import ConfigError
@@ -139,8 +140,9 @@ def test_times_of_the_paper():
 
 
 def test_field_of_view_is_horizontal_and_the_principal_point_the_centre():
-    camera = CameraConfig(width=640, height=480, fov=90)
-    assert math.isclose(camera.fx, 320) and camera.fx == camera.fy and camera.principal_point == (319.5, 239.5)
+    camera = CameraConfig(width=640, height=480, fov=90).model
+    assert math.isclose(camera.fx, 320) and camera.fx == camera.fy and (camera.cx, camera.cy) == (319.5, 239.5)
+    assert CameraConfig(focal=77, cx=3, near=2).model == PinHole(346, 260, 77, 77, 3, 129.5, 2)
 
 
 @pytest.mark.parametrize("text, message", [

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.render import reference
 from blinkgl.render.renderer import LabelFrame, LabelRequest, Renderer
-from tests.render.render_scenes import LEVEL, SECOND, camera, drift
+from tests.render.render_scenes import LEVEL, SECOND, drift, rig
 
 FACING = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 MOTION = LabelRequest("depth", "ids", "velocity", "flow_forward")
@@ -48,7 +48,7 @@ def length(v) -> np.ndarray:
 
 def moving_camera(near=0.05, step=1.0, **keys):
     turn = Rotation.from_rotvec(np.array([0.02, -0.01, 0.03]) * min(step, 1.0))
-    return camera(near=near, path=drift((0, 0, 0), np.array([0.02, 0.01, -0.01]) * step, LEVEL, LEVEL * turn), **keys)
+    return rig(near=near, path=drift((0, 0, 0), np.array([0.02, 0.01, -0.01]) * step, LEVEL, LEVEL * turn), **keys)
 
 
 def compare(gl, world, t_ns: int = 0, to_ns: int = SECOND) -> Errors:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import PinHole
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.dataset.generate import generate_sequence
@@ -18,9 +19,10 @@ from blinkgl.render import renderer as module
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
 from tests.extremes.measures import FACING
-from tests.render.render_scenes import LEVEL, camera, cube, drift, mesh, quad, scene, smooth_texture, still, thing
+from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scene, smooth_texture, still, thing
 from tests.shared_data import shared
 
 MS = 1_000_000
@@ -94,8 +96,8 @@ def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, tex
         for double_sided in (True, False):
             paint = Material(texture=smooth_texture(1) if textured else None, unlit=not lit, double_sided=double_sided)
             whole = replace(sheet(corners), closed=not double_sided)  # closed: culled, not two-sided
-            world.append(scene([thing("nasty", 1, whole, drift((0, 0, 0), (0.1, 0.05, -0.3)), paint)], camera(80, 60, 75.0, still(rotation=LEVEL))))
-    world.append(replace(world[0], camera=camera(81, 61, 64.0, drift((0, 0, 0), (0.1, 0.2, 0), LEVEL, LEVEL * Rotation.from_rotvec([0.1, 0, 0])))))
+            world.append(scene([thing("nasty", 1, whole, drift((0, 0, 0), (0.1, 0.05, -0.3)), paint)], rig(80, 60, 75.0, still(rotation=LEVEL))))
+    world.append(replace(world[0], rig=rig(81, 61, 64.0, drift((0, 0, 0), (0.1, 0.2, 0), LEVEL, LEVEL * Rotation.from_rotvec([0.1, 0, 0])))))
     for one in world:
         with Renderer(gl, one, RenderConfig(antialiasing=antialiasing, image_antialiasing="none")) as renderer:
             for name, buffer in raw_buffers(renderer).items():
@@ -105,7 +107,7 @@ def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, tex
 @pytest.mark.parametrize("seed", range(4))
 def test_slivers_have_the_depth_and_the_light_of_what_they_are(gl, seed):
     corners = slivers(np.random.default_rng(seed), 1000)
-    world = scene([thing("slivers", 1, sheet(corners), drift((0, 0, 0), (0.02, 0.01, 0.03)), Material(texture=smooth_texture(1)))], camera(near=0.01))
+    world = scene([thing("slivers", 1, sheet(corners), drift((0, 0, 0), (0.02, 0.01, 0.03)), Material(texture=smooth_texture(1)))], rig(near=0.01))
     with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
         buffers = raw_buffers(renderer)
     hit = buffers["ID"] > 0
@@ -120,7 +122,7 @@ def test_slivers_have_the_depth_and_the_light_of_what_they_are(gl, seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_what_is_seen_from_its_edge_is_not_seen(gl, seed):
     """Snapped corners cover pixels; before there was a guard a third of 60 such pixels were NaN and most others at no depth of the mesh."""
-    world = scene([thing("edges", 1, sheet(edge_on(np.random.default_rng(seed), 3000)), still())], camera(near=0.01))
+    world = scene([thing("edges", 1, sheet(edge_on(np.random.default_rng(seed), 3000)), still())], rig(near=0.01))
     with Renderer(gl, world, RenderConfig()) as renderer:
         assert not renderer.labels(0, LabelRequest("ids")).ids.any() and not renderer.luminance(0).any()
 
@@ -132,7 +134,7 @@ def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing,
     of texture coordinates and normals between those rows are infinite."""
     vertices = np.array([[-128, 128, -1], [128, 128, -1], [-1, 1, -1]], float)
     ground = mesh(vertices, [[2, 1, 0]], np.tile([0, 0, 1.0], (3, 1)), vertices[:, :2] / 4)
-    eye = replace(camera(128, 128, near=0.25, path=drift((0, 0, 0), (0, 0.1, 0), LEVEL)), fx=64.0, fy=64.0, cx=64.0, cy=32.0)
+    eye = Rig.alone(PinHole(128, 128, 64.0, 64.0, 64.0, 32.0, near=0.25), drift((0, 0, 0), (0, 0.1, 0), LEVEL))
     paint = smooth_texture(1)
     with Renderer(gl, scene([thing("ground", 1, ground, still(), Material(texture=paint, unlit=unlit))], eye, Light(sun=0.0, sky=1.0)), RenderConfig(antialiasing=antialiasing)) as renderer:
         buffers = raw_buffers(renderer)

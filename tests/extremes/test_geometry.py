@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError, GLError
 from blinkgl.render import reference
@@ -16,11 +17,11 @@ from blinkgl.scene.types import Material
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera
 from tests.render.render_scenes import (
     LEVEL,
-    camera,
     drift,
     mesh,
     mixed_scene,
     quad,
+    rig,
     scene,
     smooth_texture,
     sphere,
@@ -39,7 +40,7 @@ def test_sizes_of_nine_decades_in_one_scene(gl, promise):
     for k, s in enumerate(sizes):
         x = 0.54 * (k - 2) * s
         objects.append(thing(f"ball{k}", k + 1, sphere(0.25 * s, 3), drift((x, 3 * s, 0), (x + 0.02 * s, 3 * s, 0.01 * s), TURN, TURN * SPIN)))
-    eye = camera(near=1e-5, path=drift((0, 0, 0), (1e-6, 0, -1e-6), LEVEL, LEVEL * SPIN))
+    eye = rig(near=1e-5, path=drift((0, 0, 0), (1e-6, 0, -1e-6), LEVEL, LEVEL * SPIN))
     e = compare(gl, scene(objects, eye))
     assert set(np.unique(e.frame.ids)) == {0, 1, 2, 3, 4, 5} and e.wrong_ids == 0
     promise("sizes 1e-4 to 1e5 in one scene: flow, largest, relative", e.worst, WORST)
@@ -50,7 +51,7 @@ def test_depth_ratio_of_nine_decades(gl, promise):
     """Reversed-Z in float32 with the far plane at infinity: depth = near / Z has the same relative resolution everywhere."""
     depths = np.logspace(-3, 6, 10) * 1.2
     objects = [thing(f"q{k}", k + 1, quad(*[0.5 * z * (k + 1) / 10] * 2), drift((0, z, 0), (1e-3 * z, 1.001 * z, 0), FACING)) for k, z in enumerate(depths)]
-    e = compare(gl, scene(objects, camera(near=1e-3, path=drift((0, 0, 0), (1e-6, 0, 0), LEVEL, LEVEL * SPIN))))
+    e = compare(gl, scene(objects, rig(near=1e-3, path=drift((0, 0, 0), (1e-6, 0, 0), LEVEL, LEVEL * SPIN))))
     assert len(np.unique(e.frame.ids)) == 11 and e.wrong_ids == 0
     promise("depth 1e-3 to 1e6: flow, largest, relative", e.worst, WORST)
     promise("depth 1e-3 to 1e6: depth, largest, relative", e.depth.max(), 1e-6)
@@ -62,7 +63,7 @@ def test_order_of_surfaces_close_behind_one_another(gl, promise):
     tilt, wrong = FACING * Rotation.from_euler("xy", [30, 20], degrees=True), 0
     for z in (1e-2, 1.0, 1e2, 1e4, 1e6):
         pair = [thing("far", 1, quad(z, z, 3), still((0, z * (1 + 1e-6), 0), tilt)), thing("near", 2, quad(z, z, 5), still((0, z, 0), tilt))]
-        world = scene(pair, camera(96, 72, 90.0, near=1e-3))
+        world = scene(pair, rig(96, 72, 90.0, near=1e-3))
         with Renderer(gl, world, RenderConfig()) as renderer:
             ids = renderer.labels(0, LabelRequest("ids")).ids
         wrong += (ids != reference.cast(world, 0).instance.reshape(ids.shape)).sum()
@@ -84,7 +85,7 @@ def test_a_hundred_thousand_repeats_of_a_texture(gl, promise, away, median, wors
     n 2^-24 of one, and a steep texture (1.5 per repeat here) shows four times that. Near the middle, bilinear weights of 8 bits
     are all that is left. (Counted from a corner, the middle of this ground resolved 1/250.)"""
     paint = Material(texture=smooth_texture(1, 64), uv_scale=(1e5, 1e5), unlit=True)
-    eye = camera(path=still((away, 0, 0), LEVEL * Rotation.from_rotvec([-0.6, 0, 0])))
+    eye = rig(path=still((away, 0, 0), LEVEL * Rotation.from_rotvec([-0.6, 0, 0])))
     world = scene([thing("ground", 1, quad(1e5, 1e5, 32), still((0, 0, -1.5)), paint)], eye)
     with Renderer(gl, world, RenderConfig()) as renderer:
         luminance = renderer.luminance(0)
@@ -145,7 +146,7 @@ def test_a_mesh_beyond_float32_is_refused(gl):
 def test_fields_of_view(gl, promise, fov):
     focal = 80 / np.tan(np.radians(fov) / 2)
     world = mixed_scene(textured=False)
-    world = replace(world, camera=replace(world.camera, fx=focal, fy=focal, cx=79.5, cy=59.5))
+    world = world.with_camera(replace(world.camera, fx=focal, fy=focal, cx=79.5, cy=59.5))
     e = compare(gl, world, 300 * MS, 301 * MS)
     assert e.wrong_ids <= 2  # at 179.9 degrees the objects are specks, all silhouette
     promise(f"field of view {fov:g} degrees: flow, median, relative", e.relative, 2e-6)
@@ -154,7 +155,7 @@ def test_fields_of_view(gl, promise, fov):
 
 def sized(width, height):
     world = mixed_scene(textured=False)
-    return replace(world, camera=replace(world.camera, width=width, height=height, fx=0.94 * width, fy=0.94 * width, cx=width / 2 - 0.5, cy=height / 2 - 0.5))
+    return world.with_camera(PinHole.centred(width, height, 0.94 * width))
 
 
 @pytest.mark.parametrize("width, height", [(1, 1), (1, 7), (7, 1), (2, 2)])

@@ -20,13 +20,13 @@ from tests.extremes.measures import FACING, MOTION, compare, length, moving_came
 from tests.render.render_scenes import (
     LEVEL,
     SECOND,
-    camera,
     cube,
     curve,
     drift,
     mixed_scene,
     moved_scene,
     quad,
+    rig,
     scene,
     sphere,
     still,
@@ -47,7 +47,7 @@ def movers(px: float):
             thing("ball", 3, sphere(1.0, 4), drift((0.2, 4, 0.1), (0.2 - s, 4 + s, 0.1 + s / 2), turn, turn * spin)),
             thing("wall", 4, quad(30, 30, 8), drift((0, 9, 0), (s, 9 - 0.3 * s, 0), FACING)),
         ],
-        camera(path=drift((0, 0, 0), (0.3 * s, 0, 0.2 * s), LEVEL, pan)),
+        rig(path=drift((0, 0, 0), (0.3 * s, 0, 0.2 * s), LEVEL, pan)),
     )  # fmt: skip
 
 
@@ -87,7 +87,7 @@ def test_intervals_from_a_nanosecond_to_100_seconds(gl, promise, interval_ns):
     seconds = interval_ns / SECOND
     pan = LEVEL * Rotation.from_rotvec([0.0, 0.01, 0.02])
     path = drift((0, 4, 0), (1.0, 4.5, -0.4), FACING, FACING * Rotation.from_rotvec([0.1, 0.2, 0.1]), seconds=max(seconds, 1.0))
-    world = scene([thing("wall", 1, quad(9, 9, 4), path)], camera(path=drift((0, 0, 0), (0.1, 0, 0), LEVEL, pan, max(seconds, 1.0))))
+    world = scene([thing("wall", 1, quad(9, 9, 4), path)], rig(path=drift((0, 0, 0), (0.1, 0, 0), LEVEL, pan, max(seconds, 1.0))))
     e = compare(gl, world, 0, interval_ns)
     name = f"flow over {seconds:g} s"
     promise(f"{name}: largest, relative", e.worst, WORST)

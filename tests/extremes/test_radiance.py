@@ -14,7 +14,7 @@ from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.types import Light, Material, Texture
 from tests.extremes.measures import FACING
-from tests.render.render_scenes import LEVEL, SECOND, camera, drift, quad, scene, still, thing
+from tests.render.render_scenes import LEVEL, SECOND, drift, quad, rig, scene, still, thing
 
 TILTED = LEVEL * Rotation.from_euler("x", 160, degrees=True)
 RADIANCES = [0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9]
@@ -28,7 +28,7 @@ def bars(**keys):
 @pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa4"])
 def test_radiance_of_twenty_one_decades(gl, promise, antialiasing):
     """Float32 targets keep 2^-24 of any radiance; the luma weights' sum and the box filter round a few times more."""
-    world = scene(bars(unlit=True), camera(90, 24, 80.0))
+    world = scene(bars(unlit=True), rig(90, 24, 80.0))
     with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
         luminance, colour = renderer.luminance(0), renderer.labels(0, LabelRequest("images", "ids"))
     worst = 0.0
@@ -61,9 +61,9 @@ def test_a_hot_texel_among_black_ones(gl, promise):
     image = np.zeros((64, 64, 3), np.float32)
     image[20, 30] = 1e9
     paint = Material(texture=Texture(image), unlit=True)
-    world = scene([thing("sky", 1, quad(4, 4), still((0, 8, 0), FACING), paint)], camera(32, 32, 40.0))
+    world = scene([thing("sky", 1, quad(4, 4), still((0, 8, 0), FACING), paint)], rig(32, 32, 40.0))
     wide = scene([thing("sky", 1, quad(40, 40), still((0, 4, 0), FACING), Material(texture=Texture(image), unlit=True, uv_scale=(1600.0, 1600.0)))],
-                 camera(32, 32, 30.0))  # every pixel holds 2.7 x 2.7 whole textures  # fmt: skip
+                 rig(32, 32, 30.0))  # every pixel holds 2.7 x 2.7 whole textures  # fmt: skip
     with Renderer(gl, world, RenderConfig()) as renderer:
         near = renderer.luminance(0)
         assert np.isfinite(near).all() and near.min() == 0 and near.max() > 1e8
@@ -95,7 +95,7 @@ def test_the_logarithm_against_float64(promise):
 
 def test_more_light_than_the_emulators_take_is_refused(gl):
     """2^30 is where fixed-point logarithms end: the pass draws 1e12 well, the emulator says what it cannot use, and where."""
-    world = scene([thing("wall", 1, quad(9, 9), still((0, 4, 0), FACING), Material(base_color=(1e6,) * 3))], camera(8, 6, 8.0), Light((0, -1, 0), 1e6, 0.0))
+    world = scene([thing("wall", 1, quad(9, 9), still((0, 4, 0), FACING), Material(base_color=(1e6,) * 3))], rig(8, 6, 8.0), Light((0, -1, 0), 1e6, 0.0))
     with Renderer(gl, world, RenderConfig()) as renderer:
         luminance = renderer.luminance(0)
     np.testing.assert_allclose(luminance, 1e12, rtol=1e-6)
@@ -105,7 +105,7 @@ def test_more_light_than_the_emulators_take_is_refused(gl):
 
 def test_a_moving_dark_thing_before_a_black_sky_fires_nothing(gl):
     """Radiances below log_eps are the same darkness: 1e-12 against 0 is a change of 1e-9 in the logarithm."""
-    world = scene([thing("ghost", 1, quad(0.5, 0.5), drift((-1, 4, 0), (1, 4, 0), FACING), Material(base_color=(1e-12,) * 3, unlit=True))], camera(40, 30, 40.0))
+    world = scene([thing("ghost", 1, quad(0.5, 0.5), drift((-1, 4, 0), (1, 4, 0), FACING), Material(base_color=(1e-12,) * 3, unlit=True))], rig(40, 30, 40.0))
     esim, events = Esim(30, 40, EsimConfig(contrast_threshold=0.001)), 0
     with Renderer(gl, world, RenderConfig()) as renderer:
         for k in range(11):

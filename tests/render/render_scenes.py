@@ -6,8 +6,10 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import PinHole
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
-from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
 
 SECOND = 1_000_000_000
 
@@ -102,12 +104,12 @@ def thing(name, instance_id, shape, path, material=None) -> SceneObject:
     return SceneObject(name, instance_id, (Part(shape, material or Material()),), path)
 
 
-def camera(width=160, height=120, focal=150.0, path=None, near=0.05) -> Camera:
-    return Camera(width, height, focal, focal * 1.03, width / 2 - 1.7, height / 2 + 0.6, path or still(rotation=LEVEL), near)
+def rig(width=160, height=120, focal=150.0, path=None, near=0.05) -> Rig:
+    return Rig.alone(PinHole(width, height, focal, focal * 1.03, width / 2 - 1.7, height / 2 + 0.6, near), path or still(rotation=LEVEL))
 
 
-def scene(objects, cam=None, light=None, background=0.0) -> Scene:
-    return Scene(tuple(objects), cam or camera(), 0, SECOND, light or Light(), background)
+def scene(objects, seen_by: Rig | None = None, light=None, background=0.0) -> Scene:
+    return Scene(tuple(objects), seen_by or rig(), 0, SECOND, light or Light(), background)
 
 
 def shifted(path, offset):
@@ -141,8 +143,7 @@ def moved_scene(original: Scene, offset) -> Scene:
     return replace(
         original,
         objects=tuple(replace(o, path=shifted(o.path, offset)) for o in original.objects),
-        camera=replace(original.camera, path=shifted(original.camera.path, offset)),
-    )
+    ).with_path(shifted(original.rig.path, offset))
 
 
 def mixed_scene(width=160, height=120, seed=3, unlit=False, camera_moves=True, textured=True) -> Scene:
@@ -163,4 +164,4 @@ def mixed_scene(width=160, height=120, seed=3, unlit=False, camera_moves=True, t
         thing("sheet", 5, quad(0.5, 0.7), curve(seed + 2, (0.2, 3.6, 0.5), 0.25, 0.6, LEVEL), paint(4, double_sided=True)),
     )
     path = curve(seed + 3, (0, 0, 0), 0.15, 0.05, LEVEL) if camera_moves else still(rotation=LEVEL)
-    return scene(objects, camera(width, height, 0.94 * width, path), background=0.0)
+    return scene(objects, rig(width, height, 0.94 * width, path), background=0.0)

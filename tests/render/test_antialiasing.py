@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
+from blinkgl.camera import PinHole
 from blinkgl.config.base import validate
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.render.antialiasing import ANTIALIASING, samples_of
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene.types import Camera, Material, Scene, Texture
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Material, Scene, Texture
 from render_scenes import LEVEL, SECOND, mesh, mixed_scene, quad, scene, still, thing
 
 FACING = LEVEL.as_matrix() @ np.diag([1.0, -1.0, -1.0])  # a quad's +z towards the camera at the origin
@@ -24,7 +26,7 @@ def half_plane(angle: float, offset: float, size: int = 48) -> tuple[Scene, np.n
     depth = 10.0
     points = np.column_stack([corners * depth / size, np.full(4, depth)])  # camera axes; fx = size
     plane = thing("edge", 1, mesh(points, [[0, 1, 2], [0, 2, 3]]), still(), Material(unlit=True, double_sided=True))
-    camera = Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2, still())
+    camera = Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still())
     y, x = np.mgrid[:size, :size] - (size - 1) / 2
     return Scene((plane,), camera, 0, SECOND), half_plane_area(normal, offset - x * normal[0] - y * normal[1])
 
@@ -103,7 +105,7 @@ def stripes(period_texels: int, distance: float, size: int = 64) -> Scene:
     flat = quad(32.0, 32.0)
     flat = type(flat)(flat.vertices, flat.faces, flat.normals, (flat.vertices[:, :2] * 64 / 1024).astype(np.float32))
     body = thing("stripes", 1, flat, still((0, distance, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(image), unlit=True, double_sided=True))
-    return scene([body], Camera(size, size, size, size, (size - 1) / 2, (size - 1) / 2, still((0, 0, 0), LEVEL)))
+    return scene([body], Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still((0, 0, 0), LEVEL)))
 
 
 @pytest.mark.parametrize("bias", [-2.0, -1.0, 0.0, 1.0])
@@ -129,7 +131,7 @@ def test_four_taps_of_a_linear_texture_are_one(gl):
     """The mean of four places around the centre is the value at the centre where the texture is linear, and unlit flat colours do not change."""
     ramp = np.repeat(np.linspace(0.1, 0.9, 256, dtype=np.float32)[None, :, None], 256, 0).repeat(3, 2)
     body = thing("ramp", 1, quad(1.0, 1.0), still((0, 2.0, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(ramp), unlit=True, double_sided=True))
-    world = scene([body], Camera(64, 64, 150, 150, 31.5, 31.5, still((0, 0, 0), LEVEL)))
+    world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
     with Renderer(gl, world, RenderConfig()) as one, Renderer(gl, world, RenderConfig(antialiasing="taps4")) as four:
         np.testing.assert_allclose(four.luminance(0)[8:-8, 8:-8], one.luminance(0)[8:-8, 8:-8], atol=2e-3)
 
@@ -174,7 +176,7 @@ def test_anisotropy_keeps_stripes_that_run_into_the_distance(gl, antialiasing, b
     image = np.zeros((64, 64, 3), np.float32)
     image[:, (np.arange(64) // 8) % 2 == 0] = 1.0
     ground = thing("ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True))
-    world = scene([ground], Camera(96, 64, 90.0, 90.0, 47.5, 8.0, still(rotation=LEVEL)))
+    world = scene([ground], Rig.alone(PinHole(96, 64, 90.0, 90.0, 47.5, 8.0), still(rotation=LEVEL)))
     contrast = {}
     for anisotropy in (1.0, 4.0):
         config = RenderConfig(anisotropy=anisotropy, antialiasing=antialiasing, image_antialiasing="none")

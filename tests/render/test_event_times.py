@@ -7,11 +7,13 @@ reconstruction between frames is then off by O(step²) for the sinusoid and exac
 import numpy as np
 import pytest
 
+from blinkgl.camera import PinHole
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Esim, Events
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.types import Camera, Material, Texture
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Material, Texture
 from render_scenes import LEVEL, SECOND, drift, mixed_scene, quad, scene, still, thing
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -36,7 +38,7 @@ def wall(kind: str, texels: int = TEXELS):
     facing = drift((start, -1.0, 0.0), (start + speed, -1.0, 0.0), LEVEL, LEVEL, DURATION)
     upright = LEVEL * LEVEL.from_euler("x", 180, degrees=True)  # the quad's +z towards the camera, its +x to the right
     material = Material(texture, unlit=True, uv_scale=(2.0, 2.0))
-    return scene([thing("wall", 1, sheet, still(rotation=upright), material)], Camera(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, facing))
+    return scene([thing("wall", 1, sheet, still(rotation=upright), material)], Rig.alone(PinHole(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2), facing))
 
 
 def simulate(gl, kind: str, step_ns: int, world, reconstruction: str = "linear", config=PLAIN) -> Events:
@@ -147,7 +149,7 @@ def test_the_rate_is_taken_over_half_a_pixel(gl, antialiasing, gain, error):
     paint = Material(texture=Texture(np.tile(stripes.astype(np.float32)[None, :, None], (texels, 1, 3))), unlit=True)
     facing = LEVEL * LEVEL.from_euler("x", 180, degrees=True)
     slides = drift((0, 1, 0), (speed / focal, 1, 0), facing)
-    world = scene([thing("wall", 1, quad(0.5, 0.5), slides, paint)], Camera(48, 16, focal, focal, 23.5, 7.5, still(rotation=LEVEL)))
+    world = scene([thing("wall", 1, quad(0.5, 0.5), slides, paint)], Rig.alone(PinHole(48, 16, focal, focal, 23.5, 7.5), still(rotation=LEVEL)))
     rate, found, true = np.empty((16, 48), np.float32), [], []
     with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
         for t in np.linspace(0.05, 0.9, 23):

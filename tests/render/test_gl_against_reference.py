@@ -25,13 +25,13 @@ from blinkgl.scene.types import Light, Material
 from render_scenes import (
     LEVEL,
     SECOND,
-    camera,
     cube,
     curve,
     drift,
     mixed_scene,
     moved_scene,
     quad,
+    rig,
     scene,
     smooth_texture,
     sphere,
@@ -46,7 +46,7 @@ FLAT_WAY = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that fa
 
 
 def moving_camera():
-    return camera(path=drift((0, 0, 0), (0.2, 0.1, -0.1), LEVEL, LEVEL * Rotation.from_rotvec([0.02, -0.03, 0.05])))
+    return rig(path=drift((0, 0, 0), (0.2, 0.1, -0.1), LEVEL, LEVEL * Rotation.from_rotvec([0.02, -0.03, 0.05])))
 
 
 def shapes():
@@ -102,7 +102,7 @@ def test_every_buffer_of_the_label_pass(gl, name):
     scale = np.median(length(ref.velocity)[off])
     error = length(labels.velocity - ref.velocity)[off] / scale
     assert np.median(error) < 2e-6 and error.max() < 1e-4
-    in_camera_axes = ref.normal @ world.camera.path.pose(T0)[:3, :3]
+    in_camera_axes = ref.normal @ world.camera_path.pose(T0)[:3, :3]
     np.testing.assert_allclose(labels.normals[off], in_camera_axes[off], atol=5e-5)
     np.testing.assert_allclose(labels.colour[off], ref.colour[off], atol=2e-3 if name == "everything" else 2e-5)
     np.testing.assert_allclose(luminance, labels.colour @ reference.LUMA, atol=1e-6)  # silhouettes as well
@@ -168,7 +168,7 @@ def test_back_faces_and_two_sided_light(gl):
     assert set(np.unique(ref.instance)) == {1, 2} == set(np.unique(labels.ids))
     np.testing.assert_allclose(luminance[off], ref.luminance[off], atol=1e-5)
     np.testing.assert_allclose(labels.colour[off], ref.colour[off], atol=1e-5)
-    rotation = inside.camera.path.pose(T0)[:3, :3]
+    rotation = inside.camera_path.pose(T0)[:3, :3]
     np.testing.assert_allclose(labels.normals[off], (ref.normal @ rotation)[off], atol=1e-5)
 
 
@@ -207,7 +207,7 @@ def test_camera_rotation_gives_depth_independent_flow(gl):
     base = mixed_scene()
     eye = drift((0, 0, 0), (0, 0, 0), LEVEL, LEVEL * Rotation.from_rotvec([0.06, -0.09, 0.2]))
     frozen = [replace(o, path=still(o.path.pose(0)[:3, 3], Rotation.from_matrix(o.path.pose(0)[:3, :3]))) for o in base.objects]
-    world = replace(base, objects=tuple(frozen), camera=replace(base.camera, path=eye))
+    world = replace(base, objects=tuple(frozen)).with_path(eye)
     cam = world.camera
     labels, _ = drawn(gl, world)
     H = cam.K @ eye.pose(T1)[:3, :3].T @ eye.pose(T0)[:3, :3] @ np.linalg.inv(cam.K)
@@ -273,9 +273,9 @@ def test_backward_undoes_forward(gl):
     assert np.median(residual) < 1e-5 and np.quantile(residual, 0.99) < 1e-2
 
     # a shift by whole pixels needs no interpolation
-    cam = camera()
-    step = 4.0 / cam.fx * 7
-    slide = scene([thing("wall", 1, quad(40, 40), drift((0, 4, 0), (step, 4, 0), FLAT_WAY))], cam)
+    eye = rig()
+    step = 4.0 / eye.sensors[0].camera.fx * 7
+    slide = scene([thing("wall", 1, quad(40, 40), drift((0, 4, 0), (step, 4, 0), FLAT_WAY))], eye)
     there = drawn(gl, slide, t=0, forward=SECOND)[0].forward
     back = drawn(gl, slide, t=SECOND, backward=0)[0].backward
     assert length(there.flow[:, :-7] + back.flow[:, 7:]).max() < 1e-5
@@ -305,7 +305,7 @@ def test_behind_the_camera_and_before_the_near_plane(gl):
     fence = thing("fence", 1, quad(0.6, 0.6), still((-1.0, 3.0, 0), FLAT_WAY))
     pane = thing("pane", 3, quad(0.3, 0.3), still((0, 4.4, 0), FLAT_WAY))
     wall = thing("wall", 2, quad(30, 30), still((0, 9.0, 0), FLAT_WAY))
-    world = scene([fence, pane, wall], camera(path=eye, near=0.5))
+    world = scene([fence, pane, wall], rig(path=eye, near=0.5))
     ref = reference.render(world, 0, forward_ns=SECOND)
     labels, _ = drawn(gl, world, t=0, forward=SECOND)
     off = off_silhouettes(ref)
@@ -324,7 +324,7 @@ def test_behind_the_camera_and_before_the_near_plane(gl):
 def test_crossing_the_camera_plane(gl):
     """Ground under a descending camera: flow of hundreds of px near the plane of the camera stays precise."""
     eye = drift((0, 0, 0.5), (0, 3.0, 0.45), LEVEL, LEVEL * Rotation.from_rotvec([0.05, 0, 0]))
-    world = scene([thing("ground", 1, quad(40, 40, splits=40), still())], camera(path=eye))
+    world = scene([thing("ground", 1, quad(40, 40, splits=40), still())], rig(path=eye))
     ref = reference.render(world, 0, forward_ns=SECOND)
     labels, _ = drawn(gl, world, t=0, forward=SECOND)
     settled = ref.hit & (np.abs(ref.forward.depth) > 1e-3)
@@ -422,7 +422,7 @@ def test_the_oracle_finds_a_broken_shader(gl, tmp_path, monkeypatch, file, right
 
 
 def test_empty_scene(gl):
-    world = scene([], camera(24, 16), background=0.25)
+    world = scene([], rig(24, 16), background=0.25)
     ref = reference.render(world, T0, forward_ns=T1)
     labels, luminance = drawn(gl, world)
     for frame in (ref, labels):

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, frustum_planes, invert_rigid, projection
-from blinkgl.scene.motion.paths import StaticPath
-from blinkgl.scene.types import Camera
+from blinkgl.camera import PinHole
+from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid
 
-CAMERA = Camera(64, 40, 50.0, 70.0, 20.0, 28.0, StaticPath(np.eye(4)))  # nothing about it is symmetric
+CAMERA = PinHole(64, 40, 50.0, 70.0, 20.0, 28.0)  # nothing about it is symmetric
 
 
 def seen_at(x: float, y: float, depth: float = 3.0) -> np.ndarray:
@@ -20,7 +19,7 @@ def seen_at(x: float, y: float, depth: float = 3.0) -> np.ndarray:
     (0, (-0.4, 20), (-0.6, 20)), (1, (63.4, 20), (63.6, 20)), (2, (30, -0.4), (30, -0.6)), (3, (30, 39.4), (30, 39.6)),
 ])
 def test_a_plane_is_where_the_image_ends(plane, inside, outside):
-    planes = frustum_planes(CAMERA)
+    planes = CAMERA.frustum_planes()
     assert planes.shape == (5, 3)
     np.testing.assert_allclose(np.linalg.norm(planes, axis=1), 1.0)
     assert (planes @ seen_at(*inside) > 0).all()
@@ -28,13 +27,13 @@ def test_a_plane_is_where_the_image_ends(plane, inside, outside):
 
 
 def test_the_last_plane_is_the_cameras_own():
-    planes = frustum_planes(CAMERA)
+    planes = CAMERA.frustum_planes()
     assert (planes @ [0, 0, 1.0])[4] > 0 > (planes @ [0, 0, -1.0])[4]
 
 
 def test_projection_lands_where_the_camera_says():
     x, y, depth = 11.25, 33.5, 7.0
-    clip = projection(CAMERA) @ [*seen_at(x, y, depth), 1.0]
+    clip = CAMERA.clip_from_cam() @ [*seen_at(x, y, depth), 1.0]
     window = (clip[:2] / clip[3] + 1) / 2 * [CAMERA.width, CAMERA.height]
     np.testing.assert_allclose(window, [x + 0.5, y + 0.5], rtol=1e-12)
     assert clip[3] == pytest.approx(depth) and clip[2] / clip[3] == pytest.approx(CAMERA.near / depth)

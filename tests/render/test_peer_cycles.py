@@ -21,7 +21,7 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Light, Material, Part, SceneObject
 from blinkgl.tools import cycles_worker, peer_cycles
 from blinkgl.tools.peer_cycles import Cost, CyclesSettings, blender_camera, colours, export, frames
-from render_scenes import LEVEL, camera, cube, mixed_scene, quad, scene, smooth_texture, sphere, still, thing
+from render_scenes import LEVEL, cube, mixed_scene, quad, rig, scene, smooth_texture, sphere, still, thing
 
 TIMES = [300_000_000, 650_000_000]
 needs_blender = pytest.mark.skipif(bool(peer_cycles.available()), reason=peer_cycles.available() or "there")
@@ -49,7 +49,7 @@ def blender_pixel(point: np.ndarray, T_camera: np.ndarray, parameters: dict, wid
 def test_camera_and_poses_mean_the_same_pixel(tmp_path, fx, fy, cx, cy):
     world = mixed_scene()
     eye = replace(world.camera, fx=fx, fy=fy, cx=cx, cy=cy)
-    job, arrays = exported(replace(world, camera=eye), tmp_path)
+    job, arrays = exported(world.with_camera(eye), tmp_path)
     assert job["size"] == [160, 120] and job["blender_camera"] == blender_camera(eye)
     assert min(job["blender_camera"]["pixel_aspect_x"], job["blender_camera"]["pixel_aspect_y"]) == 1.0  # Blender's least
     for k, body in enumerate(world.objects):
@@ -245,7 +245,7 @@ def test_shadow_of_a_ball_lies_where_it_should():
     paint = Material(base_color=(0.5, 0.5, 0.5))
     world = scene([SceneObject("ground", 1, (Part(quad(15, 15), paint),), still((0, 5, -1)), "ground"),
                    thing("ball", 2, sphere(radius, 4), still(centre), paint)],
-                  camera(path=still((0, 0, 1.0), LEVEL * Rotation.from_rotvec([-0.4, 0, 0]))), Light(tuple(sun), 1.0, 0.0))
+                  rig(path=still((0, 0, 1.0), LEVEL * Rotation.from_rotvec([-0.4, 0, 0]))), Light(tuple(sun), 1.0, 0.0))
     theirs = next(frames(world, [0], CyclesSettings(samples=16, bounces=0)))
     true = reference.render(world, 0)
     ground = true.instance == 1
@@ -268,7 +268,7 @@ def test_ground_shines_on_a_sheet():
 
     world = scene([SceneObject("ground", 1, (Part(quad(4000, 4000), paint(0.6)),), still((0, 0, -20)), "ground"),
                    thing("sheet", 2, quad(1, 1), still((0, 3, 0), LEVEL), paint(0.5, double_sided=True))],
-                  camera(48, 32, 60.0), Light(sun=0.0, sky=0.8))
+                  rig(48, 32, 60.0), Light(sun=0.0, sky=0.8))
     sheet = reference.render(world, 0).instance == 2
     assert sheet.sum() > 500
     for bounces, factor in ((0, 0.5), (1, 0.8)):
@@ -281,7 +281,7 @@ def test_one_sided_meshes_vanish_from_behind_and_the_same_seed_draws_the_same(tm
     """The camera stands in a closed cube, which BlinkGL culls, and sees the sheet outside; a still scene is the same in every frame."""
     world = scene([thing("around", 1, cube(0.5), still(), Material(base_color=(1, 0, 0), unlit=True)),
                    thing("sheet", 2, quad(9, 9), still((0, 3, 0), LEVEL), Material(base_color=(0.25,) * 3, unlit=True, double_sided=True))],
-                  camera(32, 24, 30.0))
+                  rig(32, 24, 30.0))
     pictures = list(colours(world, [0, 1000], CyclesSettings(samples=4)))
     np.testing.assert_allclose(pictures[0], 0.25, atol=1e-6)
     np.testing.assert_array_equal(*pictures)

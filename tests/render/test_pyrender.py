@@ -15,7 +15,7 @@ from blinkgl.render import reference
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.types import Material, Texture
 from blinkgl.tools import peer_pyrender
-from render_scenes import camera, mixed_scene, quad, scene, still, thing
+from render_scenes import mixed_scene, quad, rig, scene, still, thing
 
 if peer_pyrender.available():
     pytest.skip(peer_pyrender.available(), allow_module_level=True)
@@ -90,7 +90,7 @@ def test_picture_is_the_same_way_up(gl):
     rng = np.random.default_rng(3)
     texels = Texture((rng.integers(0, 256, (12, 16, 3)) / 255).astype(np.float32))
     paint = Material(texture=texels, uv_scale=(0.75, 1.25), unlit=True, double_sided=True)
-    eye = camera(path=still((0.1, 0.2, -2.5)))
+    eye = rig(path=still((0.1, 0.2, -2.5)))
     picture = scene([thing("picture", 300, quad(3, 2.5), still(), paint)], eye)
     theirs = peer_pyrender.render(picture, [0])
     with Renderer(gl, picture, RenderConfig(image_antialiasing="none")) as renderer:

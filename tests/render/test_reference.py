@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import PinHole
 from blinkgl.render import reference
 from blinkgl.render.probe import probe
-from blinkgl.scene.types import Camera, Light, Material, Part, SceneObject, Texture
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Light, Material, Part, SceneObject, Texture
 from render_scenes import (
     LEVEL,
     SECOND,
-    camera,
     cube,
     curve,
     drift,
@@ -22,6 +23,7 @@ from render_scenes import (
     mixed_scene,
     moved_scene,
     quad,
+    rig,
     scene,
     sphere,
     still,
@@ -31,14 +33,14 @@ from render_scenes import (
 MS = 1_000_000
 
 
-def rays_of(cam: Camera) -> np.ndarray:
+def rays_of(cam: PinHole) -> np.ndarray:
     y, x = np.mgrid[0 : cam.height, 0 : cam.width].astype(float)
     return np.stack([(x - cam.cx) / cam.fx, (y - cam.cy) / cam.fy, np.ones_like(x)], 2)
 
 
-def project(cam: Camera, world: np.ndarray, t_ns: int) -> np.ndarray:
+def project(rig: Rig, world: np.ndarray, t_ns: int) -> np.ndarray:
     """Plain pin-hole projection of (..., 3) world points: (..., 2) px."""
-    m = cam.path.pose(t_ns)
+    cam, m = rig.sensors[0].camera, rig.path.pose(t_ns)
     local = (world - m[:3, 3]) @ m[:3, :3]
     return local[..., :2] / local[..., 2:] * [cam.fx, cam.fy] + [cam.cx, cam.cy]
 
@@ -55,7 +57,7 @@ def test_plane_depth_flow_and_velocity():
     frame = reference.render(world, t0, forward_ns=t1)
     m0, m1 = path.pose(t0), path.pose(t1)
 
-    rays = rays_of(cam) @ cam.path.pose(t0)[:3, :3].T
+    rays = rays_of(cam) @ world.rig.path.pose(t0)[:3, :3].T
     normal = m0[:3, 2]
     depth = (normal @ m0[:3, 3]) / (rays @ normal)
     seen = (depth > 0) & (np.abs((depth[..., None] * rays - m0[:3, 3]) @ m0[:3, :2]).max(-1) < 49.9)
@@ -66,19 +68,19 @@ def test_plane_depth_flow_and_velocity():
     point = depth[..., None] * rays
     local = (point - m0[:3, 3]) @ m0[:3, :3]
     after = local @ m1[:3, :3].T + m1[:3, 3]
-    flow = project(cam, after, t1) - np.stack(np.meshgrid(np.arange(cam.width), np.arange(cam.height)), 2)
+    flow = project(world.rig, after, t1) - np.stack(np.meshgrid(np.arange(cam.width), np.arange(cam.height)), 2)
     valid = seen & frame.forward.valid
     np.testing.assert_allclose(frame.forward.flow[valid], flow[valid], rtol=1e-10, atol=1e-10)
 
     body_rate = np.array([0.1, -0.2, 0.3])  # the rotation takes one second
     rate = np.array([0.3, 0.6, -0.3]) + np.cross(m0[:3, :3] @ body_rate, point - m0[:3, 3])
-    rate = rate @ cam.path.pose(t0)[:3, :3]
+    rate = rate @ world.rig.path.pose(t0)[:3, :3]
     r = rays_of(cam)
     velocity = (rate[..., :2] - r[..., :2] * rate[..., 2:]) / depth[..., None] * [cam.fx, cam.fy]
     np.testing.assert_allclose(frame.velocity[seen], velocity[seen], rtol=1e-9, atol=1e-9)
 
 
-def sphere_depth(cam: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
+def sphere_depth(cam: PinHole, centre: np.ndarray, radius: float) -> np.ndarray:
     """Z of the nearer intersection for a camera-frame centre; nan where missed."""
     r = rays_of(cam)
     a, b, c = (r * r).sum(-1), r @ centre, centre @ centre - radius**2
@@ -89,15 +91,16 @@ def sphere_depth(cam: Camera, centre: np.ndarray, radius: float) -> np.ndarray:
 def test_sphere_converges_to_the_analytic_one_with_order_two():
     """The chord error of a subdivided sphere falls as the square of its edge; depth and flow follow."""
     path = drift((0.2, 4.0, 0.1), (-0.1, 4.4, 0.3))
-    cam = camera()
+    eye = rig()
+    cam = eye.sensors[0].camera
     depth = sphere_depth(cam, LEVEL.inv().apply([0.2, 4.0, 0.1]), 1.0)
     inner = np.nan_to_num(sphere_depth(cam, LEVEL.inv().apply([0.2, 4.0, 0.1]), 0.85), nan=-1) > 0  # away from the rim
     y, x = np.mgrid[0 : cam.height, 0 : cam.width].astype(float)
     point = (depth[..., None] * rays_of(cam)) @ LEVEL.as_matrix().T + [-0.3, 0.4, 0.2]
-    flow = project(cam, point, SECOND) - np.stack([x, y], 2)
+    flow = project(eye, point, SECOND) - np.stack([x, y], 2)
     errors = []
     for level in (2, 3, 4, 5):
-        world = scene([thing("ball", 1, sphere(1.0, level), path)], cam)
+        world = scene([thing("ball", 1, sphere(1.0, level), path)], eye)
         frame = reference.render(world, 0, forward_ns=SECOND)
         errors.append(
             (np.abs(frame.depth - depth)[inner].mean(), np.linalg.norm(frame.forward.flow - flow, axis=2)[inner].mean())
@@ -112,7 +115,7 @@ def test_cube_depth_ids_normals_and_flow():
     turn0 = Rotation.from_rotvec([0.3, 0.5, -0.2])
     path = drift((0.3, 5.0, -0.2), (-0.2, 4.5, 0.1), turn0, turn0 * Rotation.from_rotvec([-0.3, 0.2, 0.4]))
     eye = drift((0, 0, 0), (0.3, 0.2, -0.1), LEVEL, LEVEL * Rotation.from_rotvec([0.05, -0.04, 0.1]))
-    world = scene([thing("box", 9, cube(1.0), path)], camera(path=eye))
+    world = scene([thing("box", 9, cube(1.0), path)], rig(path=eye))
     cam, t0, t1 = world.camera, 100 * MS, 600 * MS
     frame = reference.render(world, t0, forward_ns=t1)
 
@@ -130,11 +133,11 @@ def test_cube_depth_ids_normals_and_flow():
     np.testing.assert_allclose(frame.normal[seen], (outward @ m0[:3, :3].T)[seen], atol=1e-6)  # normals are float32
 
     local = o + enter[..., None] * d
-    flow = project(cam, local @ m1[:3, :3].T + m1[:3, 3], t1) - project(cam, local @ m0[:3, :3].T + m0[:3, 3], t0)
+    flow = project(world.rig, local @ m1[:3, :3].T + m1[:3, 3], t1) - project(world.rig, local @ m0[:3, :3].T + m0[:3, 3], t0)
     np.testing.assert_allclose(frame.forward.flow[seen], flow[seen], atol=1e-10)
     # what turns away is hidden by the cube itself: its outward normal at t1 against the ray from the camera
     away = ((outward @ m1[:3, :3].T) * (local @ m1[:3, :3].T + m1[:3, 3] - eye.pose(t1)[:3, 3])).sum(-1) > 0
-    there = project(cam, local @ m1[:3, :3].T + m1[:3, 3], t1)
+    there = project(world.rig, local @ m1[:3, :3].T + m1[:3, 3], t1)
     outside = ((there < -0.5) | (there >= [cam.width - 0.5, cam.height - 0.5])).any(-1)
     assert away[seen].any() and not away[seen].all()
     np.testing.assert_array_equal(frame.forward.occluded[seen], (away | outside)[seen])
@@ -146,7 +149,7 @@ def test_camera_rotation_is_the_homography():
     base = mixed_scene()
     frozen = tuple(replace(o, path=still(o.path.pose(0)[:3, 3] + [1, 2, 3], Rotation.from_matrix(o.path.pose(0)[:3, :3])))
                    for o in base.objects)  # fmt: skip
-    world = scene(frozen, camera(path=eye))
+    world = scene(frozen, rig(path=eye))
     cam, t0, t1 = world.camera, 0, 800 * MS
     frame = reference.render(world, t0, forward_ns=t1)
     assert len(np.unique(frame.instance)) >= 5
@@ -208,7 +211,7 @@ def test_hierarchy_equals_exhaustive_search_bit_for_bit():
             thing("twin", 12, heap, curve(8, (0, 5, 0), 0.5, 1.0)),  # equal depths everywhere: the lower part wins
             thing("axis-aligned", 13, quad(0.4, 0.4, splits=7), still((0, 3, -1.5))),
         ],
-        camera(64, 48, 60.0),
+        rig(64, 48, 60.0),
     )
     for t in (0, 510 * MS):
         fast, slow = (reference.cast(world, t, exhaustive=e) for e in (False, True))
@@ -220,10 +223,10 @@ def test_hierarchy_equals_exhaustive_search_bit_for_bit():
 def test_no_cracks_between_triangles():
     """Rays through the vertices and edges of a fine mesh, exactly: none slips through."""
     grid = quad(1.0, 1.0, splits=32)
-    cam = Camera(65, 65, 64.0, 64.0, 32.0, 32.0, still())
-    world = scene([thing("sheet", 1, grid, still((0, 0, 2.0)))], cam)  # one vertex exactly in every second pixel
-    assert reference.cast(world, 0).hit[reference.pixel_grid(cam).max(1) < 64].all()
-    ball = scene([thing("ball", 1, sphere(1.0, 3), still((0, 0, 3.0)))], cam)
+    eye = Rig.alone(PinHole(65, 65, 64.0, 64.0, 32.0, 32.0), still())
+    world = scene([thing("sheet", 1, grid, still((0, 0, 2.0)))], eye)  # one vertex exactly in every second pixel
+    assert reference.cast(world, 0).hit[reference.pixel_grid(world.camera).max(1) < 64].all()
+    ball = scene([thing("ball", 1, sphere(1.0, 3), still((0, 0, 3.0)))], eye)
     local = sphere(1.0, 3)
     corner = local.vertices[local.vertices[:, 2] < -0.5] + [0, 0, 3.0]
     xy = corner[:, :2] / corner[:, 2:] * 64.0 + 32.0
@@ -252,9 +255,9 @@ def test_tiny_motion_keeps_its_relative_precision():
     """A drift of 1e-9 units: 4e-8 px, still right to 1e-9 of itself, where subtracting projections leaves 1e-6."""
     step = 1e-9
     path = drift((0, 0, 4.0), (step, 0, 4.0))
-    cam = camera(path=still())
-    frame = reference.render(scene([thing("plane", 1, quad(9, 9), path)], cam), 0, forward_ns=SECOND)
-    np.testing.assert_allclose(frame.forward.flow[..., 0], cam.fx * step / 4.0, rtol=1e-12)
+    eye = rig(path=still())
+    frame = reference.render(scene([thing("plane", 1, quad(9, 9), path)], eye), 0, forward_ns=SECOND)
+    np.testing.assert_allclose(frame.forward.flow[..., 0], eye.sensors[0].camera.fx * step / 4.0, rtol=1e-12)
     np.testing.assert_array_equal(frame.forward.flow[..., 1], 0.0)
 
 
@@ -263,7 +266,7 @@ def test_behind_the_camera_at_the_other_time():
     eye = drift((0, 0, 0), (0, 4.0, 0), LEVEL, LEVEL)
     fence = thing("fence", 1, quad(0.6, 0.6), still((0, 3.0, 0), LEVEL * Rotation.from_euler("x", 180, degrees=True)))
     wall = thing("wall", 2, quad(30, 30), still((0, 9.0, 0), LEVEL * Rotation.from_euler("x", 180, degrees=True)))
-    world = scene([fence, wall], camera(path=eye))
+    world = scene([fence, wall], rig(path=eye))
     frame = reference.render(world, 0, forward_ns=SECOND)
     on_fence = frame.instance == 1
     assert on_fence.any() and (frame.instance[~on_fence] == 2).all()
@@ -280,7 +283,7 @@ def test_behind_the_camera_at_the_other_time():
 
 
 def test_in_front_of_the_near_plane_is_not_seen():
-    world = scene([thing("wall", 2, quad(30, 30), still((0, 0, 1.0)))], camera(path=still(), near=1.5))
+    world = scene([thing("wall", 2, quad(30, 30), still((0, 0, 1.0)))], rig(path=still(), near=1.5))
     assert not reference.cast(world, 0).hit.any()
 
 
@@ -288,14 +291,14 @@ def test_in_front_of_the_near_plane_is_not_seen():
 
 
 def test_back_faces():
-    inside = camera(path=still(rotation=LEVEL))
+    inside = rig(path=still(rotation=LEVEL))
     assert not reference.cast(scene([thing("box", 1, cube(3.0), still())], inside), 0).hit.any()
     lined = scene([thing("box", 1, cube(3.0), still(), Material(double_sided=True))], inside)
     frame = reference.render(lined, 0)
     assert frame.hit.all()
-    rays = rays_of(inside) @ LEVEL.as_matrix().T
+    rays = rays_of(lined.camera) @ LEVEL.as_matrix().T
     assert ((frame.normal * rays).sum(-1) < 0).all()  # turned towards the camera
-    opened = scene([thing("sheet", 1, quad(9, 9), still((0, 0, 2.0)))], camera(path=still()))  # normal +z: its back
+    opened = scene([thing("sheet", 1, quad(9, 9), still((0, 0, 2.0)))], rig(path=still()))  # normal +z: its back
     frame = reference.render(opened, 0)
     assert frame.hit.all()
     np.testing.assert_allclose(frame.normal, np.broadcast_to([0.0, 0, -1], frame.normal.shape), atol=1e-12)
@@ -304,7 +307,7 @@ def test_back_faces():
 def test_light_and_luma():
     light = Light(sun_direction=(0.0, 0.6, 0.8), sun=0.7, sky=0.3)
     up = thing("ground", 1, quad(50, 50), still(), Material(base_color=(0.5, 0.25, 1.0)))
-    over = camera(path=still((0, 0, 3), Rotation.from_euler("x", 180, degrees=True)))
+    over = rig(path=still((0, 0, 3), Rotation.from_euler("x", 180, degrees=True)))
     frame = reference.render(scene([up], over, light), 0)
     expected = np.array([0.5, 0.25, 1.0]) * (0.7 * 0.8 + 0.3)
     np.testing.assert_allclose(frame.colour, np.broadcast_to(expected, frame.colour.shape), rtol=1e-12)
@@ -321,10 +324,10 @@ def test_texture_is_upright_decoded_and_repeats():
     """A quad that fills the image texel by pixel: the picture itself, row 0 at the top, sRGB decoded."""
     rng = np.random.default_rng(5)
     image = rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)
-    cam = Camera(16, 12, 20.0, 20.0, 7.5, 5.5, still((0, 0, 2.0), Rotation.from_euler("x", 180, degrees=True)))
+    eye = Rig.alone(PinHole(16, 12, 20.0, 20.0, 7.5, 5.5), still((0, 0, 2.0), Rotation.from_euler("x", 180, degrees=True)))
     sheet = quad(0.8, 0.6)  # 16 x 12 px at distance 2
     paint = Material(texture=Texture(image), unlit=True)
-    frame = reference.render(scene([thing("picture", 1, sheet, still(), paint)], cam), 0)
+    frame = reference.render(scene([thing("picture", 1, sheet, still(), paint)], eye), 0)
     linear = reference.srgb_to_linear(image / 255.0)
     np.testing.assert_allclose(frame.colour, linear, atol=1e-6)  # uv are float32
     assert reference.srgb_to_linear(np.array([0.0, 1.0, 0.5])) == pytest.approx([0, 1, 0.21404114], abs=1e-8)
@@ -347,7 +350,7 @@ def test_occluded_by_a_moving_card_and_by_the_image_border():
     """A card slides over a wall: occluded exactly under its new projection or outside the image."""
     card = thing("card", 2, quad(0.5, 0.5), drift((-0.8, 0.1, 2.0), (0.4, 0.1, 2.0)))
     wall = thing("wall", 1, quad(40, 40), drift((0, 0, 4.0), (1.0, 0, 4.0)))
-    world = scene([wall, card], camera(path=still()))
+    world = scene([wall, card], rig(path=still()))
     cam = world.camera
     frame = reference.render(world, 0, forward_ns=SECOND)
     y, x = np.mgrid[0 : cam.height, 0 : cam.width].astype(float)
@@ -395,8 +398,8 @@ def test_probe_is_the_pixel():
         np.testing.assert_allclose(one.flow, frame.forward.flow[y, x], rtol=1e-13)
         np.testing.assert_allclose(one.bary @ one.corners, one.local, atol=1e-12)
         np.testing.assert_allclose(one.camera[2], one.depth, rtol=1e-12)
-        np.testing.assert_allclose(project(world.camera, one.world, t0), [x, y], atol=1e-10)
-        np.testing.assert_allclose(project(world.camera, one.world_to, t1), one.xy_to, atol=1e-10)
+        np.testing.assert_allclose(project(world.rig, one.world, t0), [x, y], atol=1e-10)
+        np.testing.assert_allclose(project(world.rig, one.world_to, t1), one.xy_to, atol=1e-10)
         np.testing.assert_allclose(one.xy_to, one.flow + [x, y], atol=1e-12)
 
 

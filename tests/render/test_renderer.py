@@ -3,16 +3,18 @@
 import numpy as np
 import pytest
 
+from blinkgl.camera import PinHole
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import renderer as module
-from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid, projection
+from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.geometry import primitives
-from blinkgl.scene.types import Camera, Light, Material, Part, Scene, SceneObject, Texture
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Light, Material, Part, Scene, SceneObject, Texture
 from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -28,7 +30,7 @@ def world(width=96, height=72, objects=12, light=Light()):
         centre = rng.uniform((-6, -2, -3), (6, 9, 3))  # some behind the camera, some outside the view
         made.append(SceneObject(f"object {i}", i + 1, (Part(mesh, material),), curve(i, centre, 0.5, 1.0)))
     f = 0.8 * width
-    camera = Camera(width, height, f, f, (width - 1) / 2, (height - 1) / 2, curve(99, (0, -4, 0), 0.1, 0.1, LEVEL))
+    camera = Rig.alone(PinHole(width, height, f, f, (width - 1) / 2, (height - 1) / 2), curve(99, (0, -4, 0), 0.1, 0.1, LEVEL))
     return Scene(tuple(made), camera, 0, SECOND, light, background=0.25)
 
 
@@ -93,11 +95,11 @@ def test_supersampling_is_the_mean_of_a_finer_image(gl, factor):
     """Slow twin: the same camera with n times the pixels, averaged by NumPy."""
     scene = world()
     c = scene.camera
-    fine = Camera(c.width * factor, c.height * factor, c.fx * factor, c.fy * factor,
-                  (c.cx + 0.5) * factor - 0.5, (c.cy + 0.5) * factor - 0.5, c.path, c.near)
+    fine = PinHole(c.width * factor, c.height * factor, c.fx * factor, c.fy * factor,
+                   (c.cx + 0.5) * factor - 0.5, (c.cy + 0.5) * factor - 0.5, c.near)
     with Renderer(gl, scene, RenderConfig(antialiasing=f"ssaa{factor}", image_antialiasing=f"ssaa{factor}")) as renderer:
         luminance, colour = renderer.luminance(0), renderer.colour(0)
-    with Renderer(gl, Scene(scene.objects, fine, 0, SECOND, scene.light, scene.background), PLAIN) as renderer:
+    with Renderer(gl, scene.with_camera(fine), PLAIN) as renderer:
         h, w = c.height, c.width
         expected = renderer.luminance(0).reshape(h, factor, w, factor).mean(axis=(1, 3), dtype=np.float64)
         expected_colour = renderer.colour(0).reshape(h, factor, w, factor, 3).mean(axis=(1, 3), dtype=np.float64)
@@ -123,7 +125,7 @@ def test_frames_and_labels_are_drawn_from_the_same_level_of_detail(gl):
     """A fine ball far away: fewer triangles, and what is bright is exactly what has an id."""
     ball = primitives.icosphere(subdivisions=4)
     objects = (SceneObject("ball", 1, (Part(ball, Material(unlit=True)),), still((0.3, 12, 0.2))),)
-    camera = Camera(96, 72, 90, 90, 47.5, 35.5, still((0, 0, 0), LEVEL))
+    camera = Rig.alone(PinHole(96, 72, 90, 90, 47.5, 35.5), still((0, 0, 0), LEVEL))
     scene = Scene(objects, camera, 0, SECOND, Light())
     with Renderer(gl, scene, PLAIN) as full, Renderer(gl, scene, PLAIN.model_copy(update={"lod": LodConfig(enabled=True)})) as coarse:
         assert coarse.triangles < full.triangles / 4 and full.scene is scene
@@ -160,12 +162,13 @@ def test_small_pictures_cover_the_whole_image(gl, width, height, every):
     """(98 * (1 / 49) is 1.9999999999999998.) Pixels are W / w apart: a wall that drifts shows its velocity at exactly those places."""
     small = (max(1, height // every), max(1, width // every))
     wall = SceneObject("wall", 1, (Part(primitives.cuboid(), Material(unlit=True)),), drift((-1.0, 4, 0), (1.0, 4.5, 0)))
-    camera = Camera(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2, still(rotation=LEVEL))
-    with Renderer(gl, Scene((wall,), camera, 0, SECOND), PLAIN) as renderer:
+    camera = Rig.alone(PinHole(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2), still(rotation=LEVEL))
+    scene = Scene((wall,), camera, 0, SECOND)
+    with Renderer(gl, scene, PLAIN) as renderer:
         made = renderer.velocity(0, every), renderer.motion(0, every), renderer.brightness(0, every)
         assert all(a.shape == (*small, 2) and a.dtype == np.float32 for a in made)
-    fewer = Camera(small[1], small[0], camera.fx * small[1] / width, camera.fy * small[0] / height, (small[1] - 1) / 2, (small[0] - 1) / 2, camera.path)
-    with Renderer(gl, Scene((wall,), fewer, 0, SECOND), PLAIN) as renderer:
+    fewer = PinHole.centred(small[1], small[0], 0.2 * small[1], 0.2 * width * small[0] / height)
+    with Renderer(gl, scene.with_camera(fewer), PLAIN) as renderer:
         np.testing.assert_allclose(made[0], renderer.velocity(0) * (width / small[1], height / small[0]), rtol=1e-4, atol=1e-4)
 
 
@@ -173,10 +176,10 @@ def test_small_pictures_cover_the_whole_image(gl, width, height, every):
 
 
 def test_projection_puts_points_on_the_documented_pixel():
-    camera = Camera(640, 480, 500.0, 510.0, 300.0, 250.0, still(), near=0.1)
+    camera = PinHole(640, 480, 500.0, 510.0, 300.0, 250.0, near=0.1)
     rng = np.random.default_rng(0)
     points = rng.uniform((-1, -1, 0.2), (1, 1, 9), (50, 3))
-    clip = np.column_stack([points, np.ones(50)]) @ projection(camera).T
+    clip = np.column_stack([points, np.ones(50)]) @ camera.clip_from_cam().T
     ndc = clip[:, :3] / clip[:, 3:]
     window = (ndc[:, :2] + 1) / 2 * (640, 480) - 0.5
     np.testing.assert_allclose(window, points[:, :2] / points[:, 2:] * (500, 510) + (300, 250), atol=1e-10)

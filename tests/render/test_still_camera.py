@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from blinkgl.camera import PinHole
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events import Esim
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.render.still import Rectangle, merged, screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath
-from blinkgl.scene.types import Camera
 from blinkgl.tools import bench_still
 from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
 
@@ -110,7 +110,7 @@ def test_another_camera_takes_nothing_from_the_first(gl):
     world = mixed_scene(48, 36, camera_moves=False)
     other = replace(world.camera, cx=world.camera.cx - 20, fx=world.camera.fx * 1.3)
     request = LabelRequest("flow_forward", "occlusion_forward")
-    with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, replace(world, camera=other), PLAIN) as fresh:
+    with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, world.with_camera(other), PLAIN) as fresh:
         out = np.empty((36, 48), np.float32)
         for t in (0, SECOND // 9):
             renderer.luminance(t, out=out)
@@ -187,7 +187,7 @@ def test_rectangles():
 
 
 def test_screen_rectangle_contains_the_projection():
-    camera = Camera(200, 100, 150.0, 150.0, 99.5, 49.5, still())
+    camera = PinHole(200, 100, 150.0, 150.0, 99.5, 49.5)
     item = SimpleNamespace(low=np.array([-0.5] * 3), high=np.array([0.5] * 3))
     T = np.eye(4)
     T[:3, 3] = (1.0, -0.5, 4.0)

@@ -20,7 +20,7 @@ from blinkgl.scene.reading import contents, reading
 from blinkgl.scene.worlds.from_file import from_gltf
 from tests.scene.gltf_files import GltfBuilder, triangle
 
-CAMERA = CameraConfig(width=64, height=48)
+CAMERA = CameraConfig(width=64, height=48).model
 
 
 def everything() -> GltfBuilder:

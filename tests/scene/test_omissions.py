@@ -16,7 +16,7 @@ from blinkgl.scene.worlds.from_file import from_gltf, from_trimesh
 from blinkgl.scene.worlds.pool import object_pool
 from tests.scene.gltf_files import GltfBuilder, triangle
 
-CAMERA = CameraConfig(width=64, height=48)
+CAMERA = CameraConfig(width=64, height=48).model
 MATT = {"metallicFactor": 0}
 
 

@@ -116,6 +116,6 @@ class LatePath:
 def with_stale_pose(scene, name: str, late_ns: int):
     """The scene with one object (or "camera") where it was ``late_ns`` ago."""
     if name == "camera":
-        return replace(scene, camera=replace(scene.camera, path=LatePath(scene.camera.path, late_ns)))
+        return scene.with_path(LatePath(scene.rig.path, late_ns))
     late = [replace(o, path=LatePath(o.path, late_ns)) if o.name == name else o for o in scene.objects]
     return replace(scene, objects=tuple(late))

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl import create_context
 from blinkgl.render import reference
@@ -20,7 +21,8 @@ from blinkgl.render.resources import SceneResources
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry.primitives import grid
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
-from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject, Texture
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Material, Part, Scene, SceneObject, Texture
 from blinkgl.tools.shader_debugger import compare, mipmaps, moments, probe, session
 from blinkgl.tools.shader_debugger.session import DebugRenderer, When, moment, open_renderer, open_subject
 from debugger_scene import HEIGHT, LOOKUP_MISTAKES, MISTAKES, WIDTH, edit, with_stale_pose
@@ -143,8 +145,7 @@ def test_derivative_of_luminance_of_a_sliding_cosine(gl):
     wall = SceneObject("wall", 1, (Part(grid(width=width, depth=width), Material(Texture(paint), unlit=True)),), StaticPath(np.eye(4)))
     eye = KeyframePath([0, 10**9], [(0.0, 0, depth), (speed, 0, depth)], Rotation.concatenate([Rotation.from_matrix(np.diag([1.0, -1, -1]))] * 2),
                        interpolation="linear")
-    camera = Camera(64, 8, 200.0, 200.0, 31.5, 3.5, eye)
-    scene = Scene((wall,), camera, 0, 10**9)
+    scene = Scene((wall,), Rig.alone(PinHole(64, 8, 200.0, 200.0, 31.5, 3.5), eye), 0, 10**9)
     when = When(500_000_000, 600_000_000, 400_000_000, 499_000_000, 501_000_000)
     x = speed * 0.5 + depth * (np.arange(64) - 31.5) / 200.0
     phase = wall.parts[0].mesh.uvs[:, 0][np.argmin(wall.parts[0].mesh.vertices[:, 0])] - (-0.5)  # where u = 0 lies, in texture widths
@@ -164,7 +165,8 @@ def test_reference_mip_level_of_a_facing_plane():
     points = np.array([[[-1, -1, depth], [1, -1, depth], [0, 1.5, depth]]])
     texels = points[:, :, :2] * per_unit
     ray = np.array([[0.02, -0.01, 1.0]])
-    assert moments.footprint(points, texels, ray, focal)[0] == pytest.approx(np.log2(per_unit * depth / 110.0), abs=1e-12)
+    slopes = np.array([[[1 / focal[0], 0.0], [0.0, 1 / focal[1]], [0.0, 0.0]]])
+    assert moments.footprint(points, texels, ray, slopes)[0] == pytest.approx(np.log2(per_unit * depth / 110.0), abs=1e-12)
     points[0, 2, 2] = 9.0
 
     def where(rx, ry):
@@ -175,7 +177,7 @@ def test_reference_mip_level_of_a_facing_plane():
     x = (where(0.02 + h, -0.01) - where(0.02 - h, -0.01)) / (2 * h) / focal[0]
     y = (where(0.02, -0.01 + h) - where(0.02, -0.01 - h)) / (2 * h) / focal[1]
     brute = np.log2(max(np.linalg.norm(x), np.linalg.norm(y)))
-    assert moments.footprint(points, texels, ray, focal)[0] == pytest.approx(brute, abs=1e-6)
+    assert moments.footprint(points, texels, ray, slopes)[0] == pytest.approx(brute, abs=1e-6)
 
 
 def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():
@@ -220,7 +222,7 @@ def test_probe_shows_the_values_of_passes(shader, config, written, world):
     for label, t in (("t", T), ("t' forward", T_NEXT)):
         at = thing.path.pose(t)[:3, :3] @ local + thing.path.pose(t)[:3, 3]
         np.testing.assert_allclose(positions[f"world, {label}"], at, atol=1e-12)
-        X = scene.camera.path.pose(t)[:3, :3].T @ (at - scene.camera.path.pose(t)[:3, 3])
+        X = scene.camera_path.pose(t)[:3, :3].T @ (at - scene.camera_path.pose(t)[:3, 3])
         np.testing.assert_allclose(positions[f"camera, {label}"], X, atol=1e-12)
         clip = np.asarray(positions[f"clip, {label}"])
         pixel = (clip[:2] / clip[3] + 1) / 2 * [WIDTH, HEIGHT] - 0.5

@@ -189,7 +189,7 @@ class ReferenceMoment(_Lazy):
         if name == "velocity":
             return {name: np.where(frame.hit[..., None], frame.velocity, 0.0)}
         if name == "normals":
-            rotation = self.scene.camera.path.pose(self.when.t_ns)[:3, :3]
+            rotation = self.scene.camera_path.pose(self.when.t_ns)[:3, :3]
             return {name: np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)}
         if name == "log_luminance":
             return {name: np.log(self["luminance"] + self.log_eps)}
@@ -212,8 +212,7 @@ class ReferenceMoment(_Lazy):
         frame, scene = self.at(t_ns), self.scene
         shape = frame.hit.shape
         uv, light, level, albedo, size = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3)), np.ones((*shape, 2))
-        rays = (reference.pixel_grid(scene.camera) - [scene.camera.cx, scene.camera.cy]) / [scene.camera.fx, scene.camera.fy]
-        rays = np.concatenate([rays, np.ones((len(rays), 1))], axis=1).reshape(*shape, 3)
+        xy = reference.pixel_grid(scene.camera).reshape(*shape, 2)
         for p, (thing, part) in enumerate(reference.scene_parts(scene)):
             on = frame.part == p
             if not on.any():
@@ -226,7 +225,7 @@ class ReferenceMoment(_Lazy):
                 pose = reference.relative_pose_at(scene, thing, t_ns)
                 points = part.mesh.vertices[corners] @ pose[:3, :3].T + pose[:3, 3]
                 texels = part.mesh.uvs[corners].astype(np.float64) * part.material.uv_scale * part.material.texture.image.shape[1::-1]
-                level[on] = footprint(points, texels, rays[on], (scene.camera.fx, scene.camera.fy)) + self.mip_bias
+                level[on] = footprint(points, texels, scene.camera.rays(xy[on]), scene.camera.ray_jacobian(xy[on])) + self.mip_bias
             albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
         colour = np.where(frame.hit[..., None], albedo * light[..., None], frame.colour)
         return {"uv": uv, "light": light, "level": level, "albedo": albedo, "colour": colour, "luminance": colour @ LUMA,
@@ -243,11 +242,11 @@ def luma_of(albedo: np.ndarray) -> np.ndarray:
     return np.repeat((albedo @ LUMA)[..., None], 3, axis=-1)
 
 
-def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, focal: tuple[float, float]) -> np.ndarray:
+def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """(N,) log2 of the texels that one pixel step covers on the planes of N triangles.
 
     points : (N, 3, 3) corners, camera axes.   texels : (N, 3, 2) texture coordinates of the corners, in texels.
-    rays : (N, 3) (rx, ry, 1).   focal : fx, fy in px.
+    rays : (N, 3) through the pixels.   slopes : (N, 3, 2) their derivatives by x and y, 1/px.
     With b = inv([A B C]) r the coordinates are (sum b_i u_i) / (sum b_i); the adjugate does, its scale cancels."""
     a, b, c = points[:, 0], points[:, 1], points[:, 2]
     rows = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -257,7 +256,7 @@ def footprint(points: np.ndarray, texels: np.ndarray, rays: np.ndarray, focal: t
         here = np.einsum("ni,nik->nk", weights, texels) / total[:, None]
         steps = []
         for axis in (0, 1):
-            slope = rows[:, :, axis] / focal[axis]  # d weights / d pixel
+            slope = np.einsum("nij,nj->ni", rows, slopes[:, :, axis])  # d weights / d pixel
             change = np.einsum("ni,nik->nk", slope, texels) - here * slope.sum(axis=1)[:, None]
             steps.append(np.linalg.norm(change / total[:, None], axis=1))
         return np.log2(np.maximum(steps[0], steps[1]))

@@ -16,20 +16,20 @@ ROUNDING = 0.01  # px; float32 leaves less
 
 
 def displaced(gpu, ref) -> np.ndarray:
-    """(H, W, 2) px from each pixel's centre to where the point drawn there lies by the true poses; 0 where nothing was drawn."""
+    """(H, W, 2) px from each pixel's centre to where the point drawn there lies by the true poses; 0 where nothing was drawn, inf where
+    that is out of the camera's sight."""
     part = gpu["part"]
     out = np.zeros((*part.shape, 2))
     for p, (thing, _) in enumerate(reference.scene_parts(ref.scene)):
         y, x = np.nonzero(part == p)
         pose = reference.relative_pose_at(ref.scene, thing, ref.when.t_ns)
-        out[y, x] = _project(ref.scene.camera, pose, gpu["local"][y, x].astype(np.float64)) - np.stack([x, y], axis=1)
+        seen = _project(ref.scene.camera, pose, gpu["local"][y, x].astype(np.float64))
+        out[y, x] = np.nan_to_num(seen - np.stack([x, y], axis=1), nan=np.inf)
     return out
 
 
 def _project(camera, pose: np.ndarray, local: np.ndarray) -> np.ndarray:
-    at = local @ pose[:3, :3].T + pose[:3, 3]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return at[:, :2] / at[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return camera.project(local @ pose[:3, :3].T + pose[:3, 3])
 
 
 def pose_suspicions(comparison, report) -> list[str]:
@@ -48,15 +48,16 @@ def pose_suspicions(comparison, report) -> list[str]:
 
     def left(some, t_cam: int, t_obj: int) -> float:
         errors = [np.linalg.norm(_project(scene.camera, _pose(scene, thing, t_cam, t_obj), local) - xy, axis=1) for thing, xy, local in some]
-        return float(np.nan_to_num(np.quantile(np.concatenate(errors), 0.9), nan=np.inf))
+        # A point out of sight is as wrong as the picture is large: more would make any explanation look good beside it.
+        return float(np.quantile(np.nan_to_num(np.concatenate(errors), nan=scene.camera.width + scene.camera.height), 0.9))
 
     found = []
     before = left(groups, now, now)
     off = displaced(gpu, ref)[wrong]
     shift = np.median(off, axis=0)
     whole = {f"everything is shifted by ({-shift[0]:+.3g}, {-shift[1]:+.3g}) px (the principal point, or a pixel's centre)":
-             float(np.quantile(np.linalg.norm(off - shift, axis=1), 0.9))}
-    if not scene.camera.path.is_static:
+             float(np.nan_to_num(np.quantile(np.linalg.norm(off - shift, axis=1), 0.9), nan=np.inf))}
+    if not scene.camera_path.is_static:
         t = _best(scene, now, lambda t: left(groups, t, now))
         whole[f"the camera is where it is at t = {_when(t, now)}: a stale pose"] = left(groups, t, now)
     if len(np.unique(owner[report.graded])) == len(numbers):  # every object that is seen
@@ -75,7 +76,7 @@ def pose_suspicions(comparison, report) -> list[str]:
 
 def _pose(scene, thing, t_cam: int, t_obj: int) -> np.ndarray:
     """(4, 4) T_cam_obj of the camera at one time and the object at another."""
-    camera, body = scene.camera.path.pose(t_cam), thing.path.pose(t_obj)
+    camera, body = scene.camera_path.pose(t_cam), thing.path.pose(t_obj)
     out = np.eye(4)
     out[:3, :3] = camera[:3, :3].T @ body[:3, :3]
     out[:3, 3] = camera[:3, :3].T @ (body[:3, 3] - camera[:3, 3])

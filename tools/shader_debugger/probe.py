@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 
 from blinkgl.render import reference
-from blinkgl.render.matrices import projection
 from blinkgl.render.probe import probe as reference_probe
 from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison
@@ -107,7 +106,7 @@ def _barycentric(parts, p, gpu, x, y):
 def _positions(gpu, ref, x, y, seen) -> list[dict]:
     """The GPU's clip position is what it used: gl_FragCoord at t; at t' the position and depth that its flow implies."""
     scene, when = ref.scene, gpu.when
-    P = projection(scene.camera)
+    P = scene.camera.clip_from_cam()
     size = np.array([scene.camera.width, scene.camera.height], float)
     rows = []
 

@@ -131,8 +131,8 @@ def _depth(comparison, name, r, g, on) -> Candidates:
     yield "window depth near / Z instead of Z", camera.near / r
     yield "1 / Z instead of Z", 1 / r
     y, x = np.nonzero(on)
-    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones(len(x))], axis=1)
-    yield "distance along the ray instead of depth along the optical axis", r * np.linalg.norm(ray, axis=1)
+    rays = camera.rays(np.stack([x, y], axis=1))
+    yield "distance along the ray instead of depth along the optical axis", r * np.linalg.norm(rays, axis=1) / rays[:, 2]
 
 
 def _screen_weights(comparison, on) -> np.ndarray:
@@ -191,7 +191,7 @@ def _normals_seen(comparison, on) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _normals(comparison, name, r, g, on) -> Candidates:
-    rotation = comparison.ref.scene.camera.path.pose(comparison.gpu.when.t_ns)[:3, :3]
+    rotation = comparison.ref.scene.camera_path.pose(comparison.gpu.when.t_ns)[:3, :3]
     yield "not turned into the camera's axes (world axes)", r @ rotation.T
     for text, normal in _normals_seen(comparison, on):
         yield text, normal @ rotation
@@ -355,5 +355,4 @@ def _flow_of(comparison, way: str, on) -> np.ndarray:
         step = reference.relative_pose_at(ref.scene, thing, getattr(when, f"{way}_ns")) - reference.relative_pose_at(ref.scene, thing, when.t_ns)
         change[rows] = local[rows] @ step[:3, :3].T + step[:3, 3]
     y, x = np.nonzero(on)
-    rays = (np.stack([x, y], axis=1) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    return (change[:, :2] - rays * change[:, 2:]) / (frame.depth[on] + change[:, 2])[:, None] * [camera.fx, camera.fy]
+    return camera.displacement(camera.rays(np.stack([x, y], axis=1)), frame.depth[on], change)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,11 +35,7 @@ HALF = 2
 def half_scene(scene: Scene) -> Scene:
     """The same view at half the width and height (rounded down)."""
     camera = scene.camera
-    width, height = max(1, camera.width // HALF), max(1, camera.height // HALF)
-    sx, sy = width / camera.width, height / camera.height
-    small = replace(camera, width=width, height=height, fx=camera.fx * sx, fy=camera.fy * sy, cx=(camera.cx + 0.5) * sx - 0.5,
-                    cy=(camera.cy + 0.5) * sy - 0.5)
-    return replace(scene, camera=small)
+    return scene.with_camera(camera.resized(max(1, camera.width // HALF), max(1, camera.height // HALF)))
 
 
 @dataclass

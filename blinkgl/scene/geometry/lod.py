@@ -65,25 +65,14 @@ def at_level_of_detail(scene: Scene, config: LodConfig) -> Scene:
 
 def largest_scale(scene: Scene, obj: SceneObject, part: Part) -> float:
     """Pixels in the image per unit of the part's surface, at most, while its bounding sphere is in view: a displacement d of any
-    direction at depth Z moves the image by at most f d / Z sqrt(1 + tan²), with the tangent of the angle to the optical axis. inf when the
-    camera is as near as the near plane, 0 when the part never is in view."""
-    camera = scene.camera
+    direction at depth Z moves the image by at most f d / Z sqrt(1 + tan²) (pin-hole), with the tangent of the angle to the optical axis. inf
+    when the camera is as near as the near plane, 0 when the part never is in view."""
     times = np.linspace(scene.t0_ns, scene.t1_ns, TIMES).astype(np.int64)
-    T_world_cam, T_world_obj = camera.path.poses(times), obj.path.poses(times)
+    T_world_cam, T_world_obj = scene.camera_path.poses(times), obj.path.poses(times)
     centre, radius = bounding_sphere(part.mesh)
     world = T_world_obj[:, :3, :3] @ centre + T_world_obj[:, :3, 3]
     seen = np.einsum("nji,nj->ni", T_world_cam[:, :3, :3], world - T_world_cam[:, :3, 3])
-    distance = np.linalg.norm(seen, axis=1)
-    edge_x = max(camera.cx + 0.5, camera.width - 0.5 - camera.cx) / camera.fx
-    edge_y = max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy
-    corner = np.hypot(edge_x, edge_y)
-    away = np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2])
-    half = np.arcsin(np.clip(radius / np.maximum(distance, 1e-300), 0.0, 1.0))
-    visible = (distance <= radius) | ((away <= np.arctan(corner) + half) & (seen[:, 2] + radius > camera.near))
-    if not visible.any():
-        return 0.0
-    nearest = float((seen[visible, 2] - radius).min())
-    return float(max(camera.fx, camera.fy) * np.sqrt(1 + corner**2) / nearest) if nearest > camera.near else float("inf")
+    return float(scene.camera.pixels_per_unit(seen, radius).max())
 
 
 def bounding_sphere(mesh: Mesh) -> tuple[np.ndarray, float]:

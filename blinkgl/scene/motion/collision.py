@@ -2,7 +2,7 @@
 
     result = resolve_collisions(objects, camera_path, camera_radius, t0_ns, t1_ns)
     if result.at_start: ...                         # a placement to be drawn again
-    scene = Scene(result.objects, replace(camera, path=result.camera_path), t0_ns, t1_ns, log=result.log)
+    scene = Scene(result.objects, Rig.alone(camera, result.camera_path), t0_ns, t1_ns, log=result.log)
 
 Method: conservative advancement (Mirtich 1996; Tang, Kim & Manocha, "C2A", ICRA 2009). At a time t two bodies are a
 distance d apart and over [t, t + dt] no point of theirs is faster than S = sum(|v| + |w| r), with bounds that come from

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import CameraModel
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     KeyedMotionConfig,
@@ -17,7 +18,6 @@ from blinkgl.config.scene import (
     PoseConfig,
     object_names,
 )
-from blinkgl.config.sequence import near_corner
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS
@@ -26,11 +26,12 @@ from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.reading import contents
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import resolve
-from blinkgl.scene.worlds.random_world import make_camera, make_light
+from blinkgl.scene.worlds.random_world import make_light
 
 _PROCEDURAL_SIZE = 1024
 # A camera (OpenCV axes) that looks along the world's +x with z up.
@@ -46,7 +47,7 @@ class InMemory:
     textures: dict[str, Texture] = field(default_factory=dict)
 
 
-def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()) -> Scene:
+def explicit_scene(config: ExplicitSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()) -> Scene:
     """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
 
     Raises ConfigError (missing file, bad parameter; with ``collisions``,
@@ -72,12 +73,12 @@ def explicit_scene(config: ExplicitSceneConfig, camera, t0_ns: int, t1_ns: int, 
         objects.append(SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
     if config.collisions:
-        result = resolve_collisions(tuple(objects), path, 1.01 * near_corner(camera), t0_ns, t1_ns)
+        result = resolve_collisions(tuple(objects), path, 1.01 * camera.near_corner, t0_ns, t1_ns)
         if result.at_start:
             raise ConfigError(f"{result.at_start[0]}, at the start", where="scene.collisions",
                               accepted="bodies apart at the start, or collisions: false")
         objects, path, log = result.objects, result.camera_path, log + list(result.log)
-    return Scene(tuple(objects), make_camera(camera, path), t0_ns, t1_ns, make_light(config.light), config.background,
+    return Scene(tuple(objects), Rig.alone(camera, path), t0_ns, t1_ns, make_light(config.light), config.background,
                  tuple(log), tuple(omissions))
 
 

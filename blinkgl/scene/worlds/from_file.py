@@ -4,9 +4,8 @@
     scene = from_trimesh(trimesh.load_scene("room.obj"), camera, t0_ns, t1_ns)
     scene = from_pyrender(pyrender_scene, camera, t0_ns, t1_ns)
 
-``camera`` is anything with width, height, fx, fy, near and principal_point (or cx, cy). Each node that shows a mesh
-becomes one object; a node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along
--z with y up in all three, get OpenCV axes. glTF's world (y up) is turned z up.
+``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a
+node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up in all three, get OpenCV axes. glTF's world (y up) is turned z up.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import CameraModel, PinHole, focal_length
 from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, make_mesh
@@ -26,18 +26,19 @@ from blinkgl.scene.importing.mesh_files import piece_of_trimesh
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import reading
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import content_hash, shrink
-from blinkgl.scene.types import Camera, Light, Material, Part, PosePath, Scene, SceneObject, Texture
+from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.explicit import motion_path
 from blinkgl.scene.worlds.pool import resolve
-from blinkgl.scene.worlds.random_world import make_camera, make_light
+from blinkgl.scene.worlds.random_world import make_light
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])    # its own inverse
 _ANIMATION_STEP = 1 / 60                         # s between the samples that a spline is laid through
 _MAX_SAMPLES = 20_000
 
 
-def scene_from_file(config: FileSceneConfig, camera, t0_ns: int, t1_ns: int, base: Path) -> Scene:
+def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path) -> Scene:
     """A ``scene: {kind: file}``."""
     path = resolve(config.path, base)
     if not path.is_file():
@@ -51,7 +52,7 @@ def scene_from_file(config: FileSceneConfig, camera, t0_ns: int, t1_ns: int, bas
     return unlit(scene) if config.light.unlit else scene
 
 
-def from_gltf(path: Path | str, camera, t0_ns: int, t1_ns: int, *, camera_name: str | int | None = None,
+def from_gltf(path: Path | str, camera: CameraModel, t0_ns: int, t1_ns: int, *, camera_name: str | int | None = None,
               camera_path: PosePath | None = None, intrinsics: str = "config", animation: str | int | None = 0, light: Light = Light(), background: float = 0.2,
               max_faces: int = 5_000_000, max_texture: int = 2048) -> Scene:
     """A glTF 2.0 file with its materials, cameras and node animations.
@@ -83,7 +84,6 @@ def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, c
         objects.append((node.name, _parts(pieces, baked, node.name, document.where, document.log), motion))
     if not objects:
         raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
-    changes = {}
     if camera_path is None or intrinsics == "file":
         index = _camera_node(document, camera_name)
         if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
@@ -91,12 +91,12 @@ def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, c
         if camera_path is None:
             camera_path, _ = _motion(document, index, channels, t0_ns, t1_ns, CV_FROM_GL)
         if intrinsics == "file":
-            changes = _gltf_intrinsics(document, index, camera)
-    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, document.log,
+            camera = _gltf_intrinsics(document, index, camera)
+    return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, document.log,
                   document.omissions)
 
 
-def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
+def from_trimesh(scene, camera: CameraModel | None = None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
                  near: float = 0.05, light: Light = Light(), background: float = 0.2, max_faces: int = 5_000_000,
                  max_texture: int = 2048) -> Scene:
     """A ``trimesh.Scene``.
@@ -126,15 +126,13 @@ def from_trimesh(scene, camera=None, t0_ns: int = 0, t1_ns: int = 1_000_000_000,
         camera_path = StaticPath(split_rigid(turn @ scene.camera_transform)[0] @ CV_FROM_GL, t0_ns, t1_ns)
     if camera is None:
         (width, height), (fx, fy) = (int(v) for v in scene.camera.resolution), scene.camera.focal
-        scene_camera = Camera(width, height, float(fx), float(fy), (width - 1) / 2, (height - 1) / 2, camera_path, near)
-    else:
-        scene_camera = make_camera(camera, camera_path)
+        camera = PinHole.centred(width, height, float(fx), float(fy), near)
     if not objects:
         raise AssetError("the scene has no faces", where="from_trimesh", accepted="a scene with a mesh")
-    return _scene(objects, scene_camera, t0_ns, t1_ns, light, background, log, omissions)
+    return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, log, omissions)
 
 
-def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
+def from_pyrender(scene, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
                   intrinsics: str = "file", up: str = "z", light: Light | None = None, background: float | None = None, max_texture: int = 2048) -> Scene:
     """A ``pyrender.Scene`` (pyrender itself is not imported here).
 
@@ -166,7 +164,8 @@ def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, 
                           accepted="a camera node, or camera_path and intrinsics='config'")
     if camera_path is None:
         camera_path = StaticPath(split_rigid(turn @ scene.get_pose(node))[0] @ CV_FROM_GL, t0_ns, t1_ns)
-    changes = _pyrender_intrinsics(node.camera, camera) if intrinsics == "file" else {}
+    if intrinsics == "file":
+        camera = _pyrender_intrinsics(node.camera, camera)
     if light is None:
         suns = sorted(getattr(scene, "directional_light_nodes", ()), key=lambda n: str(n.name or ""))
         light = Light()
@@ -175,7 +174,7 @@ def from_pyrender(scene, camera, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, 
             light = replace(light, sun_direction=tuple(float(v) for v in T[:3, 2]))
     if background is None:
         background = float(np.mean(np.asarray(scene.bg_color, float)[:3]))
-    return _scene(objects, make_camera(camera, camera_path, **changes), t0_ns, t1_ns, light, background, log, omissions)
+    return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, log, omissions)
 
 
 def unlit(scene: Scene) -> Scene:
@@ -201,13 +200,13 @@ def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return T, A
 
 
-def _scene(objects: Iterable, camera: Camera, t0_ns, t1_ns, light, background, log, omissions: Omissions) -> Scene:
+def _scene(objects: Iterable, rig: Rig, t0_ns, t1_ns, light, background, log, omissions: Omissions) -> Scene:
     made, names = [], set()
     for k, (name, parts, path) in enumerate(objects):
         name = name if name not in names else f"{name}#{k}"
         names.add(name)
         made.append(SceneObject(name, k + 1, parts, path))
-    return Scene(tuple(made), camera, t0_ns, t1_ns, light, background, tuple(dict.fromkeys(log)), omissions.lines())
+    return Scene(tuple(made), rig, t0_ns, t1_ns, light, background, tuple(dict.fromkeys(log)), omissions.lines())
 
 
 def _parts(pieces: list[gltf.Piece], baked: np.ndarray, name: str, where: str, log: list[str]) -> tuple[Part, ...]:
@@ -305,17 +304,15 @@ def _camera_node(document: gltf.Document, name: str | int | None) -> int:
                       accepted=f"one of: {', '.join(names)}, or an index below {len(order)}")
 
 
-def _gltf_intrinsics(document: gltf.Document, node: int, camera) -> dict:
+def _gltf_intrinsics(document: gltf.Document, node: int, camera: CameraModel) -> PinHole:
     description = document.tree["cameras"][document.nodes[node].camera]
     perspective = description.get("perspective", {})
     yfov = perspective.get("yfov")
     if description["type"] != "perspective" or yfov is None:
         raise AssetError("the camera is not a perspective one with a valid yfov", where=document.where, value=yfov,
                          accepted="intrinsics: config")
-    focal = camera.height / 2 / np.tan(yfov / 2)
     znear = perspective.get("znear", camera.near)
-    return dict(fx=focal, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2,
-                near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near)
+    return PinHole.centred(camera.width, camera.height, focal_length(camera.height, yfov), near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near)
 
 
 # ---- pyrender
@@ -353,15 +350,14 @@ def _pyrender_piece(primitive, max_texture: int, name: str) -> gltf.Piece:
     return gltf.Piece(positions, faces, normals, uvs, material)
 
 
-def _pyrender_intrinsics(source, camera) -> dict:
+def _pyrender_intrinsics(source, camera: CameraModel) -> PinHole:
     near = float(getattr(source, "znear", None) or camera.near)
     if hasattr(source, "yfov"):
-        focal = camera.height / 2 / np.tan(source.yfov / 2)
+        focal = focal_length(camera.height, source.yfov)
         # pyrender scales x by the aspect ratio: the viewport's, unless the camera states one.
         aspect = getattr(source, "aspectRatio", None) or camera.width / camera.height
-        fx = focal * camera.width / camera.height / aspect
-        return dict(fx=fx, fy=focal, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2, near=near)
+        return PinHole.centred(camera.width, camera.height, focal * camera.width / camera.height / aspect, focal, near)
     if hasattr(source, "fx"):
         # pyrender counts from the image's corner, we from the first pixel's centre.
-        return dict(fx=float(source.fx), fy=float(source.fy), cx=float(source.cx) - 0.5, cy=float(source.cy) - 0.5, near=near)
+        return PinHole(camera.width, camera.height, float(source.fx), float(source.fy), float(source.cx) - 0.5, float(source.cy) - 0.5, near)
     raise ConfigError("only perspective and intrinsics cameras are supported", where="from_pyrender", value=type(source).__name__)

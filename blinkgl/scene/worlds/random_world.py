@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from blinkgl.camera import CameraModel
 from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
 from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
@@ -24,8 +25,9 @@ from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.reading import contents
+from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
-from blinkgl.scene.types import Camera, Light, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
 
 _PLACEMENTS = 300      # positions tried for an object before it is left out
@@ -35,7 +37,7 @@ _STAND_OFF = 0.8       # m beyond the clearance that way-points keep from the ca
 _PANORAMA_MARGIN = 1 / 16
 
 
-def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, split: str, seed: int, sequence: int, base: Path) -> Scene:
+def random_world(config: RandomSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, split: str, seed: int, sequence: int, base: Path) -> Scene:
     """The ``sequence``-th random scene of a run; arguments as :func:`blinkgl.scene.build.build_scene`."""
     rng, rng_motion, rng_texture = (generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE))
     objects, textures = pools(config, base)
@@ -90,7 +92,7 @@ def random_world(config: RandomSceneConfig, camera, t0_ns: int, t1_ns: int, spli
         result = resolve_collisions(tuple(o for o in scene_objects if o.name not in bad), path, clearance, t0_ns, t1_ns)
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
-    return Scene(objects=result.objects, camera=make_camera(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
+    return Scene(objects=result.objects, rig=Rig.alone(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
                  light=make_light(config.light, rng), background=config.background, log=tuple(log),
                  omissions=tuple(omissions))
 
@@ -102,13 +104,6 @@ def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
 
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
 _texture_pool = lru_cache(maxsize=4)(texture_pool)
-
-
-def make_camera(camera, path, **changes) -> Camera:
-    """Scene camera from anything with width, height, fx, fy, near and principal_point or cx, cy."""
-    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
-    made = Camera(camera.width, camera.height, float(camera.fx), float(camera.fy), float(cx), float(cy), path, camera.near)
-    return replace(made, **changes)
 
 
 def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:
@@ -174,9 +169,8 @@ def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarra
     if not in_view:
         half = region.width / 2
         return rng.uniform([-half, -half, floor], [half, half, floor + region.height])
-    cx, cy = getattr(camera, "principal_point", None) or (camera.cx, camera.cy)
     pixel = rng.uniform([-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5])
-    ray = T_cam[:3, :3] @ [(pixel[0] - cx) / camera.fx, (pixel[1] - cy) / camera.fy, 1.0]
+    ray = T_cam[:3, :3] @ camera.rays(pixel)
     if resting:
         ray[2] = 0.0
     return T_cam[:3, 3] + ray / np.linalg.norm(ray) * _log_uniform(rng, config.objects.distance)

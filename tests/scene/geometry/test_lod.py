@@ -7,13 +7,15 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from blinkgl.camera import PinHole
 from blinkgl.config.lod import LodConfig
 from blinkgl.scene.geometry import lod, primitives
 from blinkgl.scene.geometry.lod import at_level_of_detail, bounding_sphere, faces_of_edge, largest_scale, level_of
 from blinkgl.scene.geometry.meshes import closedness, make_mesh, scale_mesh, weld
 from blinkgl.scene.geometry.nearest import incident_faces, walk_to_nearest
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
-from blinkgl.scene.types import Camera, Material, Part, Scene, SceneObject
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Material, Part, Scene, SceneObject
 
 SECOND = 1_000_000_000
 ON = LodConfig(enabled=True, edge_px=8.0, error_px=0.5)
@@ -33,8 +35,8 @@ def at(z):
 
 
 def one(mesh, path, width=320, height=240, f=300.0, camera=None):
-    camera = Camera(width, height, f, f, (width - 1) / 2, (height - 1) / 2, camera or StaticPath(np.eye(4)))
-    return Scene((SceneObject("thing", 1, (Part(mesh, Material()),), path),), camera, 0, SECOND)
+    rig = Rig.alone(PinHole.centred(width, height, f), camera or StaticPath(np.eye(4)))
+    return Scene((SceneObject("thing", 1, (Part(mesh, Material()),), path),), rig, 0, SECOND)
 
 
 def drawn(scene):

@@ -58,7 +58,7 @@ def test_keyframes_are_met_and_ends_held(tmp_path):
     np.testing.assert_array_equal(path.pose(10**9), path.pose(900_000_000))
     assert not path.is_static
     for t in (0, 10**9):
-        T = scene.camera.path.pose(t)
+        T = scene.camera_path.pose(t)
         to_origin = -T[:3, 3] / np.linalg.norm(T[:3, 3])
         np.testing.assert_allclose(T[:3, 2], to_origin, atol=1e-9)
 
@@ -86,7 +86,7 @@ def test_collisions_are_found_when_asked_for(tmp_path):
 def test_the_camera_is_stopped_by_a_solid(tmp_path):
     keys = [{"time": 0, "position": [-3, 0, 0], "look_at": [5, 0, 0]}, {"time": 1, "position": [3, 0, 0], "look_at": [5, 0, 0]}]
     scene = build(tmp_path, camera={"keyframes": keys, "interpolation": "linear"}, collisions=True)
-    end = scene.camera.path.pose(10**9)[0, 3]
+    end = scene.camera_path.pose(10**9)[0, 3]
     assert -0.7 < end < -0.5, "in front of the cube's face at -0.5, by about the near distance"
 
 

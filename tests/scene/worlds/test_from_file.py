@@ -20,7 +20,8 @@ from blinkgl.scene.worlds.from_file import from_gltf, from_pyrender, from_trimes
 from tests.scene.gltf_files import GltfBuilder, triangle
 from tests.shared_data import shared
 
-CAMERA = CameraConfig(width=64, height=48, fov=70)
+SETTINGS = CameraConfig(width=64, height=48, fov=70)
+CAMERA = SETTINGS.model
 T1 = 10**9
 BOX = trimesh.creation.box(extents=(1, 2, 3))
 
@@ -91,7 +92,7 @@ def test_the_camera_sees_what_gltf_says(tmp_path):
     builder = with_camera(GltfBuilder(), translation=[0, 0, 10], scale=[2, 2, 2])
     builder.node(mesh=triangle(builder))
     scene = load(tmp_path, builder, intrinsics="file")
-    T = scene.camera.path.pose(0)
+    T = scene.camera_path.pose(0)
     X = np.linalg.inv(T) @ gltf.Z_UP @ [1, 2, 0, 1]
     np.testing.assert_allclose(X[:3], [1, -2, 10], atol=1e-12)
     assert scene.camera.fy == pytest.approx(24 / math.tan(0.4)) and scene.camera.fx == scene.camera.fy
@@ -240,14 +241,14 @@ def file_scene(tmp_path, builder=None, **tree):
     if builder is not None:
         (tmp_path / "scene.glb").write_bytes(builder.glb())
     config = validate(FileSceneConfig, {"kind": "file", "path": "scene.glb", **tree}, where="scene")
-    return build_scene(config, CAMERA, 0, T1, base=tmp_path)
+    return build_scene(config, SETTINGS, 0, T1, base=tmp_path)
 
 
 def test_file_scene(tmp_path):
     scene = file_scene(tmp_path, animated(), light={"unlit": True, "sun": 3}, background=0.7)
     assert scene.background == 0.7 and scene.light.sun == 3 and all(p.material.unlit for o in scene.objects for p in o.parts)
     posed = file_scene(tmp_path, pose={"position": [0, -5, 1], "look_at": [0, 0, 1]})
-    np.testing.assert_allclose(posed.camera.path.pose(0)[:3, 2], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(posed.camera_path.pose(0)[:3, 2], [0, 1, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("tree, builder, expected", [
@@ -336,7 +337,7 @@ def test_from_trimesh():
     card = by_name["card"].parts[0]
     assert card.material.base_color == pytest.approx((128 / 255, 1, 1)) and (card.material.texture.image == 90).all()
     np.testing.assert_allclose(sorted(card.mesh.uvs.tolist()), sorted([[0, 1], [1, 1], [0, 0]]))      # v turned down
-    X = np.linalg.inv(scene.camera.path.pose(0)) @ view @ [1, 2, -5, 1]      # right, up, ahead for trimesh
+    X = np.linalg.inv(scene.camera_path.pose(0)) @ view @ [1, 2, -5, 1]      # right, up, ahead for trimesh
     np.testing.assert_allclose(X[:3], [1, -2, 5], atol=1e-12)
     assert (scene.camera.width, scene.camera.height) == (80, 60) and scene.camera.fx == pytest.approx(40 / math.tan(math.radians(30)))
     other = from_trimesh(source, CAMERA, camera_path=StaticPath(np.eye(4)), up="y")
@@ -375,7 +376,7 @@ def test_from_pyrender(indices):
     np.testing.assert_allclose(box.parts[0].mesh.uvs, np.tile([0.25, 0.25], (24, 1)))
     assert box.parts[0].material.texture.image.shape == (2, 4, 3)
     assert scene.camera.fy == pytest.approx(24 / math.tan(0.45)) and scene.camera.fx == pytest.approx(scene.camera.fy) and scene.camera.near == 0.1
-    np.testing.assert_allclose(scene.camera.path.pose(0), pose @ np.diag([1, -1, -1, 1.0]), atol=1e-12)
+    np.testing.assert_allclose(scene.camera_path.pose(0), pose @ np.diag([1, -1, -1, 1.0]), atol=1e-12)
     assert scene.light.sun_direction == pytest.approx((0, -math.sin(0.5), math.cos(0.5))) and scene.background == pytest.approx(0.4)
     scene = from_pyrender(pyrender_like(SimpleNamespace(fx=50.0, fy=60.0, cx=32.0, cy=24.0, znear=0.05), pose), CAMERA)
     assert (scene.camera.fx, scene.camera.fy, scene.camera.cx, scene.camera.cy) == (50, 60, 31.5, 23.5)

@@ -1,7 +1,6 @@
 """Random worlds: determinism, placement, splits, look, light; and configuration errors by message."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,7 @@ from blinkgl.config.scene import (
     TexturesConfig,
     WallsConfig,
 )
-from blinkgl.config.sequence import CameraConfig, near_corner
+from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
 from blinkgl.scene.types import Light
@@ -40,7 +39,7 @@ def build(settings, sequence=0, seed=0, split="train", base="."):
 
 def fingerprint(scene) -> bytes:
     times = np.array([0, 123_456_789, T1])
-    chunks = [scene.camera.path.poses(times).tobytes(), repr((scene.light, scene.log, scene.camera.K.tolist())).encode()]
+    chunks = [scene.camera_path.poses(times).tobytes(), repr((scene.light, scene.log, scene.camera.K.tolist())).encode()]
     for o in scene.objects:
         chunks += [o.name.encode(), bytes([o.instance_id]), o.path.poses(times).tobytes()]
         for p in o.parts:
@@ -97,8 +96,8 @@ def test_objects_that_slide_stay_on_the_ground(worlds):
 
 def test_bounding_spheres_are_apart_at_the_start(worlds):
     for scene in worlds:
-        centres = np.array([o.path.pose(0)[:3, 3] for o in things(scene)] + [scene.camera.path.pose(0)[:3, 3]])
-        radii = np.array([o.radius for o in things(scene)] + [near_corner(CAMERA)])
+        centres = np.array([o.path.pose(0)[:3, 3] for o in things(scene)] + [scene.camera_path.pose(0)[:3, 3]])
+        radii = np.array([o.radius for o in things(scene)] + [CAMERA.model.near_corner])
         gap = np.linalg.norm(centres[:, None] - centres, axis=2) - radii[:, None] - radii
         assert gap[~np.eye(len(gap), dtype=bool)].min() > 0
 
@@ -106,7 +105,7 @@ def test_bounding_spheres_are_apart_at_the_start(worlds):
 def test_most_objects_are_in_view_at_many_distances(worlds):
     seen, distances, total = 0, [], 0
     for scene in worlds:
-        T = np.linalg.inv(scene.camera.path.pose(0))
+        T = np.linalg.inv(scene.camera_path.pose(0))
         for o in things(scene):
             X = T[:3, :3] @ o.path.pose(0)[:3, 3] + T[:3, 3]
             total += 1
@@ -157,7 +156,7 @@ def test_options():
     assert len(things(build(config(objects=ObjectsConfig(count=0))))) == 0
     raised = build(config(ground={"height": 5.0}))
     assert min(world_vertices(o)[:, 2].min() for o in things(raised)) == pytest.approx(5, abs=1e-9)
-    assert raised.camera.path.pose(0)[2, 3] > 5.9
+    assert raised.camera_path.pose(0)[2, 3] > 5.9
 
 
 def test_crowded_worlds_leave_objects_out_and_say_so():
@@ -194,11 +193,6 @@ def test_light_from_angles():
     assert make_light(LightConfig(sun_elevation=0, sun_azimuth=90)).sun_direction == pytest.approx((0, 1, 0), abs=1e-12)
     rng = np.random.default_rng(0)
     assert make_light(LightConfig(sun_azimuth=0, sun_elevation=45), rng).sun_direction == pytest.approx((2**-0.5, 0, 2**-0.5))
-
-
-def test_near_corner():
-    camera = SimpleNamespace(width=3, height=1, fx=1.5, fy=1.0, cx=1.0, cy=0.0, near=2.0)
-    assert near_corner(camera) == pytest.approx(2 * np.sqrt(1 + 1 + 0.25))
 
 
 def message(make):
@@ -250,9 +244,9 @@ def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_pa
         return result
 
     monkeypatch.setattr(module, "resolve_collisions", once_unlucky)
-    scene = module.random_world(config(), CAMERA, 0, 10**9, "train", 3, 0, tmp_path)
+    scene = module.random_world(config(), CAMERA.model, 0, 10**9, "train", 3, 0, tmp_path)
     assert len(drawn) >= 2 and not np.allclose(drawn[0].pose(5 * 10**8), drawn[1].pose(5 * 10**8))
-    assert scene.camera.path is drawn[-1]
+    assert scene.camera_path is drawn[-1]
 
 
 def test_there_is_one_set_of_light_defaults():

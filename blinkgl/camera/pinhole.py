@@ -1,0 +1,102 @@
+"""The pin-hole camera: ``x = fx X / Z + cx``, ``y = fy Y / Z + cy``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from blinkgl.camera.model import CameraModel
+
+
+def focal_length(size: float, angle: float) -> float:
+    """px, of a pin-hole camera that sees ``angle`` rad across ``size`` px whose middle is on the optical axis."""
+    return 0.5 * size / math.tan(angle / 2)
+
+
+@dataclass(frozen=True)
+class PinHole(CameraModel):
+    """A point (X, Y, Z), Z > 0, is seen at (fx X / Z + cx, fy Y / Z + cy). Rays have Z = 1."""
+
+    kind: ClassVar[str] = "pinhole"
+
+    @classmethod
+    def centred(cls, width: int, height: int, fx: float, fy: float | None = None, near: float = 0.05) -> PinHole:
+        """With the principal point in the middle of the image; ``fy``: as fx."""
+        return cls(width, height, fx, fx if fy is None else fy, (width - 1) / 2, (height - 1) / 2, near)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
+        z = np.where(z > 0, z, np.nan)
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+
+    def jacobian(self, points: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
+        z = np.where(z > 0, z, np.nan)
+        out = np.zeros((*z.shape, 2, 3))
+        out[..., 0, 0], out[..., 0, 2] = self.fx / z, -self.fx * x / z**2
+        out[..., 1, 1], out[..., 1, 2] = self.fy / z, -self.fy * y / z**2
+        out[..., 0, 1] = out[..., 1, 0] = np.where(z > 0, 0.0, np.nan)
+        return out
+
+    def rays(self, xy: np.ndarray) -> np.ndarray:
+        xy = np.asarray(xy, np.float64)
+        out = np.ones((*xy.shape[:-1], 3))
+        out[..., :2] = (xy - [self.cx, self.cy]) / [self.fx, self.fy]
+        return out
+
+    def ray_jacobian(self, xy: np.ndarray) -> np.ndarray:
+        return np.broadcast_to([[1 / self.fx, 0.0], [0.0, 1 / self.fy], [0.0, 0.0]], (*np.shape(xy)[:-1], 3, 2)).copy()
+
+    def displacement(self, rays: np.ndarray, depth: np.ndarray, change: np.ndarray) -> np.ndarray:
+        """Without a difference of two projections: rays (r, 1) give ``f (d - r dZ) / (Z + dZ)``."""
+        after = depth + change[:, 2]
+        after = np.where((depth > 0) & (after > 0), after, np.nan)
+        return np.array([self.fx, self.fy]) * (change[:, :2] - rays[:, :2] * change[:, 2:]) / after[:, None]
+
+    def _edge(self) -> tuple[float, float]:
+        """|X / Z| and |Y / Z| of the picture's farthest corner from the optical axis."""
+        return max(self.cx + 0.5, self.width - 0.5 - self.cx) / self.fx, max(self.cy + 0.5, self.height - 0.5 - self.cy) / self.fy
+
+    @property
+    def half_angle(self) -> float:
+        return float(np.arctan(np.hypot(*self._edge())))
+
+    @property
+    def magnification(self) -> float:
+        return float(max(self.fx, self.fy) * np.sqrt(1 + np.hypot(*self._edge()) ** 2))
+
+    @property
+    def near_corner(self) -> float:
+        x, y = self._edge()
+        return self.near * math.sqrt(1 + x * x + y * y)
+
+    def frustum_planes(self) -> np.ndarray:
+        """(5, 3): left, right, top, bottom and the plane through the centre."""
+        left, right = (-0.5 - self.cx) / self.fx, (self.width - 0.5 - self.cx) / self.fx
+        top, bottom = (-0.5 - self.cy) / self.fy, (self.height - 0.5 - self.cy) / self.fy
+        planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
+        return planes / np.linalg.norm(planes, axis=1, keepdims=True)
+
+    def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
+        if points[:, 2].min() <= self.near:
+            return (0, 0, self.width, self.height) if points[:, 2].max() > self.near else None
+        # Of a convex body in front of the camera the corners are seen farthest out.
+        (left, top), (right, bottom) = (of(self.project(points), axis=0) for of in (np.min, np.max))
+        x0, x1 = max(0, int(np.floor(left)) - 1), min(self.width, int(np.ceil(right)) + 2)
+        y0, y1 = max(0, int(np.floor(top)) - 1), min(self.height, int(np.ceil(bottom)) + 2)
+        return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+
+    def clip_from_cam(self) -> np.ndarray:
+        """(4, 4) float64: x right, y down, w = Z, depth = near / Z (reversed, the far plane at infinity).
+
+        A point is seen at pixel x = fx X / Z + cx, that is at window coordinate x + 0.5, that is at ndc 2 (x + 0.5) / width - 1."""
+        w, h = self.width, self.height
+        return np.array([
+            [2 * self.fx / w, 0.0, 2 * (self.cx + 0.5) / w - 1, 0.0],
+            [0.0, 2 * self.fy / h, 2 * (self.cy + 0.5) / h - 1, 0.0],
+            [0.0, 0.0, 0.0, self.near],
+            [0.0, 0.0, 1.0, 0.0],
+        ])

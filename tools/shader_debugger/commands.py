@@ -10,11 +10,17 @@ import numpy as np
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.tools.shader_debugger.compare import Comparison, Report, parse_tolerances
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass, lookup_of, open_reference
+from blinkgl.tools.shader_debugger.moments import (
+    PASSES,
+    GpuMoment,
+    ReferenceMoment,
+    check_pass,
+    lookup_of,
+    open_reference,
+)
 from blinkgl.tools.shader_debugger.probe import as_text, probe
 from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, open_renderer
-from blinkgl.tools.shader_debugger.verdict import as_text as verdict_text
-from blinkgl.tools.shader_debugger.verdict import verdict
+from blinkgl.tools.shader_debugger.verdict import as_text as verdict_text, verdict
 
 
 def write_passes(subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None) -> list[Path]:

@@ -20,7 +20,16 @@ from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, open_reference
 from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
 from blinkgl.tools.shader_debugger.questions import MAPS, SOURCES
-from blinkgl.tools.shader_debugger.session import Snapshot, Subject, When, check_pixel, files_of, moment, open_folder, open_renderer
+from blinkgl.tools.shader_debugger.session import (
+    Snapshot,
+    Subject,
+    When,
+    check_pixel,
+    files_of,
+    moment,
+    open_folder,
+    open_renderer,
+)
 from blinkgl.tools.shader_debugger.verdict import verdict
 
 POLL_S = 0.15  # between two looks at the shader files

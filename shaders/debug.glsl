@@ -7,25 +7,14 @@
 //   OUT_LOCAL     object-local position, part number + 1
 //   OUT_WINDOW    gl_FragCoord
 
-#ifdef VERTEX_SHADER
-in vec3 in_position;
-uniform mat4 mvp;
-invariant gl_Position;
-out vec3 local;
-
-void main()
-{
-    gl_Position = mvp * vec4(in_position, 1.0);
-    local = in_position;
-}
-#endif
+#define NEEDS_LOCAL
+#include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
 layout(location = OUT_TRIANGLE) out uint triangle;
 layout(location = OUT_LOCAL) out vec4 local_position;
 layout(location = OUT_WINDOW) out vec4 window;
 
-in vec3 local;
 uniform float part_number;
 #include "guard.glsl"
 

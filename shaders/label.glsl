@@ -4,8 +4,9 @@
 //
 //   OUT_COLOUR    rgb linear radiance            OUT_DEPTH     Z along the optical axis, world units
 //   OUT_ID        instance id (0: nothing hit)   OUT_NORMAL    unit normal, camera axes, facing it
-//   OUT_VELOCITY  px/s                           OUT_FLOW_FORWARD, OUT_FLOW_BACKWARD
+//   OUT_VELOCITY  px/s (see SMALL)               OUT_FLOW_FORWARD, OUT_FLOW_BACKWARD
 //                                                (u, v in px, Z at the other time; 0 in .w of unwritten pixels)
+// SMALL: the target is a small picture of the image, whose pixels are image_scale px of the image apart; velocity is still the image's.
 // Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED. SHOW_LOOKUP, the shader debugger's, goes with
 // OUT_COLOUR 0: see lookup.glsl.
 
@@ -19,46 +20,13 @@
 #define NEEDS_UV
 #endif
 
-#ifdef VERTEX_SHADER
-in vec3 in_position;
-uniform mat4 mvp;
-invariant gl_Position;
-#ifdef NEEDS_UV
-in vec2 in_uv;
-out vec2 uv;
-#endif
-#ifdef NEEDS_NORMAL
-in vec3 in_normal;
-out vec3 normal;
-#endif
-#ifdef NEEDS_LOCAL
-out vec3 local;
-#endif
-
-void main()
-{
-    gl_Position = mvp * vec4(in_position, 1.0);
-#ifdef NEEDS_UV
-    uv = in_uv;
-#endif
-#ifdef NEEDS_NORMAL
-    normal = in_normal;
-#endif
-#ifdef NEEDS_LOCAL
-    local = in_position;
-#endif
-}
-#endif
+#include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
 #ifdef SHOW_LOOKUP
 #include "lookup.glsl"
 #endif
-#ifdef NEEDS_NORMAL
-in vec3 normal;
-#endif
 #ifdef NEEDS_LOCAL
-in vec3 local;
 uniform vec2 image_size;
 #include "motion.glsl"
 #endif
@@ -67,7 +35,6 @@ uniform vec2 image_size;
 layout(location = OUT_COLOUR) out vec4 colour;
 uniform vec3 base_color;
 #ifdef TEXTURED
-in vec2 uv;
 uniform sampler2D albedo;
 #endif
 #ifdef LIT
@@ -88,6 +55,9 @@ uniform mat3 camera_from_local;
 #ifdef OUT_VELOCITY
 layout(location = OUT_VELOCITY) out vec2 image_velocity;
 uniform mat4x3 rate;
+#ifdef SMALL
+uniform vec2 image_scale;
+#endif
 #endif
 #ifdef OUT_FLOW_FORWARD
 layout(location = OUT_FLOW_FORWARD) out vec4 flow_forward;
@@ -139,6 +109,9 @@ void main()
 #endif
 #ifdef OUT_VELOCITY
     image_velocity = velocity(rate, local, image_size);
+#ifdef SMALL
+    image_velocity *= image_scale;
+#endif
 #endif
 #ifdef OUT_FLOW_FORWARD
     flow_forward = vec4(displacement(difference_forward, local, image_size), 1.0);

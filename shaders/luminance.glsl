@@ -13,36 +13,16 @@
 #define CHANGES
 #endif
 
-#ifdef VERTEX_SHADER
-in vec3 in_position;
-uniform mat4 mvp;
-invariant gl_Position;
 #ifdef TEXTURED
-in vec2 in_uv;
-out vec2 uv;
+#define NEEDS_UV
 #endif
 #ifdef LIT
-in vec3 in_normal;
-out vec3 normal;
+#define NEEDS_NORMAL
 #endif
 #ifdef CHANGES
-out vec3 local;
+#define NEEDS_LOCAL
 #endif
-
-void main()
-{
-    gl_Position = mvp * vec4(in_position, 1.0);
-#ifdef TEXTURED
-    uv = in_uv;
-#endif
-#ifdef LIT
-    normal = in_normal;
-#endif
-#ifdef CHANGES
-    local = in_position;
-#endif
-}
-#endif
+#include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER
 #ifdef SHOW_LOOKUP
@@ -54,7 +34,6 @@ layout(location = 0) out vec2 result;
 layout(location = 0) out float result;
 #endif
 #ifdef CHANGES
-in vec3 local;
 uniform vec2 image_size;
 uniform mat4x3 rate;
 #include "motion.glsl"
@@ -66,13 +45,11 @@ const float every = float(EVERY);
 const float every = 1.0;
 #endif
 #ifdef TEXTURED
-in vec2 uv;
 uniform sampler2D albedo;
 #else
 uniform float albedo;
 #endif
 #ifdef LIT
-in vec3 normal;
 #include "light.glsl"
 #endif
 #include "guard.glsl"

@@ -61,83 +61,8 @@ FILES = {
     "outside.csv": "0.001,500,2,1\n",
     "notes.md": "# notes\n",
 }
-COMMANDS = """
-generate missing.yaml --out out
-generate unknown_key.yaml --out out
-generate brackets.yaml --out out
-generate tabs.yaml --out out
-generate list.yaml --out out
-generate type.yaml --out out
-generate negative.yaml --out out
-generate fraction.yaml --out out
-generate both.yaml --out out
-generate kind.yaml --out out
-generate flow.yaml --out out
-generate emulator.yaml --out out
-generate curve.yaml --out out
-generate sensor.yaml --out out
-generate quality.yaml --out out
-generate empty_range.yaml --out out
-generate bad_range.yaml --out out
-generate weights.yaml --out out
-generate seed.yaml --out out
-generate inline.yaml --out out
-generate name.yaml --out out
-generate texture.yaml --out out
-generate primitive.yaml --out out
-generate parameter.yaml --out out
-generate mesh.yaml --out out
-generate glb.yaml --out out
-generate keyframes.yaml --out out
-generate turn.yaml --out out
-generate corner.yaml --out out
-generate long.yaml --out out
-generate bomb.yaml --out out
-generate pool.yaml --out out
-generate frames.yaml --out out
-generate good.yaml --out notes.md
-generate good.yaml --out out --set camera.width
-generate good.yaml --out out --set camera.width=[1,2]
-generate good.yaml --out out --set camera.width.x=3
-generate good.yaml --out out --executor slurm
-generate good.yaml --out out --devices 0,one
-generate good.yaml --out out --address 10.0.0.1:6379
-explain missing.yaml
-explain kind.yaml
-verify nowhere
-verify notes.md
-report nowhere
-export nowhere --out shards
-simulate missing.mp4 --out events.h5
-simulate notes.md --out events.h5
-simulate pictures --out events.h5
-simulate pictures --out events.xyz --fps 100
-simulate pictures --out events.h5 --fps 100 --sensor davis1000
-simulate pictures --out events.h5 --fps 100 --emulator magic
-simulate pictures --out events.h5 --fps 100 --gamma wide
-convert missing.h5 events.raw
-convert broken.h5 events.raw
-convert broken.raw events.h5
-convert words.txt events.h5
-convert outside.csv events.h5 --size 240x180
-convert outside.csv events.h5 --size big
-convert notes.md events.h5
-compare missing.h5 broken.h5
-trade missing.yaml --out trade
-trade frames.yaml --out trade
-shader show nothing.glsl
-shader probe good.yaml --time 0.3 --pixel middle
-shader probe good.yaml --time 900 --pixel 1,1
-shader diff good.yaml --time 0.3 --tolerance much --out diff
-shader passes good.yaml --time 0.3 --shaders nowhere --out passes
-""".split("\n")[1:-1]
-EFLOW_COMMANDS = """
-train missing.yaml --out run
-train unknown_key.yaml --out run
-evaluate nowhere nowhere --out scores
-predict nowhere broken.h5 --out flow
-submit nowhere nowhere --out submission.zip
-""".split("\n")[1:-1]
+COMMANDS = ["", "generate missing.yaml --out out", "generate unknown_key.yaml --out out", "generate brackets.yaml --out out", "generate tabs.yaml --out out", "generate list.yaml --out out", "generate type.yaml --out out", "generate negative.yaml --out out", "generate fraction.yaml --out out", "generate both.yaml --out out", "generate kind.yaml --out out", "generate flow.yaml --out out", "generate emulator.yaml --out out", "generate curve.yaml --out out", "generate sensor.yaml --out out", "generate quality.yaml --out out", "generate empty_range.yaml --out out", "generate bad_range.yaml --out out", "generate weights.yaml --out out", "generate seed.yaml --out out", "generate inline.yaml --out out", "generate name.yaml --out out", "generate texture.yaml --out out", "generate primitive.yaml --out out", "generate parameter.yaml --out out", "generate mesh.yaml --out out", "generate glb.yaml --out out", "generate keyframes.yaml --out out", "generate turn.yaml --out out", "generate corner.yaml --out out", "generate long.yaml --out out", "generate bomb.yaml --out out", "generate pool.yaml --out out", "generate frames.yaml --out out", "generate good.yaml --out notes.md", "generate good.yaml --out out --set camera.width", "generate good.yaml --out out --set camera.width=[1,2]", "generate good.yaml --out out --set camera.width.x=3", "generate good.yaml --out out --executor slurm", "generate good.yaml --out out --devices 0,one", "generate good.yaml --out out --address 10.0.0.1:6379", "explain missing.yaml", "explain kind.yaml", "verify nowhere", "verify notes.md", "report nowhere", "export nowhere --out shards", "simulate missing.mp4 --out events.h5", "simulate notes.md --out events.h5", "simulate pictures --out events.h5", "simulate pictures --out events.xyz --fps 100", "simulate pictures --out events.h5 --fps 100 --sensor davis1000", "simulate pictures --out events.h5 --fps 100 --emulator magic", "simulate pictures --out events.h5 --fps 100 --gamma wide", "convert missing.h5 events.raw", "convert broken.h5 events.raw", "convert broken.raw events.h5", "convert words.txt events.h5", "convert outside.csv events.h5 --size 240x180", "convert outside.csv events.h5 --size big", "convert notes.md events.h5", "compare missing.h5 broken.h5", "trade missing.yaml --out trade", "trade frames.yaml --out trade", "shader show nothing.glsl", "shader probe good.yaml --time 0.3 --pixel middle", "shader probe good.yaml --time 900 --pixel 1,1", "shader diff good.yaml --time 0.3 --tolerance much --out diff", "shader passes good.yaml --time 0.3 --shaders nowhere --out passes", ""][1:-1]
+EFLOW_COMMANDS = ["", "train missing.yaml --out run", "train unknown_key.yaml --out run", "evaluate nowhere nowhere --out scores", "predict nowhere broken.h5 --out flow", "submit nowhere nowhere --out submission.zip", ""][1:-1]
 
 
 def test_every_sentence_is_reviewed():

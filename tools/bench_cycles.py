@@ -38,6 +38,7 @@ from blinkgl.events import Events, make_emulator
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
+from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Scene
 from blinkgl.srgb import to_srgb8
@@ -56,10 +57,10 @@ def smaller(scene: Scene, width: int) -> Scene:
 
 def rasterised(gl, scene: Scene, times: list[int], antialiasing: str, cost: Cost) -> Iterator[np.ndarray]:
     with Renderer(gl, scene, RenderConfig(antialiasing=antialiasing)) as renderer:
-        renderer.luminance(times[-1])  # compiles and uploads
+        renderer.luminance(times[-1]).read()  # compiles and uploads
         for t in times:
             wall, cpu = time.perf_counter(), time.process_time()
-            frame = renderer.luminance(t)
+            frame = renderer.luminance(t).read()
             cost.wall_s.append(time.perf_counter() - wall)
             cost.cpu_s.append(time.process_time() - cpu)
             yield frame
@@ -70,8 +71,8 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     config = EsimConfig(threshold_sigma=0.0)
     height, width = scene.camera.height, scene.camera.width
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(islice(displacement_times(options.max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, renderer.speed), options.frames))
-        maps = np.stack([np.linalg.norm(renderer.velocity(t), axis=-1) for t in times])
+        times = list(islice(displacement_times(options.max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t).read())), options.frames))
+        maps = np.stack([np.linalg.norm(renderer.velocity(t).read(), axis=-1) for t in times])
     speeds = SpeedMaps(np.array(times) // 1000, maps)
     step = float(np.median(np.diff(times)))
     everything = CyclesSettings(samples=options.samples, bounces=4)
@@ -110,7 +111,7 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
 def speed(gl, scene: Scene, max_px: float, options) -> dict:
     """Part 2. EEVEE and Cycles draw two frames; the first (shader compilation, acceleration structure) is set apart."""
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(displacement_times(max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, renderer.speed))
+        times = list(displacement_times(max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t).read())))
         triangles = renderer.triangles
     few = [times[0], times[len(times) // 2]]
     rows = []

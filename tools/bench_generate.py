@@ -86,9 +86,8 @@ PLAIN = RenderConfig(image_antialiasing="none")
 def event_pass(gl, kind: str, width: int, height: int, lit: bool, repeat: int) -> dict:
     """Frames/s of Renderer.luminance over moments spread across two seconds."""
     with Renderer(gl, probe_scene(kind, width, height, lit), PLAIN) as renderer:
-        out = np.empty((height, width), np.float32)
         moment = iter(range(1 << 30))
-        timed = bench.seconds(lambda: renderer.luminance(next(moment) * 7_000_000 % (2 * SECOND), out=out), repeat, warm_up=8)
+        timed = bench.seconds(lambda: renderer.luminance(next(moment) * 7_000_000 % (2 * SECOND)).view(), repeat, warm_up=8)
         floor = FLOOR.get((kind, width, height), (None, None))
         fps = 1 / timed["median"]
         return {"scene": kind, "lit": lit, "width": width, "height": height, "triangles": renderer.triangles, "fps": fps,
@@ -104,15 +103,15 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     result = {"scene": kind, "movers": movers}
     events = {}
     for name in ("full redraw", "what moves"):
-        with Renderer(gl, scene, PLAIN) as renderer:
-            renderer._still = name == "what moves"  # noqa: SLF001 - what is measured cannot be switched from outside
-            emulator, out, moment = make_emulator(EsimConfig(), 480, 640, seed=1), np.empty((480, 640), np.float32), iter(range(1 << 30))
+        with Renderer(gl, scene, PLAIN, whole=name == "full redraw") as renderer:
+            emulator, moment, last = make_emulator(EsimConfig(), 480, 640, seed=1), iter(range(1 << 30)), [None]
             made = events[name] = []
 
             def frame():
                 t = next(moment) * 2_000_000
-                renderer.luminance(t, out=out)
-                made.append(len(emulator.step(out, t, renderer.changed_rows)))
+                image = renderer.luminance(t).read()
+                made.append(len(emulator.step(image.view(), t, image.rows_changed_since(last[0]))))
+                last[0] = image
 
             result[name] = 1 / bench.seconds(frame, repeat, warm_up=8)["median"]
     assert events["full redraw"] == events["what moves"]
@@ -148,7 +147,7 @@ def peer(gl, quick: bool) -> dict:
             renderer.labels(t, LabelRequest("images", "depth"))
 
         ours = bench.seconds(both, 10 if quick else 40)["median"]
-        luminance = bench.seconds(lambda: renderer.luminance(next(moments)), 10 if quick else 40)["median"]
+        luminance = bench.seconds(lambda: renderer.luminance(next(moments)).read(), 10 if quick else 40)["median"]
     return {"pyrender_s_per_frame": theirs["seconds_per_frame"], "blinkgl_colour_depth_s_per_frame": ours,
             "blinkgl_luminance_s_per_frame": luminance, "ratio_colour_depth": theirs["seconds_per_frame"] / ours,
             "ratio_luminance": theirs["seconds_per_frame"] / luminance}

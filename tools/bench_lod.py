@@ -118,7 +118,7 @@ def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> d
         renderer = kind(gl, scene, config)
         out[name] = {"setup_s": time.perf_counter() - started, "triangles": renderer.triangles}
         made[name] = (renderer, make_emulator(EsimConfig(contrast_threshold=0.2), *shape, 0), np.empty(shape, np.float32), [], [], [])
-        renderer.luminance(times[0], out=made[name][2])
+        renderer.luminance(times[0]).read(out=made[name][2])
         renderer.stats.triangles = renderer.stats.frames = 0
     names = list(variants)
     for k in range(rounds):
@@ -126,7 +126,7 @@ def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> d
         for name in names[k % len(names):] + names[: k % len(names)]:
             renderer, emulator, frame, wall, cpu, both = made[name]
             w, c = time.perf_counter(), time.process_time()
-            renderer.luminance(times[k % len(times)], out=frame)
+            renderer.luminance(times[k % len(times)]).read(out=frame)
             wall.append(time.perf_counter() - w)
             cpu.append(time.process_time() - c)
             emulator.step(frame, t + k)

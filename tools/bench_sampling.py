@@ -114,7 +114,7 @@ def measure(scene: Scene, gl, antialiasing: str, thin: int, say) -> dict[str, li
     with Renderer(gl, scene, RenderConfig(antialiasing=antialiasing)) as renderer:
         dense, run = simulate(DisplacementTimeline(max_px=1 / 32, percentile=99, min_step_us=5, max_step_us=2000, sample_every=6), renderer)
         times = np.linspace(scene.t0_ns, scene.t1_ns, 121).astype(np.int64)
-        speeds = SpeedMaps(times // 1000, np.stack([np.hypot(*np.moveaxis(renderer.velocity(int(t)), -1, 0)) for t in times]))
+        speeds = SpeedMaps(times // 1000, np.stack([np.hypot(*np.moveaxis(renderer.velocity(int(t)).read(), -1, 0)) for t in times]))
         say(f"  reference: {run.frames} frames, {len(dense):,} events")
         results: dict[str, list[Run]] = {}
         for name, settings in WAYS.items():

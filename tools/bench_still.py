@@ -54,10 +54,9 @@ class Way:
     """One way of drawing, from the scene to events; seconds of each stage and frame."""
 
     def __init__(self, gl, scene: Scene, still: bool):
-        self.renderer = Renderer(gl, scene, PLAIN)
-        self.renderer._still = still  # noqa: SLF001 - what is measured cannot be switched from outside
+        self.renderer = Renderer(gl, scene, PLAIN, whole=not still)
         self.emulator = make_emulator(EsimConfig(), HEIGHT, WIDTH, seed=1)
-        self.frame = np.empty((HEIGHT, WIDTH), np.float32)
+        self.frame = None
         self.events: list[Events] = []
         self.stages: list[tuple[float, ...]] = []
         self.covered: list[float] = []
@@ -66,13 +65,14 @@ class Way:
         stats = self.renderer.stats
         drawn, read = stats.render_s, stats.readback_s
         wall, cpu = time.perf_counter(), time.process_time()
-        self.renderer.luminance(t_ns, out=self.frame)
+        before, self.frame = self.frame, self.renderer.luminance(t_ns).read()
+        luminance = self.frame.view()
         done = time.perf_counter()
-        self.events.append(self.emulator.step(self.frame, t_ns, self.renderer.changed_rows))
+        self.events.append(self.emulator.step(luminance, t_ns, self.frame.rows_changed_since(before)))
         end = time.perf_counter()
         self.stages.append((stats.render_s - drawn, stats.readback_s - read, end - done, end - wall, time.process_time() - cpu))
-        if self.renderer.changed is not None:
-            self.covered.append(sum(r.area for r in self.renderer.changed) / (WIDTH * HEIGHT))
+        if self.frame.changed is not None:
+            self.covered.append(sum(r.area for r in self.frame.changed) / (WIDTH * HEIGHT))
 
 
 STAGES = ("draw", "read-back", "kernel", "all", "cpu")

@@ -147,12 +147,16 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
 
     def variants(name: str) -> tuple[str, ...]:
         return tuple(sorted({"+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
-                             for program, defines in gl.shaders._programs if program == name}))
+                             for program, defines in gl.shaders.compiled if program == name}))
 
     timeline, rejected = config.timeline, 1.0
-    luminance = np.empty((renderer.height, renderer.width), np.float32)
-    rate = np.empty_like(luminance) if timeline.reconstruction == "hermite" else None
-    event_s = _timed(lambda t: renderer.luminance(t, out=luminance, rate=rate), times)
+    rates = timeline.reconstruction == "hermite"
+
+    def drawn(t: int) -> tuple[np.ndarray, np.ndarray | None]:
+        frame = renderer.luminance(t, rate=rates)
+        return frame.view(), frame.view("rate") if rates else None
+
+    event_s = _timed(drawn, times)
     fine = samples_of(config.render.antialiasing).stored
     probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
     seen = [chunk.t_ns for chunk in islice(probe, 2 * PROBES)]  # a short stretch of it, as it will be
@@ -162,8 +166,8 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
         steps = np.clip([1 / max(probe.timeline.pace(t), 1e-12) for t in times], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
         result.frames = int(duration * np.mean(1 / steps)) + 1
         rejected = 1.1  # a step is cut again now and then
-    result.passes.append(Pass("event frames" + (" with rates" if rate is not None else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
-                              variants("luminance.glsl"), pixels * fine * ((4 if rate is None else 8) + DEPTH_BYTES), result.frames,
+    result.passes.append(Pass("event frames" + (" with rates" if rates else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
+                              variants("luminance.glsl"), pixels * fine * ((8 if rates else 4) + DEPTH_BYTES), result.frames,
                               event_s * result.frames))
     if timeline.kind != "uniform":
         small_s, count = _timed(probe.timeline.pace, times), int(result.frames * rejected)
@@ -173,7 +177,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     if "images" in asked_for(config.labels):
         result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
                                   ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
-                                  _timed(renderer.colour, times[:3]) * (labels + 1)))
+                                  _timed(lambda t: renderer.colour(t).read(), times[:3]) * (labels + 1)))
     request = asked_for(config.labels)
     request = request.without(*(name for name in request if LABELS[name].anti_aliased))
     if request:
@@ -183,7 +187,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
                                   pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES), labels, each * labels))
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
-        each = _timed(lambda t: (renderer.colour(t, antialiasing="none"), renderer.velocity(t)), times[:3])
+        each = _timed(lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times[:3])
         result.passes.append(Pass("preview", f"{config.preview.rate:g} pictures per simulated second", ("colour", "velocity"),
                                   pixels * (16 + 8 + DEPTH_BYTES), pictures, each * pictures))
     each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - t0), 1e-9)

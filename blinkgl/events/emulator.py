@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
@@ -28,6 +29,16 @@ MAX_SIDE = 2**16
 NEVER_NS = -(2**62)
 NO_FRAME, NO_CODES, NO_LOG = np.empty(0, np.float32), np.empty(0, np.uint8), np.empty(0, np.int32)
 """Stand for the kind of frame that was not given."""
+
+
+def _flat(array: np.ndarray) -> np.ndarray:
+    """(H*W,) in C order. Kernels write into no frame, but numba compiles another one for arrays that must not be written, such as a
+    renderer's views: those whose memory may be are handed on as such."""
+    flat = np.ascontiguousarray(array).reshape(-1)
+    if not flat.flags.writeable:
+        with contextlib.suppress(ValueError):  # memory that really is read-only
+            flat.flags.writeable = True
+    return flat
 
 
 class Emulator(ABC):
@@ -149,14 +160,14 @@ class Emulator(ABC):
         if frame.dtype != np.uint8 and frame.dtype != np.float32:
             raise EventDataError("unsupported frame type", where=f"frame {self.frames}", value=str(frame.dtype),
                                  accepted="float32 linear luminance or uint8")
-        return np.ascontiguousarray(frame).reshape(-1)
+        return _flat(frame)
 
     def _checked_rate(self, rate: np.ndarray | None) -> np.ndarray:
         shape, dtype = (None, None) if rate is None else (np.shape(rate), np.asarray(rate).dtype)
         if shape != (self.height, self.width) or dtype != np.float32:
             raise EventDataError("hermite wants the rate of change of every pixel", where=f"frame {self.frames}", value=(shape, str(dtype)),
                                  accepted=f"({self.height}, {self.width}) float32")
-        return np.ascontiguousarray(rate).reshape(-1)
+        return _flat(rate)
 
     def flush(self) -> Events:
         """Events that are still held back; call it after the last frame. Empty for everything but ``pchip``, which then takes its slope

@@ -131,11 +131,11 @@ class Renderer:
 
     def luminance(self, t: float) -> np.ndarray:
         """(H, W) float32 linear luminance at t s: what emulators take."""
-        return self._renderer.luminance(_ns(t, "t"))
+        return self._renderer.luminance(_ns(t, "t")).read()
 
     def image(self, t: float) -> np.ndarray:
         """(H, W, 3) uint8 sRGB at t s."""
-        return to_srgb8(self._renderer.colour(_ns(t, "t")))
+        return to_srgb8(self._renderer.colour(_ns(t, "t")).read())
 
     def frame(self, t: float, labels: Sequence[str] = ("images",), *, to: float | None = None, back_to: float | None = None) -> LabelFrame:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.

@@ -46,6 +46,15 @@ FORMATS = {
 }
 
 
+def checked_array(out: np.ndarray | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """``out``, or a new array where there is none. ValueError when it is not C-contiguous or of another shape or dtype."""
+    if out is None:
+        return np.empty(shape, dtype)
+    if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
+        raise ValueError(f"out must be a C-contiguous {shape} {dtype} array, not {out.shape} {out.dtype}")
+    return out
+
+
 class Target:
     """A framebuffer of ``width`` x ``height`` px with colour textures and depth.
 
@@ -154,7 +163,7 @@ class Target:
         pixel = self.formats[i]
         x, y, w, h = region or (0, 0, self.width, self.height)
         shape = (h, w) if pixel.components == 1 else (h, w, pixel.components)
-        out = self._checked(out, shape, pixel.numpy)
+        out = checked_array(out, shape, pixel.numpy)
         self.fbo.read_into(out, (x, y, w, h), pixel.components, attachment=i, alignment=1, dtype=pixel.gl)
         return out
 
@@ -162,16 +171,8 @@ class Target:
         """(H, W) float32 window-space depth: near/z_camera for BlinkGL's reversed-Z infinite projection, 0 where cleared."""
         if self.depth is None:
             raise GLError("this target has no depth")
-        out = self._checked(out, (self.height, self.width), np.dtype(np.float32))
+        out = checked_array(out, (self.height, self.width), np.dtype(np.float32))
         self.fbo.read_into(out, (0, 0, self.width, self.height), 1, attachment=-1, alignment=1, dtype="f4")
-        return out
-
-    @staticmethod
-    def _checked(out: np.ndarray | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        if out is None:
-            return np.empty(shape, dtype)
-        if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
-            raise ValueError(f"out must be a C-contiguous {shape} {dtype} array, not {out.shape} {out.dtype}")
         return out
 
     def release(self) -> None:

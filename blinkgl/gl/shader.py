@@ -70,7 +70,7 @@ def shader_folder() -> Traversable:
 def expand(name: str, stage: str, defines: Mapping[str, Any] | None = None, folder: Traversable | None = None) -> ShaderSource:
     """Source of one stage with includes and defines written out.
 
-    name    : file in ``folder`` (default: the shipped shaders).   stage: "vertex" or "fragment".
+    name    : file in ``folder`` (default: the shipped shaders), or an absolute path; includes are always the folder's.   stage: "vertex" or "fragment".
     defines : NAME -> number, True (1), text as it stands, or False/None (left undefined).
 
     Raises ShaderError for a missing file, an include cycle, or a define that is no GLSL identifier.
@@ -79,7 +79,7 @@ def expand(name: str, stage: str, defines: Mapping[str, Any] | None = None, fold
         raise ValueError(f"stage must be one of {STAGES}, not {stage!r}")
     folder = shader_folder() if folder is None else folder
     body = _Expansion(folder)
-    body.file(name, folder / name, chain=())
+    body.file(name, Path(name) if Path(name).is_absolute() else folder / name, chain=())
     head = [body.version or DEFAULT_VERSION, f"#define {stage.upper()}_SHADER 1"]
     head += [f"#define {key} {value}" for key, value in normalised(defines)]
     lines = [(line, ("", 0)) for line in head] + body.lines
@@ -187,6 +187,11 @@ class ShaderLoader:
         if key not in self._programs:
             self._programs[key] = self._compile(name, defines)
         return self._programs[key]
+
+    @property
+    def compiled(self) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
+        """(file, sorted defines) of every program that has been asked for so far."""
+        return tuple(self._programs)
 
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in STAGES}

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ctypes
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import moderngl
 import numpy as np
@@ -17,11 +18,25 @@ _TEXTURE_2D, _TEXTURE_LOD_BIAS = 0x0DE1, 0x8501
 _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f", 8))
 
 
+class Kind(NamedTuple):
+    """What of a material makes another program."""
+
+    textured: bool
+    lit: bool
+    two_sided: bool
+
+    @property
+    def defines(self) -> dict[str, int]:
+        return {name: 1 for name, on in zip(("TEXTURED", "LIT", "TWO_SIDED"), self) if on}
+
+
 @dataclass(eq=False)
 class DrawItem:
     """One part of one object, ready to draw.
 
-    object_index : row of the frame's matrices.   number : of this item among all.   centre, radius; low, high : bounding sphere and box, object frame.
+    object_index : row of a moment's matrices.   part : number of the part among those of the scene, object by object.
+    number : of this item among all, in the order of the layers.   moves : whether the object does.
+    centre, radius; low, high : bounding sphere and box, object frame.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.
     """
@@ -36,11 +51,17 @@ class DrawItem:
     layer: int
     two_sided: bool
     lit: bool
+    moves: bool
+    part: int = -1
     number: int = -1
 
     @property
     def textured(self) -> bool:
         return self.material.texture is not None
+
+    @property
+    def kind(self) -> Kind:
+        return Kind(self.textured, self.lit, self.two_sided)
 
 
 MAX_RADIUS = 1e18
@@ -60,9 +81,11 @@ class SceneResources:
         self._textures: dict[tuple, moderngl.Texture] = {}
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
         self.items = [
-            _draw_item(index, part.mesh, part.material, obj.category)
+            _draw_item(index, part.mesh, part.material, obj.category, not obj.path.is_static)
             for index, obj in enumerate(scene.objects) for part in obj.parts
         ]
+        for part, item in enumerate(self.items):
+            item.part = part
         self.items.sort(key=lambda item: item.layer)
         for number, item in enumerate(self.items):
             item.number = number
@@ -165,7 +188,7 @@ def _near_zero(uvs: np.ndarray) -> np.ndarray:
     return uvs - np.rint((low + high) / 2) if max(-low.min(), high.max()) > 64 else uvs
 
 
-def _draw_item(index: int, mesh: Mesh, material: Material, category: str) -> DrawItem:
+def _draw_item(index: int, mesh: Mesh, material: Material, category: str, moves: bool) -> DrawItem:
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     centre = (low + high) / 2
     radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
@@ -173,4 +196,4 @@ def _draw_item(index: int, mesh: Mesh, material: Material, category: str) -> Dra
         raise AssetError("mesh is too large to be drawn in float32", where=mesh.name or f"object {index}", value=radius,
                          accepted=f"at most {MAX_RADIUS:g} units from its centre, all coordinates finite")
     two_sided = material.double_sided or not mesh.closed
-    return DrawItem(index, mesh, material, centre, radius, low, high, _LAYER[category], two_sided, lit=not material.unlit)
+    return DrawItem(index, mesh, material, centre, radius, low, high, _LAYER[category], two_sided, not material.unlit, moves)

@@ -8,38 +8,22 @@ rectangles are read back. Every pixel gets the value that a full redraw would gi
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from blinkgl.camera import CameraModel
-from blinkgl.render.resources import DrawItem
+from blinkgl.render.canvas import Canvas, Frame
+from blinkgl.render.rectangles import Rectangle, merged
+
+if TYPE_CHECKING:
+    from blinkgl.camera import CameraModel
+    from blinkgl.gl import Target
+    from blinkgl.render.passes.base import Shot
+    from blinkgl.render.resources import DrawItem
 
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9
 _COLOUR_AND_DEPTH, _NEAREST = 0x4000 | 0x0100, 0x2600
-
-
-@dataclass(frozen=True)
-class Rectangle:
-    """Pixels x0 <= x < x1, y0 <= y < y1."""
-
-    x0: int
-    y0: int
-    x1: int
-    y1: int
-
-    @property
-    def area(self) -> int:
-        return (self.x1 - self.x0) * (self.y1 - self.y0)
-
-    def meets(self, other: Rectangle) -> bool:
-        return self.x0 < other.x1 and other.x0 < self.x1 and self.y0 < other.y1 and other.y0 < self.y1
-
-    def union(self, other: Rectangle) -> Rectangle:
-        return Rectangle(min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1))
-
-    def scaled(self, factor: int) -> Rectangle:
-        return Rectangle(self.x0 * factor, self.y0 * factor, self.x1 * factor, self.y1 * factor)
 
 
 def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
@@ -51,38 +35,57 @@ def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel)
     return None if bounds is None else Rectangle(*bounds)
 
 
-def merged(rectangles: list[Rectangle]) -> list[Rectangle]:
-    """Rectangles that do not meet and cover the given ones, in a fixed order."""
-    result: list[Rectangle] = []
-    for rectangle in rectangles:
-        while (other := next((r for r in result if r.meets(rectangle)), None)) is not None:
-            result.remove(other)
-            rectangle = rectangle.union(other)
-        result.append(rectangle)
-    return sorted(result, key=lambda r: (r.y0, r.x0))
+class StillCanvas(Canvas):
+    """Of a pass that draws the scene with a camera that stands still. The target always holds the whole last frame; what is kept beside
+    it, the still objects' picture and the places of those that move, is nobody else's."""
 
+    _picture: Target | None = None
+    _covered: tuple[Rectangle, ...] = ()  # by what moves, in the last frame
 
-class Backdrop:
-    """The still part of a scene in GL, and the bookkeeping of what has moved since the last frame.
+    def draw(self, shot: Shot) -> Frame:
+        shot = replace(shot, target=self.target)
+        pass_, painter, moment = self.pass_, self.painter, shot.moment
+        visible = pass_.items(moment)
+        movers = []
+        for item in visible:
+            if item.moves:
+                rectangle = screen_rectangle(item, moment.T_cam_obj[item.object_index], shot.scene.camera)
+                if rectangle is not None:
+                    movers.append((item, rectangle))
+        covered = [rectangle for _, rectangle in movers]
+        if self._picture is None:
+            camera = shot.scene.camera
+            self._picture = self.make_target(camera.width, camera.height)
+            still = replace(shot, target=self._picture)
+            pass_.begin(painter, still)
+            pass_.paint(painter, still, [item for item in visible if not item.moves])
+            stale = [Rectangle(0, 0, camera.width, camera.height)]
+        else:
+            stale = merged([*self._covered, *covered])
+        self._covered = tuple(covered)
+        painter.prepare(self.target)
+        for rectangle in stale:
+            fine = rectangle.scaled(pass_.samples.grid)
+            painter.gl.ctx.scissor = (fine.x0, fine.y0, fine.x1 - fine.x0, fine.y1 - fine.y0)
+            self._restore(fine)
+            pass_.paint(painter, shot, [item for item, place in movers if place.meets(rectangle)])
+        painter.gl.ctx.scissor = None
+        painter.stats.frames += 1
+        return self.frame(shot, stale)
 
-    picture : Target with the still objects' luminance and depth.   frame : Target that frames are composed in."""
-
-    def __init__(self, gl, picture, frame):
-        self.picture, self.frame = picture, frame
-        self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
-        self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
-        self._covered: list[Rectangle] = []
-
-    def stale(self, covered: list[Rectangle]) -> list[Rectangle]:
-        """Where the frame has to be drawn anew, given what moving objects cover now."""
-        rectangles = merged(self._covered + covered)
-        self._covered = covered
-        return rectangles
-
-    def restore(self, rectangle: Rectangle) -> None:
-        """Copies the still picture's colour and depth into the frame, inside the rectangle (px of the targets)."""
-        self._bind(_READ_FRAMEBUFFER, self.picture.fbo.glo)
-        self._bind(_DRAW_FRAMEBUFFER, self.frame.fbo.glo)
+    def _restore(self, rectangle: Rectangle) -> None:
+        """Copies the still picture's colour and depth into the target, inside the rectangle (px of the targets)."""
+        gl = self.painter.gl
+        if not hasattr(self, "_bind"):
+            self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
+            self._blit = gl.function("glBlitFramebuffer", None, *[ctypes.c_int] * 8, ctypes.c_uint, ctypes.c_uint)
+        self._bind(_READ_FRAMEBUFFER, self._picture.fbo.glo)
+        self._bind(_DRAW_FRAMEBUFFER, self.target.fbo.glo)
         edges = (rectangle.x0, rectangle.y0, rectangle.x1, rectangle.y1)
         self._blit(*edges, *edges, _COLOUR_AND_DEPTH, _NEAREST)
-        self.frame.fbo.use()
+        self.target.fbo.use()
+
+    def release(self) -> None:
+        if self._picture is not None:
+            self._picture.release()
+        super().release()

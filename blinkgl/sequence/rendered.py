@@ -28,14 +28,13 @@ from blinkgl.timeline import Timeline, make_timeline
 
 def drawn(renderer: Renderer, times: Iterable[int], rates: bool = False) -> Iterator[EventFrame]:
     """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one. rates : with d(luminance)/dt."""
-    luminance = np.empty((renderer.height, renderer.width), np.float32)
-    rate = np.empty_like(luminance) if rates else None
-    observe = times.observe if isinstance(times, Timeline) else None
+    observe, frame = times.observe if isinstance(times, Timeline) else None, None
     for t_ns in times:
-        renderer.luminance(t_ns, out=luminance, rate=rate)
+        before, frame = frame, renderer.luminance(t_ns, rate=rates)
+        luminance, rate = frame.view(), frame.view("rate") if rates else None
         if observe is not None:
             observe(t_ns, luminance, rate)
-        yield EventFrame(t_ns, luminance, rate, renderer.changed_rows)
+        yield EventFrame(t_ns, luminance, rate, frame.rows_changed_since(before))
 
 
 class RenderedSequence(Simulation):
@@ -99,7 +98,7 @@ class RenderedSequence(Simulation):
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
-        return Picture(t_ns, self.renderer.colour(t_ns, antialiasing="none"), self.renderer.velocity(t_ns))
+        return Picture(t_ns, self.renderer.colour(t_ns, antialiasing="none").read(), self.renderer.velocity(t_ns).read())
 
     @property
     def seconds(self) -> dict[str, float]:

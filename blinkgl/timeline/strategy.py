@@ -19,13 +19,19 @@ from blinkgl.timeline.budget import TimeError, contraharmonic_mean
 from blinkgl.timeline.sampling import bounded_times, uniform_times
 
 
+class Picture(Protocol):
+    """What has been drawn, wherever it is."""
+
+    def read(self) -> np.ndarray: ...
+
+
 class Scene(Protocol):
     """What a timeline asks of a renderer: small pictures, every n-th pixel in x and y."""
 
-    def motion(self, t_ns: int, every: int) -> np.ndarray:
+    def motion(self, t_ns: int, every: int) -> Picture:
         """(h, w, 2) float32 image velocity, px/s of the whole image."""
 
-    def brightness(self, t_ns: int, every: int) -> np.ndarray:
+    def brightness(self, t_ns: int, every: int) -> Picture:
         """(h, w, 2) float32 luminance and its rate of change per second."""
 
 
@@ -64,7 +70,7 @@ class Uniform(Timeline):
 
 class Displacement(Timeline):
     def pace(self, t_ns: int) -> float:
-        speeds = moving(np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every), axis=-1))
+        speeds = moving(np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every).read(), axis=-1))
         if not len(speeds):
             return 0.0
         pace = percentile(speeds, self.config.percentile) / self.config.max_px
@@ -73,7 +79,7 @@ class Displacement(Timeline):
 
 class Brightness(Timeline):
     def pace(self, t_ns: int) -> float:
-        picture = self.scene.brightness(t_ns, self.config.sample_every)
+        picture = self.scene.brightness(t_ns, self.config.sample_every).read()
         changes = moving(np.abs(self.response.change(picture[..., 0], picture[..., 1])))
         return percentile(changes, self.config.percentile) / (self.config.max_fraction_of_threshold * self.response.threshold)
 
@@ -97,7 +103,7 @@ class Budget(Timeline):
             last = t
 
     def pace(self, t_ns: int) -> float:
-        speed = np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every), axis=-1)
+        speed = np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every).read(), axis=-1)
         self._speeds = {**dict(list(self._speeds.items())[-7:]), t_ns: speed}
         return self.error.pace(contraharmonic_mean(speed))
 

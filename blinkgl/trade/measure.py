@@ -209,7 +209,7 @@ class Bench:
         count = max(2, round(self.duration_s / 0.005) + 1)
         times = np.linspace(self.t0_ns, self.t1_ns, count).astype(np.int64)
         with Renderer(self.gl, self.scene, self.base.render) as renderer:
-            maps = [np.hypot(*np.moveaxis(renderer.velocity(int(t)), -1, 0)) for t in times]
+            maps = [np.hypot(*np.moveaxis(renderer.velocity(int(t)).read(), -1, 0)) for t in times]
         return SpeedMaps(times // 1000, np.stack(maps))
 
     def judge(self, results: list[Measured], speeds: SpeedMaps) -> list[Level]:

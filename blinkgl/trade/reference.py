@@ -16,8 +16,9 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
+from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.still import Rectangle
+from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.types import Scene
 from blinkgl.timeline.sampling import displacement_times
 from blinkgl.trade.metrics import masked
@@ -68,7 +69,7 @@ class FineTiles:
         for t_ns in times:
             for r, camera in zip(self._tiles, self._cameras):
                 self._renderer.look_through(camera)
-                self._renderer.luminance(t_ns, out=self._fine)
+                self._renderer.luminance(t_ns).read(out=self._fine)
                 # INTER_AREA at a whole-numbered ratio is the mean.
                 frame[r.y0:r.y1, r.x0:r.x1] = cv2.resize(self._fine, (r.x1 - r.x0, r.y1 - r.y0), interpolation=cv2.INTER_AREA)
             yield frame
@@ -78,7 +79,7 @@ class FineTiles:
         largest = 0.0
         for camera in self._cameras:
             self._renderer.look_through(camera)
-            largest = max(largest, self._renderer.speed(t_ns, self._scale) / self._scale)
+            largest = max(largest, largest_speed(self._renderer.motion(t_ns, self._scale).read()) / self._scale)
         return largest
 
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:

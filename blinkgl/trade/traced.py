@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from blinkgl.render.still import Rectangle
+from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.types import Scene
 from blinkgl.tools import peer_cycles
 from blinkgl.trade.reference import FineTiles

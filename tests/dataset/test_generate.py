@@ -23,7 +23,7 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.sequence_dir import verify_sequence
-from blinkgl.render.renderer import Renderer
+from blinkgl.render.passes import Luminance
 
 SMALL = {
     "seed": 4,
@@ -220,22 +220,12 @@ def test_resolved_configuration_reproduces_the_sequence(tmp_path):
 def test_a_still_camera_saves_work_and_changes_nothing(tmp_path, monkeypatch):
     scene = {**SMALL["scene"], "camera_motion": {"kind": "static"},
              "objects": {"count": 8, "distance": [2, 4]}, "object_motion": {"speed": [1, 2], "static_share": 0.2}}
-    mended = Renderer.luminance
-
-    def whole(self, *args, **kwargs):
-        still, self._still = self._still, False
-        try:
-            return mended(self, *args, **kwargs)
-        finally:
-            self._still = still
-
     for k, timeline in enumerate(({"kind": "uniform", "fps": 200}, {"kind": "displacement", "max_px": 0.3}, {"kind": "uniform", "fps": 200, "reconstruction": "hermite"},
                                   {"kind": "displacement", "max_px": 0.5, "reconstruction": "pchip"}, {"kind": "brightness", "reconstruction": "hermite"},
                                   {"kind": "budget", "max_time_error_us": 300, "reconstruction": "pchip"})):
         quick = generate(tmp_path, out=f"quick {k}", scene=scene, timeline=timeline)[0]
         with monkeypatch.context() as patch:
-            patch.setattr(Renderer, "changed_rows", None)
-            patch.setattr(Renderer, "luminance", whole)
+            patch.setattr(Luminance, "still", False)
             slow = generate(tmp_path, out=f"slow {k}", scene=scene, timeline=timeline)[0]
         assert digests(quick) == digests(slow)
         with h5py.File(quick / "events.h5") as file:

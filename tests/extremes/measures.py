@@ -54,7 +54,7 @@ def moving_camera(near=0.05, step=1.0, **keys):
 def compare(gl, world, t_ns: int = 0, to_ns: int = SECOND) -> Errors:
     true = reference.render(world, t_ns, forward_ns=to_ns)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        frame, luminance = renderer.labels(t_ns, MOTION, to_ns), renderer.luminance(t_ns)
+        frame, luminance = renderer.labels(t_ns, MOTION, to_ns), renderer.luminance(t_ns).read()
     clear = true.hit & ~reference.silhouette_band(true.instance, true.depth)
     wrong = clear & (frame.ids != true.instance)
     np.testing.assert_array_equal(frame.forward.valid[clear & ~wrong], true.forward.valid[clear & ~wrong])

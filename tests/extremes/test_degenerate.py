@@ -16,6 +16,8 @@ from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.sequence_dir import verify_sequence
 from blinkgl.render import renderer as module
+from blinkgl.render.passes import Geometry
+from blinkgl.render.passes.geometry import BUFFERS
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
@@ -26,7 +28,7 @@ from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scen
 from tests.shared_data import shared
 
 MS = 1_000_000
-RAW = [("DEPTH", "R32F"), ("ID", "R32UI"), ("NORMAL", "RGBA32F"), ("VELOCITY", "RG32F"), ("FLOW_FORWARD", "RGBA32F"), ("FLOW_BACKWARD", "RGBA32F")]
+RAW = Geometry(tuple(BUFFERS))
 
 
 def sheet(corners: np.ndarray, seed: int = 1):
@@ -77,10 +79,10 @@ def nasty() -> np.ndarray:
 
 def raw_buffers(renderer) -> dict[str, np.ndarray]:
     """Everything that every pass writes at 0, as it leaves the fragment shaders."""
-    rate = np.empty((renderer.height, renderer.width), np.float32)
-    buffers = renderer._geometry(0, RAW, 100 * MS, -100 * MS)
-    return {**buffers, "luminance": renderer.luminance(0), "with rate": renderer.luminance(0, rate=rate), "rate": rate, "colour": renderer.colour(0),
-            "brightness": renderer.brightness(0, 3), "motion": renderer.velocity(0, 3)}
+    buffers = renderer.draw(RAW, 0, {"forward": 100 * MS, "backward": -100 * MS})
+    both = renderer.luminance(0, rate=True)
+    return {**{name: buffers.read(name) for name in buffers.names}, "luminance": renderer.luminance(0).read(), "with rate": both.read(),
+            "rate": both.read("rate"), "colour": renderer.colour(0).read(), "brightness": renderer.brightness(0, 3).read(), "motion": renderer.velocity(0, 3).read()}
 
 
 @pytest.mark.parametrize("antialiasing", ["none", "taps4", "msaa4", "ssaa2"])
@@ -124,7 +126,7 @@ def test_what_is_seen_from_its_edge_is_not_seen(gl, seed):
     """Snapped corners cover pixels; before there was a guard a third of 60 such pixels were NaN and most others at no depth of the mesh."""
     world = scene([thing("edges", 1, sheet(edge_on(np.random.default_rng(seed), 3000)), still())], rig(near=0.01))
     with Renderer(gl, world, RenderConfig()) as renderer:
-        assert not renderer.labels(0, LabelRequest("ids")).ids.any() and not renderer.luminance(0).any()
+        assert not renderer.labels(0, LabelRequest("ids")).ids.any() and not renderer.luminance(0).read().any()
 
 
 @pytest.mark.parametrize("unlit", [True, False])
@@ -197,7 +199,7 @@ def test_a_texture_with_a_number_that_is_none_is_refused(gl, bad):
     image = np.full((8, 8, 3), 0.5, np.float32)
     image[2, 5] = bad
     world = scene([thing("wall", 1, quad(), still((0, 3, 0), FACING), Material(texture=Texture(image, "poster")))])
-    for draw in (lambda r: r.luminance(0), lambda r: r.colour(0)):
+    for draw in (lambda r: r.luminance(0).read(), lambda r: r.colour(0).read()):
         with Renderer(gl, world, RenderConfig()) as renderer, pytest.raises(AssetError, match=r"^poster: texel x=5, y=2 cannot be drawn .*linear light from 0"):
             draw(renderer)
 
@@ -209,7 +211,7 @@ def test_a_mesh_with_a_number_that_is_none_is_refused(gl):
         values[2, 0] = np.nan
         world = scene([thing("wall", 1, replace(plain, **{name: values}), still((0, 3, 0), FACING))])
         with Renderer(gl, world, RenderConfig()) as renderer, pytest.raises(AssetError, match="^quad: vertex 2 has a .* finite numbers$"):
-            renderer.luminance(0)
+            renderer.luminance(0).read()
 
 
 @pytest.mark.parametrize("color, background, seen", [((np.nan, 1.0, 1.0), 0.0, r"object 'wall' \(id 7\)"), ((-1.0, -1.0, -1.0), 0.0, r"object 'wall' \(id 7\)"),

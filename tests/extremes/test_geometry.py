@@ -88,7 +88,7 @@ def test_a_hundred_thousand_repeats_of_a_texture(gl, promise, away, median, wors
     eye = rig(path=still((away, 0, 0), LEVEL * Rotation.from_rotvec([-0.6, 0, 0])))
     world = scene([thing("ground", 1, quad(1e5, 1e5, 32), still((0, 0, -1.5)), paint)], eye)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        luminance = renderer.luminance(0)
+        luminance = renderer.luminance(0).read()
     near = np.s_[60:]  # magnified: mip maps do not come in
     error = np.abs(luminance - reference.render(world, 0).luminance)[near]
     promise(f"10^5 repeats on 2e5 units, {away:g} from the middle: luminance, median", np.median(error), median)
@@ -129,7 +129,7 @@ def test_meshes_without_area_or_normals(gl):
     world = scene(things)
     with Renderer(gl, world, RenderConfig()) as renderer:
         labels = renderer.labels(0, replace(MOTION, normals=True, colour=True), MS)
-        luminance = renderer.luminance(0)
+        luminance = renderer.luminance(0).read()
     assert (labels.ids == 3).mean() > 0.9
     np.testing.assert_allclose(luminance[labels.ids == 3], 0.5 * world.light.sky, rtol=1e-6)
     assert np.isfinite(labels.normals).all() and np.isfinite(labels.colour).all() and np.isfinite(luminance).all()
@@ -164,8 +164,8 @@ def test_images_of_a_few_pixels(gl, promise, width, height):
     true = reference.render(world, 300 * MS, forward_ns=310 * MS)
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa4")) as renderer:
         labels = renderer.labels(300 * MS, replace(MOTION, occlusion=True), 310 * MS)
-        assert renderer.luminance(300 * MS).shape == (height, width)
-        assert renderer.velocity(300 * MS, 4).shape == (max(1, height // 4), max(1, width // 4), 2)
+        assert renderer.luminance(300 * MS).read().shape == (height, width)
+        assert renderer.velocity(300 * MS, 4).read().shape == (max(1, height // 4), max(1, width // 4), 2)
     same = labels.ids == true.instance
     assert same.mean() > 0.7
     promise(f"image of {width} x {height}: flow, largest, relative", (length(labels.forward.flow - true.forward.flow) / length(true.forward.flow))[same].max(), WORST)
@@ -192,4 +192,4 @@ def test_large_images(gl, promise, side):
 def test_an_image_beyond_opengl_is_refused(gl):
     for width, antialiasing in ((5000, "ssaa4"), (16384, "ssaa2")):
         with Renderer(gl, sized(width, 2), RenderConfig(antialiasing=antialiasing)) as renderer, pytest.raises(GLError, match="beyond this OpenGL's limit"):
-            renderer.luminance(0)
+            renderer.luminance(0).read()

@@ -108,7 +108,7 @@ def test_a_clock_at_a_million_seconds_changes_no_bit(gl, promise):
     for t0 in (0, late):
         with Renderer(gl, world(t0), RenderConfig()) as renderer:
             t = t0 + 123_456_789
-            both.append((renderer.labels(t, MOTION, t + 1), renderer.luminance(t)))
+            both.append((renderer.labels(t, MOTION, t + 1), renderer.luminance(t).read()))
     (a, la), (b, lb) = both
     for one, other in ((a.forward.flow, b.forward.flow), (a.velocity, b.velocity), (a.depth, b.depth), (la, lb)):
         np.testing.assert_array_equal(one, other)
@@ -124,7 +124,7 @@ def test_a_million_pixels_per_second(gl, promise, speed):
     promise(f"{speed:g} px/s: velocity, largest, relative", e.velocity.max(), WORST)
     promise(f"{speed:g} px/s: flow over a microsecond, largest, relative", e.worst, WORST)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        fastest = lambda t: largest_speed(renderer.velocity(t, 4))
+        fastest = lambda t: largest_speed(renderer.velocity(t, 4).read())
         ten_px = int(10 / speed * SECOND)
         times = np.array(list(displacement_times(0.5, 1, 20_000_000, 0, ten_px, fastest)))
         slow = np.array(list(displacement_times(0.5, 100_000, 20_000_000, 0, 400_000, fastest)))

@@ -30,7 +30,7 @@ def test_radiance_of_twenty_one_decades(gl, promise, antialiasing):
     """Float32 targets keep 2^-24 of any radiance; the luma weights' sum and the box filter round a few times more."""
     world = scene(bars(unlit=True), rig(90, 24, 80.0))
     with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
-        luminance, colour = renderer.luminance(0), renderer.labels(0, LabelRequest("images", "ids"))
+        luminance, colour = renderer.luminance(0).read(), renderer.labels(0, LabelRequest("images", "ids"))
     worst = 0.0
     for k, v in enumerate(RADIANCES):
         inside = np.zeros(luminance.shape, bool)
@@ -50,7 +50,7 @@ def test_suns_from_nothing_to_1e9(gl, promise, sun, sky):
     world = scene([thing("wall", 1, quad(9, 9), still((0, 4, 0), TILTED))], light=light)
     true = reference.render(world, 0)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        luminance = renderer.luminance(0)
+        luminance = renderer.luminance(0).read()
     assert np.isfinite(luminance).all()
     scale = np.abs(true.luminance).max()
     promise(f"sun {sun:g}, sky {sky:g}: luminance, relative", np.abs(luminance - true.luminance).max() / max(scale, 1e-300), 1e-6)
@@ -65,10 +65,10 @@ def test_a_hot_texel_among_black_ones(gl, promise):
     wide = scene([thing("sky", 1, quad(40, 40), still((0, 4, 0), FACING), Material(texture=Texture(image), unlit=True, uv_scale=(1600.0, 1600.0)))],
                  rig(32, 32, 30.0))  # every pixel holds 2.7 x 2.7 whole textures  # fmt: skip
     with Renderer(gl, world, RenderConfig()) as renderer:
-        near = renderer.luminance(0)
+        near = renderer.luminance(0).read()
         assert np.isfinite(near).all() and near.min() == 0 and near.max() > 1e8
     with Renderer(gl, wide, RenderConfig()) as renderer:
-        luminance = renderer.luminance(0)
+        luminance = renderer.luminance(0).read()
     promise("a texel of 1e9 among 4095 black ones, minified: mean, relative", np.abs(luminance.mean() / (1e9 / 4096) - 1), 1e-5)
 
 
@@ -97,7 +97,7 @@ def test_more_light_than_the_emulators_take_is_refused(gl):
     """2^30 is where fixed-point logarithms end: the pass draws 1e12 well, the emulator says what it cannot use, and where."""
     world = scene([thing("wall", 1, quad(9, 9), still((0, 4, 0), FACING), Material(base_color=(1e6,) * 3))], rig(8, 6, 8.0), Light((0, -1, 0), 1e6, 0.0))
     with Renderer(gl, world, RenderConfig()) as renderer:
-        luminance = renderer.luminance(0)
+        luminance = renderer.luminance(0).read()
     np.testing.assert_allclose(luminance, 1e12, rtol=1e-6)
     with pytest.raises(EventDataError, match="frame 0: intensity at pixel x=0, y=0 cannot be used .* 0 to 1.07e\\+09"):
         Esim(6, 8).step(luminance, 0)
@@ -109,5 +109,5 @@ def test_a_moving_dark_thing_before_a_black_sky_fires_nothing(gl):
     esim, events = Esim(30, 40, EsimConfig(contrast_threshold=0.001)), 0
     with Renderer(gl, world, RenderConfig()) as renderer:
         for k in range(11):
-            events += len(esim.step(renderer.luminance(k * SECOND // 10), k * SECOND // 10))
+            events += len(esim.step(renderer.luminance(k * SECOND // 10).read(), k * SECOND // 10))
     assert events == 0

@@ -116,9 +116,8 @@ def test_slices_are_checked_too(tmp_path):
             assert len(reader.slice(40_000, 60_000))
         with h5py.File(path, "r+") as file:
             change(file)
-        with pytest.raises(BlinkGLError, match=message):
-            with DsecEventReader(path) as reader:
-                reader.slice(40_000, 60_000)
+        with pytest.raises(BlinkGLError, match=message), DsecEventReader(path) as reader:
+            reader.slice(40_000, 60_000)
 
 
 @pytest.mark.parametrize("text, message", [

@@ -295,10 +295,9 @@ def test_failure_leaves_the_old_file(tmp_path, kind):
     need(kind)
     path = tmp_path / FILES[kind]
     path.write_text("old")
-    with pytest.raises(ZeroDivisionError):
-        with event_writer(path, H, W, format=kind) as writer:
-            writer.append(random_events(100))
-            raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError), event_writer(path, H, W, format=kind) as writer:
+        writer.append(random_events(100))
+        raise ZeroDivisionError
     assert path.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == [path.name]
 
 

@@ -128,10 +128,9 @@ def test_verify_finds_damage(tmp_path, damage, problem):
 
 @pytest.mark.parametrize("error", [ValueError("bug"), KeyboardInterrupt(), SystemExit(1)])
 def test_nothing_is_left_after_an_exception(tmp_path, error):
-    with pytest.raises(type(error)):
-        with SequenceWriter(tmp_path / "a", H, W, config_yaml="") as writer:
-            fill(writer)
-            raise error
+    with pytest.raises(type(error)), SequenceWriter(tmp_path / "a", H, W, config_yaml="") as writer:
+        fill(writer)
+        raise error
     assert list(tmp_path.iterdir()) == []
 
 
@@ -250,14 +249,12 @@ def test_atomic_file(tmp_path):
         assert path.suffix == ".txt"
         path.write_text("one")
         assert not (tmp_path / "d" / "a.txt").exists()
-    with pytest.raises(ZeroDivisionError):
-        with atomic_file(tmp_path / "d" / "a.txt") as path:
-            path.write_text("two")
-            raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "d" / "a.txt") as path:
+        path.write_text("two")
+        raise ZeroDivisionError
     assert (tmp_path / "d" / "a.txt").read_text() == "one" and len(list((tmp_path / "d").iterdir())) == 1
     with pytest.raises(OutputError, match="output file exists"):
         with atomic_file(tmp_path / "d" / "a.txt", overwrite=False):
             pass
-    with pytest.raises(BlinkGLError, match="is a folder"):
-        with atomic_file(tmp_path / "d"):
-            pass
+    with pytest.raises(BlinkGLError, match="is a folder"), atomic_file(tmp_path / "d"):
+        pass

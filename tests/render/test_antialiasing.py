@@ -58,7 +58,7 @@ def test_an_edge_is_as_bright_as_it_covers_the_pixel(gl, antialiasing):
         for offset in (0.0, 0.21, 0.37):
             world, coverage = half_plane(angle, offset)
             with Renderer(gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing=antialiasing)) as renderer:
-                luminance, colour = renderer.luminance(0), renderer.colour(0)
+                luminance, colour = renderer.luminance(0).read(), renderer.colour(0).read()
             np.testing.assert_allclose(luminance * count, np.rint(luminance * count), atol=1e-5)
             np.testing.assert_allclose(colour[..., 1], luminance, atol=1e-6)
             assert (luminance[coverage < 1e-9] == 0).all() and (luminance[coverage > 1 - 1e-9] == 1).all()
@@ -68,7 +68,7 @@ def test_an_edge_is_as_bright_as_it_covers_the_pixel(gl, antialiasing):
     assert np.abs(errors).max() < worst
     assert abs(errors.mean()) < 0.01
     with Renderer(gl, world, RenderConfig()) as renderer:
-        single = (renderer.luminance(0) - coverage)[band]
+        single = (renderer.luminance(0).read() - coverage)[band]
     assert errors.std() < 0.62 * single.std()
 
 
@@ -86,7 +86,7 @@ def test_labels_are_never_filtered(gl):
     frames = []
     for antialiasing in ("none", "msaa4", "ssaa4"):
         with Renderer(gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing="msaa4")) as renderer:
-            renderer.luminance(0)
+            renderer.luminance(0).read()
             frames.append(renderer.labels(0, request, SECOND // 10))
     for other in frames[1:]:
         np.testing.assert_array_equal(frames[0].ids, other.ids)
@@ -115,7 +115,7 @@ def test_mip_bias_moves_the_level_by_that_much(gl, bias):
     contrast = {}
     for name, scene_distance, config in (("biased", distance, RenderConfig(mip_bias=bias)), ("plain", distance, RenderConfig())):
         with Renderer(gl, stripes(period, scene_distance), config) as renderer:
-            contrast[name] = float(renderer.luminance(0)[8:-8, 8:-8].std())
+            contrast[name] = float(renderer.luminance(0).read()[8:-8, 8:-8].std())
     expected = {}
     for level in (0, 1, 2, 3, 4):  # the texture's own levels, sampled by hand at the pixels' centres
         n = 2**level
@@ -133,7 +133,7 @@ def test_four_taps_of_a_linear_texture_are_one(gl):
     body = thing("ramp", 1, quad(1.0, 1.0), still((0, 2.0, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(ramp), unlit=True, double_sided=True))
     world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
     with Renderer(gl, world, RenderConfig()) as one, Renderer(gl, world, RenderConfig(antialiasing="taps4")) as four:
-        np.testing.assert_allclose(four.luminance(0)[8:-8, 8:-8], one.luminance(0)[8:-8, 8:-8], atol=2e-3)
+        np.testing.assert_allclose(four.luminance(0).read()[8:-8, 8:-8], one.luminance(0).read()[8:-8, 8:-8], atol=2e-3)
 
 
 def test_four_taps_are_nearer_to_the_finer_image(gl):
@@ -142,7 +142,7 @@ def test_four_taps_are_nearer_to_the_finer_image(gl):
     images = {}
     for antialiasing in ("none", "taps4", "ssaa4"):
         with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
-            images[antialiasing] = renderer.luminance(0)
+            images[antialiasing] = renderer.luminance(0).read()
     error = {name: float(np.sqrt(np.mean((image - images["ssaa4"]) ** 2))) for name, image in images.items()}
     assert error["taps4"] < 0.6 * error["none"]
 
@@ -181,6 +181,6 @@ def test_anisotropy_keeps_stripes_that_run_into_the_distance(gl, antialiasing, b
     for anisotropy in (1.0, 4.0):
         config = RenderConfig(anisotropy=anisotropy, antialiasing=antialiasing, image_antialiasing="none")
         with Renderer(gl, world, config) as renderer:
-            contrast[anisotropy] = renderer.luminance(0)[14].std(), renderer.colour(0)[14, :, 1].std()
+            contrast[anisotropy] = renderer.luminance(0).read()[14].std(), renderer.colour(0).read()[14, :, 1].std()
     assert contrast[1.0][0] < blurred and contrast[1.0][1] < 0.01
     assert contrast[4.0][0] > 0.3 and contrast[4.0][1] > 0.3

@@ -43,9 +43,11 @@ def wall(kind: str, texels: int = TEXELS):
 
 def simulate(gl, kind: str, step_ns: int, world, reconstruction: str = "linear", config=PLAIN) -> Events:
     emulator = Esim(HEIGHT, WIDTH, EsimConfig(contrast_threshold=THRESHOLD, threshold_sigma=0.0, log_eps=1e-9), 1, reconstruction)
-    rate = np.empty((HEIGHT, WIDTH), np.float32) if emulator.needs_rate else None
+    chunks = []
     with Renderer(gl, world, config) as renderer:
-        chunks = [emulator.step(renderer.luminance(t, rate=rate), t, None, rate) for t in range(0, int(DURATION * SECOND) + 1, step_ns)]
+        for t in range(0, int(DURATION * SECOND) + 1, step_ns):
+            frame = renderer.luminance(t, rate=emulator.needs_rate)
+            chunks.append(emulator.step(frame.read(), t, None, frame.read("rate") if emulator.needs_rate else None))
         return Events.concatenate([*chunks, emulator.flush()])
 
 
@@ -85,7 +87,7 @@ def direction(gl):
     """+1 or -1: whether u grows along +x on the rendered wall (read off one frame, so the test asks physics, not layout)."""
     world = wall("ramp")
     with Renderer(gl, world, PLAIN) as renderer:
-        row = renderer.luminance(0)[HEIGHT // 2]
+        row = renderer.luminance(0).read()[HEIGHT // 2]
     return 1.0 if row[-1] > row[0] else -1.0
 
 
@@ -125,12 +127,13 @@ def test_cubics_converge_faster_on_rendered_frames(gl, direction, monkeypatch, r
 def test_rates_are_those_of_finer_and_finer_differences(gl, antialiasing):
     """dL/dt of the shader against central differences of rendered frames, on curved, lit, textured, turning things."""
     world = mixed_scene()
-    rate, h = np.empty((120, 160), np.float32), 100_000
+    h = 100_000
     with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
-        frame = renderer.luminance(SECOND // 3, rate=rate)
-        np.testing.assert_array_equal(frame, renderer.luminance(SECOND // 3))
-        ahead, behind = (renderer.luminance(SECOND // 3 + s).astype(float) for s in (h, -h))
-        small = renderer.brightness(SECOND // 3, 4)
+        both = renderer.luminance(SECOND // 3, rate=True)
+        frame, rate = both.read(), both.read("rate")
+        np.testing.assert_array_equal(frame, renderer.luminance(SECOND // 3).read())
+        ahead, behind = (renderer.luminance(SECOND // 3 + s).read().astype(float) for s in (h, -h))
+        small = renderer.brightness(SECOND // 3, 4).read()
     difference = (ahead - behind) / (2e-9 * h)
     off = np.abs(rate - difference)
     assert np.median(off) < 0.03 * np.median(np.abs(difference)) and np.percentile(off, 85) < 0.1 * np.percentile(np.abs(difference), 85)
@@ -150,12 +153,12 @@ def test_the_rate_is_taken_over_half_a_pixel(gl, antialiasing, gain, error):
     facing = LEVEL * LEVEL.from_euler("x", 180, degrees=True)
     slides = drift((0, 1, 0), (speed / focal, 1, 0), facing)
     world = scene([thing("wall", 1, quad(0.5, 0.5), slides, paint)], Rig.alone(PinHole(48, 16, focal, focal, 23.5, 7.5), still(rotation=LEVEL)))
-    rate, found, true = np.empty((16, 48), np.float32), [], []
+    found, true = [], []
     with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
         for t in np.linspace(0.05, 0.9, 23):
-            renderer.luminance(int(t * SECOND), rate=rate)
+            rate = renderer.luminance(int(t * SECOND), rate=True).read("rate")
             at = np.arange(48) - 23.5 - speed * t + texels / 2
-            found.append(rate[8, 4:-4].copy())
+            found.append(rate[8, 4:-4])
             true.append(-speed * 0.3 * 2 * np.pi / period * np.cos(2 * np.pi * at / period)[4:-4])
     found, true = np.array(found), np.array(true)
     assert (found * true).sum() / (true * true).sum() == pytest.approx(gain, rel=0.02)

@@ -65,7 +65,7 @@ def shapes():
 def drawn(gl, world, t=T0, request=EVERYTHING, forward=T1, backward=T_BACK, **config):
     with Renderer(gl, world, RenderConfig(image_antialiasing="none", **config)) as renderer:
         labels = renderer.labels(t, request, forward, backward)
-        return labels, renderer.luminance(t)
+        return labels, renderer.luminance(t).read()
 
 
 def length(v):
@@ -181,7 +181,7 @@ def test_supersampling_is_the_mean_of_finer_rays(gl, factor):
     rays = (grid[:, None, None] + np.stack(np.meshgrid(sub, sub), -1)).reshape(-1, 2)
     fine = reference.surface(world, reference.cast(world, T0, rays)).luminance.reshape(cam.height, cam.width, -1).mean(-1)
     with Renderer(gl, world, RenderConfig(antialiasing=f"ssaa{factor}")) as renderer:
-        luminance = renderer.luminance(T0)
+        luminance = renderer.luminance(T0).read()
     error = np.abs(luminance - fine)
     assert np.quantile(error, 0.99) < 1e-5
     assert (error > 1e-3).mean() < 0.005  # sub-pixel coverage at the silhouette
@@ -191,7 +191,7 @@ def test_reduced_velocity_samples_the_same_field(gl):
     world = shapes()["everything"]
     cam = world.camera
     with Renderer(gl, world, RenderConfig()) as renderer:
-        coarse = renderer.velocity(T0, reduce=4)
+        coarse = renderer.velocity(T0, every=4).read()
     y, x = np.mgrid[0 : cam.height // 4, 0 : cam.width // 4] * 4 + 1.5  # centres of 4 x 4 blocks
     hits = reference.cast(world, T0, np.stack([x.ravel(), y.ravel()], 1))
     true = reference.velocity(world, hits).reshape(*coarse.shape)

@@ -195,7 +195,7 @@ def test_settings_are_checked(wrong, words):
 
 def ours(gl, world, t):
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa4")) as renderer:
-        return renderer.luminance(t)
+        return renderer.luminance(t).read()
 
 
 def band_of(world, t):

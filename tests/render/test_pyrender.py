@@ -79,7 +79,7 @@ def test_flat_colours_are_equal_to_8_bit_rounding(gl):
     theirs = peer_pyrender.render(base, TIMES[:1])["colour"][0]
     true = reference.render(base, TIMES[0])
     with Renderer(gl, base, RenderConfig(image_antialiasing="none")) as renderer:
-        ours = renderer.colour(TIMES[0])
+        ours = renderer.colour(TIMES[0]).read()
     band = reference.silhouette_band(true.instance, true.depth)
     for colour in (ours, true.colour):
         assert np.abs(theirs - 255.0 * colour)[~band].max() <= 0.501
@@ -94,7 +94,7 @@ def test_picture_is_the_same_way_up(gl):
     picture = scene([thing("picture", 300, quad(3, 2.5), still(), paint)], eye)
     theirs = peer_pyrender.render(picture, [0])
     with Renderer(gl, picture, RenderConfig(image_antialiasing="none")) as renderer:
-        ours = renderer.colour(0)
+        ours = renderer.colour(0).read()
     true = reference.render(picture, 0)
     assert true.hit.all() and (theirs["ids"] == 300).all()
     assert np.abs(theirs["colour"][0] - 255.0 * ours).max() < 2.5  # 8-bit weights of its filter

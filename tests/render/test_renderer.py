@@ -7,8 +7,8 @@ from blinkgl.camera import PinHole
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.render import renderer as module
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate
+from blinkgl.render.moment import Moment
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
@@ -46,11 +46,11 @@ def buffers(frame):
 
 def test_frustum_culling_changes_no_pixel(gl, monkeypatch):
     with Renderer(gl, world(), PLAIN) as renderer:
-        culled = [renderer.luminance(t) for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
+        culled = [renderer.luminance(t).read() for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
         drawn = renderer.stats.triangles
-        monkeypatch.setattr(module.Renderer, "_visible", lambda self, moment: self._resources.items)
+        monkeypatch.setattr(Moment, "visible", property(lambda self: renderer.items))
         renderer.stats.triangles = 0
-        full = [renderer.luminance(t) for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
+        full = [renderer.luminance(t).read() for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
         assert drawn < renderer.stats.triangles, "the scene has something to cull"
     for a, b in zip(culled[0], full[0]):
         np.testing.assert_array_equal(a, b)
@@ -61,20 +61,20 @@ def test_frustum_culling_changes_no_pixel(gl, monkeypatch):
 def test_back_face_culling_of_closed_meshes_changes_no_pixel(gl):
     scene = world()
     with Renderer(gl, scene, PLAIN) as renderer:
-        assert any(not item.two_sided for item in renderer._resources.items)
-        culled = renderer.luminance(0)
-        for item in renderer._resources.items:
+        assert any(not item.two_sided for item in renderer.items)
+        culled = renderer.luminance(0).read()
+        for item in renderer.items:
             item.two_sided = True
-        np.testing.assert_array_equal(culled, renderer.luminance(0))
+        np.testing.assert_array_equal(culled, renderer.luminance(0).read())
 
 
 def test_the_same_frame_twice_is_the_same_frame(gl):
     for _ in range(2):
         with Renderer(gl, world(), PLAIN) as renderer:
-            first = renderer.luminance(SECOND // 3), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
+            first = renderer.luminance(SECOND // 3).read(), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
         with Renderer(gl, world(), PLAIN) as renderer:
-            renderer.luminance(0)
-            again = renderer.luminance(SECOND // 3), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
+            renderer.luminance(0).read()
+            again = renderer.luminance(SECOND // 3).read(), buffers(renderer.labels(SECOND // 3, ALL, SECOND, 0))
         np.testing.assert_array_equal(first[0], again[0])
         for name in first[1]:
             np.testing.assert_array_equal(first[1][name], again[1][name], err_msg=name)
@@ -84,10 +84,10 @@ def test_two_renderers_in_one_context_do_not_disturb_each_other(gl):
     """Programs, and with them uniforms such as the light, belong to the context."""
     dim, bright = world(light=Light(sun=0.1, sky=0.1)), world(light=Light(sun=1.0, sky=0.8))
     with Renderer(gl, dim, PLAIN) as a, Renderer(gl, bright, PLAIN) as b:
-        alone = a.luminance(0)
-        b.luminance(0)
-        np.testing.assert_array_equal(alone, a.luminance(0))
-        assert b.luminance(0).mean() > alone.mean()
+        alone = a.luminance(0).read()
+        b.luminance(0).read()
+        np.testing.assert_array_equal(alone, a.luminance(0).read())
+        assert b.luminance(0).read().mean() > alone.mean()
 
 
 @pytest.mark.parametrize("factor", [2, 4])
@@ -98,11 +98,11 @@ def test_supersampling_is_the_mean_of_a_finer_image(gl, factor):
     fine = PinHole(c.width * factor, c.height * factor, c.fx * factor, c.fy * factor,
                    (c.cx + 0.5) * factor - 0.5, (c.cy + 0.5) * factor - 0.5, c.near)
     with Renderer(gl, scene, RenderConfig(antialiasing=f"ssaa{factor}", image_antialiasing=f"ssaa{factor}")) as renderer:
-        luminance, colour = renderer.luminance(0), renderer.colour(0)
+        luminance, colour = renderer.luminance(0).read(), renderer.colour(0).read()
     with Renderer(gl, scene.with_camera(fine), PLAIN) as renderer:
         h, w = c.height, c.width
-        expected = renderer.luminance(0).reshape(h, factor, w, factor).mean(axis=(1, 3), dtype=np.float64)
-        expected_colour = renderer.colour(0).reshape(h, factor, w, factor, 3).mean(axis=(1, 3), dtype=np.float64)
+        expected = renderer.luminance(0).read().reshape(h, factor, w, factor).mean(axis=(1, 3), dtype=np.float64)
+        expected_colour = renderer.colour(0).read().reshape(h, factor, w, factor, 3).mean(axis=(1, 3), dtype=np.float64)
     np.testing.assert_allclose(luminance, expected, rtol=1e-5)
     np.testing.assert_allclose(colour, expected_colour, rtol=1e-5)
 
@@ -110,12 +110,10 @@ def test_supersampling_is_the_mean_of_a_finer_image(gl, factor):
 def test_only_what_is_asked_for_is_made(gl):
     gl.shaders.clear()
     with Renderer(gl, world(), PLAIN) as renderer:
-        renderer.luminance(0)
-        assert {name for name, _ in gl.shaders._programs} == {"luminance.glsl"}
-        assert len(renderer._targets) == 1
-        assert all(key[0] == "luminance" for key in renderer._resources._textures), "no colour texture without a colour pass"
+        renderer.luminance(0).read()
+        assert {name for name, _ in gl.shaders.compiled} == {"luminance.glsl"}
         renderer.labels(0, LabelRequest("depth"))
-        defines = [dict(d) for name, d in gl.shaders._programs if name == "label.glsl"]
+        defines = [dict(d) for name, d in gl.shaders.compiled if name == "label.glsl"]
         assert defines and all(not any(k.startswith("OUT_") and k != "OUT_DEPTH" for k in d) for d in defines)
         frame = renderer.labels(0, LabelRequest("depth"))
         assert frame.ids is None and frame.forward is None and frame.colour is None
@@ -130,14 +128,14 @@ def test_frames_and_labels_are_drawn_from_the_same_level_of_detail(gl):
     with Renderer(gl, scene, PLAIN) as full, Renderer(gl, scene, PLAIN.model_copy(update={"lod": LodConfig(enabled=True)})) as coarse:
         assert coarse.triangles < full.triangles / 4 and full.scene is scene
         for renderer in (full, coarse):
-            np.testing.assert_array_equal(renderer.luminance(0) > 0, renderer.labels(0, LabelRequest("ids")).ids == 1)
-        assert np.abs((coarse.luminance(0) > 0).sum() / (full.luminance(0) > 0).sum() - 1) < 0.05
+            np.testing.assert_array_equal(renderer.luminance(0).read() > 0, renderer.labels(0, LabelRequest("ids")).ids == 1)
+        assert np.abs((coarse.luminance(0).read() > 0).sum() / (full.luminance(0).read() > 0).sum() - 1) < 0.05
 
 
 def test_nothing_hit_is_background(gl):
     scene = world(objects=0)
     with Renderer(gl, scene, PLAIN) as renderer:
-        assert (renderer.luminance(0) == np.float32(0.25)).all()
+        assert (renderer.luminance(0).read() == np.float32(0.25)).all()
         frame = renderer.labels(0, ALL, SECOND, 0)
     assert (frame.ids == 0).all() and np.isinf(frame.depth).all()
     assert not frame.forward.valid.any() and (frame.forward.flow == 0).all() and not frame.forward.occluded.any()
@@ -146,14 +144,14 @@ def test_nothing_hit_is_background(gl):
 def test_luminance_writes_into_the_given_array(gl):
     with Renderer(gl, world(), PLAIN) as renderer:
         out = np.empty((72, 96), np.float32)
-        assert renderer.luminance(0, out=out) is out
-        np.testing.assert_array_equal(out, renderer.luminance(0))
+        assert renderer.luminance(0).read(out=out) is out
+        np.testing.assert_array_equal(out, renderer.luminance(0).read())
 
 
 def test_reduced_velocity_samples_the_full_one(gl):
     """A quarter of the pixels in each direction: the largest speed of a smooth field changes little."""
     with Renderer(gl, world(width=192, height=144), PLAIN) as renderer:
-        full, reduced = largest_speed(renderer.velocity(0)), largest_speed(renderer.velocity(0, reduce=4))
+        full, reduced = largest_speed(renderer.velocity(0).read()), largest_speed(renderer.velocity(0, every=4).read())
     assert 0.7 * full < reduced <= 1.05 * full
 
 
@@ -165,11 +163,11 @@ def test_small_pictures_cover_the_whole_image(gl, width, height, every):
     camera = Rig.alone(PinHole(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2), still(rotation=LEVEL))
     scene = Scene((wall,), camera, 0, SECOND)
     with Renderer(gl, scene, PLAIN) as renderer:
-        made = renderer.velocity(0, every), renderer.motion(0, every), renderer.brightness(0, every)
+        made = renderer.velocity(0, every).read(), renderer.motion(0, every).read(), renderer.brightness(0, every).read()
         assert all(a.shape == (*small, 2) and a.dtype == np.float32 for a in made)
     fewer = PinHole.centred(small[1], small[0], 0.2 * small[1], 0.2 * width * small[0] / height)
     with Renderer(gl, scene.with_camera(fewer), PLAIN) as renderer:
-        np.testing.assert_allclose(made[0], renderer.velocity(0) * (width / small[1], height / small[0]), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(made[0], renderer.velocity(0).read() * (width / small[1], height / small[0]), rtol=1e-4, atol=1e-4)
 
 
 # ---- matrices ----------------------------------------------------------------------------------------------------

@@ -9,9 +9,14 @@ import pytest
 from blinkgl.camera import PinHole
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.errors import GLError
 from blinkgl.events import Esim
+from blinkgl.render.antialiasing import samples_of
+from blinkgl.render.passes import Luminance
+from blinkgl.render.rectangles import Rectangle, merged
 from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.render.still import Rectangle, merged, screen_rectangle
+from blinkgl.render.statistics import largest_speed
+from blinkgl.render.still import screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.tools import bench_still
 from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
@@ -20,22 +25,19 @@ PLAIN = RenderConfig(image_antialiasing="none")
 
 
 def full_redraw(gl, world, config=PLAIN):
-    renderer = Renderer(gl, world, config)
-    renderer._still = False
-    return renderer
+    return Renderer(gl, world, config, whole=True)
 
 
 @pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa2"])
-@pytest.mark.parametrize("reuse", [True, False])
-def test_identical_to_the_full_redraw(gl, antialiasing, reuse):
+def test_identical_to_the_full_redraw(gl, antialiasing):
     config = RenderConfig(antialiasing=antialiasing)
     world = mixed_scene(camera_moves=False)
-    out = np.empty((120, 160), np.float32) if reuse else None
     with Renderer(gl, world, config) as quick, full_redraw(gl, world, config) as slow:
-        assert quick._still
+        assert not quick.whole
         for t in range(0, SECOND, SECOND // 23):
-            np.testing.assert_array_equal(quick.luminance(t, out=out), slow.luminance(t))
-
+            frame, true = quick.luminance(t), slow.luminance(t).read()
+            np.testing.assert_array_equal(frame.view(), true)
+            np.testing.assert_array_equal(frame.read(), true)
 
 
 @pytest.mark.parametrize("kind", ["tri/16"])
@@ -63,46 +65,72 @@ def test_skipped_rows_do_not_depend_on_the_threads_share():
 def test_rates_are_identical_to_the_full_redraw(gl, antialiasing):
     config = SimpleNamespace(**{**vars(PLAIN), "antialiasing": antialiasing})
     world = mixed_scene(camera_moves=False)
-    out, rate, full_rate = (np.empty((120, 160), np.float32) for _ in range(3))
     with Renderer(gl, world, config) as quick, full_redraw(gl, world, config) as slow:
         for k, t in enumerate(range(0, SECOND, SECOND // 17)):
-            np.testing.assert_array_equal(quick.luminance(t, out=out, rate=rate), slow.luminance(t, rate=full_rate))
-            np.testing.assert_array_equal(rate, full_rate)
-            assert (rate != 0).any()
+            frame, true = quick.luminance(t, rate=True), slow.luminance(t, rate=True)
+            for name in ("luminance", "rate"):
+                np.testing.assert_array_equal(frame.view(name), true.read(name))
+                np.testing.assert_array_equal(frame.read(name), true.read(name))
+            assert (frame.view("rate") != 0).any()
             if k % 5 == 4:
-                quick.luminance(t, out=np.empty_like(out))  # another kind of frame in between
+                quick.luminance(t).view()  # another kind of frame in between
 
 
 def test_other_passes_in_between_do_not_disturb(gl):
     world = mixed_scene(camera_moves=False)
-    out = np.empty((120, 160), np.float32)
     with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
         for t in range(0, SECOND, SECOND // 7):
-            np.testing.assert_array_equal(quick.luminance(t, out=out), slow.luminance(t))
+            np.testing.assert_array_equal(quick.luminance(t).view(), slow.luminance(t).read())
             quick.velocity(t, 4)
-            quick.colour(t)
-            quick.luminance(t, out=np.empty_like(out))  # another array, then the first again
+            quick.colour(t).view()
 
 
+@pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa2"])
 @pytest.mark.parametrize("seed", range(3))
-def test_any_order_of_kinds_and_arrays(gl, seed):
-    """Which array holds what is known: frames with and without rates, into old, new and swapped arrays, at times that go back and forth."""
+def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
+    """Frames with and without rates, at times that go back and forth, viewed, read, or not looked at at all; drawn finer by somebody else in
+    between. What is viewed is right, and so is what is said to have changed since any frame."""
     rng, world = np.random.default_rng(seed), mixed_scene(48, 36, camera_moves=False)
-    arrays = [np.empty((36, 48), np.float32) for _ in range(3)]
-    true_rate, before = np.empty((36, 48), np.float32), None
-    with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
+    config = PLAIN.model_copy(update={"antialiasing": antialiasing})
+    fine = Luminance(False, samples_of(antialiasing))
+    drawn = []
+    with Renderer(gl, world, config) as quick, full_redraw(gl, world, config) as slow:
         for t in rng.integers(0, SECOND, 60).tolist():
-            out, rate = arrays[rng.integers(2)], [None, arrays[2], np.empty_like(true_rate)][rng.integers(3)]
-            image = quick.luminance(t, out=out, rate=rate)
-            np.testing.assert_array_equal(image, slow.luminance(t, rate=true_rate))
-            if rate is not None:
-                np.testing.assert_array_equal(rate, true_rate)
-            if before is not None:
-                outside = np.ones_like(image, bool)
-                for r in quick.changed:
-                    outside[r.y0:r.y1, r.x0:r.x1] = False
-                np.testing.assert_array_equal(image[outside], before[outside])
-            before = image.copy()
+            rate = bool(rng.integers(2))
+            frame, true = quick.luminance(t, rate), slow.luminance(t, rate)
+            truth = true.read()
+            for before, image in drawn[-3:]:
+                where = frame.changed_since(before)
+                if where is not None:
+                    outside = np.ones_like(image, bool)
+                    for r in where:
+                        outside[r.y0:r.y1, r.x0:r.x1] = False
+                    np.testing.assert_array_equal(image[outside], truth[outside])
+            drawn.append((frame, truth))
+            if rng.integers(3):
+                np.testing.assert_array_equal(frame.view(), truth)
+            for name in frame.names[int(rng.integers(2)):]:
+                np.testing.assert_array_equal(frame.view(name), true.read(name))
+            if not rng.integers(4):
+                np.testing.assert_array_equal(frame.read(), truth)
+            if not rng.integers(6):
+                quick.draw(fine, int(rng.integers(SECOND)))
+        assert sum(b.changed_since(a) is not None for (a, _), (b, _) in zip(drawn, drawn[1:])) > 10
+
+
+def test_the_memory_of_a_view_is_the_renderers(gl):
+    """Nobody can write into it, and what has not changed is not transferred: the same memory, wherever it is asked for."""
+    world = mixed_scene(48, 36, camera_moves=False)
+    with Renderer(gl, world, PLAIN) as renderer:
+        frame = renderer.luminance(0, rate=True)
+        seen, copied = frame.view(), frame.read()
+        with pytest.raises(ValueError, match="read-only"):
+            seen[0, 0] = 1
+        with pytest.raises(ValueError, match="read-only"):
+            frame.view("rate").fill(0)
+        copied[...] = -1
+        np.testing.assert_array_equal(renderer.luminance(SECOND // 7, rate=True).view(), seen)
+        assert (seen >= 0).all() and not np.array_equal(seen, copied)
 
 
 def test_another_camera_takes_nothing_from_the_first(gl):
@@ -111,42 +139,52 @@ def test_another_camera_takes_nothing_from_the_first(gl):
     other = replace(world.camera, cx=world.camera.cx - 20, fx=world.camera.fx * 1.3)
     request = LabelRequest("flow_forward", "occlusion_forward")
     with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, world.with_camera(other), PLAIN) as fresh:
-        out = np.empty((36, 48), np.float32)
-        for t in (0, SECOND // 9):
-            renderer.luminance(t, out=out)
-        assert renderer.changed and renderer.changed_rows is not None
+        first = renderer.luminance(0)
+        last = renderer.luminance(SECOND // 9)
+        last.view()
+        assert last.changed_since(first) and last.rows_changed_since(first) is not None
         renderer.labels(0, request, SECOND // 9)
         renderer.look_through(other)
-        assert renderer.changed is None and renderer.changed_rows is None
-        np.testing.assert_array_equal(renderer.luminance(SECOND // 9, out=out), fresh.luminance(SECOND // 9))
-        assert renderer.changed is None
+        with pytest.raises(GLError, match="no longer on the card"):
+            last.view()
+        frame = renderer.luminance(SECOND // 9)
+        assert frame.changed is None and frame.changed_since(last) is None and frame.rows_changed_since(last) is None
+        np.testing.assert_array_equal(frame.view(), fresh.luminance(SECOND // 9).read())
         a, b = (r.labels(0, request, SECOND // 9).forward for r in (renderer, fresh))
         np.testing.assert_array_equal(a.flow, b.flow)
         np.testing.assert_array_equal(a.occluded, b.occluded)
 
 
-def test_changes_are_where_they_are_said_to_be(gl):
+@pytest.mark.parametrize("antialiasing", ["none", "msaa4"])
+def test_changes_are_where_they_are_said_to_be(gl, antialiasing):
     world = mixed_scene(camera_moves=False)
-    with Renderer(gl, world, PLAIN) as renderer:
-        before = renderer.luminance(0)
-        assert renderer.changed == [Rectangle(0, 0, 160, 120)]
+    with Renderer(gl, world, PLAIN.model_copy(update={"antialiasing": antialiasing})) as renderer:
+        frame = renderer.luminance(0)
+        before = frame.read()
+        assert frame.changed_since(None) is None and frame.rows_changed_since(None) is None
         for t in range(SECOND // 20, SECOND, SECOND // 20):
-            now = renderer.luminance(t)
-            outside = np.ones_like(now, bool)
-            for r in renderer.changed:
+            last, frame = frame, renderer.luminance(t)
+            now = frame.read()
+            outside, y = np.ones_like(now, bool), np.arange(120)
+            for r in frame.changed_since(last):
                 outside[r.y0:r.y1, r.x0:r.x1] = False
             np.testing.assert_array_equal(now[outside], before[outside])
-            assert sum(r.area for r in renderer.changed) < 160 * 120
+            y0, y1 = frame.rows_changed_since(last)
+            assert outside[(y < y0) | (y >= y1)].all() and not outside[y0].all() and not outside[y1 - 1].all()
+            assert (~outside).sum() < 160 * 120
             before = now
+        assert renderer.luminance(0).changed_since(last) is None, "there was one in between"
 
 
-def test_nothing_moves_nothing_is_drawn(gl):
+@pytest.mark.parametrize("antialiasing", ["none", "ssaa2"])
+def test_nothing_moves_nothing_is_drawn(gl, antialiasing):
     world = scene([thing("box", 1, cube(0.5), still((0, 4, 0)))])
-    with Renderer(gl, world, PLAIN) as renderer:
-        out = renderer.luminance(0, out=np.empty((120, 160), np.float32))
-        drawn = renderer.stats.triangles
-        renderer.luminance(SECOND, out=out)
-        assert renderer.changed == [] and renderer.stats.triangles == drawn
+    with Renderer(gl, world, PLAIN.model_copy(update={"antialiasing": antialiasing})) as renderer:
+        first = renderer.luminance(0)
+        seen, drawn = first.view(), renderer.stats.triangles
+        second = renderer.luminance(SECOND)
+        assert second.changed_since(first) == [] and second.rows_changed_since(first) == (0, 0) and renderer.stats.triangles == drawn
+        assert np.shares_memory(second.view(), seen) and (seen == second.read()).all()
 
 
 def test_an_object_through_the_camera_and_out_of_the_image(gl):
@@ -154,29 +192,29 @@ def test_an_object_through_the_camera_and_out_of_the_image(gl):
     path = KeyframePath([0, SECOND // 2, SECOND], [(0, 3, 0), (0, -3, 0), (40, 3, 0)], [(0, 0, 0, 1)] * 3, interpolation="linear")
     world = scene([thing("wall", 1, cube(0.5), still((1, 9, 0))), thing("ball", 2, sphere(0.8), path)])
     with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
-        out = np.empty((120, 160), np.float32)
         for t in range(0, SECOND + 1, SECOND // 40):
-            np.testing.assert_array_equal(quick.luminance(t, out=out), slow.luminance(t))
+            np.testing.assert_array_equal(quick.luminance(t).view(), slow.luminance(t).read())
 
 
 def test_a_moving_camera_or_nothing_still_is_drawn_whole(gl):
     with Renderer(gl, mixed_scene(camera_moves=True), PLAIN) as renderer:
-        assert not renderer._still
-        renderer.luminance(0)
-        assert renderer.changed is None
+        assert renderer.whole
+        first = renderer.luminance(0)
+        assert renderer.luminance(1).changed_since(first) is None
     movers = scene([thing("ball", 1, sphere(0.5), curve(1, (0, 4, 0), 0.3, 0.2))])
     with Renderer(gl, movers, PLAIN) as renderer:
-        assert not renderer._still
+        assert renderer.whole
 
 
 def test_speed_is_a_bound_and_exact_where_nothing_is_hidden(gl):
     world = mixed_scene(camera_moves=False)
     with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
         for t in range(0, SECOND, SECOND // 5):
-            assert quick.speed(t) >= slow.speed(t) * (1 - 1e-6)
+            assert largest_speed(quick.motion(t).read()) >= largest_speed(slow.motion(t).read()) * (1 - 1e-6)
     alone = scene([thing("wall", 1, cube(2.0), still((0, 30, 0))), thing("ball", 2, sphere(0.5), drift((-1, 4, 0), (1, 4, 0), LEVEL))])
     with Renderer(gl, alone, PLAIN) as quick, full_redraw(gl, alone) as slow:
-        assert quick.speed(SECOND // 2) == pytest.approx(slow.speed(SECOND // 2), rel=1e-6)
+        moved = [largest_speed(renderer.motion(SECOND // 2).read()) for renderer in (quick, slow)]
+        assert moved[0] == pytest.approx(moved[1], rel=1e-6)
 
 
 def test_rectangles():

@@ -214,13 +214,11 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 @pytest.mark.parametrize("error", [ValueError("a\nb"), KeyError("a"), MemoryError(), RecursionError(),
                                    struct.error("x"), OverflowError(), UnboundLocalError("x"), SystemError("x")])
 def test_whatever_a_loader_raises_names_the_file(error):
-    with pytest.raises(AssetError) as raised:
-        with reading("mesh", "a.obj"):
-            raise error
+    with pytest.raises(AssetError) as raised, reading("mesh", "a.obj"):
+        raise error
     assert str(raised.value).startswith("a.obj: the mesh ") and "\n" not in str(raised.value) and raised.value.__cause__ is error
-    with pytest.raises(KeyboardInterrupt):
-        with reading("mesh", "a.obj"):
-            raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt), reading("mesh", "a.obj"):
+        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("name", ["a.stl", "b.stl", "a.ply", "b.ply", "a.obj", "a.glb"])

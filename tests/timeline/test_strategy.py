@@ -39,6 +39,11 @@ def times_of(config, renderer, response=Esim.response(ESIM)) -> np.ndarray:
     return np.array(list(make_timeline(config, scene.t0_ns, scene.t1_ns, renderer, response)))
 
 
+def picture(array: np.ndarray):
+    """What a renderer draws, read by whoever asks."""
+    return SimpleNamespace(read=lambda: array)
+
+
 @pytest.mark.parametrize("config, inside", [
     (DisplacementTimeline(max_px=0.5, sample_every=1), [(100, 0.5)]),
     (DisplacementTimeline(max_px=0.3, percentile=50, sample_every=2), [(50, 0.3)]),
@@ -62,7 +67,7 @@ def test_a_still_background_has_no_say_in_the_percentile():
         def motion(self, t_ns, every):
             speed = np.zeros((10, 10, 2), np.float32)
             speed[0, :5, 0] = [100, 100, 100, 100, np.inf]
-            return speed
+            return picture(speed)
 
     t = make_timeline(DisplacementTimeline(max_px=1.0, percentile=50), 0, 100 * MS, Picture(), Esim.response(ESIM))
     assert t.pace(0) == pytest.approx(100) and set(np.diff(list(t))) == {10 * MS} and t.looks >= 11
@@ -76,7 +81,7 @@ def test_brightness_bound_holds_between_frames(gl, world, fraction, percent):
         times = times_of(config, renderer).tolist()
         worst = 0.0
         for a, b in zip(times[:-1:4], times[1::4]):
-            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t) + 1e-3), renderer.labels(t, LabelRequest("ids")).ids) for t in (a, b)))
+            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t).read() + 1e-3), renderer.labels(t, LabelRequest("ids")).ids) for t in (a, b)))
             change = np.abs(lb - la)[(ia == ib)]
             worst = max(worst, np.percentile(change[change > 0], percent))
         assert 0.4 * fraction * 0.2 < worst <= 1.1 * fraction * 0.2
@@ -157,7 +162,7 @@ def drifting(config: BudgetTimeline, fast: float = 1.0, seconds: float = 1.5):
     that is said to be 50 px/s all the time."""
     x, rate, half = np.linspace(0, 2 * np.pi, 600, endpoint=False)[None], 40.0, 0.04
     speed = np.full((1, 600, 2), (50.0, 0.0), np.float32)
-    timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(motion=lambda t, n: speed), Esim.response(ESIM))
+    timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(motion=lambda t, n: picture(speed)), Esim.response(ESIM))
     for t_ns in timeline:
         k, t = divmod(t_ns * 1e-9, 2 * half)
         x_now = x - rate * (k * half * (1 + fast) + min(t, half) + fast * max(t - half, 0.0))
@@ -183,7 +188,7 @@ def test_as_many_events_are_beyond_the_target_as_the_percentile_says(fast, targe
 
 
 def test_nothing_moves_nothing_is_measured():
-    still = SimpleNamespace(motion=lambda t, n: np.zeros((3, 4, 2), np.float32))
+    still = SimpleNamespace(motion=lambda t, n: picture(np.zeros((3, 4, 2), np.float32)))
     timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, Esim.response(ESIM))
     count = 0
     for t in timeline:
@@ -196,7 +201,7 @@ def test_nothing_moves_nothing_is_measured():
 @pytest.mark.parametrize("shape, small", [((1, 1), (1, 1)), ((1, 16), (1, 4)), ((24, 1), (6, 1)), ((15, 23), (3, 5)), ((3, 5), (1, 1))])
 def test_images_smaller_than_the_sampling_or_no_multiple_of_it(shape, small):
     """The small picture of speeds is max(1, size // n) pixels a side; the signal is looked up at the same places."""
-    world = SimpleNamespace(motion=lambda t, n: np.full((*small, 2), 50.0, np.float32))
+    world = SimpleNamespace(motion=lambda t, n: picture(np.full((*small, 2), 50.0, np.float32)))
     timeline = make_timeline(BudgetTimeline(max_time_error_us=100.0, max_step_us=1000), 0, 10 * MS, world, Esim.response(ESIM))
     for t in timeline:
         timeline.observe(t, np.full(shape, 1 + 0.5 * math.sin(t * 1e-6), np.float32))

@@ -78,7 +78,7 @@ _UV = "float luminance = texture(albedo, uv).r;"
 LOOKUP_MISTAKES = {
     # name: ([(file, right, wrong), …], the first buffer that is wrong, words of the suspicion, the objects)
     "noperspective varying": (
-        [("luminance.glsl", "out vec2 uv;", "noperspective out vec2 uv;"), ("luminance.glsl", "in vec2 uv;", "noperspective in vec2 uv;")],
+        [("include/vertex.glsl", "out vec2 uv;", "noperspective out vec2 uv;"), ("include/vertex.glsl", "in vec2 uv;", "noperspective in vec2 uv;")],
         "luminance_uv", "without perspective", {"floor"}),
     "sRGB decoded twice": (
         [("label.glsl", "radiance *= texture(albedo, uv).rgb;", "radiance *= pow(texture(albedo, uv).rgb, vec3(2.2));")],

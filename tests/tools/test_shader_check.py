@@ -9,12 +9,12 @@ import sys
 from itertools import combinations
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl.shader import STAGES, ShaderError, ShaderLoader, expand, normalised, shader_folder
+from blinkgl.render.painter import Painter
 from blinkgl.render.renderer import LabelRequest, Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.shader_debugger import check, diagnostics, preprocess, timing, variants
@@ -37,7 +37,7 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     status, out, _ = shader("check", "--json")
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
-    assert result["programs"] == {"debug.glsl": 8, "downsample.glsl": 2, "label.glsl": 520, "luminance.glsl": 40}
+    assert result["programs"] == {"debug.glsl": 8, "downsample.glsl": 2, "label.glsl": 528, "luminance.glsl": 40}
 
 
 def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeypatch):
@@ -51,16 +51,16 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
 
     monkeypatch.setattr(ShaderLoader, "_compile", record)
     monkeypatch.setattr(gl, "shaders", ShaderLoader(gl.ctx))
-    monkeypatch.setattr(Renderer, "_draw", lambda self, uniforms, item: None)  # linking is enough: llvmpipe compiles at the first draw
+    monkeypatch.setattr(Painter, "draw", lambda self, uniforms, item: None)  # linking is enough: llvmpipe compiles at the first draw
     world = scene_of(config, width=8, height=6)
     fields = ("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward")
     t = 100_000_000
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
-        renderer.luminance(t), renderer.colour(t), renderer.velocity(t)
+        renderer.luminance(t), renderer.colour(t), renderer.velocity(t), renderer.velocity(t, 4)
         with Renderer(gl, world, RenderConfig(antialiasing="taps4")) as tapped:
-            tapped.luminance(t), tapped.luminance(t, rate=np.empty((6, 8), np.float32))
-        renderer.luminance(t, rate=np.empty((6, 8), np.float32))
-        renderer.brightness(t, variants.EVERY)
+            tapped.luminance(t), tapped.luminance(t, rate=True)
+        renderer.luminance(t, rate=True)
+        renderer.brightness(t, 4)
         for count in range(1, 7):
             for names in combinations(fields, count):
                 renderer.labels(t, LabelRequest(*names), t + 10**8, t - 10**8)
@@ -68,7 +68,7 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     table = {(name, normalised(defines)) for name in PRODUCTION for defines in variants.variants(name)}
     assert asked <= table
     outputs = {tuple(pair for pair in defines if pair[0].startswith("OUT_")) for name, defines in asked if name == "label.glsl"}
-    assert outputs == {normalised(defines) for defines in variants.label_outputs()}  # and none that nobody asks for
+    assert outputs == {normalised({k: v for k, v in defines.items() if k.startswith("OUT_")}) for defines in variants.variants("label.glsl")}  # and none that nobody asks for
 
 
 def sources(folder=None) -> dict[str, str]:
@@ -151,22 +151,22 @@ def test_an_error_is_shown_at_its_own_line_through_the_includes(shader, shaders)
     shown = next(i for i, text in enumerate(lines) if text.startswith(">"))
     assert "float w_next = depht" in lines[shown]
     assert lines[shown + 1].index("^") == lines[shown].index("depht")
-    assert "in 448 of 520 variants of label.glsl" in out  # those with a flow or a velocity
+    assert "in 456 of 528 variants of label.glsl" in out  # those with a flow or a velocity
 
 
 def test_a_link_error_is_shown_at_the_declaration(shader, shaders):
-    edit(shaders / "label.glsl", "out vec3 local;", "out vec4 local;")
-    edit(shaders / "label.glsl", "local = in_position;", "local = vec4(in_position, 1.0);")
+    edit(shaders / "include/vertex.glsl", "out vec3 local;", "out vec4 local;")
+    edit(shaders / "include/vertex.glsl", "local = in_position;", "local = vec4(in_position, 1.0);")
     status, out, _ = shader("check", "label.glsl", "--shaders", shaders, "--json")
     errors = json.loads(out)["errors"]
-    assert status == 1 and errors and all(e["file"] == "label.glsl" and "local" in e["text"] for e in errors)
-    declared = (shaders / "label.glsl").read_text().splitlines()[errors[0]["line"] - 1]
+    assert status == 1 and errors and all(e["file"] == "include/vertex.glsl" and "local" in e["text"] for e in errors)
+    declared = (shaders / "include/vertex.glsl").read_text().splitlines()[errors[0]["line"] - 1]
     assert declared in ("in vec3 local;", "out vec4 local;") and "^" in errors[0]["excerpt"]
 
 
 def test_unused_varyings_uniforms_and_attributes_are_listed(shader, shaders):
-    edit(shaders / "luminance.glsl", "out vec2 uv;", "out vec2 uv;\nout float left_over;\nuniform float spare;")
-    edit(shaders / "luminance.glsl", "    uv = in_uv;", "    uv = in_uv;\n    left_over = 1.0;")
+    edit(shaders / "include/vertex.glsl", "out vec2 uv;", "out vec2 uv;\nout float left_over;\nuniform float spare;")
+    edit(shaders / "include/vertex.glsl", "    uv = in_uv;", "    uv = in_uv;\n    left_over = 1.0;")
     edit(shaders / "luminance.glsl", "    vec2 uv = within_reach(uv); // hides the varying\n", "")
     edit(shaders / "luminance.glsl", "luminance = texture(albedo, uv).r;", "luminance = 0.5;")
     edit(shaders / "include/light.glsl", "light_strength.y * (0.5", "0.0 * light_strength.y * (0.5")
@@ -175,8 +175,8 @@ def test_unused_varyings_uniforms_and_attributes_are_listed(shader, shaders):
     for words in ("uniform 'spare' is never used in 24 of 40", "varying 'left_over' is written but the fragment stage does not take it",
                   "uniform 'albedo' is never used in 8 of 40", "varying 'uv' is never read in 8 of 40"):
         assert words in out, (words, out)
-    line = (shaders / "luminance.glsl").read_text().splitlines().index("uniform float spare;") + 1
-    assert f"luminance.glsl:{line}:15: uniform 'spare'" in out
+    line = (shaders / "include/vertex.glsl").read_text().splitlines().index("uniform float spare;") + 1
+    assert f"include/vertex.glsl:{line}:15: uniform 'spare'" in out
 
 
 def test_include_cycle_and_missing_include(shader, shaders):
@@ -330,9 +330,8 @@ def test_overdraw_and_the_half_resolution_twin(gl):
             assert at[0] == pytest.approx(at[1], abs=1e-12)
     for world, pixels in ((scene, 64 * 48), (half, 32 * 24)):
         with timing.TimedRenderer(gl, world, RenderConfig()) as renderer:
-            renderer.start(each=False)
-            renderer.luminance(0)
-            assert renderer.result.fragments == pixels and renderer.result.draws == 2 and renderer.result.triangles == 4
+            drawn = renderer.run(lambda r: r.luminance(0), each=False)
+            assert drawn.fragments == pixels and drawn.draws == 2 and drawn.triangles == 4
 
 
 # ------------------------------------------------------------------------------------------------- bad input

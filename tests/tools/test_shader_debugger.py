@@ -55,7 +55,7 @@ def test_passes_writes_every_buffer_that_generation_renders(written, world):
     ask = LabelRequest("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
     with create_context() as gl, Renderer(gl, scene, config.render) as renderer:
         labels = renderer.labels(T, ask, T_NEXT, T_LAST)
-        luminance, colour = renderer.luminance(T), renderer.colour(T)
+        luminance, colour = renderer.luminance(T).read(), renderer.colour(T).read()
     for name, expected in {
         "luminance": luminance, "colour": colour, "depth": labels.depth, "id": labels.ids, "normals": labels.normals, "velocity": labels.velocity,
         "flow_forward": labels.forward.flow, "valid_forward": labels.forward.valid, "occluded_forward": labels.forward.occluded,

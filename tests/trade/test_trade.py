@@ -16,8 +16,8 @@ from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import load_run
 from blinkgl.events.table import EMULATORS
+from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.still import Rectangle
 from blinkgl.show.trade import show
 from blinkgl.tools import peer_cycles
 from blinkgl.trade.measure import Bench, Level, Options
@@ -62,13 +62,13 @@ def test_fine_tiles_are_the_image_itself_and_then_its_mean(gl, config):
     for scale, antialiasing in ((1, "none"), (2, "ssaa2"), (4, "ssaa4")):
         render = bench.config([f"render.antialiasing={antialiasing}"]).render
         with Renderer(gl, bench.scene, render) as whole, FineTiles(gl, bench.scene, bench.tiles, scale) as tiles:
-            image = whole.luminance(t)
+            image = whole.luminance(t).read()
             (mine,) = tiles([t])
             inside = np.abs(mine - image)[bench.mask]
             # The tiles' projection rounds differently: a sample on an edge may fall on its other side.
             assert np.percentile(inside, 97) < 2e-4 * image.max() and inside.mean() < 2e-3 * image.max()
             assert not mine[~bench.mask].any()
-            speed = np.hypot(*np.moveaxis(whole.velocity(t), -1, 0))[bench.mask].max()
+            speed = np.hypot(*np.moveaxis(whole.velocity(t).read(), -1, 0))[bench.mask].max()
             assert tiles.speed(t) == pytest.approx(speed, rel=0.05)
 
 

@@ -13,7 +13,7 @@ from blinkgl.render.colour import LUMA
 from blinkgl.render.renderer import LabelRequest
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.session import LOOKUP_PROGRAMS, DebugRenderer, Subject, When
+from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ PASSES = {p.name: p for p in (
     Pass("depth", "depth", "world units", "depth", "label.glsl OUT_DEPTH"),
     Pass("id", "instance id", "0: nothing hit", "ids", "label.glsl OUT_ID"),
     Pass("normals", "normals", "camera axes", "unit", "label.glsl OUT_NORMAL"),
-    *_lookups("luminance", LOOKUP_PROGRAMS["luminance"]),
+    *_lookups("luminance", LOOKUP_PASSES["luminance"].program),
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
-    *_lookups("colour", LOOKUP_PROGRAMS["colour"]),
+    *_lookups("colour", LOOKUP_PASSES["colour"].program),
     Pass("colour", "colour", "linear radiance", "light", "label.glsl OUT_COLOUR"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
@@ -65,7 +65,7 @@ PASSES = {p.name: p for p in (
 def lookup_of(name: str) -> tuple[str, str]:
     """("luminance", "uv") of "luminance_uv"; ("", "") of what is no look-up."""
     pass_name, _, what = name.rpartition("_")
-    return (pass_name, what) if pass_name in LOOKUP_PROGRAMS and what in LOOKUPS else ("", "")
+    return (pass_name, what) if pass_name in LOOKUP_PASSES and what in LOOKUPS else ("", "")
 
 
 def check_pass(name: str, known=PASSES, where: str = "--pass") -> str:
@@ -105,13 +105,13 @@ class GpuMoment(_Lazy):
     def _make(self, name):
         draw, when = self.renderer, self.when
         if name == "colour":
-            return {name: draw.colour(when.t_ns)}
+            return {name: draw.colour(when.t_ns).read()}
         if name == "luminance":
-            return {name: draw.luminance(when.t_ns)}
+            return {name: draw.luminance(when.t_ns).read()}
         if name == "log_luminance":
             return {name: np.log(self["luminance"] + np.float32(self.log_eps))}
         if name == "dL_dt":
-            change = draw.luminance(when.after_ns) - draw.luminance(when.before_ns)
+            change = draw.luminance(when.after_ns).read() - draw.luminance(when.before_ns).read()
             return {name: change / np.float32(when.step_s)}
         if name in ("triangle", "part", "local", "window"):
             return self._inspect()

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,13 +17,15 @@ from blinkgl.config.sequence import NS_PER_S, SequenceConfig, load_run
 from blinkgl.errors import ConfigError, GLError
 from blinkgl.gl import GLContext, ShaderLoader, create_context
 from blinkgl.gl.shader import ShaderError, expand, shader_folder
+from blinkgl.render.painter import Painter
+from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene, check_assets
 from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.types import Scene
 
 DEBUG_PROGRAM = "debug.glsl"
-LOOKUP_PROGRAMS = {"luminance": "luminance.glsl", "colour": "label.glsl"}  # passes that show what they look up
+LENT = (DEBUG_PROGRAM, "include/vertex.glsl")
 STEP_FRACTION = 100  # the step of dL/dt is this part of the label interval
 
 
@@ -115,14 +117,17 @@ def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
 
 
 class EditedFolder:
-    """A user's copy of shaders/, to which :data:`DEBUG_PROGRAM` is lent when the copy is older than the debugger."""
+    """A user's copy of shaders/, to which :data:`DEBUG_PROGRAM`, and what that includes, is lent when the copy is older than the debugger."""
 
-    def __init__(self, folder: Path):
-        self.path = folder
+    def __init__(self, folder: Path, inside: str = ""):
+        self.path, self._inside = folder, inside
 
     def __truediv__(self, name: str):
-        own = self.path / name
-        return shader_folder() / name if name == DEBUG_PROGRAM and not own.exists() else own
+        inside = f"{self._inside}{name}"
+        if name == "include":
+            return EditedFolder(self.path, "include/")
+        own = self.path / inside
+        return shader_folder() / inside if inside in LENT and not own.exists() else own
 
     def iterdir(self):
         return self.path.iterdir()
@@ -154,9 +159,10 @@ class Snapshot:
     def of(cls, folder) -> Snapshot:
         root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
         files = {}
-        for path in [*files_of(folder), Path(str(folder / DEBUG_PROGRAM))]:
+        places = {path.relative_to(root).as_posix(): path for path in files_of(folder)} | {name: Path(str(folder / name)) for name in LENT}
+        for name, path in places.items():
             try:
-                files[path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name] = path.read_bytes()
+                files[name] = path.read_bytes()
             except OSError:
                 pass  # gone or unreadable: missing here, and reported as missing when a program needs it
         return cls(files)
@@ -198,58 +204,75 @@ class _Uniforms(dict):
         return _Nothing()
 
 
-class _Variants(dict):
-    """The renderer's table of uniforms, tolerant of edited shaders that no longer use one of them."""
+class DebugPainter(Painter):
+    """Tolerates edited shaders that no longer use a uniform."""
 
-    def __setitem__(self, key, value) -> None:
-        super().__setitem__(key, _Uniforms(value) if isinstance(value, dict) else value)
+    def uniforms(self, program):
+        return _Uniforms(super().uniforms(program))
+
+
+@dataclass(frozen=True)
+class Inspection(ScenePass):
+    """Which primitive wrote a pixel, and where on it; 0 where nothing is hit. In [..., 3] of LOCAL: number of the part + 1, an index into
+    ``reference.scene_parts``."""
+
+    program: ClassVar[str] = DEBUG_PROGRAM
+    outputs: ClassVar[tuple[Output, ...]] = (Output("TRIANGLE", "R32UI"), Output("LOCAL", "RGBA32F"), Output("WINDOW", "RGBA32F"))
+
+    def defines(self, kind):
+        return {f"OUT_{output.name}": i for i, output in enumerate(self.outputs)}
+
+    def set(self, painter, uniforms, item, shot):
+        uniforms["part_number"].value = item.part + 1
+
+
+SHOWN = (Output("lookup", "RGBA32F"), Output("albedo", "RGBA32F"))
+"""What the variant SHOW_LOOKUP writes beside a pass's own output."""
+
+
+@dataclass(frozen=True)
+class LuminanceLookup(Luminance):
+    still: ClassVar[bool] = False
+
+    @property
+    def outputs(self):
+        return (*super().outputs, *SHOWN)
+
+    def defines(self, kind):
+        return super().defines(kind) | {"SHOW_LOOKUP": 1}
+
+    @classmethod
+    def every_kind(cls):
+        yield cls()
+
+
+@dataclass(frozen=True)
+class ColourLookup(Colour):
+    outputs: ClassVar[tuple[Output, ...]] = (*Colour.outputs, *SHOWN)
+
+    def defines(self, kind):
+        return super().defines(kind) | {"SHOW_LOOKUP": 1}
+
+
+LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}
+"""Passes that show what they look up. One sample at the pixel's centre, whatever the anti-aliasing."""
 
 
 class DebugRenderer(Renderer):
-    """The production renderer, plus the debug pass, plus look-ups, plus reloading. Draws what :class:`Renderer` draws, by its code."""
+    """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame may be other shaders' work."""
 
-    OUTPUTS = (("TRIANGLE", "R32UI"), ("LOCAL", "RGBA32F"), ("WINDOW", "RGBA32F"))
-
-    def __init__(self, gl: GLContext, scene: Scene, config):
-        super().__init__(gl, scene, config)
-        self._uniforms = _Variants()
-        self._still = False  # always whole frames: what is kept from an earlier frame may be other shaders' work
-        self._showing: list | None = None  # while look-ups are drawn: the target they go to
-        self._plain: DebugRenderer | None = None
-        parts = [(index, part) for index, thing in enumerate(scene.objects) for part in thing.parts]
-        numbers = list(range(len(parts)))
-        self.part_of: dict[int, int] = {}  # id of a draw item -> index into reference.scene_parts
-        for item in self._resources.items:
-            match = next(n for n in numbers if parts[n][0] == item.object_index and parts[n][1].mesh is item.mesh
-                         and parts[n][1].material is item.material)
-            numbers.remove(match)
-            self.part_of[id(item)] = match
-
-    def release(self) -> None:
-        if self._plain is not None:
-            self._plain.release()
-        super().release()
+    def __init__(self, gl: GLContext, scene: Scene, config, painter: type[Painter] = DebugPainter):
+        super().__init__(gl, scene, config, whole=True, painter=painter)
 
     def use_shaders(self, loader: ShaderLoader) -> None:
         """Draw with another loader's programs from now on."""
+        self.forget()
         self.gl.shaders = loader
-        self._uniforms.clear()
-        self._surfaces.clear()
-        self._resources.forget_vertex_arrays()
-        if self._plain is not None:
-            self._plain.use_shaders(loader)
 
     def inspect(self, t_ns: int) -> dict[str, np.ndarray]:
-        """The outputs of debug.glsl, keyed as in :attr:`OUTPUTS`; 0 where nothing is hit."""
-        defines = {f"OUT_{name}": i for i, (name, _) in enumerate(self.OUTPUTS)}
-        target = self._target("debug", 1, tuple(fmt for _, fmt in self.OUTPUTS))
-        moment = self._moment(t_ns)
-        self._begin(target, moment)
-        for item in self._visible(moment):
-            uniforms = self._bind(DEBUG_PROGRAM, item, moment, defines)
-            uniforms["part_number"].value = self.part_of[id(item)] + 1
-            self._draw(uniforms, item)
-        return {name: self._read(target, i, time.perf_counter(), None) for i, (name, _) in enumerate(self.OUTPUTS)}
+        """The outputs of debug.glsl, see :class:`Inspection`."""
+        frame = self.draw(Inspection(), t_ns)
+        return {name: frame.read(name) for name in frame.names}
 
     def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
         """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant SHOW_LOOKUP):
@@ -257,38 +280,21 @@ class DebugRenderer(Renderer):
         One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
 
         Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
-        if self.config.antialiasing != "none":
-            if self._plain is None:
-                self._plain = DebugRenderer(self.gl, self.scene, self.config.model_copy(update={"antialiasing": "none"}))
-            return self._plain.lookups(name, t_ns)
-        program = LOOKUP_PROGRAMS[name]
+        program = LOOKUPS[name].program
         if "show_lookup(" not in "".join(line for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
                                          if not line.startswith("void")):
             raise ShaderError("does not show what it looks up", where=program,
                               accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the shipped file')
-        self._showing = []
-        try:
-            result = self.luminance(t_ns) if name == "luminance" else self.colour(t_ns, "none")
-            target = self._showing[-1]
-        finally:
-            self._showing = None
-        lookup, albedo = (self._read(target, i, time.perf_counter(), None) for i in (1, 2))
-        return {"result": result, "uv": lookup[..., :2], "level": lookup[..., 2], "light": lookup[..., 3], "albedo": albedo[..., :3],
+        frame = self.draw(LOOKUPS[name], t_ns)
+        lookup, albedo = frame.read("lookup"), frame.read("albedo")
+        return {"result": frame.read(name), "uv": lookup[..., :2], "level": lookup[..., 2], "light": lookup[..., 3], "albedo": albedo[..., :3],
                 "count": albedo[..., 3]}
 
-    def _target(self, name, scale, formats, samples=0):
-        if self._showing is None:
-            return super()._target(name, scale, formats, samples)
-        self._showing.append(super()._target("lookups:" + name, scale, (*formats, "RGBA32F", "RGBA32F"), samples))
-        return self._showing[-1]
-
-    def _bind(self, name, item, moment, defines):
-        return super()._bind(name, item, moment, defines if self._showing is None else defines | {"SHOW_LOOKUP": 1})
-
     def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
-        """Buffers of label.glsl as the shader wrote them, without the renderer's masks: DEPTH, ID, FLOW_FORWARD …"""
-        formats = {"DEPTH": "R32F", "ID": "R32UI", "FLOW_FORWARD": "RGBA32F", "FLOW_BACKWARD": "RGBA32F"}
-        return self._geometry(t_ns, [(name, formats[name]) for name in names], forward_ns, backward_ns)
+        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth: DEPTH, ID, FLOW_FORWARD …"""
+        ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
+        frame = self.draw(Geometry(names), t_ns, ends)
+        return {name: frame.read(name) for name in names}
 
 
 @contextmanager

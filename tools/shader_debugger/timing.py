@@ -26,8 +26,10 @@ import numpy as np
 
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.antialiasing import samples_of
+from blinkgl.render.labels import buffers_of
+from blinkgl.render.passes import Geometry, Pass
 from blinkgl.scene.types import Scene
-from blinkgl.tools.shader_debugger.session import DebugRenderer, Subject, When, open_renderer
+from blinkgl.tools.shader_debugger.session import DebugPainter, DebugRenderer, Subject, When, open_renderer
 
 HALF = 2
 
@@ -93,62 +95,75 @@ class Stopwatch:
         self._delete(2, self._ids)
 
 
-class TimedRenderer(DebugRenderer):
-    """Measures every pass that is drawn after :meth:`start`; draw by draw when ``each`` is set."""
+class TimedPainter(DebugPainter):
+    """Counts what is drawn after :meth:`start`; measures it draw by draw when ``each`` is set."""
 
-    def __init__(self, gl, scene, config):
-        super().__init__(gl, scene, config)
-        self._watch = Stopwatch(gl)
-        self.each, self.result, self._running, self._variant = False, Draws(), False, ""
-
-    def release(self) -> None:
-        self._watch.release()
-        super().release()
+    def __init__(self, gl, scene, resources, stats):
+        super().__init__(gl, scene, resources, stats)
+        self.watch = Stopwatch(gl)
+        self.each, self.result = False, Draws()
+        self._pass: Pass | None = None
 
     def start(self, each: bool) -> None:
         self.each, self.result = each, Draws()
 
-    def _begin(self, target, moment, background=()):
-        if not self.each:
-            self._watch.start()
-            self._wall, self._running = time.perf_counter(), True
-        super()._begin(target, moment, background)
+    def programs(self, pass_):
+        self._pass = pass_
+        return super().programs(pass_)
 
-    def _bind(self, name, item, moment, defines):
-        material = [word for word, on in (("TEXTURED", item.textured), ("LIT", item.lit), ("TWO_SIDED", item.two_sided)) if on]
-        self._variant = " ".join([name, *(d.removeprefix("OUT_") for d in defines), *material])
-        return super()._bind(name, item, moment, defines)
-
-    def _draw(self, uniforms, item):
+    def draw(self, uniforms, item):
         triangles = len(item.mesh.faces)
         if self.each:
-            self._watch.start()
-            super()._draw(uniforms, item)
-            ms, fragments = self._watch.stop()
-            one = self.result.variants.setdefault(self._variant, Draws())
+            self.watch.start()
+            super().draw(uniforms, item)
+            ms, fragments = self.watch.stop()
+            words = (*self._pass.defines(item.kind), *item.kind.defines)
+            variant = " ".join([self._pass.program, *(word.removeprefix("OUT_") for word in words)])
+            one = self.result.variants.setdefault(variant, Draws())
             one.gpu_ms, one.fragments = one.gpu_ms + ms, one.fragments + fragments
             one.draws, one.triangles = one.draws + 1, one.triangles + triangles
         else:
-            super()._draw(uniforms, item)
+            super().draw(uniforms, item)
         self.result.draws += 1
         self.result.triangles += triangles
 
-    def _read(self, target, index, started, out):
-        if self._running:
-            ms, fragments = self._watch.stop()
-            self._running = False
-            self.result.gpu_ms += ms
-            self.result.fragments += fragments
-            self.result.wall_ms += (time.perf_counter() - self._wall) * 1e3
-        return super()._read(target, index, started, out)
+
+class TimedRenderer(DebugRenderer):
+    """A renderer whose passes are measured: nothing of a frame is read."""
+
+    def __init__(self, gl, scene, config):
+        self.timed: TimedPainter | None = None
+        super().__init__(gl, scene, config, painter=self._watched)
+
+    def _watched(self, *arguments) -> TimedPainter:
+        self.timed = TimedPainter(*arguments)
+        return self.timed
+
+    def release(self) -> None:
+        self.timed.watch.release()
+        super().release()
+
+    def run(self, call, each: bool) -> Draws:
+        """What ``call(self)`` draws; as a whole, or draw by draw."""
+        self.timed.start(each)
+        if each:
+            call(self)
+            return self.timed.result
+        self.timed.watch.start()
+        wall = time.perf_counter()
+        call(self)
+        result = self.timed.result
+        result.gpu_ms, result.fragments = self.timed.watch.stop()
+        result.wall_ms = (time.perf_counter() - wall) * 1e3
+        return result
 
 
 def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
     """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that generation runs for this configuration."""
     config = subject.config
     asked, render = asked_for(config.labels), config.render
-    rate = np.empty((config.camera.height, config.camera.width), np.float32) if config.timeline.reconstruction == "hermite" else None
-    out = {"luminance" + (" and rate" if rate is not None else ""): (lambda r: r.luminance(when.t_ns, rate=rate), samples_of(render.antialiasing).grid)}
+    rate = config.timeline.reconstruction == "hermite"
+    out = {"luminance" + (" and rate" if rate else ""): (lambda r: r.luminance(when.t_ns, rate), samples_of(render.antialiasing).grid)}
     if config.timeline.kind != "uniform":
         every = config.timeline.sample_every
         if config.timeline.kind == "brightness":
@@ -157,13 +172,13 @@ def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
             out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, every), 1 / every)
     if "images" in asked or config.preview.enabled:
         out["colour"] = (lambda r: r.colour(when.t_ns), samples_of(render.image_antialiasing).grid)
-    request = LabelRequest(*asked.buffers)
-    if request:
-        out["labels"] = (lambda r: r.labels(when.t_ns, request, when.forward_ns, when.backward_ns), 1)
+    names, ends = buffers_of(asked), {"forward": when.forward_ns, "backward": when.backward_ns}
+    if names:
+        out["labels"] = (lambda r: r.draw(Geometry(names), when.t_ns, ends), 1)
     if asked.there:
-        there = LabelRequest(*asked.there)
+        there = buffers_of(LabelRequest(*asked.there))
         who = ", ".join(dict.fromkeys(LABELS[name].said for name in asked if LABELS[name].there))
-        out[f"{who}, per direction"] = (lambda r: r.labels(when.forward_ns, there), 1)
+        out[f"{who}, per direction"] = (lambda r: r.draw(Geometry(there), when.forward_ns), 1)
     return out
 
 
@@ -184,10 +199,9 @@ def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, r
     runs: dict[str, list[Draws]] = {"full": [], "half": [], "each": []}
     for k in range(repeat + 1):
         for kind, renderer in (("full", full), ("half", half), ("each", full)):  # interleaved: drift of the machine hits all alike
-            renderer.start(each=kind == "each")
-            call(renderer)
+            result = renderer.run(call, each=kind == "each")
             if k:
-                runs[kind].append(renderer.result)
+                runs[kind].append(result)
 
     def median(kind, key="gpu_ms"):
         return float(np.median([getattr(run, key) for run in runs[kind]]))

@@ -1,53 +1,33 @@
-"""Every program in every variant that the renderer compiles for some configuration and scene.
-
-The table mirrors :class:`blinkgl.render.renderer.Renderer`; a test records what the renderer asks for and compares."""
+"""Every program in every variant that passes ask for, for some configuration and scene."""
 
 from __future__ import annotations
 
-from itertools import combinations, product
+from collections.abc import Iterable
+from itertools import product
+from typing import Any
 
-LABEL_OUTPUTS = ("DEPTH", "ID", "NORMAL", "VELOCITY", "FLOW_FORWARD", "FLOW_BACKWARD")
-MATERIALS = ("TEXTURED", "LIT", "TWO_SIDED")
-FACTORS = (2, 4)
-EVERY = 4  # stands for every number of the brightness timeline's `sample_every` above 1
+from blinkgl.render.passes import PASSES, Pass, ScenePass
+from blinkgl.render.resources import Kind
+from blinkgl.tools.shader_debugger.session import LOOKUPS, Inspection
 
-
-def materials() -> list[dict[str, int]]:
-    """Defines of every kind of material."""
-    return [{name: 1 for name, on in zip(MATERIALS, switches) if on} for switches in product((False, True), repeat=len(MATERIALS))]
+KINDS = [Kind(*switches) for switches in product((False, True), repeat=len(Kind._fields))]
 
 
-def label_outputs() -> list[dict[str, int]]:
-    """Defines of every combination of label buffers; colour is drawn alone because it is super-sampled."""
-    out = [{"OUT_COLOUR": 0}]
-    for count in range(1, len(LABEL_OUTPUTS) + 1):
-        out += [{f"OUT_{name}": i for i, name in enumerate(names)} for names in combinations(LABEL_OUTPUTS, count)]
-    return out
-
-
-def debug_outputs() -> dict[str, int]:
-    """Defines of the debugger's own pass."""
-    from blinkgl.tools.shader_debugger.session import DebugRenderer
-
-    return {f"OUT_{name}": i for i, (name, _) in enumerate(DebugRenderer.OUTPUTS)}
-
-
-def lookups(program: str) -> list[dict[str, int]]:
+def lookups(program: str) -> list[dict[str, Any]]:
     """Defines of the variants in which the debugger has a production program show what it looks up."""
-    show = {"luminance.glsl": {"SHOW_LOOKUP": 1}, "label.glsl": {"OUT_COLOUR": 0, "SHOW_LOOKUP": 1}}.get(program)
-    return [] if show is None else [show | material for material in materials()]
+    return _defines(program, (type(pass_) for pass_ in LOOKUPS.values()))
 
 
-def variants(program: str) -> list[dict[str, int]] | None:
-    """Defines of every variant of a program file, without :func:`lookups`; None for a file the renderer does not know."""
-    if program == "luminance.glsl":
-        taps = [material | {"TAPS4": 1} for material in materials() if "TEXTURED" in material]
-        every = [material | {"RATE": 1, "EVERY": EVERY} for material in materials()]
-        return [material | rate for rate in ({}, {"RATE": 1}) for material in materials() + taps] + every
-    if program == "label.glsl":
-        return [outputs | material for outputs in label_outputs() for material in materials()]
-    if program == "downsample.glsl":
-        return [{"FACTOR": factor} for factor in FACTORS]
-    if program == "debug.glsl":
-        return [debug_outputs() | material for material in materials()]
-    return None
+def variants(program: str) -> list[dict[str, Any]] | None:
+    """Defines of every variant of a program file, without :func:`lookups`; None for a file that no pass knows."""
+    return _defines(program, (*PASSES, Inspection)) or None
+
+
+def _defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]:
+    found: dict[tuple, dict[str, Any]] = {}
+    for one in passes:
+        for pass_ in one.every_kind() if one.program == program else ():
+            for kind in KINDS if isinstance(pass_, ScenePass) else [None]:
+                defines = pass_.defines(kind) | (kind.defines if kind is not None else {})
+                found.setdefault(tuple(sorted(defines.items())), defines)
+    return list(found.values())

@@ -1,0 +1,194 @@
+"""What a pass draws on, and the handle of what it drew: a frame stays on the card until somebody reads it.
+
+A :class:`Canvas` owns one pass's target and, where frames are viewed, the memory that they are viewed in. It is drawn over by the pass's
+next frame; whoever reads a frame after that is told so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from blinkgl.errors import GLError
+from blinkgl.gl.framebuffer import checked_array
+from blinkgl.machine.compiling import working_clock
+from blinkgl.render.rectangles import Rectangle, merged
+
+if TYPE_CHECKING:
+    import moderngl
+
+    from blinkgl.gl import Target
+    from blinkgl.render.painter import Painter
+    from blinkgl.render.passes.base import Pass, Shot
+
+
+class Frame:
+    """What a pass drew at ``t_ns``, on the card, until the same pass draws its next frame; GLError for whoever asks afterwards.
+
+    names : of its pictures; where none is said the first is meant.   width, height : px.
+    changed : rectangles in which it may differ from the same pass's frame before it; None: anywhere. See :meth:`changed_since`."""
+
+    def __init__(self, canvas: Canvas, number: int, t_ns: int, changed: list[Rectangle] | None):
+        self._canvas, self._number, self.t_ns, self.changed = canvas, number, t_ns, changed
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._canvas.planes)
+
+    @property
+    def width(self) -> int:
+        return self._canvas.target.width
+
+    @property
+    def height(self) -> int:
+        return self._canvas.target.height
+
+    @property
+    def target(self) -> Target:
+        """What it was drawn into, for a pass that resolves or copies it."""
+        self._check()
+        return self._canvas.target
+
+    def texture(self, output: str = "") -> moderngl.Texture:
+        """Of an output of the pass (default: its first), or "depth", for another pass or a compute shader. As the program wrote it: all
+        components of its format."""
+        return self.target.depth if output == "depth" else self.target.colour[self._canvas.attachment(output)]
+
+    def read(self, name: str = "", out: np.ndarray | None = None) -> np.ndarray:
+        """A picture as an array of the caller's own, (H, W) or (H, W, C), dtype of its format; row 0 is the top row.
+
+        out : written and returned when given (C-contiguous, that shape and dtype)."""
+        self._check()
+        return self._canvas.read(name, out)
+
+    def view(self, name: str = "") -> np.ndarray:
+        """The same as a read-only array in memory that the renderer owns and writes the next frame into: no allocation, and only what
+        has changed is transferred. To be copied by whoever wants to keep it."""
+        self._check()
+        return self._canvas.view(name, self)
+
+    def changed_since(self, before: Frame | None) -> list[Rectangle] | None:
+        """Rectangles outside of which this frame equals ``before``; None: it may differ anywhere, since nothing is known of two frames
+        that are not of the same pass, one right after the other."""
+        follows = before is not None and before._canvas is self._canvas and before._number == self._number - 1
+        return self.changed if follows else None
+
+    def rows_changed_since(self, before: Frame | None) -> tuple[int, int] | None:
+        """(y0, y1): outside these rows it equals ``before``; None: it may differ anywhere."""
+        changed = self.changed_since(before)
+        if changed is None:
+            return None
+        return (min(r.y0 for r in changed), max(r.y1 for r in changed)) if changed else (0, 0)
+
+    def _check(self) -> None:
+        if self._canvas.number != self._number:
+            raise GLError("this frame is no longer on the card: its pass has drawn another one", where=f"frame at {self.t_ns * 1e-9:.9g} s",
+                          accepted="read() before the next frame is drawn")
+
+
+class Canvas:
+    """Of one pass of one renderer. width, height : of the image.   number : of the last frame; -1 when it has been released."""
+
+    def __init__(self, pass_: Pass, painter: Painter, width: int, height: int):
+        self.pass_, self.painter, self.number = pass_, painter, 0
+        self.target = self.make_target(width, height)
+        self.planes: dict[str, tuple[int, int | None]] = {}
+        """Name of each picture -> attachment, and component where it is one of several."""
+        for i, output in enumerate(pass_.outputs):
+            self.planes |= {name: (i, k) for k, name in enumerate(output.planes)} if output.planes else {output.name: (i, None)}
+        self._held: dict[int, tuple[int, dict[str, np.ndarray]]] = {}  # attachment -> number of the frame held, and its pictures
+        self._used: dict[str, Frame] = {}  # inputs of the last frame
+
+    def make_target(self, width: int, height: int) -> Target:
+        pass_ = self.pass_
+        return self.painter.gl.framebuffer(*pass_.size(width, height), colour=tuple(o.format for o in pass_.outputs), depth=pass_.depth,
+                                           samples=pass_.samples.multi)
+
+    def draw(self, shot: Shot) -> Frame:
+        """shot : its target is not looked at."""
+        shot = replace(shot, target=self.target)
+        changed = self._changed(shot)
+        self._used = dict(shot.inputs)
+        if changed is None or changed:
+            self.pass_.begin(self.painter, shot)
+            self.pass_.paint(self.painter, shot)
+        return self.frame(shot, changed)
+
+    def frame(self, shot: Shot, changed: list[Rectangle] | None) -> Frame:
+        """The handle of what has been drawn just now."""
+        self.number += 1
+        return Frame(self, self.number, shot.moment.t_ns, changed)
+
+    def _changed(self, shot: Shot) -> list[Rectangle] | None:
+        if not self.pass_.pointwise or not self._used:
+            return None
+        parts = [frame.changed_since(self._used.get(name)) for name, frame in shot.inputs.items()]
+        return None if any(part is None for part in parts) else merged([r for part in parts for r in part])
+
+    # ---- read-back -----------------------------------------------------------------------------------------------
+
+    def attachment(self, output: str) -> int:
+        names = [o.name for o in self.pass_.outputs]
+        return names.index(output) if output else 0
+
+    def read(self, name: str, out: np.ndarray | None) -> np.ndarray:
+        i, component = self._place(name)
+        self.painter.finish()
+        started = working_clock()
+        if component is None and not self.pass_.outputs[i].components:
+            out = self.target.read(i, out=out)
+        else:
+            picture = self._given_out(i, self.target.read(i), component)
+            out = checked_array(out, picture.shape, picture.dtype)
+            out[...] = picture
+        self.painter.stats.readback_s += working_clock() - started
+        return out
+
+    def view(self, name: str, frame: Frame) -> np.ndarray:
+        i, _ = self._place(name)
+        number, pictures = self._held.get(i, (0, {}))
+        if number != self.number:
+            stale = frame.changed if number == self.number - 1 and number > 0 else None
+            self._held[i] = self.number, self._update(i, pictures, stale)
+        seen = self._held[i][1][name or next(iter(self.planes))].view()
+        seen.flags.writeable = False
+        return seen
+
+    def _update(self, i: int, pictures: dict[str, np.ndarray], stale: list[Rectangle] | None) -> dict[str, np.ndarray]:
+        """The pictures of attachment ``i`` as they are now, where they were right but for ``stale``."""
+        self.painter.finish()
+        started = working_clock()
+        planes = {name: component for name, (attachment, component) in self.planes.items() if attachment == i}
+        for r in [None] if stale is None else stale:
+            if r is None and not self.pass_.outputs[i].components and len(planes) == 1:
+                (name,) = planes
+                pictures = {name: self.target.read(i, out=pictures.get(name))}
+                continue
+            part = self.target.read(i, region=None if r is None else (r.x0, r.y0, r.x1 - r.x0, r.y1 - r.y0))
+            for name, component in planes.items():
+                given_out = self._given_out(i, part, component)
+                if r is not None:
+                    pictures[name][r.y0:r.y1, r.x0:r.x1] = given_out
+                elif name in pictures:
+                    pictures[name][...] = given_out
+                else:
+                    pictures[name] = np.ascontiguousarray(given_out)
+        self.painter.stats.readback_s += working_clock() - started
+        return pictures
+
+    def _given_out(self, i: int, array: np.ndarray, component: int | None) -> np.ndarray:
+        if component is not None:
+            return array[..., component]
+        return array[..., : self.pass_.outputs[i].components or None]
+
+    def _place(self, name: str) -> tuple[int, int | None]:
+        if name and name not in self.planes:
+            raise GLError("the pass has no such output", where=type(self.pass_).__name__, value=name, accepted=", ".join(self.planes))
+        return self.planes[name] if name else next(iter(self.planes.values()))
+
+    def release(self) -> None:
+        self.number = -1
+        self.target.release()
+

@@ -1,0 +1,150 @@
+"""One instant of a scene as a camera sees it: poses, matrices, rates, what is in view. Computed once, shared by all passes.
+
+    moments = Moments(scene, resources.items)
+    moment = moments.at(t_ns)
+    moment.mvp[item.object_index], moment.visible, moment.rates
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, inverse_depth_bits
+
+if TYPE_CHECKING:
+    from blinkgl.camera import CameraModel
+    from blinkgl.render.resources import DrawItem
+    from blinkgl.scene.types import PosePath, Scene
+
+KEPT = 4
+"""Moments in memory: a label looks at its own time and at those of its neighbours, which look at it."""
+
+
+class View(NamedTuple):
+    """What drawing needs of a camera. projection : (4, 4) float64 clip_from_cam.   frustum : (5, 3) inward unit normals, camera axes."""
+
+    camera: CameraModel
+    projection: np.ndarray
+    frustum: np.ndarray
+
+    @classmethod
+    def of(cls, camera: CameraModel) -> View:
+        return cls(camera, camera.clip_from_cam(), camera.frustum_planes())
+
+
+class Rates(NamedTuple):
+    """(n, 4, 4) float64 per object, 1/s: d(MVP)/dt and d(T_world_obj)/dt, from the analytic derivatives of the paths."""
+
+    mvp: np.ndarray
+    T_world_obj: np.ndarray
+
+
+class Moment:
+    """All objects of a scene at t_ns. What nobody asks for is not computed; what somebody did is not computed again.
+
+    T_world_cam : (4, 4) float64.   T_world_obj, T_cam_obj : (n, 4, 4) float64, a row per object of the scene.
+    view : :class:`View` of the camera.   Arrays per item have a row per part that is drawn, ``DrawItem.number``."""
+
+    def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
+        self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = t_ns, view, T_world_cam, T_world_obj, stage
+
+    def through(self, view: View, T_world_cam: np.ndarray | None = None) -> Moment:
+        """The same instant through another camera; without ``T_world_cam`` at the same place. (A light that casts shadows is one.)"""
+        here = T_world_cam is None
+        other = Moment(self.t_ns, view, self.T_world_cam if here else T_world_cam, self.T_world_obj, self._stage)
+        if here:
+            other.__dict__.update({name: value for name, value in self.__dict__.items() if name in ("T_cam_obj", "centres")})
+        return other
+
+    @cached_property
+    def T_cam_obj(self) -> np.ndarray:
+        return cam_from_obj(self.T_world_cam, self.T_world_obj)
+
+    @cached_property
+    def mvp(self) -> np.ndarray:
+        """(n, 4, 4) float64 clip_from_obj."""
+        return self.view.projection @ self.T_cam_obj
+
+    @cached_property
+    def mvp_bytes(self) -> list[bytes]:
+        """Of every object, as GLSL's mat4 (column-major float32)."""
+        columns = np.ascontiguousarray(np.swapaxes(self.mvp, 1, 2), np.float32)
+        return [matrix.tobytes() for matrix in columns]
+
+    @cached_property
+    def rates(self) -> Rates:
+        stage = self._stage
+        dT_world_obj = np.zeros_like(self.T_world_obj)
+        for i in stage.moving:
+            dT_world_obj[i] = stage.paths[i].derivative(self.t_ns)
+        dT_cam_obj = cam_from_obj_rate(self.T_world_cam, stage.camera_path.derivative(self.t_ns), self.T_world_obj, dT_world_obj)
+        return Rates(self.view.projection @ dT_cam_obj, dT_world_obj)
+
+    @cached_property
+    def centres(self) -> np.ndarray:
+        """(m, 3) float64 centres of the items' bounding spheres, camera axes."""
+        T = self.T_cam_obj[self._stage.item_object]
+        return (T[:, :3, :3] @ self._stage.item_centre[..., None])[..., 0] + T[:, :3, 3]
+
+    @cached_property
+    def inverse_depths(self) -> list[bytes]:
+        """Of every item: ``inverse_depths`` of guard.glsl, a uvec2."""
+        bits = inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
+        return [row.tobytes() for row in bits]
+
+    @cached_property
+    def visible(self) -> list[DrawItem]:
+        """Items whose bounding sphere meets the view frustum: objects front to back, then ground, then sky."""
+        stage = self._stage
+        if not stage.items:
+            return []
+        inside = (self.centres @ self.view.frustum.T >= -stage.item_radius[:, None]).all(axis=1)
+        nearest = self.centres[:, 2] - stage.item_radius
+        order = np.lexsort((nearest, stage.item_layer))
+        return [stage.items[i] for i in order if inside[i]]
+
+
+class Stage:
+    """What of a scene is the same at all times, as arrays: paths of its objects, bounding spheres of its items."""
+
+    def __init__(self, scene: Scene, items: Sequence[DrawItem]):
+        self.items = items
+        self.camera_path: PosePath = scene.camera_path
+        self.paths: list[PosePath] = [o.path for o in scene.objects]
+        self.moving = [i for i, path in enumerate(self.paths) if not path.is_static]
+        self.item_object = np.array([i.object_index for i in items], np.intp)
+        self.item_centre = np.array([i.centre for i in items]).reshape(-1, 3)
+        self.item_radius = np.array([i.radius for i in items])
+        self.item_layer = np.array([i.layer for i in items])
+
+
+class Moments:
+    """Gives the moments of a scene; the last few are kept. ``stage``: :class:`Stage`."""
+
+    def __init__(self, scene: Scene, items: Sequence[DrawItem]):
+        self.stage, self.view = Stage(scene, items), View.of(scene.camera)
+        paths = self.stage.paths
+        self._start = np.stack([p.pose(scene.t0_ns) for p in paths]) if paths else np.zeros((0, 4, 4))
+        self._kept: OrderedDict[int, Moment] = OrderedDict()
+
+    def at(self, t_ns: int) -> Moment:
+        if (moment := self._kept.get(t_ns)) is not None:
+            return moment
+        stage, T_world_obj = self.stage, self._start.copy()
+        for i in stage.moving:
+            T_world_obj[i] = stage.paths[i].pose(t_ns)
+        moment = self._kept[t_ns] = Moment(t_ns, self.view, stage.camera_path.pose(t_ns), T_world_obj, stage)
+        if len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return moment
+
+    def look_through(self, camera: CameraModel) -> None:
+        """From now on through another camera on the same path."""
+        self.view = View.of(camera)
+        for t_ns, moment in self._kept.items():
+            self._kept[t_ns] = moment.through(self.view)

@@ -1,0 +1,118 @@
+"""OpenGL's state while passes are drawn: programs and their uniforms, clearing, culling, one draw call at a time."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import moderngl
+
+from blinkgl.machine.compiling import working_clock
+
+if TYPE_CHECKING:
+    from blinkgl.gl import GLContext, Target
+    from blinkgl.render.frames import RenderStats
+    from blinkgl.render.moment import Moment
+    from blinkgl.render.passes.base import Pass
+    from blinkgl.render.resources import DrawItem, Kind, SceneResources
+    from blinkgl.scene.types import Scene
+
+Uniforms = dict[str, Any]
+"""name -> moderngl.Uniform of one program; "" is the program itself."""
+
+
+class Programs(dict["Kind", Uniforms]):
+    """Of one pass: uniforms of the program for each kind of material, compiled when first asked for."""
+
+    def __init__(self, painter: Painter, pass_: Pass):
+        self._painter, self._pass = painter, pass_
+
+    def __missing__(self, kind: Kind) -> Uniforms:
+        program = self._painter.gl.program(self._pass.program, self._pass.defines(kind) | kind.defines)
+        uniforms = self[kind] = self._painter.uniforms(program)
+        return uniforms
+
+
+class Painter:
+    """Draws for the passes of one renderer. A subclass may look on: every method is called by the passes and none by another.
+
+    gl : GLContext.   resources : SceneResources.   stats : what is counted."""
+
+    def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
+        self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
+        self._programs: dict[Pass, Programs] = {}
+        self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
+        self._culling = False
+
+    def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
+        """Draw into ``target`` from now on, which is cleared: the first attachment to ``background``, 0 where it ends, the others to 0."""
+        self.prepare(target)
+        target.clear((*background, 0.0, 0.0, 0.0, 0.0)[: target.formats[0].components], depth=0.0)
+        self.stats.frames += 1
+
+    def prepare(self, target: Target) -> None:
+        """Draw into ``target`` from now on, over what it holds."""
+        ctx = self.gl.ctx
+        target.fbo.use()
+        ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
+        ctx.enable_only(moderngl.DEPTH_TEST)
+        ctx.depth_func = ">"  # reversed-Z
+        ctx.front_face = "cw"  # counter-clockwise meshes in an image whose y points down
+        ctx.cull_face = "back"
+        self._culling = False
+
+    def programs(self, pass_: Pass) -> Programs:
+        if pass_ not in self._programs:
+            self._programs[pass_] = Programs(self, pass_)
+        return self._programs[pass_]
+
+    def uniforms(self, program: moderngl.Program) -> Uniforms:
+        """The table that a pass sets values in."""
+        return {name: program[name] for name in program if isinstance(program[name], moderngl.Uniform)} | {"": program}
+
+    def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
+        """Sets what every program that draws the scene takes: matrices, depths and, where it has them, the light."""
+        index = item.object_index
+        uniforms["mvp"].write(moment.mvp_bytes[index])
+        uniforms["inverse_depths"].write(moment.inverse_depths[item.number])
+        if "sun_direction" in uniforms:
+            # Every time: the context's programs are shared with other renderers, their uniforms included.
+            light = self.scene.light
+            uniforms["light_strength"].value = (light.sun, light.sky)
+            R = moment.T_world_obj[index, :3, :3]
+            uniforms["sun_direction"].value = tuple(light.sun_direction @ R)
+            uniforms["up_direction"].value = tuple(R[2])
+
+    def draw(self, uniforms: Uniforms, item: DrawItem) -> None:
+        cull = not item.two_sided
+        if cull != self._culling:
+            (self.gl.ctx.enable if cull else self.gl.ctx.disable)(moderngl.CULL_FACE)
+            self._culling = cull
+        self.resources.vertex_array(uniforms[""], item).render(moderngl.TRIANGLES)
+        self.stats.triangles += len(item.mesh.faces)
+
+    def cover(self, pass_: Pass) -> tuple[Uniforms, moderngl.VertexArray]:
+        """Program of a pass over the whole target, and the vertex array of no vertices that draws its one triangle."""
+        if pass_ not in self._covers:
+            program = self.gl.program(pass_.program, pass_.defines(None))
+            self._covers[pass_] = self.uniforms(program), self.gl.ctx.vertex_array(program, [])
+        return self._covers[pass_]
+
+    def fill(self, array: moderngl.VertexArray, target: Target) -> None:
+        """One triangle over all of ``target``."""
+        target.fbo.use()
+        self.gl.ctx.viewport = (0, 0, target.fbo.width, target.fbo.height)
+        self.gl.ctx.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        array.render(moderngl.TRIANGLES, vertices=3)
+
+    def finish(self) -> None:
+        """Waits until all is drawn."""
+        started = working_clock()
+        self.gl.ctx.finish()
+        self.stats.render_s += working_clock() - started
+
+    def forget(self) -> None:
+        """Asks for every program again: to be called when the context's programs are to be replaced."""
+        for _, array in self._covers.values():
+            array.release()
+        self._programs, self._covers = {}, {}
+        self.resources.forget_vertex_arrays()

@@ -1,0 +1,17 @@
+"""The passes: each is a value that says what is drawn, by which program, from which other passes, into what.
+
+In: a :class:`~blinkgl.render.moment.Moment` and frames of other passes. Out: a :class:`~blinkgl.render.canvas.Frame`, by
+``Renderer.draw``. Start at ``base.py``, then ``luminance.py``."""
+
+from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
+from blinkgl.render.passes.colour import Colour
+from blinkgl.render.passes.geometry import Geometry
+from blinkgl.render.passes.luminance import Brightness, Luminance
+from blinkgl.render.passes.mean import Mean, filtered
+from blinkgl.render.passes.velocity import Velocity
+
+PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean)
+"""Those that a renderer draws of itself."""
+
+__all__ = ["PASSES", "Brightness", "Colour", "Geometry", "Input", "Luminance", "Mean", "Output", "Pass", "ScenePass", "ScreenPass", "Shot",
+           "Velocity", "filtered"]

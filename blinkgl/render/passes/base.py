@@ -1,0 +1,147 @@
+"""What a pass is. See docs/extending.md, "A pass"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+from blinkgl.render.antialiasing import Samples
+
+if TYPE_CHECKING:
+    from blinkgl.gl import Target
+    from blinkgl.render.canvas import Frame
+    from blinkgl.render.moment import Moment
+    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.resources import DrawItem, Kind
+    from blinkgl.scene.types import Scene
+
+
+class Output(NamedTuple):
+    """An attachment: ``layout(location = i)`` of the fragment stage for the i-th output of a pass.
+
+    format : key of :data:`blinkgl.gl.FORMATS`.   components : how many of its format's are given out, the first ones; 0: all.
+    planes : names of its components where each is a picture of its own; they are then read by these names."""
+
+    name: str
+    format: str
+    components: int = 0
+    planes: tuple[str, ...] = ()
+
+
+class Input(NamedTuple):
+    """What a pass reads of another one, at the same moment. sampler : the uniform that gets it.
+    output : name of an output of ``of`` (default: its first), or "depth", where ``of`` keeps its depth as a texture."""
+
+    sampler: str
+    of: Pass
+    output: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """What one drawing of a pass is given. ends : moments at other times, by name ("forward", "backward").
+    inputs : frames of the passes it reads, by sampler."""
+
+    moment: Moment
+    target: Target
+    scene: Scene
+    ends: Mapping[str, Moment] = field(default_factory=dict)
+    inputs: Mapping[str, Frame] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Of the target, (width, height) px."""
+        return self.target.width, self.target.height
+
+
+class Pass:
+    """One kind of picture of a scene: what is drawn, by which program, into what. A pass is a value (a frozen dataclass) and holds nothing;
+    equal passes share their programs, target and memory, which belong to the renderer: ``renderer.draw(pass, t_ns)`` gives a Frame.
+
+    program : file in shaders/, or the absolute path of one of your own (its includes are those of shaders/).
+    outputs : what it writes.   inputs : what it reads, drawn before it.   samples, every : its size beside the image's.
+    depth : whether it has a depth buffer; "texture": one that a later pass may read.
+    still : whether a camera that stands still has only what moves drawn again.
+    pointwise : each pixel comes of the inputs' pixel at the same place, so that it does not change where they do not."""
+
+    program: ClassVar[str]
+    outputs: tuple[Output, ...]
+    inputs: tuple[Input, ...] = ()
+    samples: Samples = Samples()
+    every: int = 1
+    depth: ClassVar[bool | str] = True
+    still: ClassVar[bool] = False
+    pointwise: ClassVar[bool] = False
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Of its target, px, for an image of width x height: ``samples.grid`` times as fine, or every n-th pixel, at least one."""
+        return tuple(max(1, side * self.samples.grid // self.every) for side in (width, height))
+
+    def background(self, scene: Scene) -> tuple[float, ...]:
+        """The first output where nothing is hit; 0 where it ends, and in all others."""
+        return ()
+
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
+        """Of the program variant, for a kind of material (None: no material at all); TEXTURED, LIT and TWO_SIDED come on top."""
+        return {}
+
+    def seen(self, moment: Moment) -> Moment:
+        """The moment as this pass looks at it: the camera's, unless it draws for another one (``moment.through``)."""
+        return moment
+
+    def begin(self, painter: Painter, shot: Shot) -> None:
+        """Before :meth:`paint`: clears what it does not write everywhere."""
+
+    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        """Draws into ``shot.target``. items : these alone, of a pass that draws the scene."""
+        raise NotImplementedError
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+        """A pass of every program variant that somebody may ask for: what `blinkgl shader check` compiles."""
+        yield cls()
+
+    def bind(self, uniforms: Uniforms, shot: Shot) -> None:
+        """Hands the inputs to a program. Unit 0 is the material's."""
+        for unit, one in enumerate(self.inputs, 1):
+            shot.inputs[one.sampler].texture(one.output).use(unit)
+            uniforms[one.sampler].value = unit
+
+
+class ScenePass(Pass):
+    """A pass that draws the scene's items."""
+
+    def items(self, moment: Moment) -> list[DrawItem]:
+        """What is drawn, in this order."""
+        return moment.visible
+
+    def begin(self, painter: Painter, shot: Shot) -> None:
+        painter.begin(shot.target, self.background(shot.scene))
+
+    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        """Textures and uniforms of the program besides those that every program of the scene has."""
+
+    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        programs = painter.programs(self)
+        for item in self.items(shot.moment) if items is None else items:
+            uniforms = programs[item.kind]
+            painter.place(uniforms, item, shot.moment)
+            self.bind(uniforms, shot)
+            self.set(painter, uniforms, item, shot)
+            painter.draw(uniforms, item)
+
+
+class ScreenPass(Pass):
+    """A pass over all pixels of its target, from its inputs: one triangle, whose vertex stage has no attributes."""
+
+    depth: ClassVar[bool | str] = False
+
+    def set(self, uniforms: Uniforms, shot: Shot) -> None:
+        """Uniforms of the program besides its inputs."""
+
+    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        uniforms, array = painter.cover(self)
+        self.bind(uniforms, shot)
+        self.set(uniforms, shot)
+        painter.fill(array, shot.target)

@@ -1,0 +1,74 @@
+"""Event frames: linear luminance, with its rate of change where somebody needs it; and the small pictures of both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from blinkgl.render.antialiasing import Samples
+from blinkgl.render.matrices import rows_xyw_bytes
+from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
+
+if TYPE_CHECKING:
+    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.resources import DrawItem, Kind
+    from blinkgl.scene.types import Scene
+
+
+class _Luminance(ScenePass):
+    program: ClassVar[str] = "luminance.glsl"
+
+    def background(self, scene: Scene) -> tuple[float, ...]:
+        return scene.background, 0.0
+
+    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        if item.textured:
+            painter.resources.luminance_texture(item.material).use(0)
+        else:
+            uniforms["albedo"].value = painter.resources.albedo_luminance(item.material)
+        # What is neither textured nor lit does not change; its program has none of these.
+        if "rate" in uniforms:
+            uniforms["rate"].write(rows_xyw_bytes(shot.moment.rates.mvp[item.object_index]))
+            uniforms["image_size"].value = shot.size
+        if "sun_rate" in uniforms:
+            dR = shot.moment.rates.T_world_obj[item.object_index, :3, :3]
+            uniforms["sun_rate"].value = tuple(shot.scene.light.sun_direction @ dR)
+            uniforms["up_rate"].value = tuple(dR[2])
+
+
+@dataclass(frozen=True)
+class Luminance(_Luminance):
+    """Output "luminance" and, with ``rate``, "rate": d(luminance)/dt per second of each pixel as the surface it shows moves (edges that
+    pass are not in it), by a shader variant of its own. float32, (H, W) each, at ``samples``."""
+
+    rate: bool = False
+    samples: Samples = Samples()
+    still: ClassVar[bool] = True
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return (Output("luminance", "RG32F", planes=("luminance", "rate")) if self.rate else Output("luminance", "R32F"),)
+
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
+        return ({"RATE": 1} if self.rate else {}) | ({"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {})
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+        return (cls(rate, Samples(taps=taps)) for rate in (False, True) for taps in (1, 4))
+
+
+@dataclass(frozen=True)
+class Brightness(_Luminance):
+    """Output "brightness", (h, w, 2) float32: luminance and its rate per second on every n-th pixel in x and y, textures filtered as for
+    the whole image."""
+
+    every: int = 1
+    outputs: ClassVar[tuple[Output, ...]] = (Output("brightness", "RG32F"),)
+
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
+        return {"RATE": 1} if self.every == 1 else {"RATE": 1, "EVERY": self.every}
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+        return (cls(every) for every in (1, 4))

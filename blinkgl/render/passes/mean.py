@@ -1,0 +1,55 @@
+"""One value per pixel of a picture that was drawn finer: the last part of anti-aliasing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from blinkgl.render.antialiasing import Samples
+from blinkgl.render.passes.base import Input, Output, Pass, ScreenPass, Shot
+
+if TYPE_CHECKING:
+    from blinkgl.render.painter import Painter
+    from blinkgl.render.resources import DrawItem, Kind
+
+
+@dataclass(frozen=True)
+class Mean(ScreenPass):
+    """The mean of each pixel's samples of another pass, of one output; outputs as its."""
+
+    of: Pass
+    program: ClassVar[str] = "downsample.glsl"
+    pointwise: ClassVar[bool] = True
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return (Input("fine", self.of),)
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return self.of.outputs
+
+    @property
+    def every(self) -> int:
+        return self.of.every
+
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
+        return {"FACTOR": self.of.samples.grid}
+
+    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        if self.of.samples.multi:
+            shot.inputs["fine"].target.resolve_into(shot.target)
+        else:
+            super().paint(painter, shot)
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+        from blinkgl.render.passes.colour import Colour
+
+        return (cls(Colour(Samples(grid=factor))) for factor in (2, 4))
+
+
+def filtered(pass_: Pass) -> Pass:
+    """A pass that gives one value per pixel: ``pass_`` itself, or the mean of its samples."""
+    return pass_ if pass_.samples.stored == 1 else Mean(pass_)

@@ -1,0 +1,46 @@
+"""Image velocity for the time sampling and the preview."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from blinkgl.render.matrices import rows_xyw_bytes
+from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
+
+if TYPE_CHECKING:
+    from blinkgl.render.moment import Moment
+    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.resources import DrawItem, Kind
+
+
+@dataclass(frozen=True)
+class Velocity(ScenePass):
+    """Output "velocity", (h, w, 2) float32 px/s of the full-size image, 0 where nothing is hit, on every n-th pixel in x and y.
+    moving_only : leaves out objects that stand still, also where they hide something."""
+
+    every: int = 1
+    moving_only: bool = False
+    program: ClassVar[str] = "label.glsl"
+    outputs: ClassVar[tuple[Output, ...]] = (Output("velocity", "RG32F"),)
+
+    def items(self, moment: Moment) -> list[DrawItem]:
+        return [item for item in moment.visible if item.moves] if self.moving_only else moment.visible
+
+    def defines(self, kind: Kind | None) -> dict[str, Any]:
+        return {"OUT_VELOCITY": 0} if self.every == 1 else {"OUT_VELOCITY": 0, "SMALL": 1}
+
+    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        width, height = shot.size
+        uniforms["rate"].write(rows_xyw_bytes(shot.moment.rates.mvp[item.object_index]))
+        uniforms["image_size"].value = width, height
+        if self.every != 1:
+            camera = shot.scene.camera
+            uniforms["image_scale"].write(np.array([camera.width / width, camera.height / height], np.float32))
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+        return (cls(every) for every in (1, 4))

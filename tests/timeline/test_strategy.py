@@ -64,7 +64,7 @@ def test_displacement_over_whole_intervals(gl, world, config, inside):
 
 def test_a_still_background_has_no_say_in_the_percentile():
     class Picture:
-        def motion(self, t_ns, every):
+        def velocity_of_movers(self, t_ns, every):
             speed = np.zeros((10, 10, 2), np.float32)
             speed[0, :5, 0] = [100, 100, 100, 100, np.inf]
             return picture(speed)

@@ -4,7 +4,7 @@ import pytest
 
 pytest.importorskip("griffe", reason="the extra [docs] is not installed")
 
-from blinkgl.tools.docstrings import markdown  # noqa: E402
+from blinkgl.tools.docstrings import markdown
 
 
 @pytest.mark.parametrize(("written", "shown"), [
@@ -14,6 +14,7 @@ from blinkgl.tools.docstrings import markdown  # noqa: E402
     ("A.\n\nParameters\n----------\na, b : one\n    and more.\n*rest : others\n\nText : that is none: of it.\n\nRaises\n------\nValueError\n    never.",
      "A.\n\n\n**Parameters**\n\n\n- **a, b**: one\n  and more.\n- ***rest**: others\n\n\n- **Text**: that is none: of it.\n\n\n**Raises**\n\n\n- **ValueError**:\n  never."),
     ("Code:\n\n    a : int = 1\n\n```\nb : int\n```", "Code:\n\n    a : int = 1\n\n```\nb : int\n```"),
+    ("A room.\n\nIn:    numbers.\nOut:   :class:`Scene`.", "A room.\n\n\n- **In**: numbers.\n- **Out**: `Scene`."),
     ("One line: of text; a: b.", "One line: of text; a: b."),
 ])
 def test_shown(written, shown):

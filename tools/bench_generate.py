@@ -33,8 +33,9 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.report import STAGES, Totals
 from blinkgl.events import make_emulator
 from blinkgl.gl import create_context
+from blinkgl.labels import LabelRequest
 from blinkgl.machine import bench
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath

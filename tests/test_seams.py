@@ -425,7 +425,7 @@ def test_what_has_no_labels_is_not_disturbed_by_one(command, position, tmp_path)
         options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5),), rounds=1)
         assert trade(load_run(labelled(tmp_path)), options=options, settings=(Setting("displacement 2 px"),))["settings"]
     else:
-        assert sum(len(e) for e in simulate([np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)], fps=1000)) > 0
+        assert sum(len(e) for e in frames_to_events([np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)], fps=1000)) > 0
 
 
 def shader(*arguments):

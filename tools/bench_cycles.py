@@ -34,11 +34,12 @@ from rich.table import Table
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import BlinkGLError
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.srgb import to_srgb8
 from blinkgl.timeline.sampling import displacement_times
@@ -81,12 +82,15 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     costs, streams, first = {}, {}, {}
     for name in (*ANTIALIASINGS, *traced):
         cost = costs[name] = Cost()
-        emulator, chunks = make_emulator(config, height, width, seed=1), []
         source = rasterised(gl, scene, times, name, cost) if name in ANTIALIASINGS else frames(scene, times, traced[name], cost)
-        for t, frame in zip(times, source):
-            first.setdefault(name, frame.copy())
-            chunks.append(emulator.step(frame, t))
-        streams[name] = Events.concatenate(chunks)
+
+        def event_frames(name=name, source=source):
+            for t, frame in zip(times, source):
+                first.setdefault(name, frame.copy())
+                yield EventFrame(t, frame)
+
+        camera = EventCamera(config, None, height, width, seed=1)
+        streams[name] = Events.concatenate([events for _, events in emulate(event_frames(), camera)])
         console.print(f"{name}: {len(streams[name]):,} events, {np.median(cost.wall_s):.3f} s per frame", highlight=False)
     rows = [("filtering", a, "our light") for a in ANTIALIASINGS]
     rows += [("shadows", "our light", "shadows"), ("bounces", "shadows", "everything")]
@@ -161,8 +165,7 @@ def main() -> None:
         return
     template = load_run(options.config, options.overrides)
     config = template.sequence(options.sequence)
-    scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split, seed=config.seed,
-                        sequence=options.sequence, base=template.base)
+    scene = sequence_scene(config, options.sequence, template.base)
     result: dict = {}
     with create_context() as gl:
         result["machine"], result["load_before"] = bench.machine_line(gl.renderer), os.getloadavg()

@@ -17,7 +17,9 @@ from blinkgl.labels import LABELS
 if TYPE_CHECKING:
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
+    from blinkgl.scene.types import Scene as SceneData
 
+MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
 EmulatorSettings = str | Mapping[str, Any] | Config
 
@@ -100,6 +102,15 @@ def configured(source: Source, *, emulator: EmulatorSettings | None = None, sens
         if key in own:
             validate_field(SequenceConfig, key, own[key])
     return RunTemplate(merge(template.tree, own), template.base) if own else template
+
+
+def scene_of(source: Source, config: SequenceConfig, index: int) -> SceneData:
+    """What sequence ``index`` shows. Raises ConfigError and AssetError."""
+    if isinstance(source, Scene):
+        return source.build(config)
+    from blinkgl.scene.build import sequence_scene
+
+    return sequence_scene(config, index, source.base)
 
 
 def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:

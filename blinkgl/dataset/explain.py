@@ -221,6 +221,6 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     if config.timeline.reconstruction != "hermite":
         add("rates of change in the event frames", f"timeline.reconstruction: {config.timeline.reconstruction}")
     for name, value in config.events.model_dump().items():
-        if value in (0, 0.0, False) and name not in ("seed",):
+        if value in (0, 0.0, False) and name != "seed":
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
     add("shadows, inter-reflection, motion blur, depth of field", "BlinkGL does not model them")

@@ -17,7 +17,7 @@ from blinkgl.front import arguments as check
 from blinkgl.front.runs import Emulator, Source, Timeline, configured, labels_tree
 from blinkgl.front.scenes import Scene
 from blinkgl.gl import create_context
-from blinkgl.labels import LabelFrame, asked_for
+from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.scene import types as data
 from blinkgl.scene.build import build_scene
@@ -59,22 +59,23 @@ class Recording:
     @property
     def flow(self) -> np.ndarray:
         """(K, H, W, 2) float32 px, +x right, +y down, from each label's time to the next; 0 where :attr:`valid` is False."""
-        return np.stack([label.forward.flow for label in self._with_flow()])
+        return np.stack([flow.flow for flow in self._forward()])
 
     @property
     def valid(self) -> np.ndarray:
         """(K, H, W) bool."""
-        return np.stack([label.forward.valid for label in self._with_flow()])
+        return np.stack([flow.valid for flow in self._forward()])
 
     def window(self, k: int) -> Events:
         """Events from label ``k``'s time until the next one's, those that flow ``k`` spans."""
         k = check.whole(k, "k", 0, len(self.t_us) - 1)
         return self.events.window(int(self.t_us[k]), int(self.image_t_us[k + 1]))
 
-    def _with_flow(self) -> tuple[LabelFrame, ...]:
-        if any(label.forward is None for label in self.labels):
+    def _forward(self) -> list[Flow]:
+        flows = [label.forward for label in self.labels if label.forward is not None]
+        if len(flows) < len(self.labels):
             raise ConfigError("the recording has no forward flow", where="labels", accepted="'flow' among them")
-        return self.labels
+        return flows
 
 
 def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, sensor: str | None = None, timeline: Timeline | None = None,

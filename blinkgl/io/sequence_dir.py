@@ -106,7 +106,7 @@ class SequenceWriter:
             raise
         return self
 
-    def __exit__(self, kind, error, _) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if kind is None:
             try:
                 self._finish()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,6 +12,9 @@ from blinkgl.labels import grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Instant, Key, Label, Towards, View
+
+if TYPE_CHECKING:
+    from blinkgl.config.labels import LabelsConfig
 
 _KEYS = {
     "flow": Key(tuple[Literal["forward", "backward"], ...], Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"), "depth"),
@@ -35,7 +38,7 @@ class FlowTo(Label):
     keys = property(lambda self: _KEYS)
     said = property(lambda self: "flow" if self.towards == "forward" else self.name)
 
-    def asked(self, labels) -> bool:
+    def asked(self, labels: LabelsConfig) -> bool:
         return self.towards in labels.flow
 
     def ask(self, tree: dict[str, Any]) -> None:
@@ -62,7 +65,7 @@ class FlowTo(Label):
         return (Form(folder, "png", _png, _read), Form(folder + "_npy", "npy", _npy, _read), Form(folder + "_flo", "flo", _flo, _read),
                 Form(folder, "h5", rows=_rows))
 
-    def written(self, labels) -> tuple[Form, ...]:
+    def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
         return (self.forms[0], *(form for form in self.forms[1:] if form.ending in labels.float_flow))
 
     def problem(self, value: Flow) -> str | None:

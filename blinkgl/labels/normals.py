@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from blinkgl.labels.label import Instant, Label
+
+if TYPE_CHECKING:
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
 
 
 class Normals(Label):
@@ -22,6 +28,6 @@ class Normals(Label):
         # A mesh's own normals may be of no length, and are then no direction here either.
         return None if (np.linalg.norm(value, axis=-1) < 1 + 1e-3).all() else "a normal longer than 1"
 
-    def reference(self, scene, frame) -> np.ndarray:
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         rotation = scene.camera_path.pose(frame.t_ns)[:3, :3]
         return np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from blinkgl.labels import grading
 from blinkgl.labels.label import Instant, Label
+
+if TYPE_CHECKING:
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
 
 
 class Velocity(Label):
@@ -22,5 +28,5 @@ class Velocity(Label):
     def problem(self, value: np.ndarray) -> str | None:
         return None if np.isfinite(value).all() else "a velocity that is no finite number"
 
-    def reference(self, scene, frame) -> np.ndarray:
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return np.where(frame.hit[..., None], frame.velocity, 0.0)

@@ -15,10 +15,11 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import DTypeLike
 
 from blinkgl.config.base import validate
 from blinkgl.config.events import EmulatorConfig
@@ -164,7 +165,7 @@ def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, 
 
 def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None,
                   timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None, overwrite: bool = True,
-                  progress: Callable[[SimulationReport, float | None], None] | None = None, **options) -> SimulationReport:
+                  progress: Callable[[SimulationReport, float | None], None] | None = None, **options: Any) -> SimulationReport:
     """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format (.h5 .raw .aedat4
     .txt .csv .npz .npy); options as :func:`simulate`. The files appear whole or not at all.
 
@@ -219,7 +220,7 @@ class Decoder:
         self._gamma = gamma
         self._tables: dict[np.dtype, np.ndarray] = {}
 
-    def table(self, dtype) -> np.ndarray:
+    def table(self, dtype: DTypeLike) -> np.ndarray:
         """Luminance of each code of an unsigned integer type, float32."""
         dtype = np.dtype(dtype)
         if dtype not in self._tables:

@@ -138,7 +138,7 @@ def _value(folder: Path, name: str, flow: Path) -> Any:
     """What a label holds beside a file of flow; None where the sequence has no such label. Raises AssetError."""
     form = LABELS[name].forms[0]
     path = folder / form.file(int(flow.stem))
-    return form.read(path) if path.is_file() else None
+    return form.read(path) if form.read is not None and path.is_file() else None
 
 
 def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> list[int]:
@@ -184,7 +184,7 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
 
 def _pairs(path: Path) -> list[tuple[int, int]]:
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
-    return [tuple(int(v) for v in line.split(",")) for line in lines]
+    return [(int(start), int(end)) for start, end in (line.split(",") for line in lines)]
 
 
 # ---- parameters ------------------------------------------------------------------------------------------------------

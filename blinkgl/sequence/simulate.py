@@ -150,7 +150,7 @@ class Simulation(ABC):
     def poses(self) -> dict[str, np.ndarray]:
         """What poses.npz holds; empty where nobody knows."""
 
-    def _resume(self) -> None:
+    def _resume(self) -> None:  # noqa: B027 - most have nothing to do then
         """Called when it is its turn again: the receiver may have used OpenGL meanwhile."""
 
     @abstractmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from blinkgl.errors import ConfigError
 from blinkgl.show.terminal import plain_column, plain_console, say
 
 
-def emulator_options(name: str, config: str | None, overrides: list[str], sensor: str | None = None) -> dict[str, Any]:
+def emulator_options(name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None) -> dict[str, Any]:
     """``emulator`` and ``readout`` of :func:`blinkgl.simulate` from an emulator's name, an optional YAML mapping (it may name
     the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where nothing else is said."""
     data: dict[str, Any] = {}
@@ -33,8 +34,8 @@ def emulator_options(name: str, config: str | None, overrides: list[str], sensor
     return {"emulator": emulator_config({**camera.values(data["emulator"]), **data}), "readout": camera.readout}
 
 
-def run(source: str, target: str, *, emulator: str, sensor: str | None = None, config: str | None = None, overrides: list[str] = (),
-        quiet: bool = False, **options) -> int:
+def run(source: str, target: str, *, emulator: str, sensor: str | None = None, config: str | None = None, overrides: Sequence[str] = (),
+        quiet: bool = False, **options: Any) -> int:
     """``options``: of :func:`~blinkgl.recordings.simulation.simulate_file`."""
     from blinkgl.machine.compiling import compiled_s, compiling_line
     from blinkgl.recordings.simulation import simulate_file

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from blinkgl.config.timeline import TimelineConfig
 from blinkgl.events.response import Response
 from blinkgl.timeline.budget import TimeError, contraharmonic_mean
 from blinkgl.timeline.sampling import bounded_times, uniform_times
@@ -38,7 +39,7 @@ class Scene(Protocol):
 class Timeline:
     """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when asked for."""
 
-    def __init__(self, config, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
+    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
         self.config, self.t0_ns, self.t1_ns, self.scene, self.response = config, t0_ns, t1_ns, scene, response
         self.looks = 0
         """Small pictures asked for so far."""
@@ -87,7 +88,7 @@ class Brightness(Timeline):
 class Budget(Timeline):
     """The step whose estimated error is what was asked for: :mod:`blinkgl.timeline.budget`."""
 
-    def __init__(self, config, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
+    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
         super().__init__(config, t0_ns, t1_ns, scene, response)
         in_px = config.max_time_error_px is not None
         self.error = TimeError(config.reconstruction, config.max_time_error_px if in_px else config.max_time_error_us * 1e-6, in_px,
@@ -127,7 +128,7 @@ PROBE_EVERY = 12
 _KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness, "budget": Budget}
 
 
-def make_timeline(config, t0_ns: int, t1_ns: int, scene: Scene, response: Response) -> Timeline:
+def make_timeline(config: TimelineConfig, t0_ns: int, t1_ns: int, scene: Scene, response: Response) -> Timeline:
     """Of any ``timeline:`` configuration."""
     return _KINDS[config.kind](config, t0_ns, t1_ns, scene, response)
 

@@ -16,6 +16,7 @@ import numpy as np
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
+from blinkgl.gl import GLContext
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import build_scene
@@ -111,7 +112,7 @@ class Level:
 class Bench:
     """One sequence at one image size: its scenes, its clip, its judged pixels."""
 
-    def __init__(self, gl, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
+    def __init__(self, gl: GLContext, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
         self.gl, self.options, self.say = gl, options, say
         if options.reference == "cycles":
             from blinkgl.tools import peer_cycles

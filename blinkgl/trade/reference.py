@@ -16,6 +16,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
+from blinkgl.gl import GLContext
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
@@ -51,7 +52,7 @@ class FineTiles:
 
     cost = None
 
-    def __init__(self, gl, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
+    def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._tiles, self._scale = tiles, scale
         self._shape = (scene.camera.height, scene.camera.width)
         self._cameras = [scene.camera.part(r.x0, r.y0, r.x1, r.y1, scale) for r in tiles]
@@ -61,7 +62,7 @@ class FineTiles:
     def __enter__(self) -> FineTiles:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._renderer.release()
 
     def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:

@@ -1,5 +1,6 @@
 """A still camera redraws only what moves, and every pixel is as in a full redraw."""
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -115,7 +116,7 @@ def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
                 np.testing.assert_array_equal(frame.read(), truth)
             if not rng.integers(6):
                 quick.draw(fine, int(rng.integers(SECOND)))
-        assert sum(b.changed_since(a) is not None for (a, _), (b, _) in zip(drawn, drawn[1:])) > 10
+        assert sum(b.changed_since(a) is not None for (a, _), (b, _) in itertools.pairwise(drawn)) > 10
 
 
 def test_the_memory_of_a_view_is_the_renderers(gl):

@@ -4,7 +4,7 @@ import pytest
 
 pytest.importorskip("griffe", reason="the extra [docs] is not installed")
 
-from blinkgl.tools.docstrings import markdown  # noqa: E402
+from blinkgl.tools.docstrings import markdown
 
 
 @pytest.mark.parametrize(("written", "shown"), [

@@ -84,7 +84,7 @@ def check_program(ctx: moderngl.Context, folder, name: str, result: Result) -> N
                 if diagnostic.kind == "error":
                     _add(result.errors, diagnostic, name, defines)
             continue
-        for diagnostic in unused(sources, {member for member in program}):
+        for diagnostic in unused(sources, set(program)):
             _add(result.unused, diagnostic, name, defines)
     loader.clear()
 

@@ -174,7 +174,7 @@ class Inspector:
         except ShaderError as error:
             found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
             self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
-        except Exception as error:  # an edit that compiles but cannot be drawn with: not the tool's end
+        except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
             self.errors = [Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")]
         else:
             self.errors = []
@@ -231,7 +231,7 @@ class Worker:
     def _run(self, opened: Future) -> None:
         try:
             self.inspector.open()
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001 - raised by whoever waits
             opened.set_exception(error)
             return
         opened.set_result(None)
@@ -239,7 +239,7 @@ class Worker:
             function, arguments, answer = job
             try:
                 answer.set_result(function(*arguments))
-            except BaseException as error:
+            except BaseException as error:  # noqa: BLE001 - raised by whoever asked
                 answer.set_exception(error)
         self.inspector.close()
 

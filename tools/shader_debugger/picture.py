@@ -151,7 +151,7 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
         for spine in axes.spines.values():
             spine.set_visible(False)
         return
-    x, y, w, h = box
+    x, y, _, h = box
     text = {"mask": "white: yes, black: no", "ids": "one colour per number", "unit": "r, g, b = x, y, z; grey is 0",
             "uv": "r, g = fractional part of u, v", "light": f"sRGB, white = {legend.get('high', 1):.3g}"}.get(kind, "")
     if kind == "wheel":

@@ -174,8 +174,8 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
 def as_text(found: dict) -> str:
     """The probe as fixed-width text."""
     x, y = found["pixel"]
-    lines = [f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
-             f"{found['times_s']['backward']:.9g} s (backward)"]
+    lines = [(f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
+              f"{found['times_s']['backward']:.9g} s (backward)")]
     if found["band"]:
         lines.append("in the silhouette band: the pixel's centre may fall on either side of an edge, so nothing is graded here")
     lines += ["", f"{'':3}{'buffer':<20} {'GPU':<34} {'reference (float64)':<34} {'error':>10} {'ULPs':>9}  unit"]

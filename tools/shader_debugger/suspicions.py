@@ -78,7 +78,7 @@ Candidates = Iterator[tuple[str, np.ndarray]]
 def _candidates(comparison, report, r, g, on) -> Candidates:
     """(text, what the GPU would have written) pairs; r, g : (N[, C]) at the pixels ``on``."""
     name = report.quantity.name
-    of, what = lookup_of(name)
+    _, what = lookup_of(name)
     specific = {"uv": _uv, "level": _level, "albedo": _albedo, "light": _light}.get(what) or {
         "depth": _depth, "normals": _normals, "luminance": _shaded, "colour": _shaded, "velocity": _velocity,
         "flow_forward": _flow, "flow_backward": _flow}.get(name)

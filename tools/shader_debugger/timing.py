@@ -222,10 +222,10 @@ def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, r
 
 
 def as_text(result: dict) -> str:
-    lines = [f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x {result['height']} px, "
-             f"{result['renderer']}, median of {result['repeat']}", "",
-             f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} {'fragments':>10} "
-             f"{'overdraw':>8}"]
+    lines = [(f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x {result['height']} px, "
+              f"{result['renderer']}, median of {result['repeat']}"), "",
+             (f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} {'fragments':>10} "
+              f"{'overdraw':>8}")]
     for p in result["passes"]:
         lines.append(f"{p['pass']:<26} {p['gpu_ms']:>8.3f} {p['wall_ms']:>8.3f} {p['vertex_ms']:>8.3f} {p['fragment_ms']:>8.3f} {p['draws']:>6} "
                      f"{p['triangles']:>9} {p['fragments']:>10} {p['overdraw']:>8.2f}")

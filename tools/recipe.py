@@ -1,12 +1,12 @@
-"""Runs the Dockerfile's steps in a bare Debian, where there is no Docker: its RUN lines in a chroot, its COPY lines with cp.
+"""Takes the Dockerfile's steps in a bare Debian, where there is no Docker: its RUN lines in a chroot.
 
     debootstrap --variant=minbase bookworm out/debian                        # as root; the FROM of the recipe, 200 MB
     python -m blinkgl.tools.recipe --root out/debian --target nvidia
     python -m blinkgl.tools.recipe --root out/debian --run generate /opt/blinkgl/configs/demo.yaml --out out/demo
 
-The first call takes the steps that lead to a target; ``--run`` is what ``docker run`` would start then, as its user, in its folder and
-environment. It needs root, is no container (network and processes are the host's), and changes nothing outside the folder. /proc and /dev
-are mounted into it in a mount namespace of their own, which ends with the command.
+The first call takes the steps that lead to a target; ``--run`` is what ``docker run`` would start then, as its user, in
+its folder and environment. It needs root, is no container (network and processes are the host's), and changes nothing
+outside the folder. /proc and /dev are mounted into it in a mount namespace of their own, which ends with the command.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ class Step:
 class State:
     """What the steps so far have set."""
 
-    environment: dict[str, str] = field(default_factory=lambda: {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"})
+    environment: dict[str, str] = field(
+        default_factory=lambda: {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"}
+    )
     folder: str = "/"
     user: str = "root"
     command: list[str] = field(default_factory=list)
@@ -68,7 +70,7 @@ def steps(recipe: str) -> list[Step]:
 
 
 def stage(recipe: str, target: str) -> tuple[str, list[Step]]:
-    """The image that a target begins with, and the steps from there to its end, those of the targets it is built on first."""
+    """The image that a target begins with, and the steps from there to its end."""
     stages: dict[str, tuple[str, list[Step]]] = {}
     name = ""
     for step in steps(recipe):
@@ -83,11 +85,14 @@ def stage(recipe: str, target: str) -> tuple[str, list[Step]]:
 
 def inside(root: Path, state: State, command: str) -> int:
     """Exit status of a shell command inside ``root``."""
-    script = f'mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && exec chroot --userspec={shlex.quote(state.user)} "$0" /bin/sh -c "$1"'
+    change = f"exec chroot --userspec={shlex.quote(state.user)}"
+    script = f'mount -t proc proc "$0/proc" && mount --rbind /dev "$0/dev" && {change} "$0" /bin/sh -c "$1"'
     settings = [f"{name}={value}" for name, value in state.environment.items()]
     line = f"cd {shlex.quote(state.folder)} && {command}"
     home = "/root" if state.user == "root" else f"/home/{state.user}"
-    return subprocess.run(["unshare", "--mount", "env", "-i", f"HOME={home}", *settings, "sh", "-c", script, str(root), line], check=False).returncode
+    return subprocess.run(
+        ["unshare", "--mount", "env", "-i", f"HOME={home}", *settings, "sh", "-c", script, str(root), line], check=False
+    ).returncode
 
 
 def copy(context: Path, root: Path, state: State, text: str) -> None:
@@ -105,7 +110,8 @@ def copy(context: Path, root: Path, state: State, text: str) -> None:
 def build(recipe: str, target: str, context: Path, root: Path, certificates: Path | None = None) -> State:
     """Takes the steps of a target in ``root``, a bare system. Raises RuntimeError with the line that failed.
 
-    certificates : those that pip is to believe besides, where a proxy stands between this machine and the package index."""
+    certificates : those that pip is to believe besides, where a proxy stands before the package index.
+    """
     state = State()
     if certificates is not None:
         shutil.copy(certificates, root / "tmp/certificates.crt")
@@ -127,7 +133,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, required=True, help="folder of a bare Debian")
     parser.add_argument("--target", default="cpu")
-    parser.add_argument("--certificates", type=Path, help="file that pip believes besides, behind a proxy that signs for others")
+    parser.add_argument(
+        "--certificates", type=Path, help="file that pip believes besides, behind a proxy that signs for others"
+    )
     parser.add_argument("--run", nargs=argparse.REMAINDER, help="start the built image's command with these arguments")
     arguments = parser.parse_args()
     recipe = Path("Dockerfile").read_text(encoding="utf-8")

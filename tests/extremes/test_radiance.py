@@ -11,7 +11,8 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Esim
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LabelRequest
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Light, Material, Texture
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, SECOND, drift, quad, rig, scene, still, thing

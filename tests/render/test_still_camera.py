@@ -15,7 +15,8 @@ from blinkgl.events import Esim
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.passes import Luminance
 from blinkgl.render.rectangles import Rectangle, merged
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LabelRequest
+from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath

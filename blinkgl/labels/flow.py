@@ -14,8 +14,8 @@ from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Key, Label, Towards, View
 
 if TYPE_CHECKING:
-    from blinkgl.render.passes import Shot
     from blinkgl.config.labels import LabelsConfig
+    from blinkgl.render.passes import Shot
 
 _KEYS = {
     "flow": Key(tuple[Literal["forward", "backward"], ...], Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"), "depth"),

@@ -100,7 +100,7 @@ def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None 
     emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
     sensor : camera whose size, emulator values and read-out are taken, such as "davis346".   timeline : :class:`Timeline`.
     quality : "fast", "balanced", "accurate" or "reference".
-    labels : of images, flow, flow_backward, occlusion, depth, ids, normals, velocity; default: the source's (images, flow, occlusion).
+    labels : names of labels, such as images, flow, flow_backward, occlusion, depth (docs/configuration.md has all); default: the source's.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
     images, frames, chunks, times = [], [], [], []

@@ -30,7 +30,7 @@ from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.gl import ShaderError, create_context
 from blinkgl.io.formats import open_events
-from blinkgl.labels import LABELS, Form, Label, LabelRequest, register as register_label, unregister as unregister_label
+from blinkgl.labels import LABELS, Form, Label, LabelFrame, LabelRequest, register as register_label, unregister as unregister_label
 from blinkgl.labels.files import npy
 from blinkgl.labels.label import Key
 from blinkgl.recordings.simulation import frames_to_events
@@ -633,8 +633,9 @@ def test_a_label_may_look_at_others_and_at_another_time(drawing):
             renderer.labels(t_ns, LabelRequest("next_depth"))
     finally:
         unregister_label("next_depth")
+    assert frame.next_depth is frame.values["next_depth"]
     with pytest.raises(AttributeError, match="no label 'next_depth'"):
-        frame.next_depth
+        LabelFrame(0, {}).next_depth
 
 
 @pytest.mark.parametrize("reference, said", [

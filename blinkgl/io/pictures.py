@@ -1,4 +1,4 @@
-"""A label as a picture, by its kind."""
+"""Arrays as pictures, by their kind: what a label or a buffer of the shader debugger looks like."""
 
 from __future__ import annotations
 

@@ -58,7 +58,9 @@ class PinHole(CameraModel):
 
     def _edge(self) -> tuple[float, float]:
         """|X / Z| and |Y / Z| of the picture's farthest corner from the optical axis."""
-        return max(self.cx + 0.5, self.width - 0.5 - self.cx) / self.fx, max(self.cy + 0.5, self.height - 0.5 - self.cy) / self.fy
+        return max(self.cx + 0.5, self.width - 0.5 - self.cx) / self.fx, max(
+            self.cy + 0.5, self.height - 0.5 - self.cy
+        ) / self.fy
 
     @property
     def half_angle(self) -> float:
@@ -81,22 +83,27 @@ class PinHole(CameraModel):
         return planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        if points[:, 2].min() <= self.near:
-            return (0, 0, self.width, self.height) if points[:, 2].max() > self.near else None
-        # Of a convex body in front of the camera the corners are seen farthest out.
-        (left, top), (right, bottom) = (of(self.project(points), axis=0) for of in (np.min, np.max))
-        x0, x1 = max(0, int(np.floor(left)) - 1), min(self.width, int(np.ceil(right)) + 2)
-        y0, y1 = max(0, int(np.floor(top)) - 1), min(self.height, int(np.ceil(bottom)) + 2)
+        """Of a convex body in front of the camera the corners are seen farthest out."""
+        z = points[:, 2]
+        if z.min() <= self.near:
+            return (0, 0, self.width, self.height) if z.max() > self.near else None
+        # Not by `project`: asked of every moving thing in every frame, and nothing here is behind the camera.
+        x, y = self.fx * points[:, 0] / z + self.cx, self.fy * points[:, 1] / z + self.cy
+        x0, x1 = max(0, math.floor(x.min()) - 1), min(self.width, math.ceil(x.max()) + 2)
+        y0, y1 = max(0, math.floor(y.min()) - 1), min(self.height, math.ceil(y.max()) + 2)
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
     def clip_from_cam(self) -> np.ndarray:
         """(4, 4) float64: x right, y down, w = Z, depth = near / Z (reversed, the far plane at infinity).
 
-        A point is seen at pixel x = fx X / Z + cx, that is at window coordinate x + 0.5, that is at ndc 2 (x + 0.5) / width - 1."""
+        A point is seen at pixel x = fx X / Z + cx, that is at window coordinate x + 0.5, that is at ndc 2 (x + 0.5) /
+        width - 1."""
         w, h = self.width, self.height
-        return np.array([
-            [2 * self.fx / w, 0.0, 2 * (self.cx + 0.5) / w - 1, 0.0],
-            [0.0, 2 * self.fy / h, 2 * (self.cy + 0.5) / h - 1, 0.0],
-            [0.0, 0.0, 0.0, self.near],
-            [0.0, 0.0, 1.0, 0.0],
-        ])
+        return np.array(
+            [
+                [2 * self.fx / w, 0.0, 2 * (self.cx + 0.5) / w - 1, 0.0],
+                [0.0, 2 * self.fy / h, 2 * (self.cy + 0.5) / h - 1, 0.0],
+                [0.0, 0.0, 0.0, self.near],
+                [0.0, 0.0, 1.0, 0.0],
+            ]
+        )

@@ -21,7 +21,7 @@ from blinkgl.labels import LABELS, asked_for
 from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.recorded import RECORDED
@@ -60,8 +60,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     if config.frames is not None:
         return _explain_frames(config, index, template.base)
     with create_context(config.gl.backend, config.gl.device) as gl:
-        scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
-                            seed=config.seed, sequence=index, base=template.base)
+        scene = sequence_scene(config, index, template.base)
         with Renderer(gl, scene, config.render) as renderer:
             result = Explanation(machine=gl.renderer)
             result.scene = _describe(renderer.scene, renderer)
@@ -88,7 +87,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
         "not used": "camera, time, timeline, scene and render: nothing is rendered"}
     count = min(PROBES, len(files)) - 1
     until_ns, started, steps = round(count * 1e9 / frames.fps), time.perf_counter(), 0
-    for chunk in probe:
+    for chunk in probe.chunks():
         steps += 1
         if chunk.t_ns >= until_ns:
             break
@@ -159,7 +158,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     event_s = _timed(drawn, times)
     fine = samples_of(config.render.antialiasing).stored
     probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
-    seen = [chunk.t_ns for chunk in islice(probe, 2 * PROBES)]  # a short stretch of it, as it will be
+    seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be
     if timeline.kind == "uniform":
         result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:

@@ -21,7 +21,7 @@ from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.render.renderer import Renderer as SceneRenderer
 from blinkgl.scene import types as data
 from blinkgl.scene.build import build_scene
-from blinkgl.sequence import EventChunk, simulate as core
+from blinkgl.sequence import EventChunk, GroundTruth, simulate as core
 from blinkgl.srgb import to_srgb8
 
 _LATEST_S = 1e7
@@ -95,12 +95,14 @@ def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, 
             if isinstance(item, EventChunk):
                 chunks.append(item.events)
                 continue
+            assert isinstance(item, GroundTruth), "no pictures were asked for"
             times.append(item.t_ns // 1000)
             if (image := item.frame.values.pop("images", None)) is not None:
                 images.append(to_srgb8(image))
             if item.forward_ns is not None:
                 frames.append(item.frame)
     t_us, camera = np.array(times, np.int64), sequence.camera
+    assert camera is not None, "a scene is seen by an event camera"
     return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames), t_us, np.stack(images) if images else None, config, sequence.frames,
                      camera.saturated + camera.dropped)
 

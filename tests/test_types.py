@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -92,7 +93,8 @@ def test_a_users_program_is_checked(tmp_path):
     """Errors at the lines that are wrong and nowhere else: a class that a checker takes for Any would be an error nowhere."""
     pytest.importorskip("pyrefly", reason="the extra [dev] is not installed")
     (tmp_path / "program.py").write_text(PROGRAM, encoding="utf-8")
-    command = [sys.executable, "-m", "pyrefly", "check", "--preset", "strict", "--output-format", "json", "--python-interpreter-path", sys.executable,
+    program = next(file.locate() for file in metadata.files("pyrefly") or () if file.name == "pyrefly")
+    command = [program, "check", "--preset", "strict", "--output-format", "json", "--python-interpreter-path", sys.executable,
                "--search-path", REPOSITORY, "program.py"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     errors = json.loads(done.stdout)["errors"]

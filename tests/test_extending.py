@@ -75,6 +75,6 @@ def test_a_network(code):
         model({k: torch.randn(1, 5, 50, 64) for k in ("old", "new")})
 
 
-@pytest.mark.parametrize("place", sorted({place for place in re.findall(r"`((?:blinkgl|eflow|shaders|tools|tests|configs|docs)/[\w./]*)`", PAGE)}))
+@pytest.mark.parametrize("place", sorted(set(re.findall(r"`((?:blinkgl|eflow|shaders|tools|tests|configs|docs)/[\w./]*)`", PAGE))))
 def test_every_place_is_there(place):
     assert (Path(__file__).parents[1] / place).exists(), f"docs/extending.md names {place}"

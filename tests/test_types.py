@@ -20,12 +20,15 @@ from pathlib import Path
 import numpy as np
 
 import blinkgl
-from blinkgl import Camera, Esim, Events, Keyframes, LabelFrame, Material, Mesh, Primitive, Recording, Renderer, Scene, Timeline, look_at
+from blinkgl import Camera, Esim, Events, Keyframes, LabelFrame, Material, Mesh, Primitive, Recording, Renderer, Scene
+from blinkgl import Timeline, look_at
 
 flight = Keyframes({0: look_at((-2, -0.3, 0.8), (0, 0, 0)), 0.2: look_at((-2, 0.3, 0.8), (0, 0, 0))})
-scene = Scene(Camera(32, 24, pose=flight), duration=0.1) + Primitive("cuboid", extents=(1, 1, 2), material=Material(color=(1, 0.5, 0)))
+orange = Material(color=(1, 0.5, 0))
+scene = Scene(Camera(32, 24, pose=flight), duration=0.1) + Primitive("cuboid", extents=(1, 1, 2), material=orange)
 scene = scene + Mesh(vertices=np.eye(3), faces=[[0, 1, 2]], pose=(0, 0, 1))
-recording: Recording = blinkgl.record(scene, emulator={"emulator": "v2e", "cutoff_hz": 200}, timeline=Timeline("uniform", fps=500))
+uniform = Timeline("uniform", fps=500)
+recording: Recording = blinkgl.record(scene, emulator={"emulator": "v2e", "cutoff_hz": 200}, timeline=uniform)
 flow: np.ndarray = recording.flow
 events: Events = recording.window(0)
 emulator = Esim(24, 32, seed=1, contrast_threshold=0.2)

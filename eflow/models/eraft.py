@@ -143,7 +143,7 @@ class Eraft(FlowModel):
         for i in range(iterations):
             flow = flow.detach()
             wanted = self.training or self.plain or i == iterations - 1
-            step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: B023 - called at once
+            step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: B023
             if self.training and self.config.checkpoint_iterations:
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
             else:

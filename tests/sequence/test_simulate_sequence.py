@@ -77,7 +77,7 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
     config = config_of(tmp_path)
     drawn = []
     for name in ("luminance", "colour", "labels", "velocity", "motion"):
-        def spied(self, *args, _name=name, _draw=getattr(Renderer, name), **kwargs):  # noqa: B008 - bound to this turn of the loop
+        def spied(self, *args, _name=name, _draw=getattr(Renderer, name), **kwargs):  # noqa: B008
             drawn.append(_name)
             return _draw(self, *args, **kwargs)
         monkeypatch.setattr(Renderer, name, spied)

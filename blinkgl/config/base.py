@@ -258,6 +258,7 @@ def members(annotation: Any) -> list[Any]:
 
 
 def is_model(annotation: Any) -> bool:
+    """Whether it is a pydantic model and nothing more."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 

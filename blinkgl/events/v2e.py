@@ -82,6 +82,8 @@ class Pixels(NamedTuple):
 
 
 class Interval(NamedTuple):
+    """What is the same for all pixels of a step."""
+
     t0_ns: int
     dt_ns: int
     base_us: int

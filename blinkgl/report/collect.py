@@ -51,6 +51,8 @@ class Parameter:
 
 @dataclass
 class Collected:
+    """What the page of a data set is made of."""
+
     root: Path
     sequences: list[dict[str, Any]]
     plan: Plan | None

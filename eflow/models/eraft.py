@@ -18,6 +18,8 @@ FEATURES, HIDDEN, CONTEXT = 256, 128, 128
 
 
 class ResidualBlock(nn.Module):
+    """Two convolutions beside a shortcut (He et al., CVPR 2016)."""
+
     def __init__(self, inputs: int, outputs: int, stride: int, norm: type[nn.Module]):
         super().__init__()
         self.conv1, self.norm1 = nn.Conv2d(inputs, outputs, 3, stride, 1), norm(outputs)

@@ -301,4 +301,5 @@ def random_primitive(kind: str, index: int) -> Mesh:
 
 
 def random_primitive_hash(kind: str, index: int) -> str:
+    """``source_hash`` of :func:`random_primitive`, without making it."""
     return parameter_hash("random primitive", 1, kind, index)

@@ -19,9 +19,10 @@ from rich.table import Table
 
 from blinkgl.config.sequence import load_run
 from blinkgl.gl import create_context
+from blinkgl.labels import LabelRequest
 from blinkgl.machine import bench
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 
 REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")

@@ -34,7 +34,8 @@ from rich.table import Table
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import BlinkGLError
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
@@ -81,12 +82,15 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     costs, streams, first = {}, {}, {}
     for name in (*ANTIALIASINGS, *traced):
         cost = costs[name] = Cost()
-        emulator, chunks = make_emulator(config, height, width, seed=1), []
         source = rasterised(gl, scene, times, name, cost) if name in ANTIALIASINGS else frames(scene, times, traced[name], cost)
-        for t, frame in zip(times, source):
-            first.setdefault(name, frame.copy())
-            chunks.append(emulator.step(frame, t))
-        streams[name] = Events.concatenate(chunks)
+
+        def event_frames(name=name, source=source):
+            for t, frame in zip(times, source):
+                first.setdefault(name, frame.copy())
+                yield EventFrame(t, frame)
+
+        camera = EventCamera(config, None, height, width, seed=1)
+        streams[name] = Events.concatenate([events for _, events in emulate(event_frames(), camera)])
         console.print(f"{name}: {len(streams[name]):,} events, {np.median(cost.wall_s):.3f} s per frame", highlight=False)
     rows = [("filtering", a, "our light") for a in ANTIALIASINGS]
     rows += [("shadows", "our light", "shadows"), ("bounces", "shadows", "everything")]

@@ -22,7 +22,8 @@ from rich.table import Table
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
@@ -62,7 +63,7 @@ class Judged:
     def __init__(self, gl, scene: Scene, config, emulator, factor: int = 1):
         self.factor, self.renderer = factor, Renderer(gl, finer(scene, factor) if factor > 1 else scene, config)
         camera = scene.camera
-        self.emulator = make_emulator(emulator, camera.height, camera.width, 0)
+        self.camera = EventCamera(emulator, None, camera.height, camera.width, 0)
         self.frame = np.empty((camera.height * factor, camera.width * factor), np.float32)
         self.shape = (camera.height, camera.width)
         self.parts: list[Events] = []
@@ -76,7 +77,7 @@ class Judged:
         self.cpu.append(time.process_time() - cpu)
         if self.factor > 1:
             image = image.reshape(self.shape[0], self.factor, self.shape[1], self.factor).mean(axis=(1, 3))
-        self.parts.append(self.emulator.step(image, t_ns))
+        self.parts.append(self.camera.step(EventFrame(t_ns, image)))
         return image
 
     @property

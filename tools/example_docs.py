@@ -29,7 +29,7 @@ PICTURES = {
 }
 """Of an example: the picture it makes, its name in docs/images, and what it shows."""
 ORDER = ("scene_in_python", "frame_with_labels", "own_trajectory", "video_to_events", "events_over_frame", "event_tensors", "dataset_from_yaml",
-         "torch_dataloader", "compare_recordings", "convert_formats", "sensors")
+         "torch_dataloader", "online_windows", "compare_recordings", "convert_formats", "sensors")
 
 HEADER = """# Examples
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.reader import to_yaml
-from blinkgl.config.sequence import load_run
+from blinkgl.config.sequence import LabelsConfig, load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.events.table import EMULATORS
 from blinkgl.machine.bench import machine_line
@@ -34,7 +34,7 @@ BASE = {
         "pool": {"urdfs": False},
         "textures": {"variants": 12, "photographs": False, "max_size": 128},
     },
-    "labels": {"flow": ["forward", "backward"], "occlusion": True, "depth": True, "ids": True, "normals": True, "velocity": True},
+    "labels": {"flow": ["forward", "backward"], **{name: True for name, info in LabelsConfig.model_fields.items() if info.annotation is bool}},
 }
 STILL = "scene.camera_motion={speed: 0, rotation_rate: 0}"
 CASES: dict[str, list[str]] = {

@@ -17,7 +17,9 @@ from blinkgl.labels import LABELS
 if TYPE_CHECKING:
     from blinkgl.dataset.run import Outcome
     from blinkgl.dataset.verify import Verification
+    from blinkgl.scene.types import Scene as SceneData
 
+MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
 Emulator = str | Mapping[str, Any] | Config
 
@@ -100,6 +102,16 @@ def configured(source: Source, *, emulator: Emulator | None = None, sensor: str 
         if key in own:
             validate_field(SequenceConfig, key, own[key])
     return RunTemplate(merge(template.tree, own), template.base) if own else template
+
+
+def scene_of(source: Source, config: SequenceConfig, index: int) -> SceneData:
+    """What sequence ``index`` shows. Raises ConfigError and AssetError."""
+    if isinstance(source, Scene):
+        return source.build(config)
+    from blinkgl.scene.build import build_scene
+
+    return build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split, seed=config.seed,
+                       sequence=index, base=source.base)
 
 
 def events_tree(emulator: Emulator) -> dict[str, Any]:

@@ -11,10 +11,11 @@ from pydantic import Field
 from blinkgl.labels import grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.frames import Flow
-from blinkgl.labels.label import Drawn, Instant, Key, Label, Towards, View
+from blinkgl.labels.label import Drawn, Key, Label, Towards, View
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
+    from blinkgl.render.passes import Shot
 
 _KEYS = {
     "flow": Key(tuple[Literal["forward", "backward"], ...], Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"), "depth"),
@@ -44,19 +45,20 @@ class FlowTo(Label):
     def ask(self, tree: dict[str, Any]) -> None:
         tree["flow"] = [*tree.get("flow", ()), self.towards]
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {f"difference_{self.towards}": (at.mvp_there(self.towards) - at.mvp)[:, [0, 1, 3]]}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {f"difference_{self.towards}": (shot.ends[self.towards].mvp - shot.moment.mvp)[:, [0, 1, 3]]}
 
     def finish(self, drawn: Drawn) -> Flow:
         raw = drawn.raw(self.name)
         valid = (raw[..., 3] > 0) & (raw[..., 2] > 0)
         return Flow(np.where(valid[..., None], raw[..., :2], np.float32(0)), valid)
 
-    def own(self, value: Flow, height: int, width: int) -> Flow:
-        flow, valid = np.array(value.flow), np.array(value.valid)
-        if flow.shape != (height, width, 2) or valid.shape != (height, width):
-            raise TypeError(f"label '{self.name}': {flow.shape} and valid {valid.shape}, not {(height, width, 2)} and {(height, width)}")
-        return Flow(flow, valid.astype(bool))
+    def wrong(self, value: Flow, height: int, width: int) -> str | None:
+        shapes = np.shape(value.flow), np.shape(value.valid)
+        return None if shapes == ((height, width, 2), (height, width)) else f"{shapes[0]} and valid {shapes[1]}, not {(height, width, 2)} and {(height, width)}"
+
+    def own(self, value: Flow) -> Flow:
+        return Flow(np.array(value.flow), np.array(value.valid).astype(bool))
 
     @property
     def forms(self) -> tuple[Form, ...]:

@@ -8,9 +8,10 @@ import numpy as np
 
 from blinkgl.labels import files, grading
 from blinkgl.labels.files import Form
-from blinkgl.labels.label import Instant, Label, View
+from blinkgl.labels.label import Label, View
 
 if TYPE_CHECKING:
+    from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
     from blinkgl.scene.types import Scene
 
@@ -22,8 +23,8 @@ class Ids(Label):
     title, unit, kind = "instance ids", "0: nothing hit", "ids"
     buffer, dtype = "R32UI", np.uint32
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {"instance_id": np.array([thing.instance_id for thing in at.scene.objects], np.uint32)}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"instance_id": np.array([thing.instance_id for thing in shot.scene.objects], np.uint32)}
 
     @property
     def forms(self) -> tuple[Form, ...]:

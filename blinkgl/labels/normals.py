@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from blinkgl.labels.label import Instant, Label
+from blinkgl.labels.label import Label
 
 if TYPE_CHECKING:
+    from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
     from blinkgl.scene.types import Scene
 
@@ -21,8 +22,8 @@ class Normals(Label):
     buffer, varyings, channels = "RGBA32F", ("normal",), 3
     judged_in, tolerance = "of a unit vector", 1e-3
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {"camera_from_local": at.T_cam_obj[:, :3, :3]}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"camera_from_local": shot.moment.T_cam_obj[:, :3, :3]}
 
     def problem(self, value: np.ndarray) -> str | None:
         # A mesh's own normals may be of no length, and are then no direction here either.

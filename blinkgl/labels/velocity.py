@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from blinkgl.labels import grading
-from blinkgl.labels.label import Instant, Label
+from blinkgl.labels.label import Label
 
 if TYPE_CHECKING:
+    from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
     from blinkgl.scene.types import Scene
 
@@ -22,8 +23,8 @@ class Velocity(Label):
     buffer, varyings, channels = "RG32F", ("local",), 2
     judged_in, tolerance, error = "px per label interval", 1e-2, staticmethod(grading.motion_per_interval)
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {"rate": at.mvp_rate[:, [0, 1, 3]]}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"rate": shot.moment.rates.mvp[:, [0, 1, 3]]}
 
     def problem(self, value: np.ndarray) -> str | None:
         return None if np.isfinite(value).all() else "a velocity that is no finite number"

@@ -57,7 +57,7 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
 
 
 def _example(e: Example) -> dict[str, Any]:
-    pictures = (("frame", e.image), ("events", e.events), ("flow", e.flow))
+    pictures = (("frame", e.image), ("events", e.events), ("flow", e.flow), *e.others)
     return {"name": e.name, "caption": e.caption, "pictures": [(label, None if array is None else png(_small(array))) for label, array in pictures]}
 
 

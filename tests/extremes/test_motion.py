@@ -12,7 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LabelRequest
+from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.timeline import displacement_times, uniform_times

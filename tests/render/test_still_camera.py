@@ -12,10 +12,11 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import GLError
 from blinkgl.events import Esim
+from blinkgl.labels import LabelRequest
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.passes import Luminance
 from blinkgl.render.rectangles import Rectangle, merged
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath

@@ -76,11 +76,15 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
     """And it changes nothing of the rest: events are the same with and without labels and pictures between them."""
     config = config_of(tmp_path)
     drawn = []
-    for name in ("luminance", "colour", "labels", "velocity", "motion"):
-        def spied(self, *args, _name=name, _draw=getattr(Renderer, name), **kwargs):  # noqa: B008
-            drawn.append(_name)
-            return _draw(self, *args, **kwargs)
+
+    def spy(name, draw):
+        def spied(self, *args, **kwargs):
+            drawn.append(name)
+            return draw(self, *args, **kwargs)
         monkeypatch.setattr(Renderer, name, spied)
+
+    for name in ("luminance", "colour", "labels", "velocity", "motion"):
+        spy(name, getattr(Renderer, name))
     made = {}
     for name, wanted in (("everything", {"pictures_hz": 40}), ("events", {"labels": False}), ("labels", {"events": False})):
         drawn.clear()

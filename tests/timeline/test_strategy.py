@@ -13,7 +13,8 @@ from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.config.timeline import BrightnessTimeline, BudgetTimeline, DisplacementTimeline, UniformTimeline
 from blinkgl.events import Esim, Events, emulator_of
 from blinkgl.events.v2e_model import lin_log
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.labels import LabelRequest
+from blinkgl.render.renderer import Renderer
 from blinkgl.sequence import simulate_sequence
 from blinkgl.timeline import make_timeline
 from blinkgl.timeline.budget import TimeError, contraharmonic_mean, weighted_percentile

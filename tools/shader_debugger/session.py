@@ -187,7 +187,7 @@ class Snapshot:
 def files_of(folder) -> list[Path]:
     """Every shader file below ``folder``, for watching and for messages."""
     root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
-    return sorted([*root.glob("*.glsl"), *(root / "include").glob("*.glsl")])
+    return sorted([*root.glob("*.glsl"), *(root / "include").rglob("*.glsl")])
 
 
 class _Nothing:
@@ -291,7 +291,7 @@ class DebugRenderer(Renderer):
                 "count": albedo[..., 3]}
 
     def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
-        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth: DEPTH, ID, FLOW_FORWARD …"""
+        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
         frame = self.draw(Geometry(names), t_ns, ends)
         return {name: frame.read(name) for name in names}

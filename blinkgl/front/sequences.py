@@ -14,7 +14,7 @@ from blinkgl.front import arguments as check
 from blinkgl.front.runs import MAX_INDEX, Emulator, Source, Timeline, configured
 from blinkgl.front.scenes import Scene
 from blinkgl.labels import Flow, LabelFrame
-from blinkgl.sequence import EventChunk, Simulation, simulate as core
+from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate as core
 from blinkgl.srgb import to_srgb8
 
 
@@ -109,11 +109,13 @@ def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, 
             if isinstance(item, EventChunk):
                 chunks.append(item.events)
                 continue
+            assert isinstance(item, GroundTruth), "no pictures were asked for"
             image = item.frame.values.pop("images", None)
             if image is not None:
                 images.append(to_srgb8(image) if image.dtype.kind == "f" else image)
             frames.append(item.frame)
             times.append(item.t_ns // 1000)
     t_us, camera = np.array(times, np.int64), sequence.camera
+    assert camera is not None, "events were asked for"
     return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames[:-1]), t_us, np.stack(images) if images else None, sequence.config,
                      sequence.frames, camera.saturated + camera.dropped)

@@ -193,7 +193,7 @@ def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
     pictures = []
     for name, label in LABELS.items():
         form = label.forms[0]
-        if name in ("images", _FLOW.name) or not (folder / form.file(index)).is_file():
+        if name in ("images", _FLOW.name) or form.read is None or not (folder / form.file(index)).is_file():
             continue
         value = form.read(folder / form.file(index))
         pictures += [(view.title, picture(view.kind, view.of(value))[0]) for view in label.views if not (view.kind == "mask" and len(label.views) > 1)]

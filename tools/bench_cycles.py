@@ -40,7 +40,7 @@ from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.srgb import to_srgb8
 from blinkgl.timeline.sampling import displacement_times
@@ -165,8 +165,7 @@ def main() -> None:
         return
     template = load_run(options.config, options.overrides)
     config = template.sequence(options.sequence)
-    scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split, seed=config.seed,
-                        sequence=options.sequence, base=template.base)
+    scene = sequence_scene(config, options.sequence, template.base)
     result: dict = {}
     with create_context() as gl:
         result["machine"], result["load_before"] = bench.machine_line(gl.renderer), os.getloadavg()

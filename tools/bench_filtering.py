@@ -28,7 +28,7 @@ from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.statistics import largest_speed
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.timeline import displacement_times
 from blinkgl.trade.matching import match_events
@@ -132,7 +132,7 @@ def main() -> None:
         report["machine"] = bench.machine_line(gl.renderer)
         for index in arguments.sequences:
             config = run.sequence(index)
-            scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, seed=config.seed, sequence=index, base=run.base)
+            scene = sequence_scene(config, index, run.base)
             times = displacement_frames(gl, scene, arguments.max_px, arguments.frames)
             report["sequences"][index] = judge(gl, scene, SETTINGS, times, arguments.factor, int(arguments.limit * 1e3),
                                                EsimConfig(contrast_threshold=0.2))

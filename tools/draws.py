@@ -83,7 +83,7 @@ def told_scene(scene: Scene) -> dict[str, Any]:
     camera = scene.camera
     said: dict[str, Any] = {
         "log": list(scene.log), "light": told([*scene.light.sun_direction, scene.light.sun, scene.light.sky]),
-        "camera": [camera.fx, camera.fy, camera.cx, camera.cy, *told(camera.path.poses(TIMES_NS)), *told(np.stack([camera.path.derivative(int(t)) for t in TIMES_NS]))],
+        "camera": [camera.fx, camera.fy, camera.cx, camera.cy, *told(scene.camera_path.poses(TIMES_NS)), *told(np.stack([scene.camera_path.derivative(int(t)) for t in TIMES_NS]))],
     }
     for thing in scene.objects:
         said[f"{thing.instance_id} {thing.category} {thing.name}"] = [

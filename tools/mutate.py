@@ -8,7 +8,8 @@
 A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is made in a copy of
 the tree, so nothing here is touched. The tests that reached its line run, its module's own first, until one fails (killed), the time is up
 (killed: "time"), or all passed (survived). Lines that no test reaches are survivors without a run. What coverage cannot see is
-compiled: a numba kernel is given all tests of its module's callers, a shader those of ``tests/render`` and ``tests/extremes``.
+compiled: a numba kernel is given all tests of its module's callers, a shader those of ``tests/render`` and
+``tests/extremes``.
 
 What takes time is starting, not testing. So the tests of a mutant run in a child of a process (``--serve``, one per copy) that has imported
 what the tree stands on (numpy, numba, pytest, ...) and nothing of the tree itself. A kernel's machine code is taken from the cache unless
@@ -52,10 +53,12 @@ MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
 SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",
                "examples")
+DEBUGGERS = "shaders/include/lookup.glsl"
+"""the include that only the shader debugger asks for"""
 MOST_TESTS, MOST_S = 300, 120.0
 """of the tests that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
-"""bytes of address space: a mutant that never stops collecting must not take the machine with it"""
+"""bytes: a mutant that never stops collecting must not take the machine with it"""
 
 PRELOADED = ("numpy", "numba", "scipy.interpolate", "scipy.ndimage", "scipy.spatial.transform", "scipy.optimize", "scipy.special", "cv2", "h5py",
              "hdf5plugin", "pydantic", "yaml", "typer", "rich.console", "rich.table", "rich.progress", "PIL.Image", "imageio.v3", "moderngl", "trimesh",
@@ -408,7 +411,7 @@ class Reach:
         if path not in self._lines:
             tests = {}  # one object for each name
             by_line = self.data.contexts_by_lineno(str(ROOT / path)).items()
-            self._lines[path] = {line: sorted({tests.setdefault(c.split("|")[0], c.split("|")[0]) for c in contexts}) for line, contexts in by_line}
+            self._lines[path] = {line: sorted({tests.setdefault(c, c) for c in (c.rsplit("|", 1)[0] for c in contexts)}) for line, contexts in by_line}
             self._anywhere[path] = {c for contexts in self._lines[path].values() for c in contexts if c}
         return self._lines[path]
 
@@ -422,7 +425,8 @@ class Reach:
         if mutant.path in self.sources and self.sources[mutant.path] != (ROOT / mutant.path).read_text():
             raise SystemExit(f"{mutant.path} has changed since --map: run it again")
         if mutant.path.endswith(".glsl"):
-            contexts = [t for t in self.seconds if t.startswith(("tests/render/", "tests/extremes/")) and "pyrender" not in t and "cycles" not in t]
+            users = ("tests/tools/test_shader_",) if mutant.path == DEBUGGERS else ("tests/render/", "tests/extremes/")
+            contexts = [t for t in self.seconds if t.startswith(users) and "pyrender" not in t and "cycles" not in t]
         else:
             room = f"tests/{Path(mutant.path).parts[1]}/"
             reached = self.anywhere(mutant.path)
@@ -433,7 +437,7 @@ class Reach:
                 contexts = set().union(*(self.anywhere(path) for path in callers))
             else:
                 contexts = self._around(mutant)
-        ids = {c for c in contexts if c} - self.idle
+        ids = (set(contexts) & self.seconds.keys()) - self.idle
         chosen, together = [], 0.0
         for test in sorted(ids, key=lambda t: (self._distance(mutant, t), self.seconds.get(t, 1.0), t)):
             together += self.seconds.get(test, 1.0)
@@ -521,12 +525,13 @@ def serve() -> int:
 
 def _awaited(child: int, limit_s: float) -> str:
     handle = os.pidfd_open(child)
-    in_time = bool(select.select([handle], [], [], limit_s)[0])
+    ready = select.select([handle, sys.stdin], [], [], limit_s)[0]  # no order comes while one is carried out: readable is who gives them gone
+    in_time = handle in ready
     os.close(handle)
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # the child, if it still runs, and what it started
     _, status = os.waitpid(child, 0)
-    if not in_time or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
+    if not in_time or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF):
         return "time"
     return "passed" if os.WIFEXITED(status) and os.WEXITSTATUS(status) == 0 else "failed"
 
@@ -538,8 +543,7 @@ def _run_tests(order: dict) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for old, new in ((nothing, 0), (output, 1), (output, 2)):
         os.dup2(old, new)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    resource.setrlimit(resource.RLIMIT_CPU, (int(order["processor_s"]), int(order["processor_s"]) + 30))
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))  # not of address space, of which Ray maps more than it uses
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]
@@ -551,17 +555,21 @@ def _run_tests(order: dict) -> int:
     import pytest
 
     status = pytest.main(["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *order["tests"]],
-                         plugins=[_Witness(Path(order["output"]).with_suffix(".failed"))])
+                         plugins=[_Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"])])
     sys.stdout.flush()
     sys.stderr.flush()
     return int(status)
 
 
 class _Witness:
-    """A plugin of pytest that writes down which test failed, or which file could not be collected."""
+    """A plugin of pytest that writes down which test failed, or which file could not be collected, and ends the process when a test takes
+    many times the processor time that it took once (``seconds``; ``spare_s`` more for kernels that have to be compiled)."""
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, seconds: dict[str, float], spare_s: float):
+        self.path, self.seconds, self.spare_s = path, seconds, spare_s
+
+    def pytest_runtest_logstart(self, nodeid, location) -> None:
+        signal.setitimer(signal.ITIMER_PROF, self.spare_s + 3 * self.seconds.get(nodeid, 10.0))
 
     def pytest_runtest_logreport(self, report) -> None:
         if report.failed:
@@ -587,15 +595,15 @@ class Copy:
         self.kernels = Kernels(folder)
         self.server = Server(folder)
 
-    def run(self, tests: list[str], processor_s: float, stale: set[str] = frozenset(), original: dict[str, str] | None = None) -> tuple[str, str]:
-        """("passed" | "failed" | "time", the test that failed, "" where the process died). ``original``: digests of the sources of files
-        that were edited outside of kernels."""
+    def run(self, tests: dict[str, float], spare_s: float, stale: set[str] = frozenset(), original: dict[str, str] | None = None) -> tuple[str, str]:
+        """("passed" | "failed" | "time", the test that failed, "" where the process died). ``tests``: with the seconds that each took.
+        ``original``: digests of the sources of files that were edited outside of kernels."""
         failed = self.folder / "output.failed"
         failed.unlink(missing_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
             self.kernels.cache(stale, Path(scratch))
-            outcome = self.server.ask({"tests": tests, "processor_s": processor_s, "limit_s": 60 + 3 * processor_s, "kernels": scratch,
-                                       "original": original or {}, "output": str(self.folder / "output.txt")})
+            outcome = self.server.ask({"tests": list(tests), "seconds": tests, "spare_s": spare_s, "limit_s": 10 * spare_s + 4 * sum(tests.values()),
+                                       "kernels": scratch, "original": original or {}, "output": str(self.folder / "output.txt")})
         return outcome, failed.read_text() if outcome == "failed" and failed.exists() else ""
 
     def leave_out_what_is_gone(self, reach: Reach) -> None:
@@ -611,11 +619,11 @@ class Copy:
     def passes(self, test: str) -> bool:
         """Whether a test passes here with the source as it is; asked about each test once."""
         if test not in self.sound | self.unfit:
-            (self.sound if self.run([test], 200)[0] == "passed" else self.unfit).add(test)
+            (self.sound if self.run({test: 60.0}, 60)[0] == "passed" else self.unfit).add(test)
         return test in self.sound
 
     def judge(self, mutant: Mutant, reach: Reach) -> dict:
-        tests = [t for t in reach.tests(mutant) if t not in self.unfit]
+        tests = {t: reach.seconds.get(t, 1.0) for t in reach.tests(mutant) if t not in self.unfit}
         result = {**asdict(mutant), "name": mutant.name, "tests": len(tests), "by": ""}
         if not tests:
             return {**result, "outcome": "no test"}
@@ -626,12 +634,12 @@ class Copy:
         started = time.monotonic()
         path.write_text(mutant.apply(source.decode()))
         try:
-            outcome, failed = self.run(tests, (60 if stale else 20) + 4 * sum(reach.seconds.get(t, 1.0) for t in tests), stale, original)
+            outcome, failed = self.run(tests, 60 if stale else 15, stale, original)
         finally:
             path.write_bytes(source)
         if outcome == "failed" and failed in tests and not self.passes(failed):
             return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
-        if outcome == "failed" and not failed and self.run(tests, 600)[0] != "passed":
+        if outcome == "failed" and not failed and self.run(tests, 60)[0] != "passed":
             return {**result, "outcome": "broken"}  # the process died, and does so without the mutant
         return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed,
                 "seconds": round(time.monotonic() - started, 1)}

@@ -21,7 +21,7 @@ from blinkgl.labels import LABELS, asked_for
 from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.recorded import RECORDED
@@ -62,8 +62,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     if config.frames is not None:
         return _explain_frames(config, index, template.base)
     with create_context(config.gl.backend, config.gl.device) as gl:
-        scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
-                            seed=config.seed, sequence=index, base=template.base)
+        scene = sequence_scene(config, index, template.base)
         with Renderer(gl, scene, config.render) as renderer:
             result = Explanation(machine=gl.renderer)
             result.scene = _describe(renderer.scene, renderer)

@@ -108,10 +108,9 @@ def scene_of(source: Source, config: SequenceConfig, index: int) -> SceneData:
     """What sequence ``index`` shows. Raises ConfigError and AssetError."""
     if isinstance(source, Scene):
         return source.build(config)
-    from blinkgl.scene.build import build_scene
+    from blinkgl.scene.build import sequence_scene
 
-    return build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split, seed=config.seed,
-                       sequence=index, base=source.base)
+    return sequence_scene(config, index, source.base)
 
 
 def events_tree(emulator: Emulator) -> dict[str, Any]:

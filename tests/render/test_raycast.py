@@ -120,6 +120,18 @@ def test_near_and_far_are_half_open(kernel):
     assert at(2.0, 3.0) == 0 and at(0.0, 2.0) == -1 and at(np.nextafter(2.0, 3), 3.0) == -1 and at(0.0, np.nextafter(2.0, 3)) == 0
 
 
+@pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
+@pytest.mark.parametrize("turned", [False, True])
+def test_edges_and_corners_belong_to_the_triangle_seen_from_either_side(kernel, turned):
+    """Rays exactly through them: an edge that two triangles share is missed by neither."""
+    sheet = np.array([[[-1, -1, 2], [1, -1, 2], [-1, 1, 2.0]]])
+    rays = np.array([[-1, -1], [1, -1], [-1, 1], [0, -1], [-1, 0], [0, 0], [-0.5, -0.5], [0.5, -0.5 - 2**-30]]) / 2
+    hit, bary, depth = ask(kernel, forest_of([sheet[:, ::-1] if turned else sheet], [False]), np.zeros((1, 3)), np.eye(3)[None], rays)
+    assert (hit[:, 0] == 0).all() and (depth == 2).all() and set(hit[:, 2]) == {int(turned)} and (bary >= 0).all()
+    outside = np.array([[-1 - 2**-30, 0], [0, -1 - 2**-30], [2**-29, 0], [1, 1]]) / 2
+    assert (ask(kernel, forest_of([sheet], [False]), np.zeros((1, 3)), np.eye(3)[None], outside)[0][:, 0] == -1).all()
+
+
 def test_a_tree_holds_every_triangle_once_inside_its_boxes():
     corners = triangles(5, 101)
     tree = build_tree(corners.reshape(-1, 3), np.arange(303).reshape(-1, 3))

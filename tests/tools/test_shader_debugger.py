@@ -375,7 +375,8 @@ def test_another_object_s_texture_is_named(shader, config, monkeypatch):
     assert first["suspicions"][0].startswith("the texture of ball (")
 
 
-@pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0")])
+@pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0"),
+                                  ("--set", "render.antialiasing=taps4", "--time", "0.1")])
 def test_right_shaders_raise_no_suspicion(shader, config, more):
     status, out, _ = shader("diff", config, *more)
     assert status == 0 and "looks as if" not in out and "FAIL" not in out

@@ -20,7 +20,7 @@ from blinkgl.gl.shader import ShaderError, expand, shader_folder
 from blinkgl.render.painter import Painter
 from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import build_scene, check_assets
+from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.types import Scene
 
@@ -72,8 +72,7 @@ def open_subject(config: str, *, seed: int | None = None, sequence: int | None =
     index = template.sequence(0).output.first_index if sequence is None else sequence
     one = template.sequence(index)
     check_assets(one.scene, template.base, one.output.split)
-    scene = build_scene(one.scene, one.camera, one.time.t0_ns, one.time.t1_ns, split=one.output.split, seed=one.seed, sequence=index,
-                        base=template.base)
+    scene = sequence_scene(one, index, template.base)
     # Here, and not in each renderer: the rays of the reference have to meet the triangles that are drawn.
     scene = at_level_of_detail(scene, one.render.lod)
     one = one.model_copy(update={"render": one.render.model_copy(update={"lod": LodConfig()})})

@@ -55,7 +55,9 @@ class FlowTo(Label):
 
     def wrong(self, value: Flow, height: int, width: int) -> str | None:
         shapes = np.shape(value.flow), np.shape(value.valid)
-        return None if shapes == ((height, width, 2), (height, width)) else f"{shapes[0]} and valid {shapes[1]}, not {(height, width, 2)} and {(height, width)}"
+        if shapes == ((height, width, 2), (height, width)):
+            return None
+        return f"not {width}x{height} px: flow {shapes[0]}, valid {shapes[1]}"
 
     def own(self, value: Flow) -> Flow:
         return Flow(np.array(value.flow), np.array(value.valid).astype(bool))

@@ -115,7 +115,7 @@ def test_budget_keeps_to_its_target_and_its_estimate_to_the_truth(gl, world, rec
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="none")) as renderer:
         dense = Events.concatenate([chunk.events for chunk in run_of(UniformTimeline(fps=8000), renderer)])
         run = run_of(config, renderer)
-        events = Events.concatenate([chunk.events for chunk in run])
+        events = Events.concatenate([chunk.events for chunk in run.chunks()])
     matching = match_events(dense, events, 72, 96, 3_000)
     true, median = (np.percentile(np.abs(matching.dt_us[matching.matched]), q) for q in (75, 50))
     said = run.timeline.info()["time_error"]

@@ -28,9 +28,12 @@ class PinHole(CameraModel):
         return cls(width, height, fx, fx if fy is None else fy, (width - 1) / 2, (height - 1) / 2, near)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
-        z = np.where(z > 0, z, np.nan)
-        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
+        points = np.asarray(points, np.float64)
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        out = np.empty((*points.shape[:-1], 2))
+        out[..., 0] = self.fx * points[..., 0] / z + self.cx
+        out[..., 1] = self.fy * points[..., 1] / z + self.cy
+        return out
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
@@ -84,9 +87,10 @@ class PinHole(CameraModel):
         if points[:, 2].min() <= self.near:
             return (0, 0, self.width, self.height) if points[:, 2].max() > self.near else None
         # Of a convex body in front of the camera the corners are seen farthest out.
-        (left, top), (right, bottom) = (of(self.project(points), axis=0) for of in (np.min, np.max))
-        x0, x1 = max(0, int(np.floor(left)) - 1), min(self.width, int(np.ceil(right)) + 2)
-        y0, y1 = max(0, int(np.floor(top)) - 1), min(self.height, int(np.ceil(bottom)) + 2)
+        seen = self.project(points)
+        (left, top), (right, bottom) = seen.min(axis=0).tolist(), seen.max(axis=0).tolist()
+        x0, x1 = max(0, math.floor(left) - 1), min(self.width, math.ceil(right) + 2)
+        y0, y1 = max(0, math.floor(top) - 1), min(self.height, math.ceil(bottom) + 2)
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
     def clip_from_cam(self) -> np.ndarray:

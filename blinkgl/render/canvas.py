@@ -6,7 +6,6 @@ next frame; whoever reads a frame after that is told so.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -122,10 +121,9 @@ class Canvas:
                                            samples=pass_.samples.multi)
 
     def draw(self, shot: Shot) -> Frame:
-        """shot : its target is not looked at."""
-        shot = replace(shot, target=self.target)
+        """What the pass draws of a moment into :attr:`target`."""
         changed = self._changed(shot)
-        self._used = dict(shot.inputs)
+        self._used = dict(shot.inputs) if self.pass_.pointwise else {}
         if changed is None or changed:
             self.pass_.begin(self.painter, shot)
             self.pass_.paint(self.painter, shot)

@@ -80,10 +80,9 @@ class Moment:
         return self.view.projection @ self.T_cam_obj
 
     @cached_property
-    def mvp_bytes(self) -> list[bytes]:
-        """Of every object, as GLSL's mat4 (column-major float32)."""
-        columns = np.ascontiguousarray(np.swapaxes(self.mvp, 1, 2), np.float32)
-        return [matrix.tobytes() for matrix in columns]
+    def mvp_columns(self) -> np.ndarray:
+        """(n, 4, 4) float32 the same as GLSL has it, column by column."""
+        return np.ascontiguousarray(self.mvp.swapaxes(1, 2), np.float32)
 
     @cached_property
     def rates(self) -> Rates:
@@ -101,10 +100,9 @@ class Moment:
         return (T[:, :3, :3] @ self._stage.item_centre[..., None])[..., 0] + T[:, :3, 3]
 
     @cached_property
-    def inverse_depths(self) -> list[bytes]:
-        """Of every item: ``inverse_depths`` of guard.glsl, a uvec2."""
-        bits = inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
-        return [row.tobytes() for row in bits]
+    def inverse_depths(self) -> np.ndarray:
+        """(m, 2) uint32: ``inverse_depths`` of guard.glsl, a uvec2 per item."""
+        return inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
 
     @cached_property
     def visible(self) -> list[DrawItem]:

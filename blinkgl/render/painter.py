@@ -72,7 +72,7 @@ class Painter:
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what every program that draws the scene takes: matrices, depths and, where it has them, the light."""
         index = item.object_index
-        uniforms["mvp"].write(moment.mvp_bytes[index])
+        uniforms["mvp"].write(moment.mvp_columns[index])
         uniforms["inverse_depths"].write(moment.inverse_depths[item.number])
         if "sun_direction" in uniforms:
             # Every time: the context's programs are shared with other renderers, their uniforms included.

@@ -16,10 +16,12 @@ __version__ = "0.1.0"
 _HOMES = {
     "blinkgl.front.scenes": ("Camera", "Keyframes", "Light", "Material", "Mesh", "Pose", "Primitive", "Scene", "look_at"),
     "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
-    "blinkgl.front.drawing": ("Recording", "Renderer", "record", "render_frame"),
+    "blinkgl.front.sequences": ("Recording", "record", "simulate_sequence"),
+    "blinkgl.front.drawing": ("Renderer", "render_frame"),
     "blinkgl.front.sensors": ("DvsVoltmeter", "Esim", "V2e", "load_sensor"),
     "blinkgl.front.files": ("compare", "convert", "open_events", "read_events", "read_flow", "simulate", "simulate_file", "write_events", "write_flow"),
     "blinkgl.events.types": ("Events",),
+    "blinkgl.sequence.items": ("EventChunk", "GroundTruth", "Picture"),
     "blinkgl.labels.frames": ("Flow", "LabelFrame"),
     "blinkgl.errors": ("AssetError", "BlinkGLError", "ConfigError", "EventDataError", "GLError", "OutputError"),
 }
@@ -28,7 +30,7 @@ _HOME = {name: module for module, names in _HOMES.items() for name in names}
 if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it with the table
     from blinkgl.errors import AssetError, BlinkGLError, ConfigError, EventDataError, GLError, OutputError
     from blinkgl.events.types import Events
-    from blinkgl.front.drawing import Recording, Renderer, record, render_frame
+    from blinkgl.front.drawing import Renderer, render_frame
     from blinkgl.front.files import (
         compare,
         convert,
@@ -43,13 +45,16 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.front.runs import Timeline, generate, load, verify
     from blinkgl.front.scenes import Camera, Keyframes, Light, Material, Mesh, Pose, Primitive, Scene, look_at
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
+    from blinkgl.front.sequences import Recording, record, simulate_sequence
     from blinkgl.labels.frames import Flow, LabelFrame
+    from blinkgl.sequence.items import EventChunk, GroundTruth, Picture
 
 __all__ = [
-    "AssetError", "BlinkGLError", "Camera", "ConfigError", "DvsVoltmeter", "Esim", "EventDataError", "Events", "Flow", "GLError", "Keyframes",
-    "LabelFrame", "Light", "Material", "Mesh", "OutputError", "Pose", "Primitive", "Recording", "Renderer", "Scene", "Timeline", "V2e", "compare",
-    "convert", "generate", "load", "load_sensor", "look_at", "open_events", "read_events", "read_flow", "record", "render_frame", "simulate",
-    "simulate_file", "verify", "write_events", "write_flow",
+    "AssetError", "BlinkGLError", "Camera", "ConfigError", "DvsVoltmeter", "Esim", "EventChunk", "EventDataError",
+    "Events", "Flow", "GLError", "GroundTruth", "Keyframes", "LabelFrame", "Light", "Material", "Mesh", "OutputError",
+    "Picture", "Pose", "Primitive", "Recording", "Renderer", "Scene", "Timeline", "V2e", "compare", "convert",
+    "generate", "load", "load_sensor", "look_at", "open_events", "read_events", "read_flow", "record", "render_frame",
+    "simulate", "simulate_file", "simulate_sequence", "verify", "write_events", "write_flow",
 ]
 
 

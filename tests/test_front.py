@@ -21,7 +21,7 @@ from blinkgl.io.dsec import DsecEventReader
 from blinkgl.scene.build import build_scene
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-FRONT = ("arguments", "drawing", "files", "runs", "scenes", "sensors")
+FRONT = ("arguments", "drawing", "files", "runs", "scenes", "sensors", "sequences")
 
 
 def box_scene(**more) -> blinkgl.Scene:
@@ -40,7 +40,7 @@ def test_import_brings_nothing_with_it():
 
 
 def test_table_list_and_type_checker_agree():
-    assert sorted(blinkgl._HOME) == sorted(blinkgl.__all__) and 30 <= len(blinkgl.__all__) <= 40
+    assert sorted(blinkgl._HOME) == sorted(blinkgl.__all__) and 30 <= len(blinkgl.__all__) <= 45
     tree = ast.parse((REPOSITORY / "blinkgl/__init__.py").read_text(encoding="utf-8"))
     typed = [node for branch in tree.body if isinstance(branch, ast.If) for node in branch.body if isinstance(node, ast.ImportFrom)]
     assert {name.name: node.module for node in typed for name in node.names} == blinkgl._HOME
@@ -232,6 +232,14 @@ WRONG = [
     ("sensor", lambda d: b.record(box_scene(), sensor="eye")),
     ("quality", lambda d: b.record(box_scene(), quality="best")),
     ("timeline", lambda d: b.record(box_scene(), timeline="uniform")),
+    ("source", lambda d: b.simulate_sequence(d / "a.yaml")),
+    ("index", lambda d: b.simulate_sequence(box_scene(), index=1.5)),
+    ("labels", lambda d: b.simulate_sequence(box_scene(), labels=["depht"])),
+    ("emulator", lambda d: b.simulate_sequence(box_scene(), emulator="dvs")),
+    ("events", lambda d: b.simulate_sequence(box_scene(), events=0)),
+    ("pictures_hz", lambda d: b.simulate_sequence(box_scene(), pictures_hz=0)),
+    ("pictures_hz", lambda d: b.simulate_sequence(box_scene(), events=False, pictures_hz=30)),
+    ("simulate_sequence", lambda d: [list(once) for once in [b.simulate_sequence(box_scene(), events=False)] * 2]),
     ("num", lambda d: b.generate(box_scene(), d / "out", num=0)),
     ("workers", lambda d: b.generate(box_scene(), d / "out", workers="two")),
     ("out", lambda d: b.generate(box_scene(), None)),

@@ -19,10 +19,11 @@ from rich.table import Table
 
 from blinkgl.config.sequence import load_run
 from blinkgl.gl import create_context
+from blinkgl.labels import LabelRequest
 from blinkgl.machine import bench
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
-from blinkgl.scene.build import build_scene
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.build import sequence_scene
 
 REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
 
@@ -30,8 +31,7 @@ REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backwar
 def compare(gl, template, index: int) -> dict[str, float]:
     """Errors of one label of one sequence; pixels are counted in the whole image."""
     config = template.sequence(index)
-    scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
-                        seed=config.seed, sequence=index, base=template.base)
+    scene = sequence_scene(config, index, template.base)
     times = config.time.label_times_ns
     now, interval = times[len(times) // 2 - 1], config.time.interval_ns
     with Renderer(gl, scene, config.render) as renderer:

@@ -34,15 +34,16 @@ from rich.table import Table
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import BlinkGLError
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.srgb import to_srgb8
 from blinkgl.timeline.sampling import displacement_times
+from blinkgl.timeline.speed import largest_speed
 from blinkgl.tools.peer_cycles import Cost, CyclesSettings, available, frames
 from blinkgl.trade.metrics import SpeedMaps, event_errors
 
@@ -71,7 +72,7 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     config = EsimConfig(threshold_sigma=0.0)
     height, width = scene.camera.height, scene.camera.width
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(islice(displacement_times(options.max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t).read())), options.frames))
+        times = list(islice(displacement_times(options.max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t).read())), options.frames))
         maps = np.stack([np.linalg.norm(renderer.velocity(t).read(), axis=-1) for t in times])
     speeds = SpeedMaps(np.array(times) // 1000, maps)
     step = float(np.median(np.diff(times)))
@@ -81,12 +82,15 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     costs, streams, first = {}, {}, {}
     for name in (*ANTIALIASINGS, *traced):
         cost = costs[name] = Cost()
-        emulator, chunks = make_emulator(config, height, width, seed=1), []
         source = rasterised(gl, scene, times, name, cost) if name in ANTIALIASINGS else frames(scene, times, traced[name], cost)
-        for t, frame in zip(times, source):
-            first.setdefault(name, frame.copy())
-            chunks.append(emulator.step(frame, t))
-        streams[name] = Events.concatenate(chunks)
+
+        def event_frames(name=name, source=source):
+            for t, frame in zip(times, source):
+                first.setdefault(name, frame.copy())
+                yield EventFrame(t, frame)
+
+        camera = EventCamera(config, None, height, width, seed=1)
+        streams[name] = Events.concatenate([events for _, events in emulate(event_frames(), camera)])
         console.print(f"{name}: {len(streams[name]):,} events, {np.median(cost.wall_s):.3f} s per frame", highlight=False)
     rows = [("filtering", a, "our light") for a in ANTIALIASINGS]
     rows += [("shadows", "our light", "shadows"), ("bounces", "shadows", "everything")]
@@ -111,7 +115,7 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
 def speed(gl, scene: Scene, max_px: float, options) -> dict:
     """Part 2. EEVEE and Cycles draw two frames; the first (shader compilation, acceleration structure) is set apart."""
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(displacement_times(max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t).read())))
+        times = list(displacement_times(max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t).read())))
         triangles = renderer.triangles
     few = [times[0], times[len(times) // 2]]
     rows = []
@@ -161,8 +165,7 @@ def main() -> None:
         return
     template = load_run(options.config, options.overrides)
     config = template.sequence(options.sequence)
-    scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split, seed=config.seed,
-                        sequence=options.sequence, base=template.base)
+    scene = sequence_scene(config, options.sequence, template.base)
     result: dict = {}
     with create_context() as gl:
         result["machine"], result["load_before"] = bench.machine_line(gl.renderer), os.getloadavg()

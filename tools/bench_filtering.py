@@ -22,14 +22,15 @@ from rich.table import Table
 
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.timeline import displacement_times
+from blinkgl.timeline.speed import largest_speed
 from blinkgl.trade.matching import match_events
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -62,7 +63,7 @@ class Judged:
     def __init__(self, gl, scene: Scene, config, emulator, factor: int = 1):
         self.factor, self.renderer = factor, Renderer(gl, finer(scene, factor) if factor > 1 else scene, config)
         camera = scene.camera
-        self.emulator = make_emulator(emulator, camera.height, camera.width, 0)
+        self.camera = EventCamera(emulator, None, camera.height, camera.width, 0)
         self.frame = np.empty((camera.height * factor, camera.width * factor), np.float32)
         self.shape = (camera.height, camera.width)
         self.parts: list[Events] = []
@@ -76,7 +77,7 @@ class Judged:
         self.cpu.append(time.process_time() - cpu)
         if self.factor > 1:
             image = image.reshape(self.shape[0], self.factor, self.shape[1], self.factor).mean(axis=(1, 3))
-        self.parts.append(self.emulator.step(image, t_ns))
+        self.parts.append(self.camera.step(EventFrame(t_ns, image)))
         return image
 
     @property
@@ -111,7 +112,7 @@ def judge(gl, scene: Scene, settings: dict, times: list[int], factor: int, limit
 def displacement_frames(gl, scene: Scene, max_px: float, count: int) -> list[int]:
     """The first ``count`` times, ns, between which nothing moves further than ``max_px``."""
     with Renderer(gl, scene, PLAIN) as renderer:
-        return list(islice(displacement_times(max_px, 200_000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t, 4).read())), count))
+        return list(islice(displacement_times(max_px, 200_000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t, 4).read())), count))
 
 
 def main() -> None:
@@ -131,7 +132,7 @@ def main() -> None:
         report["machine"] = bench.machine_line(gl.renderer)
         for index in arguments.sequences:
             config = run.sequence(index)
-            scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, seed=config.seed, sequence=index, base=run.base)
+            scene = sequence_scene(config, index, run.base)
             times = displacement_frames(gl, scene, arguments.max_px, arguments.frames)
             report["sequences"][index] = judge(gl, scene, SETTINGS, times, arguments.factor, int(arguments.limit * 1e3),
                                                EsimConfig(contrast_threshold=0.2))

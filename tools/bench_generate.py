@@ -15,6 +15,7 @@ run are worth more than absolute times.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import math
 import tempfile
@@ -31,16 +32,18 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.report import STAGES, Totals
-from blinkgl.events import make_emulator
+from blinkgl.events.camera import EventCamera, emulate
 from blinkgl.gl import create_context
+from blinkgl.labels import LabelRequest
 from blinkgl.machine import bench
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject
+from blinkgl.sequence.rendered import drawn
 
 SECOND = 1_000_000_000
 
@@ -104,15 +107,9 @@ def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     events = {}
     for name in ("full redraw", "what moves"):
         with Renderer(gl, scene, PLAIN, whole=name == "full redraw") as renderer:
-            emulator, moment, last = make_emulator(EsimConfig(), 480, 640, seed=1), iter(range(1 << 30)), [None]
+            event_pass = emulate(drawn(renderer, itertools.count(0, 2_000_000)), EventCamera(EsimConfig(), None, 480, 640, seed=1))
             made = events[name] = []
-
-            def frame():
-                t = next(moment) * 2_000_000
-                image = renderer.luminance(t).read()
-                made.append(len(emulator.step(image.view(), t, image.rows_changed_since(last[0]))))
-                last[0] = image
-
+            frame = lambda run=event_pass, made=made: made.append(len(next(run)[1]))
             result[name] = 1 / bench.seconds(frame, repeat, warm_up=8)["median"]
     assert events["full redraw"] == events["what moves"]
     result["ratio"] = result["what moves"] / result["full redraw"]

@@ -24,7 +24,7 @@ from rich.table import Table
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig, RunTemplate
-from blinkgl.events import make_emulator
+from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
@@ -117,19 +117,19 @@ def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> d
         started = time.perf_counter()
         renderer = kind(gl, scene, config)
         out[name] = {"setup_s": time.perf_counter() - started, "triangles": renderer.triangles}
-        made[name] = (renderer, make_emulator(EsimConfig(contrast_threshold=0.2), *shape, 0), np.empty(shape, np.float32), [], [], [])
+        made[name] = (renderer, EventCamera(EsimConfig(contrast_threshold=0.2), None, *shape, 0), np.empty(shape, np.float32), [], [], [])
         renderer.luminance(times[0]).read(out=made[name][2])
         renderer.stats.triangles = renderer.stats.frames = 0
     names = list(variants)
     for k in range(rounds):
         t = times[k % len(times)] + (k // len(times)) * (times[-1] - times[0])
         for name in names[k % len(names):] + names[: k % len(names)]:
-            renderer, emulator, frame, wall, cpu, both = made[name]
+            renderer, camera, frame, wall, cpu, both = made[name]
             w, c = time.perf_counter(), time.process_time()
             renderer.luminance(times[k % len(times)]).read(out=frame)
             wall.append(time.perf_counter() - w)
             cpu.append(time.process_time() - c)
-            emulator.step(frame, t + k)
+            camera.step(EventFrame(t + k, frame))
             both.append(time.perf_counter() - w)
     for name, (renderer, _, _, wall, cpu, both) in made.items():
         out[name] |= {"drawn": renderer.stats.triangles / renderer.stats.frames, "ms": 1e3 * float(np.median(wall)),

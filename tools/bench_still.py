@@ -20,7 +20,8 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.events import EsimConfig
-from blinkgl.events import Events, make_emulator
+from blinkgl.events import Events
+from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
@@ -55,7 +56,7 @@ class Way:
 
     def __init__(self, gl, scene: Scene, still: bool):
         self.renderer = Renderer(gl, scene, PLAIN, whole=not still)
-        self.emulator = make_emulator(EsimConfig(), HEIGHT, WIDTH, seed=1)
+        self.camera = EventCamera(EsimConfig(), None, HEIGHT, WIDTH, seed=1)
         self.frame = None
         self.events: list[Events] = []
         self.stages: list[tuple[float, ...]] = []
@@ -65,10 +66,10 @@ class Way:
         stats = self.renderer.stats
         drawn, read = stats.render_s, stats.readback_s
         wall, cpu = time.perf_counter(), time.process_time()
-        before, self.frame = self.frame, self.renderer.luminance(t_ns).read()
-        luminance = self.frame.view()
+        before, self.frame = self.frame, self.renderer.luminance(t_ns)
+        luminance = self.frame.read()
         done = time.perf_counter()
-        self.events.append(self.emulator.step(luminance, t_ns, self.frame.rows_changed_since(before)))
+        self.events.append(self.camera.step(EventFrame(t_ns, luminance, rows=self.frame.rows_changed_since(before))))
         end = time.perf_counter()
         self.stages.append((stats.render_s - drawn, stats.readback_s - read, end - done, end - wall, time.process_time() - cpu))
         if self.frame.changed is not None:

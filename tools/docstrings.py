@@ -1,6 +1,6 @@
 """Reads BlinkGL's docstrings for the documentation site: a Griffe extension, named in mkdocs.yml.
 
-The docstrings are written to be read in the source. Two habits in them mean nothing to Markdown and are translated here:
+The docstrings are written to be read in the source. Two habits in them mean nothing to Markdown and are translated:
 ``:class:`~blinkgl.events.types.Events```, which becomes code, and the lines that explain arguments,
 
     width, height : px.   fov : horizontal field of view, degrees,
@@ -22,6 +22,8 @@ NAMES = r"(?:\*{0,2}\w+(?: ?, \*{0,2}\w+)*)"
 ENTRY = re.compile(rf"^({NAMES}) : (?=\S)(.*)$")
 NEXT = re.compile(rf"(?:(?<=\.) +|(?<=\S) {{3,}})(?={NAMES} : \S)")
 """Between two entries on one line: a full stop, or three blanks."""
+ROOM = re.compile(r"^(In|Out|Start): +(?=\S)(.*)$")
+"""The three lines of a package."""
 ONLY = "\0"
 """Marks an entry that is a name alone, with its meaning in the lines below."""
 LAST = re.compile(r"^(Raises?|Returns?|Times?|Yields?)\b")
@@ -69,7 +71,7 @@ def _listed(lines: list[str]) -> list[str]:
     inside = fenced = False
     for line in lines:
         fenced ^= line.lstrip().startswith("```")
-        entry = None if fenced or line.startswith("    ") else ENTRY.match(line)
+        entry = None if fenced or line.startswith("    ") else ENTRY.match(line) or ROOM.match(line)
         if entry or line.startswith(ONLY):
             if not inside:
                 out.append("")
@@ -86,7 +88,15 @@ def _listed(lines: list[str]) -> list[str]:
 
 
 class Docstrings(griffe.Extension):
-    """Translates every docstring once, when its object has been read."""
+    """Translates every docstring once. A room shows its modules, not besides what it hands on of them."""
+
+    def on_module(self, *, mod: griffe.Module, **_: Any) -> None:
+        if mod.is_init_module and mod.parent is not None:
+            mod.exports = None
+            modules = {
+                name: member for name, member in sorted(mod.members.items()) if isinstance(member, griffe.Module)
+            }
+            mod.members = {name: member for name, member in mod.members.items() if name not in modules} | modules
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
         if obj.docstring is not None:

@@ -6,9 +6,14 @@
     python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41 # those of a line
 
 A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is made in a copy of
-the tree, so nothing here is touched. The tests that reached its line run, shortest first, until one fails (killed), the time is up
+the tree, so nothing here is touched. The tests that reached its line run, its module's own first, until one fails (killed), the time is up
 (killed: "time"), or all passed (survived). Lines that no test reaches are survivors without a run. What coverage cannot see is
-compiled: a numba kernel is given all tests of its module's callers, a shader those of ``tests/render``.
+compiled: a numba kernel is given all tests of its module's callers, a shader those of ``tests/render`` and
+``tests/extremes``.
+
+What takes time is starting, not testing. So the tests of a mutant run in a child of a process (``--serve``, one per copy) that has imported
+what the tree stands on (numpy, numba, pytest, ...) and nothing of the tree itself. A kernel's machine code is taken from the cache unless
+the edit can be in it: an edited kernel, a constant that kernels may hold, and the kernels of every module that imports it are compiled again.
 
 Exit status 1 when less than ``--at-least`` (0.9) of the mutants died. Mutants that change nothing a test could see (an estimate that only
 saves time, say) are listed with the reason in ``tools/mutants_equivalent.txt``, printed, and not counted.
@@ -18,12 +23,18 @@ from __future__ import annotations
 
 import argparse
 import ast
+import collections
 import concurrent.futures
+import contextlib
+import gc
+import hashlib
+import importlib
 import json
 import os
 import random
 import re
 import resource
+import select
 import shutil
 import signal
 import subprocess
@@ -42,10 +53,21 @@ MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
 SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",
                "examples")
-MOST_TESTS, MOST_S = 120, 40.0
-"""of the shortest that reach a line, for one mutant: how many, and how long they take together"""
+DEBUGGERS = "shaders/include/lookup.glsl"
+"""the include that only the shader debugger asks for"""
+MOST_TESTS, MOST_S = 300, 120.0
+"""of the tests that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
-"""bytes of address space: a mutant that never stops collecting must not take the machine with it"""
+"""bytes: a mutant that never stops collecting must not take the machine with it"""
+
+PRELOADED = ("numpy", "numba", "scipy.interpolate", "scipy.ndimage", "scipy.spatial.transform", "scipy.optimize", "scipy.special", "cv2", "h5py",
+             "hdf5plugin", "pydantic", "yaml", "typer", "rich.console", "rich.table", "rich.progress", "PIL.Image", "imageio.v3", "moderngl", "trimesh",
+             "networkx", "fcl", "fast_simplification", "pytest", "_pytest.doctest", "hypothesis", "hypothesis.strategies", "hypothesis.extra.numpy",
+             "concurrent.futures.process", "multiprocessing.pool", "http.server", "urllib.request", "sqlite3", "unittest.mock", "tarfile")
+"""what the server imports before it forks; none of them starts a thread or opens a display when it is imported"""
+
+COMPILED = re.compile(r"\b(njit|jit|vectorize|register_jitable|overload|intrinsic)\b")
+"""in a decorator: the function is compiled, alone or into the kernels that call it"""
 
 ARITHMETIC = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*", ast.Pow: "*", ast.MatMult: None,
               ast.BitAnd: "|", ast.BitOr: "&", ast.BitXor: "|", ast.LShift: ">>", ast.RShift: "<<"}
@@ -71,7 +93,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        shorten = lambda text: " ".join(text.split())[:60]
+        shorten = lambda text: " ".join(text.split())[:60]  # noqa: E731
         return f"{self.path}:{self.line}:{self.column}: {shorten(self.before)} -> {shorten(self.after) or '(nothing)'}"
 
     def apply(self, source: str) -> str:
@@ -100,12 +122,19 @@ class _Finder(ast.NodeVisitor):
     def add(self, start: int, end: int, after: str, operator: str) -> None:
         line = self.source.count("\n", 0, start) + 1
         mutant = Mutant(self.path, line, start - self.starts[line - 1] + 1, self.source[start:end], after, operator, self.compiled)
+        first, last = self.statement
         try:
-            ast.parse(mutant.apply(self.source))
+            ast.parse(self.source[first:start] + after + self.source[end:last])
         except SyntaxError:
             return
         if mutant.before != mutant.after:
             self.found.append(mutant)
+
+    def visit_Module(self, node) -> None:
+        for statement in node.body:
+            first = min([statement.lineno, *(d.lineno for d in getattr(statement, "decorator_list", ()))])
+            self.statement = self.starts[first - 1], self.span(statement)[1]  # the part of the source that has to parse
+            self.visit(statement)
 
     def between(self, left, right, symbol: str, operator: str) -> None:
         """The operator's symbol between two operands, brackets and comments left alone."""
@@ -118,7 +147,7 @@ class _Finder(ast.NodeVisitor):
         if node.name in ("__repr__", "__str__"):
             return
         outer = self.compiled
-        self.compiled = outer or any(re.search(r"\b(njit|jit|vectorize)\b", ast.unparse(d)) for d in node.decorator_list)
+        self.compiled = outer or any(COMPILED.search(ast.unparse(d)) for d in node.decorator_list)
         for statement in node.body:
             self.visit(statement)
         self.compiled = outer
@@ -147,7 +176,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_BinOp(self, node) -> None:
         symbol = ARITHMETIC.get(type(node.op))
-        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
+        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))  # noqa: E731
         if symbol and not literal(node.left) and not literal(node.right):
             self.between(node.left, node.right, symbol, "arithmetic")
         self.generic_visit(node)
@@ -167,7 +196,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node) -> None:
-        start, _end = self.span(node)
+        start, end = self.span(node)
         inner = self.span(node.operand)[0]
         if isinstance(node.op, (ast.Not, ast.USub)):
             self.add(start, inner, "", "negation left out")
@@ -201,7 +230,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_Attribute(self, node) -> None:
         if node.attr in NAMES:
-            _start, end = self.span(node)
+            start, end = self.span(node)
             self.add(end - len(node.attr), end, NAMES[node.attr], "function")
         self.visit(node.value)
 
@@ -265,15 +294,94 @@ def drawn(count: int, seed: int) -> list[Mutant]:
 # ---- which tests reach a line --------------------------------------------------------------------------------------
 
 
-def make_map(jobs: str) -> None:
-    """Runs the suite under coverage and keeps who ran what, and how long it took."""
+def make_map(jobs: str, tests: list[str]) -> None:
+    """Runs the suite under coverage and keeps who ran what, and how long it took. With ``tests``, adds those to what is known."""
     MAP.mkdir(parents=True, exist_ok=True)
+    sources = {p: (ROOT / p).read_text() for room in ROOMS for p in modules(room)}
+    known = sorted(MAP.glob("durations*.xml"))
+    if not tests:
+        for old in known:
+            old.unlink()
+    elif json.loads((MAP / "sources.json").read_text()) != sources:
+        raise SystemExit("the source has changed since --map: make the whole map again")
     environment = {**os.environ, "COVERAGE_FILE": str(MAP / "coverage.db")}
     status = subprocess.run([sys.executable, "-m", "pytest", "-q", "-n", jobs, "--dist", "worksteal", "--cov=blinkgl", "--cov-context=test",
-                             "--cov-report=term:skip-covered", f"--junitxml={MAP / 'durations.xml'}"], cwd=ROOT, env=environment).returncode
+                             "--cov-report=term:skip-covered", f"--junitxml={MAP / f'durations{len(known) if tests else 0}.xml'}",
+                             *(["--cov-append"] if tests else []), *tests], cwd=ROOT, env=environment).returncode
+    if status not in (0, 1):
+        raise SystemExit("the suite cannot be run")
     if status:
-        raise SystemExit("the suite must pass before mutants are of any use")
-    (MAP / "sources.json").write_text(json.dumps({p: (ROOT / p).read_text() for room in ROOMS for p in modules(room)}))
+        print("tests that failed have no say")
+    (MAP / "sources.json").write_text(json.dumps(sources))
+
+
+def _called_at_import(folder: Path) -> set[str]:
+    """Names of functions that are called when a module of ``blinkgl`` is imported: what they return may be a constant of a kernel."""
+    names = set()
+
+    def visit(node) -> None:
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Call):
+                names.add(child.func.attr if isinstance(child.func, ast.Attribute) else getattr(child.func, "id", ""))
+            if not isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+                visit(child)
+
+    for path in sorted((folder / "blinkgl").rglob("*.py")):
+        visit(ast.parse(path.read_text()))
+    return names
+
+
+class Kernels:
+    """Which modules hold kernels, and which of them must be compiled again for a mutant."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.files = [p for p in (folder / "blinkgl").rglob("*.py") if "__pycache__" not in p.parts]
+        self.holders = {p.relative_to(folder).as_posix() for p in self.files if re.search(rf"^\s*@.*{COMPILED.pattern}", p.read_text(), re.M)}
+        self.imports = {p.relative_to(folder).as_posix(): self._imported(p) for p in self.files}
+        self.early = _called_at_import(folder)
+
+    def _imported(self, path: Path) -> set[str]:
+        found = set()
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("blinkgl"):
+                names = [node.module] + [f"{node.module}.{alias.name}" for alias in node.names]
+            elif isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names if alias.name.startswith("blinkgl")]
+            else:
+                continue
+            for name in names:
+                found |= {p for p in (name.replace(".", "/") + ".py", name.replace(".", "/") + "/__init__.py") if (self.folder / p).exists()}
+        return found
+
+    def users(self, path: str) -> set[str]:
+        """Modules that import ``path``, themselves or by way of another; ``path`` among them."""
+        known, new = set(), {path}
+        while new:
+            known |= new
+            new = {p for p, imported in self.imports.items() if imported & new} - known
+        return known
+
+    def stale(self, mutant: Mutant) -> set[str]:
+        """Modules whose kernels may contain what the mutant changed. An edit inside a function that is not compiled and not called on
+        import reaches no kernel: those are compiled from other functions and from the constants of modules."""
+        if not mutant.path.endswith(".py"):
+            return set()
+        tree = ast.parse((self.folder / mutant.path).read_text())
+        around = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef)) and n.body[0].lineno <= mutant.line <= n.end_lineno]
+        if around and not mutant.compiled and not self.early & {n.name for n in around}:
+            return set()
+        return self.users(mutant.path) & self.holders
+
+    def cache(self, stale: set[str], into: Path) -> None:
+        """Links what was compiled to ``into``, laid out as numba wants its NUMBA_CACHE_DIR, without what is stale."""
+        for folder in {(self.folder / p).parent for p in self.holders}:
+            inner = into / f"{folder.name}_{hashlib.sha1(str(folder).encode()).hexdigest()}"
+            inner.mkdir()
+            old = {Path(p).stem for p in stale if (self.folder / p).parent == folder}
+            for file in (folder / "__pycache__").glob("*.nb[ic]"):
+                if file.name.split(".")[0] not in old:
+                    os.link(file, inner / file.name)
 
 
 class Reach:
@@ -287,40 +395,68 @@ class Reach:
         self.data = coverage.CoverageData(str(MAP / "coverage.db"))
         self.data.read()
         self.sources = json.loads((MAP / "sources.json").read_text())
-        self.seconds = {}
-        for case in ElementTree.parse(MAP / "durations.xml").iter("testcase"):
-            file = case.get("classname", "").replace(".", "/") + ".py"
-            self.seconds[f"{file}::{case.get('name')}"] = float(case.get("time", 0))
+        self.seconds: dict[str, float] = {}
+        self.idle: set[str] = set()  # skipped or failed
+        for durations in sorted(MAP.glob("durations*.xml")):
+            for case in ElementTree.parse(durations).iter("testcase"):
+                test = f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"
+                self.seconds[test] = float(case.get("time", 0))
+                if case.find("failure") is not None or case.find("error") is not None or case.find("skipped") is not None:
+                    self.idle.add(test)
         self._lines: dict[str, dict[int, list[str]]] = {}
+        self._anywhere: dict[str, set[str]] = {}
+        self.kernels = Kernels(ROOT)
 
     def lines(self, path: str) -> dict[int, list[str]]:
         if path not in self._lines:
-            self._lines[path] = self.data.contexts_by_lineno(str(ROOT / path))
+            tests = {}  # one object for each name
+            by_line = self.data.contexts_by_lineno(str(ROOT / path)).items()
+            self._lines[path] = {line: sorted({tests.setdefault(c, c) for c in (c.rsplit("|", 1)[0] for c in contexts)}) for line, contexts in by_line}
+            self._anywhere[path] = {c for contexts in self._lines[path].values() for c in contexts if c}
         return self._lines[path]
 
+    def anywhere(self, path: str) -> set[str]:
+        """Tests that run any line of a module."""
+        self.lines(path)
+        return self._anywhere[path]
+
     def tests(self, mutant: Mutant) -> list[str]:
-        """Shortest first. Empty: no test reaches the line."""
+        """In the order in which they run: the module's own file, its room, the others; quick files and tests first. Empty: none reaches the line."""
         if mutant.path in self.sources and self.sources[mutant.path] != (ROOT / mutant.path).read_text():
             raise SystemExit(f"{mutant.path} has changed since --map: run it again")
         if mutant.path.endswith(".glsl"):
-            contexts = [t for t in self.seconds if t.startswith("tests/render/") and "pyrender" not in t and "cycles" not in t]
+            users = ("tests/tools/test_shader_",) if mutant.path == DEBUGGERS else ("tests/render/", "tests/extremes/")
+            contexts = [t for t in self.seconds if t.startswith(users) and "pyrender" not in t and "cycles" not in t]
         else:
-            room = f"tests/{Path(mutant.path).parent.name}/"
-            reached = {c for contexts in self.lines(mutant.path).values() for c in contexts if c}
+            room = f"tests/{Path(mutant.path).parts[1]}/"
+            reached = self.anywhere(mutant.path)
             if not reached:  # compiled as a whole, or run in a process of its own
                 contexts = [t for t in self.seconds if t.startswith(room)]
             elif mutant.compiled:
-                contexts = [c for c in reached if c.startswith(room)] or list(reached)
+                callers = self.kernels.users(mutant.path) & self.kernels.holders
+                contexts = set().union(*(self.anywhere(path) for path in callers))
             else:
                 contexts = self._around(mutant)
-        ids = {c.split("|")[0] for c in contexts if c}
+        ids = (set(contexts) & self.seconds.keys()) - self.idle
         chosen, together = [], 0.0
-        for test in sorted(ids, key=lambda t: (self.seconds.get(t, 1.0), t)):
+        for test in sorted(ids, key=lambda t: (self._distance(mutant, t), self.seconds.get(t, 1.0), t)):
             together += self.seconds.get(test, 1.0)
             if len(chosen) == MOST_TESTS or (chosen and together > MOST_S):
                 break
             chosen.append(test)
-        return chosen
+        files = collections.defaultdict(list)  # a file's tests stay together: they share a context
+        for test in chosen:
+            files[test.split("::")[0]].append(self.seconds.get(test, 1.0))
+        pace = {file: sum(seconds) / len(seconds) for file, seconds in files.items()}
+        return sorted(chosen, key=lambda t: (self._distance(mutant, t), pace[t.split("::")[0]], t.split("::")[0], self.seconds.get(t, 1.0), t))
+
+    @staticmethod
+    def _distance(mutant: Mutant, test: str) -> int:
+        """0: a test of the module, 1: of its room, 2: of another."""
+        path, file = Path(mutant.path), Path(test.split("::")[0])
+        if file.stem == f"test_{path.stem}":
+            return 0
+        return 1 if file.parts[1] == ("render" if path.suffix == ".glsl" else path.parts[1]) else 2
 
     def _around(self, mutant: Mutant) -> list[str]:
         """Coverage names the first line of a statement only. What runs when a module is imported (a default, a constant) concerns all
@@ -329,11 +465,116 @@ class Reach:
         for line in range(mutant.line, 0, -1):
             if line in lines:
                 reached = [c for c in lines[line] if c]
-                return reached or ([c for contexts in lines.values() for c in contexts] if "" in lines[line] else [])
+                return reached or (list(self.anywhere(mutant.path)) if "" in lines[line] else [])
         return []
 
 
 # ---- running -------------------------------------------------------------------------------------------------------
+
+
+class Server:
+    """A process that has imported what the tree needs and runs tests in children of its own (:func:`serve`)."""
+
+    def __init__(self, folder: Path):
+        environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "LP_NUM_THREADS": "0", "PYGLET_HEADLESS": "1"}
+        self.process = subprocess.Popen([sys.executable, str(ROOT / "tools" / "mutate.py"), "--serve"], cwd=folder, env=environment, text=True,
+                                        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+
+    def ask(self, order: dict) -> str:
+        self.process.stdin.write(json.dumps(order) + "\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        if not answer:
+            raise RuntimeError("the process that runs the tests is gone")
+        return json.loads(answer)
+
+    def close(self) -> None:
+        self.process.stdin.close()
+        self.process.wait(60)
+        self.process.stdout.close()
+
+
+def serve() -> int:
+    """Reads orders from standard input, one JSON object a line; runs each in a child; answers "passed", "failed" or "time"."""
+    here = str(ROOT / "tools")
+    sys.path[:] = [p for p in sys.path if p != here]
+    for name in PRELOADED:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    import numba
+
+    numba.njit("f8(f8)")(lambda x: x + 1.0)  # fills numba's tables of types, which it does when it compiles or loads the first kernel
+    taken = sorted(m for m in sys.modules if m.split(".")[0] in ("blinkgl", "eflow", "tests"))
+    assert not taken, f"of the tree, before it is edited: {taken}"
+    gc.collect()
+    gc.freeze()
+    answers = os.fdopen(os.dup(1), "w")
+    os.set_inheritable(answers.fileno(), False)
+    for line in iter(sys.stdin.readline, ""):
+        order = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            try:
+                os._exit(_run_tests(order))
+            finally:  # also where pytest itself fails
+                os._exit(99)
+        outcome = _awaited(child, order["limit_s"])
+        print(json.dumps(outcome), file=answers, flush=True)
+    return 0
+
+
+def _awaited(child: int, limit_s: float) -> str:
+    handle = os.pidfd_open(child)
+    ready = select.select([handle, sys.stdin], [], [], limit_s)[0]  # no order comes while one is carried out: readable is who gives them gone
+    in_time = handle in ready
+    os.close(handle)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(child, signal.SIGKILL)  # the child, if it still runs, and what it started
+    _, status = os.waitpid(child, 0)
+    if not in_time or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF):
+        return "time"
+    return "passed" if os.WIFEXITED(status) and os.WEXITSTATUS(status) == 0 else "failed"
+
+
+def _run_tests(order: dict) -> int:
+    """In a child: the tests of ``order`` by the source as it is now."""
+    os.setsid()
+    output = os.open(order["output"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    for old, new in ((nothing, 0), (output, 1), (output, 2)):
+        os.dup2(old, new)
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))  # not of address space, of which Ray maps more than it uses
+    from numba.core import caching, config
+
+    os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]
+    original, stamp = order["original"], caching._SourceFileBackedLocatorMixin.get_source_stamp
+    # An edit that no kernel contains leaves those of its file as they are, though the file is another.
+    caching._SourceFileBackedLocatorMixin.get_source_stamp = lambda self: bytes.fromhex(original[self._py_file]) if self._py_file in original else stamp(self)
+    sys.argv = ["pytest"]
+    import pytest
+
+    status = pytest.main(["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *order["tests"]],
+                         plugins=[_Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"])])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    return int(status)
+
+
+class _Witness:
+    """A plugin of pytest that writes down which test failed, or which file could not be collected, and ends the process when a test takes
+    many times the processor time that it took once (``seconds``; ``spare_s`` more for kernels that have to be compiled)."""
+
+    def __init__(self, path: Path, seconds: dict[str, float], spare_s: float):
+        self.path, self.seconds, self.spare_s = path, seconds, spare_s
+
+    def pytest_runtest_logstart(self, nodeid, location) -> None:
+        signal.setitimer(signal.ITIMER_PROF, self.spare_s + 3 * self.seconds.get(nodeid, 10.0))
+
+    def pytest_runtest_logreport(self, report) -> None:
+        if report.failed:
+            self.path.write_text(report.nodeid)
+
+    pytest_collectreport = pytest_runtest_logreport
 
 
 class Copy:
@@ -350,25 +591,25 @@ class Copy:
             (folder / "blinkgl" / inner).symlink_to(folder / inner)
         if (ROOT.parent / "shared").is_dir():
             os.environ.setdefault("BLINKGL_SHARED", str(ROOT.parent / "shared"))
+        self.kernels = Kernels(folder)
+        self.server = Server(folder)
 
-    def run(self, tests: list[str], limit_s: float, kernels: Path | None) -> tuple[str, str]:
-        """("passed" | "failed" | "time", end of the output)."""
-        listing = self.folder / "tests.txt"
-        listing.write_text("\n".join(tests) + "\n")
-        environment = {**os.environ, "PYTHONPATH": str(self.folder), "PYTHONDONTWRITEBYTECODE": "1"}
-        if kernels is not None:
-            environment["NUMBA_CACHE_DIR"] = str(kernels)
-        process = subprocess.Popen([sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", f"@{listing}"],
-                                   cwd=self.folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True)
-        # Not by preexec_fn, which may hang: it runs between fork and exec, where another thread's lock is held for ever.
-        resource.prlimit(process.pid, resource.RLIMIT_AS, (MEMORY, MEMORY))
-        try:
-            output, _ = process.communicate(timeout=limit_s)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-            return "time", ""
-        return ("passed" if process.returncode == 0 else "failed"), output[-3000:]
+    def run(self, tests: dict[str, float], spare_s: float, stale: set[str] = frozenset(), original: dict[str, str] | None = None) -> tuple[str, str]:
+        """("passed" | "failed" | "time", the test that failed, "" where the process died). ``tests``: with the seconds that each took.
+        ``original``: digests of the sources of files that were edited outside of kernels."""
+        failed = self.folder / "output.failed"
+        failed.unlink(missing_ok=True)
+        with tempfile.TemporaryDirectory() as scratch:
+            self.kernels.cache(stale, Path(scratch))
+            outcome = self.server.ask({"tests": list(tests), "seconds": tests, "spare_s": spare_s, "limit_s": 10 * spare_s + 4 * sum(tests.values()),
+                                       "kernels": scratch, "original": original or {}, "output": str(self.folder / "output.txt")})
+        return outcome, failed.read_text() if outcome == "failed" and failed.exists() else ""
+
+    def leave_out_what_is_gone(self, reach: Reach) -> None:
+        """Tests of the map that cannot be collected any more have no say."""
+        listing = subprocess.run([sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"], cwd=self.folder, text=True,
+                                 env={**os.environ, "PYTHONPATH": str(self.folder)}, stdout=subprocess.PIPE).stdout
+        self.unfit |= set(reach.seconds) - set(listing.splitlines())
 
     sound: ClassVar[set[str]] = set()
     unfit: ClassVar[set[str]] = set()
@@ -377,29 +618,29 @@ class Copy:
     def passes(self, test: str) -> bool:
         """Whether a test passes here with the source as it is; asked about each test once."""
         if test not in self.sound | self.unfit:
-            (self.sound if self.run([test], 300, None)[0] == "passed" else self.unfit).add(test)
+            (self.sound if self.run({test: 60.0}, 60)[0] == "passed" else self.unfit).add(test)
         return test in self.sound
 
     def judge(self, mutant: Mutant, reach: Reach) -> dict:
-        tests = [t for t in reach.tests(mutant) if t not in self.unfit]
+        tests = {t: reach.seconds.get(t, 1.0) for t in reach.tests(mutant) if t not in self.unfit}
         result = {**asdict(mutant), "name": mutant.name, "tests": len(tests), "by": ""}
         if not tests:
             return {**result, "outcome": "no test"}
         path = self.folder / mutant.path
-        source = path.read_text()
+        source = path.read_bytes()
+        stale = self.kernels.stale(mutant)
+        original = {} if mutant.path in stale else {str(path): hashlib.sha256(source).hexdigest()}
         started = time.monotonic()
-        with tempfile.TemporaryDirectory() as kernels:
-            path.write_text(mutant.apply(source))
-            try:
-                expected = sum(reach.seconds.get(t, 1.0) for t in tests)
-                # A kernel's file has changed, so have the files that call it: numba's cache would not notice, hence an empty one.
-                outcome, output = self.run(tests, 60 + 5 * expected, Path(kernels) if mutant.compiled and mutant.path.endswith(".py") else None)
-            finally:
-                path.write_text(source)
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+?)(?: - .*)?$", output, re.M)
-        if outcome == "failed" and failed and not self.passes(failed.group(1)):
+        path.write_text(mutant.apply(source.decode()))
+        try:
+            outcome, failed = self.run(tests, 60 if stale else 15, stale, original)
+        finally:
+            path.write_bytes(source)
+        if outcome == "failed" and failed in tests and not self.passes(failed):
             return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
-        return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed.group(1) if failed else "",
+        if outcome == "failed" and not failed and self.run(tests, 60)[0] != "passed":
+            return {**result, "outcome": "broken"}  # the process died, and does so without the mutant
+        return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed,
                 "seconds": round(time.monotonic() - started, 1)}
 
 
@@ -427,6 +668,7 @@ def excuses(mutants: list[Mutant]) -> dict[str, str]:
 def judged(mutants: list[Mutant], reach: Reach, jobs: int) -> Iterator[dict]:
     with tempfile.TemporaryDirectory(prefix="blinkgl-mutants-") as scratch, concurrent.futures.ThreadPoolExecutor(jobs) as pool:
         idle = [Copy(_made(Path(scratch) / f"copy{k}")) for k in range(jobs)]
+        idle[0].leave_out_what_is_gone(reach)
 
         def one(mutant: Mutant) -> dict:
             copy = idle.pop()
@@ -435,7 +677,12 @@ def judged(mutants: list[Mutant], reach: Reach, jobs: int) -> Iterator[dict]:
             finally:
                 idle.append(copy)
 
-        yield from (future.result() for future in concurrent.futures.as_completed([pool.submit(one, m) for m in mutants]))
+        try:
+            yield from (future.result() for future in concurrent.futures.as_completed([pool.submit(one, m) for m in mutants]))
+        finally:
+            pool.shutdown(cancel_futures=True)
+            for copy in idle:
+                copy.server.close()
 
 
 def _made(folder: Path) -> Path:
@@ -445,17 +692,20 @@ def _made(folder: Path) -> Path:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--map", action="store_true", help="run the suite under coverage (needs pytest-cov) and stop")
+    parser.add_argument("--map", nargs="*", metavar="TEST", help="run the suite, or more tests of the same source, under coverage (needs pytest-cov) and stop")
     parser.add_argument("--count", type=int, default=200, help=f"mutants drawn, over {', '.join(ROOMS)}")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2, help="mutants side by side")
     parser.add_argument("--show", metavar="FILE", help="list the mutants of a module")
     parser.add_argument("--only", metavar="FILE[:LINE]", help="all mutants of a module or a line")
     parser.add_argument("--at-least", type=float, default=0.9, help="share that must die")
+    parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--out", type=Path, help="results as JSON; those that are there already are kept")
     options = parser.parse_args(arguments)
-    if options.map:
-        make_map(str(options.jobs))
+    if options.serve:
+        return serve()
+    if options.map is not None:
+        make_map(str(options.jobs), options.map)
         return 0
     if options.show:
         print(*(f"{m.name}  [{m.operator}]" for m in mutants_of(options.show, (ROOT / options.show).read_text())), sep="\n")
@@ -477,6 +727,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.out:
             options.out.write_text(json.dumps(results, indent=1))
     survivors = [r for r in results if r["outcome"] in ("survived", "no test")]
+    results = [r for r in results if r["outcome"] != "broken"]
     share = 1 - len(survivors) / max(len(results), 1)
     print(f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as equivalent")
     print(*(f"survived: {r['name']}  ({r['outcome']}, {r['tests']} tests)" for r in sorted(survivors, key=lambda r: r["name"])), sep="\n")

@@ -16,10 +16,12 @@ Self = TypeVar("Self", bound="CameraModel")
 
 @dataclass(frozen=True)
 class CameraModel(ABC):
-    """A camera's mathematics. Points are in camera axes (OpenCV: x right, y down, z forward); pixels are (x, y), +x right, +y down, with (0, 0)
-    the centre of the top-left pixel, so that the image is [-0.5, width - 0.5) x [-0.5, height - 0.5).
+    """A camera's mathematics. Points are in camera axes (OpenCV: x right, y down, z forward); pixels are (x, y), +x
+    right, +y down, with (0, 0) the centre of the top-left pixel, so that the image is
+    [-0.5, width - 0.5) x [-0.5, height - 0.5).
 
-    Every model puts a point on an image plane at distance 1 in its own way and goes from there to pixels by ``x = fx u + cx``, ``y = fy v + cy``.
+    Every model puts a point on an image plane at distance 1 in its own way and goes from there to pixels by
+    ``x = fx u + cx``, ``y = fy v + cy``.
 
     width, height : px.   fx, fy, cx, cy : px.   near : nothing whose Z is smaller is seen, world units.
     kind : the model's name in the table (:mod:`blinkgl.camera.table`).
@@ -56,7 +58,8 @@ class CameraModel(ABC):
 
     @abstractmethod
     def project(self, points: np.ndarray) -> np.ndarray:
-        """(..., 2) px where (..., 3) points are seen; nan where the model sees no such point (behind a pin-hole camera)."""
+        """(..., 2) px where (..., 3) points are seen; nan where the model sees no such point (behind a pin-hole
+        camera)."""
 
     @abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
@@ -64,7 +67,8 @@ class CameraModel(ABC):
 
     @abstractmethod
     def rays(self, xy: np.ndarray) -> np.ndarray:
-        """(..., 3) directions, of any length, in which the points lie that are seen at (..., 2) px; nan where there are none."""
+        """(..., 3) directions, of any length, in which the points lie that are seen at (..., 2) px; nan where there
+        are none."""
 
     @abstractmethod
     def ray_jacobian(self, xy: np.ndarray) -> np.ndarray:
@@ -80,24 +84,29 @@ class CameraModel(ABC):
     @property
     @abstractmethod
     def magnification(self) -> float:
-        """A displacement d of any direction at depth Z moves the image by at most ``magnification * d / Z`` px, wherever in the picture."""
+        """A displacement d of any direction at depth Z moves the image by at most ``magnification * d / Z`` px,
+        wherever in the picture."""
 
     @property
     @abstractmethod
     def near_corner(self) -> float:
-        """Distance from the camera's centre to the farthest point of the near plane that is in the picture; inf where that is half of space."""
+        """Distance from the camera's centre to the farthest point of the near plane that is in the picture; inf where
+        that is half of space."""
 
     @abstractmethod
     def frustum_planes(self) -> np.ndarray:
-        """(n, 3) inward unit normals, camera axes, of planes through the centre: what is in the picture is on the inner side of each."""
+        """(n, 3) inward unit normals, camera axes, of planes through the centre: what is in the picture is on the
+        inner side of each."""
 
     @abstractmethod
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        """(x0, y0, x1, y1): pixels x0 <= x < x1, y0 <= y < y1 are all that the convex hull of (n, 3) points can touch, with a pixel to spare on
+        """(x0, y0, x1, y1): pixels x0 <= x < x1, y0 <= y < y1 are all that the convex hull of (n, 3) points can
+        touch, with a pixel to spare on
         every side. The whole image where the hull meets the near plane; None when it is out of the picture."""
 
     def pixels_per_unit(self, centres: np.ndarray, radius: float) -> np.ndarray:
-        """(n,) pixels in the image per unit of length on any surface in spheres about (n, 3) centres, at most: 0 for a sphere out of the picture,
+        """(n,) pixels in the image per unit of length on any surface in spheres about (n, 3) centres, at most: 0 for
+        a sphere out of the picture,
         inf for one that reaches the near plane in it."""
         distance = np.linalg.norm(centres, axis=1)
         away = np.arctan2(np.hypot(centres[:, 0], centres[:, 1]), centres[:, 2])
@@ -124,22 +133,40 @@ class CameraModel(ABC):
         """(4, 4) float64 from camera axes to clip space (:mod:`blinkgl.render.matrices`).
 
         Raises ConfigError: only a pin-hole image is a matrix's work, so only that is drawn."""
-        raise ConfigError("this camera model cannot be drawn", where="camera", value=self.kind, accepted="a pin-hole camera")
+        raise ConfigError(
+            "this camera model cannot be drawn", where="camera", value=self.kind, accepted="a pin-hole camera"
+        )
 
     def displacement(self, rays: np.ndarray, depth: np.ndarray, change: np.ndarray) -> np.ndarray:
-        """(n, 2) px by which points move in the image that are seen along (n, 3) rays at (n,) depth Z and move by (n, 3) change; nan where they
+        """(n, 2) px by which points move in the image that are seen along (n, 3) rays at (n,) depth Z and move by (n,
+        3) change; nan where they
         are not seen before or after."""
         points = rays * (depth / rays[:, 2])[:, None]
         return self.project(points + change) - self.project(points)
 
     def part(self: Self, x0: int, y0: int, x1: int, y1: int, scale: int = 1) -> Self:
-        """The camera that sees pixels x0 <= x < x1, y0 <= y < y1 of this one alone, ``scale`` times finer in x and y."""
+        """The camera that sees pixels x0 <= x < x1, y0 <= y < y1 of this one alone, ``scale`` times finer in x and
+        y."""
         # Pixel x is [x - 0.5, x + 0.5): its left edge, not its centre, is a multiple of the scale.
-        return replace(self, width=(x1 - x0) * scale, height=(y1 - y0) * scale, fx=self.fx * scale, fy=self.fy * scale,
-                       cx=(self.cx - x0 + 0.5) * scale - 0.5, cy=(self.cy - y0 + 0.5) * scale - 0.5)
+        return replace(
+            self,
+            width=(x1 - x0) * scale,
+            height=(y1 - y0) * scale,
+            fx=self.fx * scale,
+            fy=self.fy * scale,
+            cx=(self.cx - x0 + 0.5) * scale - 0.5,
+            cy=(self.cy - y0 + 0.5) * scale - 0.5,
+        )
 
     def resized(self: Self, width: int, height: int) -> Self:
         """The camera that sees the same with width x height pixels."""
         sx, sy = width / self.width, height / self.height
-        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy,
-                       cx=(self.cx + 0.5) * sx - 0.5, cy=(self.cy + 0.5) * sy - 0.5)
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+        )

@@ -61,7 +61,9 @@ class PinHole(CameraModel):
 
     def _edge(self) -> tuple[float, float]:
         """|X / Z| and |Y / Z| of the picture's farthest corner from the optical axis."""
-        return max(self.cx + 0.5, self.width - 0.5 - self.cx) / self.fx, max(self.cy + 0.5, self.height - 0.5 - self.cy) / self.fy
+        return max(self.cx + 0.5, self.width - 0.5 - self.cx) / self.fx, max(
+            self.cy + 0.5, self.height - 0.5 - self.cy
+        ) / self.fy
 
     @property
     def half_angle(self) -> float:
@@ -96,11 +98,14 @@ class PinHole(CameraModel):
     def clip_from_cam(self) -> np.ndarray:
         """(4, 4) float64: x right, y down, w = Z, depth = near / Z (reversed, the far plane at infinity).
 
-        A point is seen at pixel x = fx X / Z + cx, that is at window coordinate x + 0.5, that is at ndc 2 (x + 0.5) / width - 1."""
+        A point is seen at pixel x = fx X / Z + cx, that is at window coordinate x + 0.5, that is at ndc 2 (x + 0.5) /
+        width - 1."""
         w, h = self.width, self.height
-        return np.array([
-            [2 * self.fx / w, 0.0, 2 * (self.cx + 0.5) / w - 1, 0.0],
-            [0.0, 2 * self.fy / h, 2 * (self.cy + 0.5) / h - 1, 0.0],
-            [0.0, 0.0, 0.0, self.near],
-            [0.0, 0.0, 1.0, 0.0],
-        ])
+        return np.array(
+            [
+                [2 * self.fx / w, 0.0, 2 * (self.cx + 0.5) / w - 1, 0.0],
+                [0.0, 2 * self.fy / h, 2 * (self.cy + 0.5) / h - 1, 0.0],
+                [0.0, 0.0, 0.0, self.near],
+                [0.0, 0.0, 1.0, 0.0],
+            ]
+        )

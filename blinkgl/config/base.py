@@ -26,7 +26,7 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Generic, TypeVar
 
 import annotated_types
 from pydantic import (
@@ -96,7 +96,7 @@ class Config(BaseModel):
             raise TypeError(f"{cls.__name__}.{others.pop()}: say by @rule which keys it reads")
         for name, one in found.items():
             inspect.signature(one.check).bind(*one.keys)
-            for path, _ in one.paths():
+            for path, _whole in one.paths():
                 if not _fits(cls, path):
                     raise TypeError(f"{cls.__name__}.{name}: there is no key {'.'.join(path)}")
 
@@ -118,7 +118,7 @@ class Config(BaseModel):
 def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
     """Annotation of a field that is one of ``models``, told apart by the value of the key ``tag``; where that key is not given
     it is ``default``, so that a table may say only what it changes."""
-    union = typing.Union[models]  # noqa: UP007 - of as many as there are
+    union: Any = typing.Union[models]  # type: ignore[not-a-type]  # noqa: UP007 - of as many as there are
     if default is None:
         return Annotated[union, Discriminator(tag)]
     return Annotated[union, Discriminator(tag), BeforeValidator(partial(_with_tag, tag, default))]
@@ -128,17 +128,20 @@ def _with_tag(tag: str, default: str, data: Any) -> Any:
     return {tag: default, **data} if isinstance(data, dict) and tag not in data else data
 
 
-class Members:
+M = TypeVar("M", bound=Config)
+
+
+class Members(Generic[M]):
     """Models told apart by the value of their key ``tag`` (``default`` where that is not given), in the order in which they were
     added. More may be added at any time: see :class:`Family`."""
 
     def __init__(self, tag: str, default: str):
         self.tag, self.default = tag, default
-        self.models: dict[str, type[Config]] = {}
+        self.models: dict[str, type[M]] = {}
         """By the value of the tag."""
         self._adapter: TypeAdapter | None = None
 
-    def add(self, model: type[Config]) -> None:
+    def add(self, model: type[M]) -> None:
         """Raises TypeError for a model without the tag, or with another's value of it."""
         tag = tag_of(model)
         if tag is None or tag[0] != self.tag:
@@ -169,7 +172,7 @@ class Family(Config):
     up when a value is validated and when the models are walked (:func:`members`), not when the field's model is made; so one that is
     added later counts as much as the first. Members are subclasses of it, by which they are known to share what it declares."""
 
-    members: ClassVar[Members]
+    members: ClassVar[Members[Any]]
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
@@ -222,7 +225,7 @@ class Growing(Config):
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
         if not vars(cls).get("_made", False):
             return handler(source)
-        return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))
+        return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))  # noqa: PLW0108 - the class as it then is
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: core_schema.CoreSchema, handler: Any) -> dict[str, Any]:
@@ -310,6 +313,10 @@ def _get(node: Any, path: list[str]) -> Any:
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
+def _dotted(*names: str) -> str:
+    return ".".join(name for name in names if name)
+
+
 def validate(model: type[Config], data: Any, *, where: str = "") -> Any:
     """``model`` built from plain data; raises :class:`ConfigError` naming the first bad path, its value and
     what is accepted (for an unknown key: the nearest valid one)."""
@@ -323,7 +330,7 @@ def validate_field(model: type[Config], name: str, value: Any) -> Any:
     """``value`` as the model's field ``name`` alone would hold it. Raises ConfigError as :func:`validate`."""
     info = model.model_fields[name]
     try:
-        kind = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
+        kind: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation  # type: ignore[not-a-type]
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:
         raise _translate(model, error, "", (name,)) from None
@@ -352,7 +359,7 @@ def _translate(model: type[BaseModel], error: ValidationError, where: str, start
     first = problems[0]
     kind, context = first["type"], first.get("ctx", {})
     path, owners, annotations, info = _locate(model, (*start, *first["loc"]), kind)
-    dotted = ".".join(filter(None, [where, *path])) or "config"
+    dotted = _dotted(where, *path) or "config"
     if kind == "extra_forbidden":
         return ConfigError("unknown key", where=dotted, accepted=_nearest(model, path, owners))
     if kind in ("union_tag_invalid", "union_tag_not_found"):
@@ -364,11 +371,11 @@ def _translate(model: type[BaseModel], error: ValidationError, where: str, start
     if kind == "missing":
         short = path and path[-1].isdigit() and not owners
         problem, value = ("too few entries", first["input"]) if short else ("is required", ...)
-        return ConfigError(problem, where=".".join(filter(None, [where, *path[:-1]])) if short else dotted, value=value,
+        return ConfigError(problem, where=_dotted(where, *path[:-1]) if short else dotted, value=value,
                            accepted=None if short else describe(annotations, info))
     refused = context.get("error")
     if isinstance(refused, Refused):
-        there = ".".join(filter(None, [where, *path, refused.where])) or "config"
+        there = _dotted(where, *path, refused.where) or "config"
         return ConfigError(refused.problem, where=there, value=refused.value, accepted=refused.accepted)
     if refused is not None:
         return ConfigError(str(refused), where=dotted, value=first["input"])

@@ -27,7 +27,13 @@ class EmulatorConfig(Family):
     """The configuration of any emulator; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its name,
     ``emulator: Literal["..."] = "..."``, takes no argument without a default, and says what stands here."""
 
-    members = Members("emulator", default="esim")
+    members: ClassVar[Members[EmulatorConfig]] = Members("emulator", default="esim")
+
+    if TYPE_CHECKING:
+
+        @property
+        def emulator(self) -> str:
+            """The name."""
 
     reconstructions: ClassVar[tuple[str, ...]]
     """Paths between frames that the emulator can follow; "linear" is one of them."""

@@ -30,7 +30,7 @@ class FramesConfig(Config):
     factor: int = Field(4, ge=1, le=1000, description="cubic: steps per given frame")
 
     @rule("fps", "count")
-    def _fits_a_file(fps, count):
+    def _fits_a_file(fps: float, count: int | None):
         check_span(count or 3, fps)
 
 

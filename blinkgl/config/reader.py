@@ -9,7 +9,7 @@ key (``<<: *base``) brings. Dates are text, since nothing here is a date. ``1e-4
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import yaml
 from yaml.composer import Composer, ComposerError
@@ -37,8 +37,8 @@ if not _Events:
 class _Loader(Composer, _Events, SafeConstructor, Resolver):
     """Composes with a count of the values that the document expands to; refuses what is not plain data."""
 
-    yaml_constructors: ClassVar[dict] = {}
-    yaml_implicit_resolvers: ClassVar[dict] = {
+    yaml_constructors: dict = {}  # noqa: RUF012 - as PyYAML declares it
+    yaml_implicit_resolvers: dict = {  # noqa: RUF012
         first: [(tag, regexp) for tag, regexp in known if not tag.endswith(":timestamp")] for first, known in Resolver.yaml_implicit_resolvers.items()}
 
     def __init__(self, text: str):
@@ -49,7 +49,7 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         self._values, self._depth = 0, 0
         self._sizes: dict[int, int] = {}
 
-    def compose_node(self, parent: Node | None, index: Any) -> Node:
+    def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         """As Composer's; an alias counts as everything behind it."""
         before = self._values
         if self.check_event(yaml.AliasEvent):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -198,18 +199,18 @@ class RandomSceneConfig(Config):
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
 
     @rule("region.width", "region.height", "objects.size", "sky.size")
-    def _sky_holds_everything(width, height, sizes, sky):
+    def _sky_holds_everything(width: float, height: float, sizes: tuple[float, float], sky: float | None):
         least = max(1.2 * width, width + 2 * sizes[1], 2.2 * height)
         if sky is not None and sky < least:
             raise Refused(f"must be at least {least:g} to hold the region and its objects", where="sky.size", value=sky)
 
     @rule("region.camera_height", "region.height")
-    def _camera_below_the_ceiling(camera_heights, height):
+    def _camera_below_the_ceiling(camera_heights: tuple[float, float], height: float):
         if camera_heights[0] >= height:
             raise Refused(f"must begin below region.height {height:g}", where="region.camera_height", value=list(camera_heights))
 
     @rule("objects.size", "region.height")
-    def _objects_below_the_ceiling(sizes, height):
+    def _objects_below_the_ceiling(sizes: tuple[float, float], height: float):
         if sizes[0] >= height:
             raise Refused(f"must begin below region.height {height:g}", where="objects.size", value=list(sizes))
 
@@ -229,7 +230,7 @@ class PoseConfig(Config):
             raise Refused("only one of quaternion, euler, look_at may be given, not " + " and ".join(given))
 
     @rule("quaternion")
-    def _some_rotation(quaternion):
+    def _some_rotation(quaternion: tuple[float, ...] | None):
         if quaternion is not None and sum(q * q for q in quaternion) < 1e-12:
             raise Refused("a quaternion must not be zero", where="quaternion", value=list(quaternion))
 
@@ -252,7 +253,7 @@ class KeyedMotionConfig(PoseConfig):
     interpolation: Literal["spline", "linear"] = Field("spline", description="between key frames: C2 spline, or straight lines and slerp")
 
     @rule("keyframes.*.time")
-    def _in_order(times):
+    def _in_order(times: tuple[float, ...]):
         if len(times) == 1:
             raise Refused("one key frame is no motion; give two or more, or a fixed pose", where="keyframes")
         for k, (before, after) in enumerate(itertools.pairwise(times)):
@@ -265,7 +266,7 @@ class KeyedMotionConfig(PoseConfig):
             raise Refused("give a fixed pose or keyframes, not both")
 
     @rule("keyframes.*.euler", "keyframes.*.quaternion", "keyframes.*.look_at")
-    def _shortest_turns(eulers, quaternions, look_ats):
+    def _shortest_turns(eulers: tuple, quaternions: tuple, look_ats: tuple):
         # Between poses the body turns the shortest way: half a turn has no shortest way, and more would go back.
         otherwise = [q is not None or at is not None for q, at in zip(quaternions, look_ats)]
         for k in range(len(eulers) - 1):
@@ -345,7 +346,7 @@ def _known(used, known, key: str, table: str, at=None) -> None:
                           accepted="one of: " + ", ".join(known) if known else f"a name under {table}")
 
 
-def object_names(names, meshes) -> list[str]:
+def object_names(names: Iterable[str | None], meshes: Iterable[str]) -> list[str]:
     """Names of an explicit scene's objects: as given (None: not), else the mesh's, with the object's number where that is taken."""
     made: list[str] = []
     for number, (name, mesh) in enumerate(zip(names, meshes)):
@@ -374,7 +375,7 @@ class ExplicitSceneConfig(Config):
         _known(used, known, "mesh", "scene.meshes")
 
     @rule("objects.*.name", "objects.*.mesh")
-    def _names_differ(names, meshes):
+    def _names_differ(names: tuple[str | None, ...], meshes: tuple[str, ...]):
         object_names(names, meshes)
 
     @rule("objects.*.material", "#materials")

@@ -24,7 +24,7 @@ class ReadoutConfig(Config):
                               "is lost.")
 
     @rule("events_per_second", "row_ns", "queue_events")
-    def _queue_empties(rate, row_ns, queue):
+    def _queue_empties(rate: float, row_ns: float, queue: int):
         if drain_us(rate, row_ns, queue) > 2**32:
             raise Refused("the last event of a full queue would wait for more than an hour", where="queue_events", value=queue,
                           accepted="a shorter queue or a faster bus")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -86,7 +86,7 @@ class TimeConfig(Config):
     start: float = Field(0.0, ge=0, le=1e7, description="clock at the start of the pre-roll, s")
 
     @rule("duration", "label_rate")
-    def _labels(duration, rate):
+    def _labels(duration: float, rate: float):
         if duration * rate < 1 - 1e-9:
             raise Refused("duration * label_rate must be at least 1 label")
         if duration * rate > MAX_LABELS:
@@ -195,7 +195,7 @@ class SequenceConfig(Config):
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
     @rule("timeline.reconstruction", "events.emulator", "?frames")
-    def _the_emulator_follows(path, emulator, frames):
+    def _the_emulator_follows(path: str, emulator: str, frames: bool):
         able = followers(path)
         if emulator not in able and not frames:
             own = EmulatorConfig.members.models[emulator].reconstructions
@@ -203,13 +203,13 @@ class SequenceConfig(Config):
                           where="timeline.reconstruction", value=path, accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}")
 
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
-    def _late_events_fit(duration, label_rate, rate, row_ns, queue):
+    def _late_events_fit(duration: float, label_rate: float, rate: float | None, row_ns: float, queue: int):
         if rate is not None and span_s(duration, label_rate) + 1e-6 * drain_us(rate, row_ns, queue) > MAX_SPAN_S:
             raise Refused("events that wait for the read-out would leave it after the end of the file", where="time.duration", value=duration,
                           accepted=f"at most {MAX_SPAN_S - 1 / label_rate - 1e-6 * drain_us(rate, row_ns, queue):.6g}")
 
     @rule("time.start", "?readout")
-    def _picoseconds_fit(start, readout):
+    def _picoseconds_fit(start: float, readout: bool):
         if readout and start > 8e6:
             raise Refused("too late for the read-out, which counts picoseconds", where="time.start", value=start, accepted="at most 8000000")
 
@@ -285,7 +285,7 @@ def _validated(tree: dict[str, Any]) -> SequenceConfig:
     return validate(SequenceConfig, tree)
 
 
-def load_run(path: str | Path, overrides: list[str] | tuple[str, ...] = (), *, seed: int | None = None) -> RunTemplate:
+def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
     """Reads a YAML file, applies ``a.b=c`` overrides (c is YAML) and an optional seed, checks all that can be drawn.
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
@@ -299,7 +299,7 @@ def load_run(path: str | Path, overrides: list[str] | tuple[str, ...] = (), *, s
     return template
 
 
-def apply_overrides(tree: dict[str, Any], overrides: list[str] | tuple[str, ...]) -> dict[str, Any]:
+def apply_overrides(tree: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
     """Copy of ``tree`` with ``--set`` options applied; tables on the way are made when absent."""
     tree = copy.deepcopy(tree)
     for option in overrides:

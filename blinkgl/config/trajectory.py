@@ -28,14 +28,11 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     return pair
 
 
-def _range(most: float) -> Any:
-    number = Annotated[float, Field(ge=0, le=most)]
-    return Annotated[tuple[number, number], BeforeValidator(_as_pair), AfterValidator(_ordered)]
-
-
 # Far beyond anything filmed; past them float64 geometry is fine but a unit was almost certainly mistaken.
-SpeedRange = _range(1e4)
-RateRange = _range(36_000.0)
+_Speed = Annotated[float, Field(ge=0, le=1e4)]
+_Rate = Annotated[float, Field(ge=0, le=36_000.0)]
+SpeedRange = Annotated[tuple[_Speed, _Speed], BeforeValidator(_as_pair), AfterValidator(_ordered)]
+RateRange = Annotated[tuple[_Rate, _Rate], BeforeValidator(_as_pair), AfterValidator(_ordered)]
 
 
 class MotionConfig(Config):

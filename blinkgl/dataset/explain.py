@@ -21,7 +21,7 @@ from blinkgl.labels import LABELS, asked_for
 from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.recorded import RECORDED
@@ -60,8 +60,7 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
     if config.frames is not None:
         return _explain_frames(config, index, template.base)
     with create_context(config.gl.backend, config.gl.device) as gl:
-        scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
-                            seed=config.seed, sequence=index, base=template.base)
+        scene = sequence_scene(config, index, template.base)
         with Renderer(gl, scene, config.render) as renderer:
             result = Explanation(machine=gl.renderer)
             result.scene = _describe(renderer.scene, renderer)
@@ -221,6 +220,6 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     if config.timeline.reconstruction != "hermite":
         add("rates of change in the event frames", f"timeline.reconstruction: {config.timeline.reconstruction}")
     for name, value in config.events.model_dump().items():
-        if value in (0, 0.0, False) and name not in ("seed",):
+        if value in (0, 0.0, False) and name != "seed":
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
     add("shadows, inter-reflection, motion blur, depth of field", "BlinkGL does not model them")

@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import overload
 
 from blinkgl.config.base import validate
 from blinkgl.config.reader import to_yaml
@@ -66,7 +67,13 @@ class Tasks(Sequence[Task]):
     def __len__(self) -> int:
         return self._starts[-1]
 
-    def __getitem__(self, number):
+    @overload
+    def __getitem__(self, number: int) -> Task: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> tuple[Task, ...]: ...
+
+    def __getitem__(self, number: int | slice) -> Task | tuple[Task, ...]:
         if isinstance(number, slice):
             return tuple(self[n] for n in range(*number.indices(len(self))))
         if not -len(self) <= number < len(self):

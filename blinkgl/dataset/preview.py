@@ -39,7 +39,7 @@ class PreviewRecorder:
     def __enter__(self) -> PreviewRecorder:
         return self
 
-    def __exit__(self, kind, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._video is not None:
             with self._clock("preview"):
                 self._video.close() if kind is None else self._video.abort()

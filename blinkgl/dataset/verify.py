@@ -254,12 +254,8 @@ def _check_times(folder: Path, manifest: dict[str, Any], label: Label, files: li
 
 
 def _check_value(path: Path, manifest: dict[str, Any], label: Label) -> list[str]:
-    try:
-        value = label.forms[0].read(path)
-        label.own(value, manifest["height"], manifest["width"])
-    except TypeError as error:
-        return [f"not {manifest['width']}x{manifest['height']} px: {error}"]
-    problem = label.problem(value)
+    value = label.forms[0].read(path)
+    problem = label.wrong(value, manifest["height"], manifest["width"]) or label.problem(value)
     return [] if problem is None else [problem]
 
 

@@ -122,7 +122,7 @@ class Maker:
     def __enter__(self) -> Maker:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.gl is not None:
             self.gl.release()
             self.gl = None

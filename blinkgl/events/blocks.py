@@ -12,19 +12,22 @@ from blinkgl.events.packing import JIT
 
 
 @numba.njit(**JIT)
-def copy_block(source, target):
+def copy_block(source: np.ndarray, target: np.ndarray) -> None:
+    """``target[:] = source``."""
     for i in range(source.size):
         target[i] = source[i]
 
 
 @numba.njit(**JIT)
-def scale_block(frame, scale, out):
+def scale_block(frame: np.ndarray, scale: float, out: np.ndarray) -> None:
+    """``out[:] = frame * scale``."""
     for i in range(frame.size):
         out[i] = frame[i] * scale
 
 
 @numba.njit(**JIT)
-def lookup_block(codes, table, out):
+def lookup_block(codes: np.ndarray, table: np.ndarray, out: np.ndarray) -> None:
+    """``out[:] = table[codes]``."""
     for i in range(codes.size):
         out[i] = table[codes[i]]
 
@@ -38,7 +41,7 @@ _BIT_COUNTS = np.array([_mask.bit_count() for _mask in range(256)], np.int64)
 
 
 @numba.njit(**JIT)
-def compact_flags(flags, scratch, first_pixel, out):
+def compact_flags(flags: np.ndarray, scratch: np.ndarray, first_pixel: int, out: np.ndarray) -> int:
     """Numbers ``first_pixel + i`` of the set flags into ``out``; returns how many.
 
     flags : (n,) uint8 of 0 and 1, n a multiple of 8. scratch : (n / 8,) int64. out : int32 with room for 8 more than

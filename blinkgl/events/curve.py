@@ -41,26 +41,26 @@ class Curve(NamedTuple):
 
 
 @register_jitable
-def limited(slope):
+def limited(slope: float) -> float:
     """A slope in units of the secant, cut to what keeps the cubic monotone (and 0 for NaN)."""
     return min(slope, STEEPEST) if slope > 0.0 else 0.0
 
 
 @register_jitable
-def slope_between(before, after, before_ns, after_ns):
+def slope_between(before: float, after: float, before_ns: float, after_ns: float) -> float:
     """Slope at a frame, from secants (any unit) and lengths of the intervals beside it: that of the parabola through
     the three frames. Second order; the caller limits it."""
     return (before * after_ns + after * before_ns) / (before_ns + after_ns)
 
 
 @register_jitable
-def slope_at_end(near, far, near_ns, far_ns):
+def slope_at_end(near: float, far: float, near_ns: float, far_ns: float) -> float:
     """Slope at the first or last frame: of the parabola through it and the two frames next to it."""
     return near + (near - far) * near_ns / (near_ns + far_ns)
 
 
 @register_jitable
-def end_slopes(older, before, now, newer, dt_ns, older_ns, newer_ns):
+def end_slopes(older: float, before: float, now: float, newer: float, dt_ns: float, older_ns: float, newer_ns: float) -> tuple[float, float]:
     """(alpha, beta) of an interval from the log intensities of four frames; older_ns or newer_ns 0: there is no such frame."""
     change = np.float64(now - before)
     secant = change / dt_ns
@@ -77,14 +77,14 @@ def end_slopes(older, before, now, newer, dt_ns, older_ns, newer_ns):
 
 
 @register_jitable
-def curve_time(y, alpha, beta, low):
+def curve_time(y: float, alpha: float, beta: float, low: float) -> float:
     """s in [low, 1] with y(s) = y, for a monotone cubic and ``y`` in [0, 1] not below y(low). Newton's method inside a
     bracket that shrinks at every step, bisection where it would leave it; error 1e-15 where the curve is not flat."""
     if y >= 1.0:
         return 1.0
-    a, b = alpha + beta - 2.0, 3.0 - 2.0 * alpha - beta
+    a, b = alpha + beta - 2.0, 3.0 - 2.0 * alpha - beta  # y(s) = ((a s + b) s + alpha) s
     high = 1.0
-    s = min(max(y, low), 1.0)
+    s = min(max(y, low), 1.0)  # where the straight line meets it
     for _ in range(100):
         value = ((a * s + b) * s + alpha) * s - y
         if value > 0.0:
@@ -92,7 +92,7 @@ def curve_time(y, alpha, beta, low):
         else:
             low = s
         slope = (3.0 * a * s + 2.0 * b) * s + alpha
-        new = 0.5 * (low + high)
+        new = 0.5 * (low + high)  # unless Newton's step stays inside
         if slope > 0.0:
             newton = s - value / slope
             if low <= newton <= high:
@@ -105,7 +105,7 @@ def curve_time(y, alpha, beta, low):
 
 
 @numba.njit(**JIT)
-def slope_block(rate, intensity, eps, out):
+def slope_block(rate: np.ndarray, intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
     """d ln(I + eps)/dt in 2^-25 per ns from dI/dt per second, float32."""
     for i in range(rate.size):
         out[i] = np.float32(rate[i] / np.float32(intensity[i] + eps)) * PER_SECOND

@@ -73,7 +73,7 @@ class Interval(NamedTuple):
 
 
 @numba.njit(**JIT)
-def log_block(intensity, eps, out):
+def log_block(intensity: np.ndarray, eps: float, out: np.ndarray) -> None:
     """ln(intensity + eps) into ``out``, int32, 2^-25."""
     for i in range(intensity.size):
         out[i] = log_q25(np.float32(intensity[i] + eps))
@@ -84,6 +84,7 @@ def _flag_block(level, upper, lower, flags):
     """Flags (uint8) of the pixels at or beyond a level; returns how far the farthest is beyond (negative: none is)."""
     farthest = _FAR_BELOW
     for i in range(level.size):
+        # The reference lies between the two levels, so at most one of them has been reached.
         beyond = max(np.int32(level[i] - upper[i]), np.int32(lower[i] - level[i]))
         flags[i] = np.uint8(beyond >= _I0)
         farthest = max(farthest, beyond)
@@ -91,11 +92,12 @@ def _flag_block(level, upper, lower, flags):
 
 
 @register_jitable
-def crossing_ns(part, whole, dt_ns):
+def crossing_ns(part: float, whole: float, dt_ns: int) -> int:
     """floor(part / whole * dt_ns) for 0 <= part <= whole < 2^31, exactly, for any dt_ns < 2^52."""
-    if dt_ns < _LONG_NS:
+    if dt_ns < _LONG_NS:  # both factors below 2^31: the product fits
         return np.int64(np.uint64(part * dt_ns) // np.uint64(whole))
-    high, low = dt_ns >> 20, dt_ns & 0xFFFFF  # schoolbook division, two digits
+    # Schoolbook division of part * dt by whole, dt as two digits of base 2^20: no product reaches 2^63.
+    high, low = dt_ns >> 20, dt_ns & 0xFFFFF
     quotient, rest = part * high // whole, part * high % whole
     return (quotient << 20) + ((rest << 20) + part * low) // whole
 
@@ -116,18 +118,21 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
         while i >= row_end:
             y += 1
             row_end += v.width
+        # Rebecq et al. 2018, section 3: the path goes from p.log[i] to ``level``, ``whole`` units. What of it lies beyond the level that is
+        # being passed is ``gap``, so that level is met at the fraction (whole - gap) / whole of a straight line.
         level, above, below = np.int64(now[i - first]), np.int64(p.upper[i]), np.int64(p.lower[i])
         whole = abs(level - p.log[i])
         polarity = np.int64(level >= above)
         gap = max(level - above, below - level)  # how far the signal ends beyond the level being passed
-        pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity
-        step_on, step_off = v.on_all, v.off_all
+        pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity  # the word of packing.py but for its time
+        step_on, step_off = v.on_all, v.off_all  # the pixel's own thresholds; ``up`` and ``down`` are those now in force, with jitter
         if p.on.size:
             step_on, step_off = np.int64(p.on[i]), np.int64(p.off[i])
         up, down = step_on, step_off
         step = down + polarity * (up - down)
         emitted = 0
         if curve is not None:
+            # Slopes in units of the secant: a falling path becomes a rising one, and both are solved alike.
             before, s = np.int64(p.log[i]), 0.0
             if slope.size:
                 secant = (level - before) / v.dt_ns
@@ -136,13 +141,14 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
                 older = np.int64(curve.older[i]) if curve.older_ns > 0.0 else before
                 newer = np.int64(curve.newer[i]) if curve.newer_ns > 0.0 else level
                 alpha, beta = end_slopes(older, before, level, newer, np.float64(v.dt_ns), curve.older_ns, curve.newer_ns)
+        # One turn per level passed. All are of one polarity, since neither a line nor a monotone cubic turns back.
         while gap >= 0:
             if curve is None:
                 after_ns = start_ns + crossing_ns(whole - gap, whole, v.dt_ns)
             else:
                 s = curve_time((whole - gap) / whole, alpha, beta, s)
                 after_ns = start_ns + np.int64(s * v.dt_ns)
-            alive = True
+            alive = True  # out of the refractory period; if not, the event is lost, but the reference moves all the same
             if p.last_ns.size:
                 alive = v.base_us * 1000 + after_ns - p.last_ns[i] >= v.refractory_ns
                 if alive:
@@ -155,6 +161,7 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
                 else:
                     cut += 1
             if p.fired.size:
+                # The next thresholds, drawn once per level and numbered by the levels passed: how the path was cut into frames has no part in it.
                 p.fired[i] += 1
                 a, b = normal2(v.seed, np.uint64(i), _JITTER, np.uint64(p.fired[i]))
                 up = max(v.floor_on, step_on + np.int64(np.floor(v.jitter * a + 0.5)))
@@ -178,7 +185,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         e = min(s + BLOCK, pixels)
         n = e - s
         if n < BLOCK:
-            flags[:] = 0
+            flags[:] = 0  # the last block is shorter, and compact_flags looks at whole words
         if codes.size:
             lookup_block(codes[s:e], table, now[:n])
         else:
@@ -186,14 +193,15 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         farthest = _flag_block(now[:n], p.upper[s:e], p.lower[s:e], flags)
         if farthest >= 0:
             count = compact_flags(flags, scratch, s, active)
+            # As many events a pixel as levels fit between the first one and the farthest, rounded up; never more than the block's share.
             cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
-            if filled + count * cap > packed.size:
-                return block, filled, cut
+            if filled + count * cap > packed.size:  # no room for the worst case; nothing of this block has been touched: the caller
+                return block, filled, cut  # makes room and comes back to it
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, None, None)
             cut += cut_here
-        copy_block(now[:n], p.log[s:e])
+        copy_block(now[:n], p.log[s:e])  # last: until here p.log is the frame before
     return stop_block, filled, cut
 
 

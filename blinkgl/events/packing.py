@@ -24,6 +24,10 @@ _EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
 JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
 
 
+# A radix sort from the lowest digit of the time up (Knuth, TAOCP 3, 5.2.5). Every pass keeps the order of equal digits, so what has been
+# sorted by lower digits stays sorted, and the first pass keeps the raster order.
+
+
 @numba.njit(**JIT)
 def _count_digits(packed, start, stop, shift, mask, histogram):
     for i in range(start, stop):
@@ -34,7 +38,7 @@ def _count_digits(packed, start, stop, shift, mask, histogram):
 def _scatter(packed, start, stop, shift, mask, offsets, out):
     for i in range(start, stop):
         digit = (packed[i] >> shift) & mask
-        out[offsets[digit]] = packed[i]
+        out[offsets[digit]] = packed[i]  # the next free place of this part's events of this digit
         offsets[digit] += 1
 
 
@@ -121,6 +125,7 @@ class PackedBuffer:
             return Events.empty()
         threads = max(1, min(threads, total // _EVENTS_PER_THREAD))
         parts = 1 if threads == 1 else min(_PARTS_PER_THREAD * threads, len(counts))
+        # Short intervals take one pass; longer ones passes of 11 bits, whose 2048 counters and write positions stay in the first-level cache.
         bits = max(1, int(span_us).bit_length())
         digit_bits = bits if bits <= _SINGLE_PASS_BITS else _DIGIT_BITS
         if self._sorted.shape[1] < total:

@@ -41,14 +41,16 @@ class Stream(IntEnum):
 
 @register_jitable
 def _round(c0, c1, c2, c3, k0, k1):
+    # Two products of 32 x 32 bits; their high halves cross over to the other pair of words.
     p0 = c0 * _M0
     p1 = c2 * _M1
     return (p1 >> _S32) ^ c1 ^ k0, p1 & _MASK32, (p0 >> _S32) ^ c3 ^ k1, p0 & _MASK32
 
 
 @register_jitable
-def philox4x32(c0, c1, c2, c3, k0, k1):
+def philox4x32(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> tuple[int, int, int, int]:
     """Four 32-bit words (held in uint64) of the block at counter (c0, c1, c2, c3) under key (k0, k1)."""
+    # Ten rounds, the key bumped between them by the golden ratio and sqrt(3) - 1. Written out, since arrays come through here as well.
     c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
     k0, k1 = (k0 + _W0) & _MASK32, (k1 + _W1) & _MASK32
     c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
@@ -71,14 +73,15 @@ def philox4x32(c0, c1, c2, c3, k0, k1):
 
 
 @register_jitable
-def uniform2(seed, pixel, stream, index):
+def uniform2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
     """Two independent uniforms in the open interval (0, 1), 53 bits each. All arguments uint64 (or arrays of it)."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
+    # The upper 53 of 64 bits, and a half: neither 0 nor 1 comes out.
     return (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53, (_D(((w3 << _S32) | w2) >> _S11) + _HALF) * _ULP53
 
 
 @register_jitable
-def normal2(seed, pixel, stream, index):
+def normal2(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
     """Two independent standard normals (Box-Muller), float64."""
     u, v = uniform2(seed, pixel, stream, index)
     radius = np.sqrt(_MINUS2 * log_f64(u))
@@ -90,15 +93,16 @@ _THREE_ROOT, _TWO, _ULP32 = _D(np.sqrt(3.0)), _D(2.0), _D(2.0**-32)
 
 
 @register_jitable
-def rough_normal(seed, pixel, stream, index):
+def rough_normal(seed: int, pixel: int, stream: int, index: int) -> float:
     """Mean 0, variance 1, near normal (sum of four uniforms, within +-3.5): a third of the cost of a normal, for
     jitters whose exact law nobody has measured."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
+    # Four uniforms of variance 1/12; their mean, 2 - 2^-31, is taken off, and sqrt(3) makes the variance 1.
     return (_D(w0 + w1 + w2 + w3) * _ULP32 + (_TWO * _ULP32 - _TWO)) * _THREE_ROOT
 
 
 @register_jitable
-def normal_and_uniform(seed, pixel, stream, index):
+def normal_and_uniform(seed: int, pixel: int, stream: int, index: int) -> tuple[float, float]:
     """A standard normal (angle of 32 bits) and an independent uniform (32 bits) from one block."""
     w0, w1, w2, w3 = philox4x32(pixel & _MASK32, stream, index & _MASK32, index >> _S32, seed & _MASK32, seed >> _S32)
     u = (_D(((w1 << _S32) | w0) >> _S11) + _HALF) * _ULP53

@@ -8,6 +8,7 @@ code. The tests ask for equality event for event. For small frames only.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -158,7 +159,7 @@ class ReferenceV2e:
         self.release: list[int | None] = [None] * self.pixels
         self.t_ns: int | None = None
 
-    def shot_times(self, block: int):
+    def shot_times(self, block: int) -> Iterator[tuple[int, int, int, int]]:
         """All candidate events of one block of pixels: (ns, pixel in block, polarity, index), endlessly."""
         whole = np.float64(self.shot_table[block, -1])
         rate = 0.5 * self.config.shot_noise_rate_hz * v2e.DARKEST * 1e-9 * whole
@@ -236,7 +237,7 @@ class ReferenceV2e:
         below, part = v2e.noise_place(k)
         return v2e.next_noise(self.hum, k, sizes[below] + part * (sizes[below + 1] - sizes[below]), normals)
 
-    def pixel(self, i, x, lag, intensity, kappa, t_ns, noise, hum) -> list[tuple[int, int, int, int]]:
+    def pixel(self, i: int, x: int, lag: float, intensity: float, kappa: float, t_ns: int, noise: float, hum: float) -> list[tuple[int, int, int, int]]:
         f = np.float64
         dt_ns, (y, column) = t_ns - self.t_ns, divmod(i, self.width)
         since = (self.t_ns - self.epoch) * 1e-9, (t_ns - self.epoch) * 1e-9

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 
-def smallest_threshold(config) -> float:
+class Thresholds(Protocol):
+    """Whatever has a contrast threshold and, where OFF differs, another."""
+
+    contrast_threshold: float
+    contrast_threshold_off: float | None
+
+
+def smallest_threshold(config: Thresholds) -> float:
     """Of a configuration with ``contrast_threshold`` and ``contrast_threshold_off``."""
     return min(config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold)
 

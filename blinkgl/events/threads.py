@@ -36,7 +36,7 @@ def _exchange(typingctx, array, index, value):
 
 
 @register_jitable
-def take_part(taken, start):
+def take_part(taken: np.ndarray, start: int) -> int:
     """In a kernel: the number of a part that no thread has taken before, the next from ``start`` on, around the end; -1 when none is left.
 
     A thread that starts at the same place every time finds what it left in its core's cache."""

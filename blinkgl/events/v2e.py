@@ -165,6 +165,8 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
     table = p.shot_table[block]
     whole = np.float64(table[table.size - 1])
     t_ns, index = p.clock_ns[block], p.clock_index[block]
+    # A Poisson process of candidates for the block as a whole, as fast as if all its pixels were dark, thinned below to what their
+    # intensities allow (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock a block instead of one a pixel.
     while t_ns <= end_ns:
         gap, pick = shot_draw(v.seed, np.uint64(block), np.uint64(index), v.shot_unit_per_ns * whole)
         # How many entries are <= weight. Weights are much alike, so the proportional guess is a cache line away.
@@ -173,18 +175,18 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
             place -= 1
         while place < table.size - 1 and table[place] <= weight:
             place += 1
-        offset, on = place & (BLOCK - 1), place < BLOCK
+        offset, on = place & (BLOCK - 1), place < BLOCK  # the table holds the ON half of all pixels, then the OFF half
         if offset < pixels_in_block:
             i = first + offset
             after = max(t_ns - v.t0_ns, 0)
             intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
-            u, _ = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)
+            u, _ = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)  # odd: shot_draw has the even numbers
             if u * DARKEST < shot_factor(intensity):
                 if count == keys.size:
-                    return -1, t_ns, index
+                    return -1, t_ns, index  # the caller doubles ``keys`` and begins the block anew: draws know no state
                 key = (offset << 42) | (after << 1) | np.int64(on)
                 slot = count
-                if count < _INSERTION_LIMIT:
+                if count < _INSERTION_LIMIT:  # a few are put where they belong, many are sorted at the end
                     while slot > 0 and keys[slot - 1] > key:
                         keys[slot] = keys[slot - 1]
                         slot -= 1
@@ -221,6 +223,7 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
         leak = np.float64(p.leak[i]) if p.leak.size else 0.0
         x0 = np.float64(p.x[i])
         dx = np.float64(x_now[o]) - x0
+        # Over the interval, s from 0 to 1: z(s) = lin-log (a straight line) + lag (e^-ks, see curve_of) + leak and noise (straight lines).
         lag, k = 0.0, -1.0
         if p.lag.size:
             lag = np.float64(p.lag[i])
@@ -237,7 +240,7 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
         up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
         on, off = np.float64(constants[j, 0]), np.float64(constants[j, 1])
         s, now_ns, dead = 0.0, np.int64(0), False
-        if p.release.size and up == -np.inf:
+        if p.release.size and up == -np.inf:  # in its dead time, which ends where the comparator takes its new reference
             if p.release[i] > end_ns:
                 dead = True
             else:
@@ -245,9 +248,10 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                 s = now_ns / dt_ns
                 reference = signal_at(s, c, rise, fall, k)
                 up, down = reference + on, reference - off
-        while noise < noise_end and (keys[noise] >> 42) < o:
+        while noise < noise_end and (keys[noise] >> 42) < o:  # left by pixels that died before them
             noise += 1
         emitted = 0
+        # One turn per event: the crossing that comes next or the shot noise that comes before it.
         while not dead:
             while noise < noise_end and (keys[noise] >> 42) == o and ((keys[noise] >> 1) & _MASK41) < now_ns:
                 noise += 1
@@ -256,7 +260,7 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                 fires, polarity, target = True, np.int64(1), up
             elif end <= down:
                 fires, target = True, down
-            event_s, event_ns, reference = 2.0, np.int64(0), target
+            event_s, event_ns, reference = 2.0, np.int64(0), target  # a crossing leaves the reference at the level that it met
             if fires:
                 event_s = crossing_fraction(s, target, polarity, c, rise, fall, k, end)
                 event_ns = np.int64(event_s * dt_ns)
@@ -276,7 +280,7 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
             else:
                 cut += 1
             s, now_ns = event_s, event_ns
-            if v.leak_jitter > 0.0:
+            if v.leak_jitter > 0.0:  # every event draws the leak anew: what follows moves over to its line
                 a = rough_normal(v.seed, np.uint64(i), _LEAK_JITTER, np.uint64(v.t0_ns + event_ns))
                 p.leak[i] = np.float32(constants[j, 2] / max(0.1, 1.0 + v.leak_jitter * a))
                 change = np.float64(p.leak[i]) - leak
@@ -292,10 +296,10 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                     dead = True
                     break
                 s = now_ns / dt_ns
-            if from_noise or p.release.size:
+            if from_noise or p.release.size:  # noise, and the end of a dead time, leave the reference wherever the signal is
                 reference = signal_at(s, c, rise, fall, k)
             up, down = reference + on, reference - off
-        if dead:
+        if dead:  # both levels passed, whatever the signal does: the pixel is looked at in every interval until it is released
             p.upper[i], p.lower[i] = -_INF, _INF
         else:
             p.upper[i], p.lower[i] = np.float32(up), np.float32(down)
@@ -385,10 +389,11 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 flags[keys[j] >> 42] = 1
         if farthest >= _ZERO or shots:
             count = compact_flags(flags, scratch, s, active)
+            # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.
             cap = min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
             if count * cap > share:
                 cap = max(1, share // count)
-            if filled + count * cap > packed.size:
+            if filled + count * cap > packed.size:  # no room for the worst case; nothing of this block has been touched
                 return block, filled, cut
             if plain:
                 filled, cut_here = _emit_block_plain(active, count, s, x, constants, p, v, cap, packed, filled)
@@ -396,6 +401,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
                 now = (intensity, x, lag, noise)
                 filled, cut_here = _emit_block(active, count, s, now, constants, keys, shots, p, v, cap, packed, filled)
             cut += cut_here
+        # Last: until here these are of the frame before.
         if p.intensity.size:
             copy_block(intensity[:n], p.intensity[s:e])
         copy_block(x[:n], p.x[s:e])

@@ -25,7 +25,7 @@ REBASE = 0.02
 
 # --- photoreceptor -----------------------------------------------------------------------------------------
 @register_jitable
-def lin_log(intensity):
+def lin_log(intensity: float) -> float:
     """ln(I) above 20 DN, the chord from the origin below (v2e, ``lin_log``); float32."""
     return select(intensity <= _JOINT, intensity * _SLOPE, log_f32(np.maximum(intensity, _JOINT)))
 
@@ -34,8 +34,9 @@ _P0, _P1, _P2, _P3, _P4, _P5, _P6 = (_F(c) for c in (1, -1 / 2, 1 / 6, -1 / 24, 
 
 
 @register_jitable
-def decay(k):
+def decay(k: float) -> tuple[float, float]:
     """(e^-k, (1 - e^-k)/k) for float32 k >= 0 without cancellation at small k."""
+    # ``select`` computes both sides: each is held to the range in which it is right.
     small = np.minimum(k, _HALF)
     p = _gentle_growth(small)
     large = np.maximum(k, _HALF)
@@ -55,14 +56,16 @@ def _gentle_growth(k):
 
 
 @register_jitable
-def relax(lag, before, now, intensity_before, intensity_now, kappa):
+def relax(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
     """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
+    # The low-pass y' = (x - y) / tau with x on a straight line: lag(1) = lag(0) e^-k - (x1 - x0) (1 - e^-k) / k. Its corner frequency is
+    # f_c (I + 20) / 275 (v2e, ``low_pass_filter``), at the interval's mean intensity.
     a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
     return lag * a - (now - before) * g
 
 
 @register_jitable
-def relax_gently(lag, before, now, intensity_before, intensity_now, kappa):
+def relax_gently(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
     """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
     k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
     g = _gentle_growth(k)
@@ -71,7 +74,7 @@ def relax_gently(lag, before, now, intensity_before, intensity_now, kappa):
 
 # --- where the signal meets a level ------------------------------------------------------------------------
 @register_jitable
-def curve_of(base, drift, dx, lag, k):
+def curve_of(base: float, drift: float, dx: float, lag: float, k: float) -> tuple[float, float, float]:
     """(c, rise, fall) of z(s) = c + rise s + fall e^{-k s} over an interval, s in [0, 1], float64.
 
     base: lin-log intensity and leak at the start; drift: change by leak and noise; dx: change of the lin-log
@@ -79,12 +82,12 @@ def curve_of(base, drift, dx, lag, k):
     """
     if k < 0:
         return base, drift + dx, 0.0
-    behind = dx / k
+    behind = dx / k  # how far a low-pass stays behind a ramp in the end
     return base - behind, drift + dx, lag + behind
 
 
 @register_jitable
-def signal_at(s, c, rise, fall, k):
+def signal_at(s: float, c: float, rise: float, fall: float, k: float) -> float:
     """z at fraction s of the interval."""
     if k < 0:
         return c + rise * s
@@ -92,14 +95,14 @@ def signal_at(s, c, rise, fall, k):
 
 
 @register_jitable
-def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
+def crossing_fraction(start: float, target: float, polarity: int, c: float, rise: float, fall: float, k: float, end: float) -> float:
     """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
 
     The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below
     1e-6 of the interval unless the curve is flat there."""
     if k < 0:
         return min(max((target - c) / rise, start), 1.0)
-    sign = 1.0 if polarity else -1.0
+    sign = 1.0 if polarity else -1.0  # an OFF crossing is an ON crossing of -z
     low, high = start, 1.0
     e_low = 1.0 if start == 0.0 else fall_f64(k * start)
     f_low = sign * (c + rise * start + fall * e_low - target)
@@ -110,9 +113,9 @@ def crossing_fraction(start, target, polarity, c, rise, fall, k, end):
     v_low, v_high = sign * (rise - k * fall * e_low), sign * (rise - k * (end - c - rise))
     width, height = high - low, f_high - f_low
     u = -f_low / height
-    s = low + width * u
+    s = low + width * u  # where the chord meets the level
     if v_low > 0 and v_high > 0:
-        stretch = height / (width * v_low * v_high)
+        stretch = height / (width * v_low * v_high)  # s as a cubic of z: slopes 1 / z' at both ends
         guess = u * ((1.0 - u) * stretch * ((1.0 - u) * v_high - u * v_low) + u * (3.0 - 2.0 * u))
         if 0.0 < guess < 1.0:
             s = low + width * guess
@@ -142,15 +145,16 @@ DARKEST = 1.0 - 0.75 * 20.0 / 275.0
 
 
 @register_jitable
-def shot_factor(intensity):
+def shot_factor(intensity: float) -> float:
     """Noise falls to a quarter from dark to full scale (v2e, SHOT_NOISE_INTEN_FACTOR 0.25)."""
     return 1.0 - 0.75 * min(max((intensity + 20.0) / 275.0, 0.0), 1.0)
 
 
 @register_jitable
-def shot_draw(seed, block, index, rate_per_ns):
+def shot_draw(seed: int, block: int, index: int, rate_per_ns: float) -> tuple[int, float]:
     """Draw number ``index`` of a block: (ns to the event after it, uniform that picks pixel and polarity)."""
     u, v = uniform2(seed, block, _SHOT, index * _U2)
+    # Exponential waiting time, at least 1 ns so that the clock goes on; 1e18 ns are 30 years.
     return np.int64(min(-log_f64(u) / rate_per_ns, 1e18)) + np.int64(1), v
 
 
@@ -170,14 +174,14 @@ def shot_tables(on: np.ndarray, off: np.ndarray, theta_on: float, theta_off: flo
 
 # --- photoreceptor noise -----------------------------------------------------------------------------------
 @register_jitable
-def next_noise(noise, k, size, normal):
+def next_noise(noise: float, k: float, size: float, normal: float) -> float:
     """Photoreceptor noise k time constants later: the exact step of its stationary process. float32."""
-    a, _ = decay(k)
+    a, _ = decay(k)  # Ornstein-Uhlenbeck: n(k) = n e^-k + size sqrt(1 - e^-2k) N(0, 1), of any step
     return noise * a + size * np.sqrt(_ONE - a * a) * normal
 
 
 @register_jitable
-def noise_place(k):
+def noise_place(k: float) -> tuple[int, float]:
     """Place in the table of sizes: (entry below, fraction)."""
     place = (log_f32(np.maximum(k, _SMALLEST_K)) - _TABLE_LOW) * _TABLE_PER
     below = np.int32(np.minimum(np.maximum(place, _ZERO), _TABLE_LAST))

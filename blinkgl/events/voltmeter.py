@@ -49,22 +49,22 @@ MAX_DRAWS = 2**19
 
 
 @register_jitable
-def drift_and_noise(before, now, k1, k2, k3, k4_dt, k5_dt, k6, root_dt):
+def drift_and_noise(before: float, now: float, k1: float, k2: float, k3: float, k4_dt: float, k5_dt: float, k6: float, root_dt: float) -> tuple[float, float]:
     """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
-    room = mean + k2
+    room = mean + k2  # (L + k2): the gain of the logarithm
     return k1 * (now - before) / room + k4_dt + k5_dt * mean, (k3 * np.sqrt(mean) / room + k6) * root_dt
 
 
 @register_jitable
-def move(v, drift):
+def move(v: float, drift: float) -> float:
     """V (int32, 2^-29) at the interval's end if nothing fires; a drift beyond 2.25 thresholds is cut to that."""
     cut = select(drift > _DRIFT_LIMIT, _DRIFT_LIMIT, select(drift < -_DRIFT_LIMIT, -_DRIFT_LIMIT, drift))
     return np.int32(v + np.int32(cut * _V_SCALE))
 
 
 @register_jitable
-def near_threshold(v, v_end, noise):
+def near_threshold(v: float, v_end: float, noise: float) -> bool:
     """Whether a threshold may be reached: 6.5 sigma sqrt(dt) around the path's extremes."""
     high, low = select(v > v_end, v, v_end), select(v > v_end, v_end, v)
     reach = FAR * noise
@@ -72,20 +72,20 @@ def near_threshold(v, v_end, noise):
 
 
 @register_jitable
-def in_reach(v, drift, noise):
+def in_reach(v: float, drift: float, noise: float) -> bool:
     """:func:`near_threshold` for the rest of an interval, float64, V in thresholds."""
     reach = _FAR_64 * noise
     return max(v, v + drift) + reach >= 1.0 or min(v, v + drift) - reach <= -1.0
 
 
 @register_jitable
-def one_minus_exp(x):
+def one_minus_exp(x: float) -> float:
     """1 - e^-x for x >= 0, to 1e-11 relative."""
     return x * (1.0 - x * (0.5 - x * (1.0 / 6.0))) if x < 1e-4 else 1.0 - exp_f64(-x)
 
 
 @register_jitable
-def on_first(to_on, to_off, mu, sigma):
+def on_first(to_on: float, to_off: float, mu: float, sigma: float) -> float:
     """P(+threshold before -threshold) for drift mu and diffusion sigma, at distances to_on and to_off > 0.
 
     (e^{2 mu b/s^2} - 1)/(e^{2 mu b/s^2} - e^{-2 mu a/s^2}) (Lin et al. 2022, eq. 9), arranged so that nothing
@@ -106,7 +106,7 @@ def on_first(to_on, to_off, mu, sigma):
 
 
 @register_jitable
-def hitting_time(distance, mu, sigma, normal, uniform):
+def hitting_time(distance: float, mu: float, sigma: float, normal: float, uniform: float) -> float:
     """Time to a threshold at ``distance`` > 0 that is reached: inverse Gaussian, mean distance/|mu|, shape
     distance^2/sigma^2; Levy's law without drift.
 
@@ -164,8 +164,9 @@ def _sense_block(before, now, v, interval, v_end, flags):
         end = move(v[i], drift)
         v_end[i] = end
         flags[i] = np.uint8(near_threshold(v[i], end, noise))
+        # Mean number of events between thresholds at +-1: |mu| dt of the drift alone, sigma^2 dt of the diffusion alone.
         mean_events = _F(abs(drift) + noise * noise)
-        most = max(most, mean_events.view(np.int32))
+        most = max(most, mean_events.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
     return np.int32(most).view(np.float32)
 
 
@@ -187,6 +188,7 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
         pixel = (y << 17) | ((i - row_end + v.width) << 1)
         before, after = np.float64(p.intensity[i]), np.float64(now[i - first])
         mean = 0.5 * (before + after)
+        # drift_and_noise, once more in double precision and per us: a pixel may fire at any time of the interval.
         mu = v.k1 * (after - before) / dt_us / (mean + v.k2) + v.k4 + v.k5 * mean
         sigma = v.k3 * np.sqrt(mean) / (mean + v.k2) + v.k6
         voltage = p.v[i] / V_ONE
@@ -198,21 +200,22 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
             t_us, voltage = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0
             p.release[i] = NEVER_NS
         emitted, draw, dead = 0, 0, False
+        # One turn per event, after which V is 0 again, until no threshold is reached before the frame's end.
         while True:
             left_us = dt_us - t_us
             if not in_reach(voltage, mu * left_us, sigma * np.sqrt(left_us)):
                 voltage += mu * left_us
                 break
-            index = (np.uint64(v.step) << _U20) | np.uint64(2 * draw)
+            index = (np.uint64(v.step) << _U20) | np.uint64(2 * draw)  # two blocks a draw: (normal, uniform), then the side
             normal, which = normal_and_uniform(v.seed, np.uint64(i), _DIFFUSION, index)
             chance = on_first(1.0 - voltage, 1.0 + voltage, mu, sigma)
-            polarity = np.int64(chance)
+            polarity = np.int64(chance)  # where it is certain, no number is drawn
             if 0.0 < chance < 1.0:
                 side, _ = uniform2(v.seed, np.uint64(i), _DIFFUSION, index + _U1)
                 polarity = np.int64(side < chance)
             distance = 1.0 - voltage if polarity else 1.0 + voltage
             hit_us = t_us + hitting_time(distance, mu, sigma, normal, which)
-            if not hit_us <= dt_us:
+            if not hit_us <= dt_us:  # too late, or never (inf): no event, and V takes its drift along, as in the paper's algorithm
                 voltage = max(min(voltage + mu * left_us, NEAREST), -NEAREST)
                 break
             draw += 1
@@ -255,7 +258,7 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
-            cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)
+            cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)  # far beyond what chance adds to the mean
             if count * cap > share:
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:

@@ -43,14 +43,14 @@ def number(value: Any, where: str, *, least: float = -math.inf, most: float = ma
     """A finite number in [least, most] and greater than ``above``. Raises ConfigError."""
     bounds = [f"greater than {above:g}"] * (above > -math.inf) + [f"at least {least:g}"] * (least > -math.inf) + [f"at most {most:g}"] * (most < math.inf)
     real = isinstance(value, (numbers.Real, np.number)) and not isinstance(value, bool) and math.isfinite(value)
-    if not real or not least <= value <= most or not value > above:
+    if not real or not least <= float(value) <= most or not float(value) > above:
         raise ConfigError("out of range" if real else "not a finite number", where=where, value=value, accepted=" ".join(["a number", " and ".join(bounds)]).strip())
     return float(value)
 
 
 def whole(value: Any, where: str, least: int, most: int) -> int:
     """A whole number in [least, most]. Raises ConfigError."""
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not least <= value <= most:
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or not least <= int(value) <= most:
         raise ConfigError("not a whole number in range", where=where, value=value, accepted=f"{least} to {most}")
     return int(value)
 

@@ -215,7 +215,7 @@ class Mesh(_Body):
             raise ConfigError("give a file, or vertices and faces", where="Mesh.file", value=file)
         if file is not None:
             self.mesh = self._checked(MeshConfig, check.given(file=str(check.path(file, "Mesh.file")), up=up))
-        else:
+        elif vertices is not None and faces is not None:
             # The model wants a shape or a file; explicit_scene is given these triangles under the mesh's name.
             self.mesh, self.triangles = {"primitive": "grid"}, _triangles(vertices, faces, uvs)
             material = material if material is not None else Material()

@@ -216,7 +216,7 @@ def _overridden(device: int) -> int:
 
 def _egl(device: int) -> Any:
     """glcontext's EGL object, current in this thread."""
-    from glcontext import egl
+    from glcontext import egl  # type: ignore[missing-module-attribute]  # an extension module
 
     libegl = os.environ.get("GLCONTEXT_LINUX_LIBEGL") or _loadable(_EGL_LIBRARIES)
     if libegl is None:

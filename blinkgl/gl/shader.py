@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 STAGES = ("vertex", "fragment")
 DEFAULT_VERSION = "#version 430 core"
+
+MADE: list[Callable[[], Mapping[str, str]]] = []
+"""Includes that are no files: each gives texts by the name that they are included by. Whoever makes some adds itself here; a file of the
+shader folder wins."""
 
 _VERSION = re.compile(r"\s*#\s*version\b")
 _INCLUDE = re.compile(r'\s*#\s*include\b\s*(?P<argument>.*?)\s*(//.*)?$')
@@ -42,12 +46,15 @@ _STAGE_HEADER = re.compile(r"(vertex|fragment)_shader$")
 @dataclass(frozen=True)
 class ShaderSource:
     """text : GLSL as the compiler sees it, one stage.
-    origin : (file, line) of each of its lines, 1-based, the file relative to the shader folder; ("", 0) for generated lines."""
+    origin : (file, line) of each of its lines, 1-based, the file relative to the shader folder; ("", 0) for generated lines.
+    files : text of every file in it, by the same names.   made : names of those that are no files (:data:`MADE`), as they are included."""
 
     name: str
     stage: str
     text: str
     origin: tuple[tuple[str, int], ...]
+    files: Mapping[str, str] = field(default_factory=dict)
+    made: tuple[str, ...] = ()
 
     def locate(self, line: int) -> tuple[str, int]:
         """File and line that line ``line`` (1-based) of ``text`` came from."""
@@ -83,7 +90,12 @@ def expand(name: str, stage: str, defines: Mapping[str, Any] | None = None, fold
     head = [body.version or DEFAULT_VERSION, f"#define {stage.upper()}_SHADER 1"]
     head += [f"#define {key} {value}" for key, value in normalised(defines)]
     lines = [(line, ("", 0)) for line in head] + body.lines
-    return ShaderSource(name, stage, "\n".join(line for line, _ in lines) + "\n", tuple(origin for _, origin in lines))
+    return ShaderSource(name, stage, "\n".join(line for line, _ in lines) + "\n", tuple(origin for _, origin in lines), body.files, tuple(body.made))
+
+
+def made_includes() -> dict[str, str]:
+    """All texts of :data:`MADE` as they are now."""
+    return {name: text for make in MADE for name, text in make().items()}
 
 
 def normalised(defines: Mapping[str, Any] | None) -> tuple[tuple[str, str], ...]:
@@ -107,6 +119,8 @@ class _Expansion:
     def __init__(self, folder: Traversable):
         self.folder = folder
         self.version: str | None = None
+        self.files: dict[str, str] = {}
+        self.made: dict[str, None] = {}
         self.lines: list[tuple[str, tuple[str, int]]] = []
 
     def file(self, shown: str, path: Traversable, chain: tuple[str, ...], included_at: str | None = None) -> None:
@@ -115,8 +129,13 @@ class _Expansion:
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
-            reason = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else "no such shader file"
-            raise ShaderError(reason, where=included_at or "shaders", value=shown, accepted=self._available(path)) from None
+            name = shown.removeprefix("include/")
+            if isinstance(error, UnicodeDecodeError) or name == shown or name not in (made := made_includes()):
+                reason = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else "no such shader file"
+                raise ShaderError(reason, where=included_at or "shaders", value=shown, accepted=self._available(path)) from None
+            text = made[name]
+            self.made[name] = None
+        self.files[shown] = text
         in_comment = False
         for number, line in enumerate(text.splitlines(), 1):
             origin = (shown, number)
@@ -180,11 +199,13 @@ class ShaderLoader:
         self.ctx = ctx
         self.folder = shader_folder() if folder is None else folder
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], moderngl.Program] = {}
+        self._made: dict[tuple[str, tuple[tuple[str, str], ...]], dict[str, str]] = {}  # includes of a program that are no files
 
     def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
-        """The program of file ``name`` with ``defines``; compiled when first asked for. Raises ShaderError."""
+        """The program of file ``name`` with ``defines``; compiled when first asked for, and again when an include that is no file has
+        changed. Raises ShaderError."""
         key = (name, normalised(defines))
-        if key not in self._programs:
+        if key not in self._programs or not self._made.get(key, {}).items() <= made_includes().items():
             self._programs[key] = self._compile(name, defines)
         return self._programs[key]
 
@@ -196,9 +217,11 @@ class ShaderLoader:
     def _compile(self, name: str, defines: Mapping[str, Any] | None) -> moderngl.Program:
         sources = {stage: expand(name, stage, defines, self.folder) for stage in STAGES}
         try:
-            return self.ctx.program(vertex_shader=sources["vertex"].text, fragment_shader=sources["fragment"].text)
+            program = self.ctx.program(vertex_shader=sources["vertex"].text, fragment_shader=sources["fragment"].text)
         except moderngl.Error as error:
-            raise translate(str(error), sources, self.folder) from None
+            raise translate(str(error), sources) from None
+        self._made[name, normalised(defines)] = {made: source.files[f"include/{made}"] for source in sources.values() for made in source.made}
+        return program
 
     def clear(self) -> None:
         """Release every program; the next call of :meth:`program` reads its file again (live reload)."""
@@ -207,7 +230,7 @@ class ShaderLoader:
         self._programs.clear()
 
 
-def translate(log: str, sources: Mapping[str, ShaderSource], folder: Traversable) -> ShaderError:
+def translate(log: str, sources: Mapping[str, ShaderSource]) -> ShaderError:
     """moderngl's error text as a ShaderError that speaks of the files the user wrote."""
     stage = next((m[1] for m in map(_STAGE_HEADER.match, log.splitlines()) if m), None)
     source = sources.get(stage or "")
@@ -220,7 +243,7 @@ def translate(log: str, sources: Mapping[str, ShaderSource], folder: Traversable
             continue
         file, number = source.locate(line)
         where = f"{file}:{number}" if file else f"{name} (generated line {line}: {_line(source.text, line)})"
-        blocks.append(f"{where}: {kind}: {text}\n{_excerpt(folder, file, number)}")
+        blocks.append(f"{where}: {kind}: {text}\n{_excerpt(source.files.get(file, ''), number)}")
         if first is None and kind == "error":
             first = ShaderError(f"{text} [{stage} stage]", where=where)
     if first is None:
@@ -244,9 +267,9 @@ def _line(text: str, number: int) -> str:
     return lines[number - 1].strip() if 1 <= number <= len(lines) else ""
 
 
-def _excerpt(folder: Traversable, file: str, number: int, around: int = 2) -> str:
-    if not file:
+def _excerpt(text: str, number: int, around: int = 2) -> str:
+    if not text:
         return ""
-    lines = (folder / file).read_text(encoding="utf-8").splitlines()
+    lines = text.splitlines()
     shown = range(max(1, number - around), min(len(lines), number + around) + 1)
     return "\n".join(f"{'>' if i == number else ' '} {i:4d} | {lines[i - 1]}" for i in shown) + "\n"

@@ -71,7 +71,7 @@ def _look_up(flow, valid, maximum, wheel, invalid, rgb):
 
 
 @numba.njit(cache=True, nogil=True)
-def count_events(x, y, p, counts):
+def count_events(x: np.ndarray, y: np.ndarray, p: np.ndarray, counts: np.ndarray) -> None:
     """Adds events to ``counts`` (2, H, W) uint16 by polarity, saturating."""
     for i in range(len(x)):
         n = counts[p[i], y[i], x[i]]

@@ -141,7 +141,7 @@ class DsecEventWriter:
     def __enter__(self) -> DsecEventWriter:
         return self
 
-    def __exit__(self, kind, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close() if kind is None else self.abort()
 
     def _check(self, events: Events) -> None:
@@ -288,7 +288,7 @@ class DsecEventReader:
     def __enter__(self) -> DsecEventReader:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -75,7 +75,7 @@ class EventFile:
     def __enter__(self) -> EventFile:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def read(self) -> Events:
@@ -177,7 +177,7 @@ def event_writer(path: str | os.PathLike, height: int, width: int, *, format: st
             raise
 
 
-def write_events(path: str | os.PathLike, chunks: Events | Iterable[Events], height: int, width: int, **options) -> int:
+def write_events(path: str | os.PathLike, chunks: Events | Iterable[Events], height: int, width: int, **options: Any) -> int:
     """Writes events or an iterable of chunks; options as :func:`event_writer`. Returns the number of events."""
     count = 0
     with event_writer(path, height, width, **options) as writer:

@@ -17,6 +17,7 @@ from pathlib import Path
 import h5py
 import hdf5plugin
 import numpy as np
+from numpy.typing import DTypeLike
 
 from blinkgl.errors import AssetError
 
@@ -114,7 +115,7 @@ def dataset(file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, 
     return found
 
 
-def blosc_dataset(file: h5py.File, name: str, shape: tuple[int, ...], dtype, chunks: tuple[int, ...]) -> h5py.Dataset:
+def blosc_dataset(file: h5py.File, name: str, shape: tuple[int, ...], dtype: DTypeLike, chunks: tuple[int, ...]) -> h5py.Dataset:
     """A new data set that grows along its first axis: Blosc-zstd level 1 with bit shuffle (filter 32001), as in DSEC's files."""
     codec = hdf5plugin.Blosc(cname="zstd", clevel=_LEVEL, shuffle=_BIT_SHUFFLE)
     return file.create_dataset(name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, compression=codec)

@@ -109,7 +109,7 @@ class NpzReader:
     def __enter__(self) -> NpzReader:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._archive.close()
 
     def __contains__(self, name: str) -> bool:

@@ -109,7 +109,7 @@ class PreviewWriter:
     def __enter__(self) -> PreviewWriter:
         return self
 
-    def __exit__(self, kind, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close() if kind is None else self.abort()
 
     def _panel_view(self, panel: int) -> np.ndarray:

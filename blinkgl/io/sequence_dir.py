@@ -106,7 +106,7 @@ class SequenceWriter:
             raise
         return self
 
-    def __exit__(self, kind, error, _) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
         if kind is None:
             try:
                 self._finish()
@@ -132,7 +132,9 @@ class SequenceWriter:
         """The ``index``-th value of a label (:mod:`blinkgl.labels`) of ``t_us``; ``to_us``: where it leads, of those that lead to another time.
         Pixels that a form cannot hold are counted in ``lost`` and the manifest. Raises TypeError: a value of another shape or kind of number."""
         label = label_of(name)
-        value = label.own(value, self.height, self.width)
+        if (wrong := label.wrong(value, self.height, self.width)) is not None:
+            raise TypeError(f"label '{name}': {wrong}")
+        value = label.own(value)
         if label.stamps is not None and label.towards is None:
             self._stamp(label.stamps, str(int(t_us)))
         elif label.stamps is not None:

@@ -63,10 +63,10 @@ class VideoWriter:
             self._process.wait()
             self._release()
 
-    def __enter__(self):
+    def __enter__(self) -> VideoWriter:
         return self
 
-    def __exit__(self, kind, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close() if kind is None else self.abort()
 
     def _fail(self, error: OSError | None) -> None:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from blinkgl.labels import grading
 from blinkgl.labels.label import Drawn, Label
+
+if TYPE_CHECKING:
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
 
 _SHARE = 0.95
 """Of the pixels, that two renderers agree on: silhouettes may fall on either side."""
@@ -29,5 +35,5 @@ class Depth(Label):
     def agrees(self, one: np.ndarray, other: np.ndarray) -> bool:
         return one.shape == other.shape and bool(np.isclose(one, other, rtol=1e-4).mean() >= _SHARE)
 
-    def reference(self, scene, frame) -> np.ndarray:
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return frame.depth

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -11,7 +11,11 @@ from pydantic import Field
 from blinkgl.labels import grading
 from blinkgl.labels.files import Form
 from blinkgl.labels.frames import Flow
-from blinkgl.labels.label import Drawn, Instant, Key, Label, Towards, View
+from blinkgl.labels.label import Drawn, Key, Label, Towards, View
+
+if TYPE_CHECKING:
+    from blinkgl.config.labels import LabelsConfig
+    from blinkgl.render.passes import Shot
 
 _KEYS = {
     "flow": Key(tuple[Literal["forward", "backward"], ...], Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"), "depth"),
@@ -35,25 +39,28 @@ class FlowTo(Label):
     keys = property(lambda self: _KEYS)
     said = property(lambda self: "flow" if self.towards == "forward" else self.name)
 
-    def asked(self, labels) -> bool:
+    def asked(self, labels: LabelsConfig) -> bool:
         return self.towards in labels.flow
 
     def ask(self, tree: dict[str, Any]) -> None:
         tree["flow"] = [*tree.get("flow", ()), self.towards]
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {f"difference_{self.towards}": (at.mvp_there(self.towards) - at.mvp)[:, [0, 1, 3]]}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {f"difference_{self.towards}": (shot.ends[self.towards].mvp - shot.moment.mvp)[:, [0, 1, 3]]}
 
     def finish(self, drawn: Drawn) -> Flow:
         raw = drawn.raw(self.name)
         valid = (raw[..., 3] > 0) & (raw[..., 2] > 0)
         return Flow(np.where(valid[..., None], raw[..., :2], np.float32(0)), valid)
 
-    def own(self, value: Flow, height: int, width: int) -> Flow:
-        flow, valid = np.array(value.flow), np.array(value.valid)
-        if flow.shape != (height, width, 2) or valid.shape != (height, width):
-            raise TypeError(f"label '{self.name}': {flow.shape} and valid {valid.shape}, not {(height, width, 2)} and {(height, width)}")
-        return Flow(flow, valid.astype(bool))
+    def wrong(self, value: Flow, height: int, width: int) -> str | None:
+        shapes = np.shape(value.flow), np.shape(value.valid)
+        if shapes == ((height, width, 2), (height, width)):
+            return None
+        return f"not {width}x{height} px: flow {shapes[0]}, valid {shapes[1]}"
+
+    def own(self, value: Flow) -> Flow:
+        return Flow(np.array(value.flow), np.array(value.valid).astype(bool))
 
     @property
     def forms(self) -> tuple[Form, ...]:
@@ -62,7 +69,7 @@ class FlowTo(Label):
         return (Form(folder, "png", _png, _read), Form(folder + "_npy", "npy", _npy, _read), Form(folder + "_flo", "flo", _flo, _read),
                 Form(folder, "h5", rows=_rows))
 
-    def written(self, labels) -> tuple[Form, ...]:
+    def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
         return (self.forms[0], *(form for form in self.forms[1:] if form.ending in labels.float_flow))
 
     def problem(self, value: Flow) -> str | None:

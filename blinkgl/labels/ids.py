@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from blinkgl.labels import files, grading
-from blinkgl.labels.label import Instant, Label, View
+from blinkgl.labels.files import Form
+from blinkgl.labels.label import Label, View
+
+if TYPE_CHECKING:
+    from blinkgl.render.passes import Shot
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
 
 
 class Ids(Label):
@@ -15,17 +23,17 @@ class Ids(Label):
     title, unit, kind = "instance ids", "0: nothing hit", "ids"
     buffer, dtype = "R32UI", np.uint32
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {"instance_id": np.array([thing.instance_id for thing in at.scene.objects], np.uint32)}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"instance_id": np.array([thing.instance_id for thing in shot.scene.objects], np.uint32)}
 
     @property
-    def forms(self):
+    def forms(self) -> tuple[Form, ...]:
         return (files.ids_png("ids"),)
 
     def problem(self, value: np.ndarray) -> str | None:
         return None if value.dtype == np.uint16 else f"{value.dtype} and not uint16"
 
-    def reference(self, scene, frame) -> np.ndarray:
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return frame.instance
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from blinkgl.labels import files
+from blinkgl.labels.files import Form
 from blinkgl.labels.label import Label, View
 
 
@@ -16,7 +17,7 @@ class Images(Label):
     stamps, shard = "images/timestamps.txt", "image.png"
 
     @property
-    def forms(self):
+    def forms(self) -> tuple[Form, ...]:
         return (files.image_png("images"),)
 
     @property

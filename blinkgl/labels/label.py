@@ -18,6 +18,7 @@ from blinkgl.labels.files import Form
 
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
+    from blinkgl.render.passes import Shot
     from blinkgl.render.reference import ReferenceFrame
     from blinkgl.scene.types import Scene
 
@@ -75,25 +76,6 @@ class View:
     same_triangle: bool = True
     band_there: bool = False
     note: str = ""
-
-
-class Instant(Protocol):
-    """What :meth:`Label.uniforms` is given: all objects of a scene at one time. Matrices are float64, (n, 4, 4) for n objects.
-
-    scene : as it is drawn.   t_ns : the time.   T_world_cam : (4, 4).   T_world_obj, T_cam_obj.   mvp : to clip space.   mvp_rate : its derivative, 1/s.
-    mvp_there(towards) : at the time that labels lead to in that direction."""
-
-    scene: Scene
-    t_ns: int
-    T_world_cam: np.ndarray
-    T_world_obj: np.ndarray
-    T_cam_obj: np.ndarray
-    mvp: np.ndarray
-
-    @property
-    def mvp_rate(self) -> np.ndarray: ...
-
-    def mvp_there(self, towards: Towards) -> np.ndarray: ...
 
 
 class Drawn(Protocol):
@@ -191,8 +173,9 @@ class Label:
 
     # ---- the shader and the CPU ----------------------------------------------------------------------------------
 
-    def uniforms(self, at: Instant) -> Mapping[str, np.ndarray]:
-        """Values of the uniforms in ``glsl``, once a frame: name -> array whose first axis counts the scene's objects. Of matrices, (n, rows, columns)."""
+    def uniforms(self, shot: Shot) -> Mapping[str, np.ndarray]:
+        """Values of the uniforms in ``glsl``, once a frame: name -> array whose first axis counts the scene's objects, (n,), (n, k) for a vector,
+        (n, rows, columns) for a matrix. ``shot.moment`` has the poses and matrices, ``shot.ends[towards]`` those of the other time."""
         return {}
 
     def finish(self, drawn: Drawn) -> Any:
@@ -200,15 +183,22 @@ class Label:
         raw = drawn.raw(self.name)
         return np.ascontiguousarray(raw[..., : self.channels]) if self.channels else raw
 
-    def own(self, value: Any, height: int, width: int) -> Any:
-        """A copy of a value. Raises TypeError for one of another shape or kind of number."""
-        array = np.array(value)
+    def wrong(self, value: Any, height: int, width: int) -> str | None:
+        """What is wrong with the shape or the kind of number of a value, in words; None: nothing."""
+        array = np.asarray(value)
+        if array.shape[:2] != (height, width):
+            return f"not {width}x{height} px: {array.shape}"
         shapes = [(height, width), (height, width, 3)] if self.channels is None else [(height, width, self.channels) if self.channels else (height, width)]
         kind = "" if self.dtype is None else np.dtype(self.dtype).kind
         if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):
             said = f" {np.dtype(self.dtype)}" if kind else ""
-            raise TypeError(f"label '{self.name}': {array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{said}")
-        return array.astype(self.dtype, copy=False) if kind == "f" else array
+            return f"{array.shape} {array.dtype} and not {' or '.join(map(str, shapes))}{said}"
+        return None
+
+    def own(self, value: Any) -> Any:
+        """A copy of a value, as it is written."""
+        array = np.array(value)
+        return array.astype(self.dtype, copy=False) if array.dtype.kind == "f" and self.dtype is not None else array
 
     # ---- files ---------------------------------------------------------------------------------------------------
 

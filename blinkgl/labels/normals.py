@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from blinkgl.labels.label import Instant, Label
+from blinkgl.labels.label import Label
+
+if TYPE_CHECKING:
+    from blinkgl.render.passes import Shot
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
 
 
 class Normals(Label):
@@ -15,13 +22,13 @@ class Normals(Label):
     buffer, varyings, channels = "RGBA32F", ("normal",), 3
     judged_in, tolerance = "of a unit vector", 1e-3
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {"camera_from_local": at.T_cam_obj[:, :3, :3]}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"camera_from_local": shot.moment.T_cam_obj[:, :3, :3]}
 
     def problem(self, value: np.ndarray) -> str | None:
         # A mesh's own normals may be of no length, and are then no direction here either.
         return None if (np.linalg.norm(value, axis=-1) < 1 + 1e-3).all() else "a normal longer than 1"
 
-    def reference(self, scene, frame) -> np.ndarray:
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         rotation = scene.camera_path.pose(frame.t_ns)[:3, :3]
         return np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)

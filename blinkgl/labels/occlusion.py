@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
 
 from blinkgl.labels import files, grading
+from blinkgl.labels.files import Form
 from blinkgl.labels.label import Drawn, Key, Label, Towards, View
+
+if TYPE_CHECKING:
+    from blinkgl.config.labels import LabelsConfig
 
 _KEYS = {"occlusion": Key(bool, Field(True, description="masks of pixels that are not visible at the flow's other end"), "depth")}
 
@@ -27,7 +31,7 @@ class OcclusionAt(Label):
     keys = property(lambda self: _KEYS)
     said = property(lambda self: "occlusion")
 
-    def asked(self, labels) -> bool:
+    def asked(self, labels: LabelsConfig) -> bool:
         return labels.occlusion and self.towards in labels.flow
 
     def ask(self, tree: dict[str, Any]) -> None:
@@ -41,7 +45,7 @@ class OcclusionAt(Label):
         return occlusion_mask(flow.flow, z_there, flow.valid, drawn.raw("ids"), drawn.there("depth"), drawn.there("ids"), drawn.scene.camera.near)
 
     @property
-    def forms(self):
+    def forms(self) -> tuple[Form, ...]:
         return (files.mask_png(f"occlusion/{self.towards}"),)
 
     @property

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import re
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.labels import LabelsConfig
@@ -86,6 +87,9 @@ def _checked(label: Any) -> dict[str, Key]:
     made = type(label).finish is not Label.finish or label.anti_aliased
     unless(label.buffer or made, "buffer", "is missing, and so is `finish`: nothing makes the label")
     unless(label.buffer or label.glsl is None, "buffer", "is missing: `glsl` has nowhere to write to")
+    if label.buffer and label.glsl is None:
+        unless(resources.files("blinkgl.shaders").joinpath(f"include/labels/{name}.glsl").is_file(), "glsl",
+               f"is missing, and so is the file shaders/include/labels/{name}.glsl")
     if label.glsl is not None:
         head = f"{BUFFERS[label.buffer].glsl} label_{name}()"
         unless(isinstance(label.glsl, str), "glsl", f"is {label.glsl!r} and not text")

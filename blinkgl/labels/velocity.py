@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from blinkgl.labels import grading
-from blinkgl.labels.label import Instant, Label
+from blinkgl.labels.label import Label
+
+if TYPE_CHECKING:
+    from blinkgl.render.passes import Shot
+    from blinkgl.render.reference import ReferenceFrame
+    from blinkgl.scene.types import Scene
 
 
 class Velocity(Label):
@@ -16,11 +23,11 @@ class Velocity(Label):
     buffer, varyings, channels = "RG32F", ("local",), 2
     judged_in, tolerance, error = "px per label interval", 1e-2, staticmethod(grading.motion_per_interval)
 
-    def uniforms(self, at: Instant) -> dict[str, np.ndarray]:
-        return {"rate": at.mvp_rate[:, [0, 1, 3]]}
+    def uniforms(self, shot: Shot) -> dict[str, np.ndarray]:
+        return {"rate": shot.moment.rates.mvp[:, [0, 1, 3]]}
 
     def problem(self, value: np.ndarray) -> str | None:
         return None if np.isfinite(value).all() else "a velocity that is no finite number"
 
-    def reference(self, scene, frame) -> np.ndarray:
+    def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
         return np.where(frame.hit[..., None], frame.velocity, 0.0)

@@ -212,7 +212,7 @@ def _numba() -> Iterator[Check]:
     def version() -> str:
         import numba
 
-        return f"{numba.__version__}, {numba.config.NUMBA_NUM_THREADS} threads"
+        return f"{numba.__version__}, {numba.get_num_threads()} threads"
 
     def threads() -> str:
         import numba
@@ -276,7 +276,8 @@ def _codecs() -> Iterator[Check]:
 
         image = np.arange(32 * 32 * 3, dtype=np.uint16).reshape(32, 32, 3) * 21
         _, data = cv2.imencode(".png", image)
-        if not np.array_equal(cv2.imdecode(data, cv2.IMREAD_UNCHANGED), image):
+        read = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        if read is None or not np.array_equal(read, image):
             raise ValueError("read other values than written")
         return f"round trip (OpenCV {cv2.__version__})"
 

@@ -1,30 +1,21 @@
-"""Ground truth of one time from the buffers of the label pass: what is read, masked and, for occlusion, looked up at the other time."""
+"""Ground truth of one time: what the label pass draws, finished by the rows of the labels, which may look at the buffers of other times."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from blinkgl.labels import Flow, LabelFrame, LabelRequest
+from blinkgl.labels import LABELS, Label, LabelFrame, LabelRequest
 from blinkgl.machine.compiling import working_clock
-from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.passes import Geometry
 
 if TYPE_CHECKING:
     from blinkgl.render.renderer import Renderer
+    from blinkgl.scene.types import Scene
 
-SURFACES = 3
-"""Times whose surfaces are kept: neighbouring labels look at the same moments."""
-
-
-OUTPUTS = {"depth": "DEPTH", "ids": "ID", "normals": "NORMAL", "velocity": "VELOCITY", "flow_forward": "FLOW_FORWARD", "flow_backward": "FLOW_BACKWARD"}
-"""Name of a label -> its output of the label pass."""
-
-
-def buffers_of(request: LabelRequest) -> tuple[str, ...]:
-    """Outputs of the label pass that a request takes, in their order."""
-    return tuple(OUTPUTS[name] for name in request.buffers)
+KEPT = 3
+"""Times whose buffers are kept for others: neighbouring labels look at the same moments."""
 
 
 class Labels:
@@ -32,61 +23,79 @@ class Labels:
 
     def __init__(self, renderer: Renderer):
         self._renderer = renderer
-        self._surfaces: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._kept: dict[tuple[int, tuple[str, ...]], dict[str, np.ndarray]] = {}
 
     def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
         """See :meth:`Renderer.labels`."""
-        draw, result = self._renderer, {}
-        if "images" in request:
-            result["images"] = draw.colour(t_ns).read()
-        if names := buffers_of(request):
-            ends = {"forward": forward_ns} if "FLOW_FORWARD" in names else {}
-            ends |= {"backward": backward_ns} if "FLOW_BACKWARD" in names else {}
+        draw, ends = self._renderer, {}
+        for towards, end_ns in (("forward", forward_ns), ("backward", backward_ns)):
+            if who := [name for name in request if LABELS[name].towards == towards]:
+                if end_ns is None:
+                    raise TypeError(f"label '{who[0]}' leads to another time: t_{towards}_ns")
+                ends[towards] = end_ns
+        there = {towards: self._buffers(end_ns, names) for towards, end_ns in ends.items()
+                 if (names := LabelRequest(*(name for name in request if LABELS[name].towards == towards)).there)}
+        drawn: dict[str, np.ndarray] = {}
+        if names := request.buffers:
             frame = draw.draw(Geometry(names), t_ns, ends)
-            buffers = {name: frame.read(name) for name in names}
-            if "depth" in request:
-                result["depth"] = np.where(buffers["DEPTH"] > 0, buffers["DEPTH"], np.float32(np.inf))
-            if "ids" in request:
-                result["ids"] = buffers["ID"]
-            if "normals" in request:
-                result["normals"] = np.ascontiguousarray(buffers["NORMAL"][..., :3])
-            if "velocity" in request:
-                result["velocity"] = buffers["VELOCITY"]
-            for way, other_ns in ends.items():
-                flow = self._flow(buffers[f"FLOW_{way.upper()}"], buffers.get("ID"), other_ns, f"occlusion_{way}" in request)
-                result[f"flow_{way}"] = Flow(flow.flow, flow.valid)
-                if flow.occluded is not None:
-                    result[f"occlusion_{way}"] = flow.occluded
-        return LabelFrame(t_ns, result)
+            drawn = {name: frame.read(name) for name in names}
+        values: dict[str, Any] = {}
+        for name in request:
+            if LABELS[name].anti_aliased:
+                values[name] = draw.colour(t_ns).read()
+        started = working_clock()
+        for name in request:
+            self._finished(name, drawn, there, values)
+        draw.stats.render_s += working_clock() - started
+        return LabelFrame(t_ns, {name: values[name] for name in request})
+
+    def _finished(self, name: str, drawn: dict[str, np.ndarray], there: dict[str, dict[str, np.ndarray]], values: dict[str, Any]) -> Any:
+        if name not in values:
+            label, draw = LABELS[name], self._renderer
+            value = label.finish(_Drawn(label, draw.scene, drawn, there.get(label.towards, {}), lambda other: self._finished(other, drawn, there, values)))
+            if (wrong := label.wrong(value, draw.height, draw.width)) is not None:
+                raise TypeError(f"label '{name}': `finish` gives {wrong}")
+            values[name] = value
+        return values[name]
 
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """See :meth:`Renderer.shown_at`."""
-        number = int(self._surface(t_ns)[1][y, x])
+        number = int(self._buffers(t_ns, LabelRequest("ids").buffers)["ids"][y, x])
         names = [f"object '{o.name}' (id {number})" for o in self._renderer.scene.objects if number and o.instance_id == number]
         return names[0] if names else "the background"
 
     def forget(self) -> None:
         """Nothing of what was drawn before is used again."""
-        self._surfaces = {}
+        self._kept = {}
 
-    def _flow(self, buffer: np.ndarray, ids: np.ndarray | None, t_other_ns: int, occlusion: bool) -> Flow:
-        surface = self._surface(t_other_ns) if occlusion else None
-        started = working_clock()
-        w_next = buffer[..., 2]
-        hit = buffer[..., 3] > 0
-        valid = hit & (w_next > 0)
-        flow = np.where(valid[..., None], buffer[..., :2], np.float32(0))
-        occluded = None
-        if surface is not None:
-            occluded = occlusion_mask(flow, w_next, valid, ids, *surface, self._renderer.scene.camera.near)
-        self._renderer.stats.render_s += working_clock() - started
-        return Flow(flow, valid, occluded)
+    def _buffers(self, t_ns: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """Buffers of these labels at a time, as the shader wrote them."""
+        key = (t_ns, names)
+        if key not in self._kept:
+            frame = self._renderer.draw(Geometry(names), t_ns)
+            self._kept[key] = {name: frame.read(name) for name in names}
+            while len(self._kept) > KEPT:
+                self._kept.pop(next(iter(self._kept)))
+        return self._kept[key]
 
-    def _surface(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
-        """(depth, ids) at t_ns."""
-        if t_ns not in self._surfaces:
-            frame = self._renderer.draw(Geometry(("DEPTH", "ID")), t_ns)
-            self._surfaces[t_ns] = frame.read("DEPTH"), frame.read("ID")
-            while len(self._surfaces) > SURFACES:
-                self._surfaces.pop(next(iter(self._surfaces)))
-        return self._surfaces[t_ns]
+
+class _Drawn:
+    """:class:`blinkgl.labels.label.Drawn`: what one label may look at."""
+
+    def __init__(self, label: Label, scene: Scene, drawn: dict[str, np.ndarray], there: dict[str, np.ndarray], value_of):
+        self.scene, self._label, self._drawn, self._there, self._value_of = scene, label, drawn, there, value_of
+
+    def raw(self, name: str) -> np.ndarray:
+        return self._allowed(self._drawn, name, (self._label.name, *self._label.needs), "needs")
+
+    def value(self, name: str) -> Any:
+        self.raw(name)
+        return self._value_of(name)
+
+    def there(self, name: str) -> np.ndarray:
+        return self._allowed(self._there, name, self._label.there, "there")
+
+    def _allowed(self, buffers: dict[str, np.ndarray], name: str, known: tuple[str, ...], part: str) -> np.ndarray:
+        if name not in known or name not in buffers:
+            raise TypeError(f"label '{self._label.name}': `finish` looks at '{name}', which is not among its `{part}`")
+        return buffers[name]

@@ -11,7 +11,8 @@ import moderngl
 import numpy as np
 
 from blinkgl.errors import AssetError
-from blinkgl.render.colour import LUMA, decode_image, luminance_image
+from blinkgl.gl import GLContext
+from blinkgl.render.colour import LUMA, linear_image, luminance_image
 from blinkgl.scene.types import Material, Mesh, Scene
 
 _TEXTURE_2D, _TEXTURE_LOD_BIAS = 0x0DE1, 0x8501
@@ -74,7 +75,7 @@ _LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
 class SceneResources:
     """GL side of one Scene. Release it before the context."""
 
-    def __init__(self, gl, scene: Scene, anisotropy: float = 1.0, mip_bias: float = 0.0):
+    def __init__(self, gl: GLContext, scene: Scene, anisotropy: float = 1.0, mip_bias: float = 0.0):
         self.ctx, self.scene, self.anisotropy, self.mip_bias = gl.ctx, scene, anisotropy, mip_bias
         self._parameter = gl.function("glTexParameterf", None, ctypes.c_uint, ctypes.c_uint, ctypes.c_float)
         self._buffers: dict[tuple, tuple[moderngl.Buffer, moderngl.Buffer]] = {}
@@ -122,7 +123,7 @@ class SceneResources:
         if key not in self._textures:
             image = material.texture.image
             srgb8 = image.dtype == np.uint8
-            self._textures[key] = self._upload(image if srgb8 else decode_image(image), material.texture.name,
+            self._textures[key] = self._upload(image if srgb8 else linear_image(image), material.texture.name,
                                                internal_format=0x8C41 if srgb8 else None)  # GL_SRGB8
         return self._textures[key]
 

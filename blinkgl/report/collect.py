@@ -36,6 +36,8 @@ class Example:
     events: np.ndarray
     flow: np.ndarray
     caption: str
+    others: list[tuple[str, np.ndarray]] = field(default_factory=list)
+    """heading and picture of every further label of the sequence"""
 
 
 @dataclass
@@ -138,7 +140,7 @@ def _value(folder: Path, name: str, flow: Path) -> Any:
     """What a label holds beside a file of flow; None where the sequence has no such label. Raises AssetError."""
     form = LABELS[name].forms[0]
     path = folder / form.file(int(flow.stem))
-    return form.read(path) if path.is_file() else None
+    return form.read(path) if form.read is not None and path.is_file() else None
 
 
 def _spread(sequences: list[dict[str, Any]], order: list[int], count: int) -> list[int]:
@@ -179,12 +181,26 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
     top = float(np.percentile(speed, 99)) if speed.size else 0.0
     caption = (f"{line['emulator'] or ''}, t = {start / 1e6:.3f} s; events of {window / 1000:.1f} ms ({len(events):,}); "
                f"flow over {(end - start) / 1000:g} ms, full colour {top:.1f} px")
-    return Example(line["path"], image, event_colour(counts), flow_colour(flow, top or None, valid), caption)
+    return Example(line["path"], image, event_colour(counts), flow_colour(flow, top or None, valid), caption, _others(folder, int(flows[k].stem)))
+
+
+def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
+    """Pictures of the labels besides those that every example shows."""
+    from blinkgl.io.pictures import picture
+
+    pictures = []
+    for name, label in LABELS.items():
+        form = label.forms[0]
+        if name in ("images", _FLOW.name) or not (folder / form.file(index)).is_file():
+            continue
+        value = form.read(folder / form.file(index))
+        pictures += [(view.title, picture(view.kind, view.of(value))[0]) for view in label.views if not (view.kind == "mask" and len(label.views) > 1)]
+    return pictures
 
 
 def _pairs(path: Path) -> list[tuple[int, int]]:
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line and not line.startswith("#")]
-    return [tuple(int(v) for v in line.split(",")) for line in lines]
+    return [(int(start), int(end)) for start, end in (line.split(",") for line in lines)]
 
 
 # ---- parameters ------------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,7 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
 
 
 def _example(e: Example) -> dict[str, Any]:
-    pictures = (("frame", e.image), ("events", e.events), ("flow", e.flow))
+    pictures = (("frame", e.image), ("events", e.events), ("flow", e.flow), *e.others)
     return {"name": e.name, "caption": e.caption, "pictures": [(label, None if array is None else png(_small(array))) for label, array in pictures]}
 
 
@@ -95,24 +95,24 @@ def _coverage(values: np.ndarray, low: float, high: float, kind: str) -> tuple[s
 
 def _counts(p: Parameter) -> list[tuple[str, float, float | None]]:
     counted = Counter(str(v) for v in p.values)
+    expected: defaultdict[str, float] = defaultdict(float)
     if p.kind == "shares":
-        expected = Counter()
         for part in p.spec:
             expected[str(part["value"])] += float(part["share"])
     elif p.kind == "weighted":
         total = sum(float(w) for w in p.spec.values())
-        expected = Counter({str(k): float(w) / total for k, w in p.spec.items()})
+        expected |= {str(k): float(w) / total for k, w in p.spec.items()}
     else:
-        expected = Counter()
         for value in p.spec:
             expected[str(value)] += 1 / len(p.spec)
     return [(key, counted[key], share * len(p.values)) for key, share in expected.items()]
 
 
 def _cost(costs: list[dict[str, Any]]) -> dict[str, Any]:
-    seconds: Counter = Counter()
+    seconds: defaultdict[str, float] = defaultdict(float)
     for c in costs:
-        seconds.update(c["seconds"])
+        for stage, value in c["seconds"].items():
+            seconds[stage] += value
         seconds["other"] += max(0.0, c["total_s"] - sum(c["seconds"].values()))
     total, simulated = sum(c["total_s"] for c in costs), sum(c["simulated_s"] for c in costs)
     facts = [("wall time of all sequences", f"{total / 3600:.2f} h" if total > 3600 else f"{total:.1f} s"),

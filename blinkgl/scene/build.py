@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
-from blinkgl.config.sequence import CameraConfig
+from blinkgl.config.sequence import CameraConfig, SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.types import Scene
 from blinkgl.scene.worlds.explicit import explicit_scene, primitive_mesh
@@ -34,6 +35,22 @@ def build_scene(config: SceneConfig, camera: CameraConfig, t0_ns: int, t1_ns: in
     if isinstance(config, ExplicitSceneConfig):
         return explicit_scene(config, camera.model, t0_ns, t1_ns, base)
     return scene_from_file(config, camera.model, t0_ns, t1_ns, base)
+
+
+def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -> Scene:
+    """The scene of sequence ``index`` of a run, with the sensor that records what the configuration asks for.
+
+    base : folder that the configuration's relative paths start from. Raises ConfigError and AssetError."""
+    time, seed = config.time, config.seed
+    scene = build_scene(config.scene, config.camera, time.t0_ns, time.t1_ns, split=config.output.split, seed=seed,
+                        sequence=index, base=base)
+    return recording(scene, config)
+
+
+def recording(scene: Scene, config: SequenceConfig) -> Scene:
+    """The scene whose first sensor records what ``events:``, ``readout:`` and ``labels:`` of the configuration say."""
+    recorded = {"emulator": config.events, "readout": config.readout, "labels": config.labels}
+    return replace(scene, rig=scene.rig.with_first(**recorded))
 
 
 def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "train") -> None:

@@ -19,7 +19,7 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.scene import LightConfig
 
 if TYPE_CHECKING:
-    from blinkgl.scene.rig import Rig
+    from blinkgl.scene.rig import Rig, Sensor
 
 
 @runtime_checkable
@@ -155,6 +155,11 @@ class Scene:
     omissions: tuple[str, ...] = field(default=())
 
     @property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """What the rig carries."""
+        return self.rig.sensors
+
+    @property
     def camera(self) -> CameraModel:
         """Of the rig's first sensor: what pictures of the scene are drawn with."""
         return self.rig.sensors[0].camera
@@ -166,7 +171,11 @@ class Scene:
 
     def with_camera(self, camera: CameraModel) -> Scene:
         """The scene seen by another camera from the same place."""
-        return replace(self, rig=self.rig.with_camera(camera))
+        return replace(self, rig=self.rig.with_first(camera=camera))
+
+    def seen_by(self, number: int) -> Scene:
+        """The scene as the rig's sensor of this number sees it: with that one alone. Raises ConfigError where there is none."""
+        return replace(self, rig=self.rig.seen_by(number))
 
     def with_path(self, path: PosePath) -> Scene:
         """The scene with its rig on another way."""

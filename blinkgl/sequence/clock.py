@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from blinkgl.machine.compiling import compiled_s, working_clock
@@ -17,7 +18,7 @@ class StageClock:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
-    def __call__(self, stage: str):
+    def __call__(self, stage: str) -> Iterator[None]:
         begin = working_clock()
         try:
             yield

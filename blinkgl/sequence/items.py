@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Union
 
 import numpy as np
 
@@ -51,4 +50,4 @@ class Picture:
     velocity: np.ndarray | None = None
 
 
-Item = Union[EventChunk, GroundTruth, Picture]
+Item = EventChunk | GroundTruth | Picture

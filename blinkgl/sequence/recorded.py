@@ -96,6 +96,9 @@ class RecordedSequence(Simulation):
         super().__init__(resolved, index, clock, size=size, span_ns=(0, self._time_of(len(self.files) - 1, frames.fps)), camera=camera,
                          pictures_hz=None if pictures_hz is None else min(pictures_hz, frames.fps * 8), labels=labels)
 
+    def _resume(self) -> None:
+        """Nothing is drawn here."""
+
     @staticmethod
     def _time_of(k: int, fps: float) -> int:
         return round(k * 1e9 / fps)

@@ -18,7 +18,7 @@ from blinkgl.gl import GLContext, create_context
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import recording, sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.items import GroundTruth, Picture
@@ -40,7 +40,8 @@ def drawn(renderer: Renderer, times: Iterable[int], rates: bool = False) -> Iter
 class RenderedSequence(Simulation):
     """See :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
-    scene : as it was built.   renderer : what draws it, at its level of detail."""
+    scene : as it was built.   renderer : what draws it, at its level of detail.
+    sensor : what is recorded, and through which camera. A scene that was made already is recorded as the configuration says."""
 
     def __init__(self, config: SequenceConfig, index: int, gl: GLContext | None, *, base: Path, events: bool, labels: bool,
                  pictures_hz: float | None, scene: Scene | None, renderer: Renderer | None, window_ns: tuple[int, int] | None):
@@ -48,20 +49,20 @@ class RenderedSequence(Simulation):
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
             with clock("scene"):
-                scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
-                                    seed=config.seed, sequence=index, base=base)
+                scene = sequence_scene(config, index, base)
         with ExitStack() as stack:
             if renderer is None:
                 gl = gl or stack.enter_context(create_context(config.gl.backend, config.gl.device))
                 renderer = stack.enter_context(Renderer(gl, scene, config.render))
             size, span_ns = (renderer.height, renderer.width), window_ns or (scene.t0_ns, scene.t1_ns)
             self.scene, self.renderer, self.omissions = scene, renderer, scene.omissions
+            self.sensor = recording(scene, config).sensors[0]
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
             if events:
-                camera = EventCamera(config.events, config.readout, *size, kernel_seed(config.seed, index, Role.EVENTS),
-                                     config.timeline.reconstruction)
-                self.timeline = make_timeline(config.timeline, *span_ns, renderer, emulator_of(config.events).response(config.events))
+                emulator, readout = self.sensor.emulator, self.sensor.readout
+                camera = EventCamera(emulator, readout, *size, kernel_seed(config.seed, index, Role.EVENTS), config.timeline.reconstruction)
+                self.timeline = make_timeline(config.timeline, *span_ns, renderer, emulator_of(emulator).response(emulator))
             super().__init__(config, index, clock, size=size, span_ns=span_ns, pictures_hz=pictures_hz, camera=camera, labels=labels,
                              stack=stack.pop_all())
 
@@ -88,7 +89,7 @@ class RenderedSequence(Simulation):
         return ((k, t) for k, t in enumerate(self.config.time.label_times_ns) if self.t0_ns <= t <= self.t1_ns)
 
     def _truth(self, k: int, t_ns: int) -> GroundTruth:
-        request, interval = asked_for(self.config.labels), self.config.time.interval_ns
+        request, interval = asked_for(self.sensor.labels), self.config.time.interval_ns
         last = k == self.config.time.label_count
         if last:
             request = LabelRequest(*(name for name in request if LABELS[name].at_last))

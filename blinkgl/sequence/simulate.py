@@ -45,6 +45,8 @@ def simulate_sequence(config: SequenceConfig, index: int = 0, gl: GLContext | No
     scene : made already, instead of the configuration's.   renderer : made already, and not released at the end; its scene is drawn.
     window_ns : first and last time, ns, instead of all of the sequence. (These three: of what is drawn, not of recorded frames.)
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
+    if pictures_hz is not None and not events:
+        raise ConfigError("pictures are of event frames, and there are none", where="pictures_hz", value=pictures_hz, accepted="None, or events=True")
     # They import this module, for what they share.
     from blinkgl.sequence.recorded import RecordedSequence
     from blinkgl.sequence.rendered import RenderedSequence
@@ -150,6 +152,7 @@ class Simulation(ABC):
     def poses(self) -> dict[str, np.ndarray]:
         """What poses.npz holds; empty where nobody knows."""
 
+    @abstractmethod
     def _resume(self) -> None:
         """Called when it is its turn again: the receiver may have used OpenGL meanwhile."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -13,7 +14,7 @@ from blinkgl.recordings.comparison import BLUR_PX, compare, plot
 from blinkgl.show.terminal import plain_console, say
 
 
-def run(a: str, b: str | None, out: str | None = None, **options) -> int:
+def run(a: str, b: str | None, out: str | None = None, **options: Any) -> int:
     """``options``: of :func:`~blinkgl.recordings.comparison.compare`. With ``out`` also compare.json and compare.png in that folder."""
     result = compare(a, b, **options)
     console = plain_console()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from blinkgl.errors import ConfigError
 from blinkgl.io.formats import convert
 from blinkgl.show.terminal import plain_console, say
 
 
-def run(source: str, target: str, *, size: str | None = None, **options) -> int:
+def run(source: str, target: str, *, size: str | None = None, **options: Any) -> int:
     """``options``: of :func:`~blinkgl.io.formats.convert`. size : "WIDTHxHEIGHT"."""
     known = None
     if size is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rich.console import Console
 from rich.table import Table
 
@@ -10,7 +12,7 @@ from blinkgl.dataset.explain import Explanation, explain
 from blinkgl.show.terminal import plain_console, say
 
 
-def run(config: str, *, sequence: int | None = None, seed: int | None = None, overrides: list[str] = ()) -> int:
+def run(config: str, *, sequence: int | None = None, seed: int | None = None, overrides: Sequence[str] = ()) -> int:
     """``sequence``: default the first of the run."""
     show(explain(load_run(config, overrides, seed=seed), sequence), plain_console())
     return 0

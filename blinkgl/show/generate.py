@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -26,7 +26,7 @@ SET_ASIDE = 3
 """Exit status of a run that is over but lacks sequences."""
 
 
-def run(config: str, out: str, *, num: int | None = None, seed: int | None = None, overrides: list[str] = (), quiet: bool = False,
+def run(config: str, out: str, *, num: int | None = None, seed: int | None = None, overrides: Sequence[str] = (), quiet: bool = False,
         executor: Executor | None = None, resume: bool = False, mixed: bool = False, time_limit_s: float = 0.0) -> int:
     """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing, whose names and reasons
     are said even when ``quiet``. Raises what it raises."""
@@ -159,7 +159,8 @@ def _line(report: SequenceReport) -> str:
 def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -> None:
     """The final table: what was made, how fast, and where the time went. ``elapsed_s``: of the run, where several workers
     each spent wall time at once."""
-    s = made.summary()
+    s, first = made.summary(), made.first
+    assert first is not None, "there is nothing to show of no sequences"
     table = Table(title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",
                   title_justify="left", show_header=False)
     table.add_row("event frames", f"{s['frames']:,}")
@@ -170,7 +171,7 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     table.add_row("wall time of all sequences" if len(made) > 1 else "wall time", f"{s['total_s']:.1f} s")
     table.add_row("per simulated second", f"{s['seconds_per_simulated_second']:.2f} s")
     table.add_row("rate", f"{s['events_per_second'] / 1e6:.2f} M events/s")
-    if (error := made.first.timeline.get("time_error")) is not None:
+    if (error := first.timeline.get("time_error")) is not None:
         name = f"p{error['percentile']:g}"
         table.add_row("time error, estimated", f"median {error['median_us']} µs, {name} {error[name + '_us']} µs"
                       + (" (first sequence)" if len(made) > 1 else ""))
@@ -179,5 +180,5 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
         seconds = s[f"{name}_s"]
         table.add_row(name, f"{seconds:.2f} s  {100 * seconds / s['total_s']:4.0f} %")
     console.print(table)
-    folder = made.first.path
+    folder = first.path
     say(console, f"look at {folder / 'preview.mp4'}" if (folder / "preview.mp4").exists() else f"written to {folder}")

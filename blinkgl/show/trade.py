@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -23,7 +24,7 @@ def run(config: str, out: str, *, overrides: list[str], quick: bool, only: list[
         raise ConfigError("unknown reference", where="--reference", value=reference, accepted="raster or cycles")
     template = load_run(config, overrides, seed=seed)
     options = QUICK if quick else Options()
-    changes = {"limit_us": round(limit_ms * 1000), "sequence": template.sequence(0).output.first_index if sequence is None else sequence}
+    changes: dict[str, Any] = {"limit_us": round(limit_ms * 1000), "sequence": template.sequence(0).output.first_index if sequence is None else sequence}
     if reference == "cycles":
         changes |= {"reference": reference, "levels": TRACED_LEVELS}
     if clip is not None:

@@ -16,9 +16,10 @@ import numpy as np
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, apply_overrides
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, emulator_of
+from blinkgl.gl import GLContext
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.build import build_scene
+from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import Simulation, simulate_sequence
 from blinkgl.trade.labels import flow_errors
@@ -111,7 +112,7 @@ class Level:
 class Bench:
     """One sequence at one image size: its scenes, its clip, its judged pixels."""
 
-    def __init__(self, gl, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
+    def __init__(self, gl: GLContext, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
         self.gl, self.options, self.say = gl, options, say
         if options.reference == "cycles":
             from blinkgl.tools import peer_cycles
@@ -144,8 +145,7 @@ class Bench:
     def scene_of(self, config: SequenceConfig) -> Scene:
         key = json.dumps(config.scene.model_dump(), sort_keys=True)
         if key not in self._scenes:
-            self._scenes[key] = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split=config.output.split,
-                                            seed=config.seed, sequence=self.options.sequence, base=self._template.base)
+            self._scenes[key] = sequence_scene(config, self.options.sequence, self._template.base)
         return self._scenes[key]
 
     @property

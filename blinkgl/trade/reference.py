@@ -16,11 +16,12 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
+from blinkgl.gl import GLContext
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.types import Scene
 from blinkgl.timeline.sampling import displacement_times
+from blinkgl.timeline.speed import largest_speed
 from blinkgl.trade.metrics import masked
 
 FrameSource = Callable[[Iterable[int]], Iterator[np.ndarray]]
@@ -51,7 +52,7 @@ class FineTiles:
 
     cost = None
 
-    def __init__(self, gl, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
+    def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._tiles, self._scale = tiles, scale
         self._shape = (scene.camera.height, scene.camera.width)
         self._cameras = [scene.camera.part(r.x0, r.y0, r.x1, r.y1, scale) for r in tiles]
@@ -61,7 +62,7 @@ class FineTiles:
     def __enter__(self) -> FineTiles:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._renderer.release()
 
     def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:
@@ -79,7 +80,7 @@ class FineTiles:
         largest = 0.0
         for camera in self._cameras:
             self._renderer.look_through(camera)
-            largest = max(largest, largest_speed(self._renderer.motion(t_ns, self._scale).read()) / self._scale)
+            largest = max(largest, largest_speed(self._renderer.velocity_of_movers(t_ns, self._scale).read()) / self._scale)
         return largest
 
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:

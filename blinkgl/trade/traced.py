@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from blinkgl.gl import GLContext
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.scene.types import Scene
 from blinkgl.tools import peer_cycles
@@ -19,7 +20,7 @@ class TracedFrames:
 
     cost : seconds per frame, filled as frames are drawn. Raises BlinkGLError when Blender is not there or stops."""
 
-    def __init__(self, gl, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
+    def __init__(self, gl: GLContext, scene: Scene, tiles: tuple[Rectangle, ...], scale: int):
         self._motion = FineTiles(gl, scene, tiles, 1)
         self.cost = peer_cycles.Cost()
         self._frames = peer_cycles.source(scene, peer_cycles.CyclesSettings(samples=scale * scale), self.cost)
@@ -27,7 +28,7 @@ class TracedFrames:
     def __enter__(self) -> TracedFrames:
         return self
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, *_: object) -> None:
         self._motion.__exit__()
 
     def __call__(self, times: Iterable[int]) -> Iterator[np.ndarray]:

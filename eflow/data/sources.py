@@ -27,6 +27,7 @@ from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
 from blinkgl.io.images import read_npy
 from blinkgl.io.index import INDEX, read_index
+from blinkgl.labels import LABELS
 from eflow.data.window import RawSample, Window
 
 FORMATS = ("blinkgl", "dsec", "mvsec", "blinkflow")
@@ -171,14 +172,15 @@ def find_blinkgl(root: Path) -> list[Sequence]:
     for folder in folders:
         if any(part.startswith(".") for part in folder.relative_to(root).parts) or not (folder / "events.h5").is_file():
             continue
-        stamps = folder / "flow/forward_timestamps.txt"
-        forward, backward = sorted((folder / "flow/forward").glob("*.png")), sorted((folder / "flow/backward").glob("*.png"))
+        there, back = LABELS["flow_forward"], LABELS["flow_backward"]
+        stamps = folder / there.stamps
+        forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
         if not forward and not stamps.exists():  # made without flow: there is nothing to learn from it, and nothing wrong with it
             continue
         times = read_times(stamps)
-        _same_count(folder / "flow/forward", forward, times)
+        _same_count(folder / there.forms[0].folder, forward, times)
         if backward:
-            _same_count(folder / "flow/backward", backward, times)
+            _same_count(folder / back.forms[0].folder, backward, times)
         entries = tuple(Entry(int(f.stem), t0, t1, f, backward[i] if backward else None)
                         for i, (f, (t0, t1)) in enumerate(zip(forward, times, strict=True)))
         name = folder.relative_to(root).as_posix()

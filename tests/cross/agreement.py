@@ -22,11 +22,11 @@ from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.index import read_index
 from blinkgl.io.sequence_dir import read_manifest
+from blinkgl.labels import LABELS, asked_for
 from blinkgl.report import write_report
 from blinkgl.report.collect import collect
 
-LEFT_OUT = {"images": "images/", "depth": "depth/", "instance ids": "ids/", "normals": "normals/", "velocity label": "velocity/", "forward flow": "flow/forward/",
-            "backward flow": "flow/backward/", "occlusion masks": "occlusion/", "preview": "preview.mp4"}
+LEFT_OUT = {label.heading: label.forms[0].folder + "/" for label in LABELS.values()} | {"occlusion masks": "occlusion/", "preview": "preview.mp4"}
 """What explain says is left out -> how the names of its files would begin."""
 
 
@@ -155,7 +155,7 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
         return found
     count = lambda prefix, ending: sum(n.startswith(prefix) and n.endswith(ending) for n in files)
     events = next(p for name, p in passes.items() if name.startswith("event frames"))
-    wanted = any((config.labels.flow, config.labels.depth, config.labels.ids, config.labels.normals, config.labels.velocity))
+    wanted = asked_for(config.labels).without("images")
     found.same("images", explain=passes["colour"].count if "colour" in passes else 0, files=count("images/", ".png"))
     found.same("labels", explain=passes["labels"].count if "labels" in passes else 0, manifest=manifest["labels"] if wanted else 0)
     found.same("preview", explain="preview" in passes, files="preview.mp4" in files)

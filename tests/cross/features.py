@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from blinkgl.config.base import is_model, members
 from blinkgl.config.quality import QUALITIES
 from blinkgl.config.sensor import sensor_names
-from blinkgl.config.sequence import SequenceConfig
+from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 
 WIDTH, HEIGHT, FPS = 32, 24, 100
 _POOLS = {"pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
@@ -88,7 +88,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo", "h5")}},
     "labels": {
         "default": NOTHING,
-        "all": {"labels": {"depth": True, "ids": True, "normals": True, "velocity": True}},
+        "all": {"labels": {name: True for name, info in LabelsConfig.model_fields.items() if info.annotation is bool}},
         "fewest": {"labels": {"occlusion": False}},
     },
     "preview": {"off": NOTHING, "on": {"preview": {"enabled": True, "rate": 100, "slowdown": 10}}},

@@ -135,6 +135,16 @@ def test_a_folder_that_cannot_be_used_is_set_aside(tmp_path, tartan, damage, mes
     assert [p.parent.name for p in (tmp_path / "out").rglob("*.h5")] == ["tartan_000000"]
 
 
+def test_a_folder_that_cannot_be_used_stops_its_preview_and_says_what_was_wrong(tmp_path, tartan):
+    copy = Path(shutil.copytree(tartan, tmp_path / "copy"))
+    (copy / "P001/image_left/000003_left.png").write_bytes(b"no image")
+    template = recipe(tmp_path, copy)
+    template.tree["groups"]["tartan"]["preview"] = {"enabled": True}
+    outcome = run_dataset(template, tmp_path / "out")
+    assert list(outcome.set_aside) == ["test/tartan_000001"] and "000003_left.png" in outcome.set_aside["test/tartan_000001"]
+    assert sorted(p.name for p in (tmp_path / "out/test").iterdir()) == ["tartan_000000"] and (tmp_path / "out/test/tartan_000000/preview.mp4").is_file()
+
+
 def test_the_shipped_recipe_takes_frames(tmp_path, tartan):
     mini = Path(__file__).parents[2] / "configs/blinkflow_mini.yaml"
     assert run(["generate", str(mini), "--out", str(tmp_path / "out"), "--num", "1", "--quiet", "--set", "groups.e_tartan.enabled=true",

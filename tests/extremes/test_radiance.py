@@ -10,8 +10,9 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Esim
+from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Light, Material, Texture
 from tests.extremes.measures import FACING
 from tests.render.render_scenes import LEVEL, SECOND, drift, quad, rig, scene, still, thing

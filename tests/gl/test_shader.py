@@ -144,7 +144,7 @@ def test_error_formats_of_all_drivers(folder, message):
     sources = {stage: expand("program.glsl", stage, {"GAIN": 1.0}, folder) for stage in ("vertex", "fragment")}
     line = sources["fragment"].origin.index(("include/value.glsl", 3)) + 1
     log = f"GLSL Compiler failed\n\nfragment_shader\n===============\n{message.format(line=line)}\n"
-    error = translate(log, sources, folder)
+    error = translate(log, sources)
     assert str(error).startswith("include/value.glsl:3: ") and "nothing" in str(error) and "[fragment stage]" in str(error)
     assert ">    3 |     return twice(GAIN);" in error.detail
 
@@ -152,20 +152,20 @@ def test_error_formats_of_all_drivers(folder, message):
 def test_warnings_before_the_error_do_not_hide_it(folder):
     sources = {stage: expand("program.glsl", stage, {"GAIN": 1.0}, folder) for stage in ("vertex", "fragment")}
     line = sources["vertex"].origin.index(("program.glsl", 8)) + 1
-    error = translate(f"GLSL Compiler failed\n\nvertex_shader\n=====\n0({line - 1}) : warning C7050: unused\n0({line}) : error C0000: bad\n", sources, folder)
+    error = translate(f"GLSL Compiler failed\n\nvertex_shader\n=====\n0({line - 1}) : warning C7050: unused\n0({line}) : error C0000: bad\n", sources)
     assert str(error) == "program.glsl:8: C0000: bad [vertex stage]"
     assert "program.glsl:7: warning: C7050: unused" in error.detail
 
 
 def test_unknown_format_is_passed_on_whole(folder):
     sources = {"vertex": expand("program.glsl", "vertex", {"GAIN": 1.0}, folder)}
-    error = translate("GLSL Compiler failed\n\nvertex_shader\n=====\nFehler in Zeile 3\n", sources, folder)
+    error = translate("GLSL Compiler failed\n\nvertex_shader\n=====\nFehler in Zeile 3\n", sources)
     assert str(error) == "program.glsl: GLSL Compiler failed Fehler in Zeile 3 [vertex stage]"
 
 
 def test_error_in_a_generated_line_shows_it(folder):
     sources = {"vertex": expand("program.glsl", "vertex", {"GAIN": 1.0}, folder)}
-    error = translate("x\nvertex_shader\n===\n0:3(1): preprocessor error: bad define\n", sources, folder)
+    error = translate("x\nvertex_shader\n===\n0:3(1): preprocessor error: bad define\n", sources)
     assert str(error) == "program.glsl (generated line 3: #define GAIN 1.0): bad define [vertex stage]"
 
 

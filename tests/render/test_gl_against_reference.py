@@ -18,8 +18,9 @@ from shared_data import shared
 
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl.shader import ShaderLoader, shader_folder
+from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Light, Material
 from render_scenes import (
@@ -401,7 +402,7 @@ def test_random_world_of_real_meshes_and_photographs(gl):
         ("include/motion.glsl", "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next", "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next"),
         ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
         ("include/motion.glsl", "* d.z) / w_next", "* d.z) * gl_FragCoord.w"),
-        ("label.glsl", "depth = 1.0 / gl_FragCoord.w", "depth = 1.0 / gl_FragCoord.w - 0.05"),
+        ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),
     ],
     ids=["sign of the flow", "no perspective division", "division by the old depth", "depth off by the near plane"],
 )  # fmt: skip

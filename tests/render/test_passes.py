@@ -36,7 +36,7 @@ class EdgeBand(ScreenPass):
 
     reach: int = 1
     program: ClassVar[str] = str(TOYS / "edge_band.glsl")
-    inputs: ClassVar[tuple[Input, ...]] = (Input("ids", Geometry(("ID",))),)
+    inputs: ClassVar[tuple[Input, ...]] = (Input("ids", Geometry(("ids",))),)
     outputs: ClassVar[tuple[Output, ...]] = (Output("edge", "R32UI"),)
 
     def defines(self, kind):
@@ -136,18 +136,18 @@ def test_what_two_inputs_read_is_drawn_once(gl):
 def test_mistakes_of_a_pass_are_named(gl):
     @dataclass(frozen=True)
     class Wrong(EdgeBand):
-        inputs: ClassVar[tuple[Input, ...]] = (Input("ids", Geometry(("ID",)), "depht"),)
+        inputs: ClassVar[tuple[Input, ...]] = (Input("ids", Geometry(("ids",)), "depht"),)
 
     @dataclass(frozen=True)
     class NoDepth(EdgeBand):
-        inputs: ClassVar[tuple[Input, ...]] = (Input("ids", Geometry(("ID",)), DEPTH_BUFFER),)
+        inputs: ClassVar[tuple[Input, ...]] = (Input("ids", Geometry(("ids",)), DEPTH_BUFFER),)
 
     @dataclass(frozen=True)
     class Nowhere(EdgeBand):
         program: ClassVar[str] = str(TOYS / "nowhere.glsl")
 
     with Renderer(gl, mixed_scene(48, 36), PLAIN) as renderer:
-        with pytest.raises(GLError, match="Geometry: the pass has no such output .got 'depht'.; expected ID"):
+        with pytest.raises(GLError, match="Geometry: the pass has no such output .got 'depht'.; expected ids"):
             renderer.draw(Wrong(), 0)
         with pytest.raises(GLError, match="Geometry: the pass keeps no depth buffer that can be read"):
             renderer.draw(NoDepth(), 0)
@@ -227,7 +227,7 @@ def test_what_is_read_what_is_viewed_and_what_is_written_into_are_one(gl, antial
     with Renderer(gl, mixed_scene(48, 36), config) as renderer:
         for t in (0, SECOND // 5):
             frames = [renderer.luminance(t, rate=True), renderer.brightness(t, 5), renderer.velocity(t, 3), renderer.colour(t),
-                      renderer.draw(Geometry(("DEPTH", "NORMAL", "ID")), t)]
+                      renderer.draw(Geometry(("depth", "ids", "normals")), t)]
             for frame in frames:
                 for name in frame.names:
                     image = frame.read(name)
@@ -294,5 +294,5 @@ def test_a_moment_through_another_camera(gl):
 
 def test_passes_are_values():
     assert Luminance() == Luminance(False) and len({Luminance(), Luminance(), Luminance(True), Brightness(), Colour()}) == 4
-    assert Mean(Luminance(True)) == Mean(Luminance(True)) and Geometry(("ID",)) != Geometry(("DEPTH",))
+    assert Mean(Luminance(True)) == Mean(Luminance(True)) and Geometry(("ids",)) != Geometry(("depth",))
     assert [o.format for o in Mean(Luminance(True)).outputs] == ["RG32F"]

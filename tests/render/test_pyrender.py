@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from blinkgl.config.sequence import RenderConfig
+from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material, Texture
 from blinkgl.tools import peer_pyrender
 from render_scenes import mixed_scene, quad, rig, scene, still, thing

@@ -7,7 +7,7 @@ import itertools
 import cv2
 import numpy as np
 import pytest
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from skimage import data
 
 from blinkgl.errors import EventDataError
@@ -28,6 +28,29 @@ def test_cubic_is_pchip_in_log_luminance():
         assert np.abs(np.log(frame + 1e-3) - reference((t - times[0]) * 1e-6)).max() < 2e-4
     first = [f for f, t in out if times[0] < t < times[1]]
     assert all(((f >= np.minimum(frames[0], frames[1]) - 1e-5) & (f <= np.maximum(frames[0], frames[1]) + 1e-5)).all() for f in first)
+
+
+@pytest.mark.parametrize("factor", [2, 3, 7])
+def test_cubic_is_the_hermite_spline_of_pchips_slopes_and_of_the_outer_secants(factor):
+    """At every time, the ends included: there the slope is that of the straight line to the only neighbour."""
+    times = np.array([0, 4, 14, 15, 35]) * 1_000_000 + 10**15
+    frames = np.random.default_rng(3).random((5, 3, 4)).astype(np.float32)
+    frames[2, 0] = frames[1, 0] * 1.5  # a level after a rise: slope 0 on both sides of it
+    frames[3, 0] = frames[2, 0]
+    ms, logs = (times - times[0]) * 1e-6, np.log(frames.astype(np.float64) + 1e-3)
+    slopes = PchipInterpolator(ms, logs, axis=0).derivative()(ms)
+    slopes[0], slopes[-1] = (logs[1] - logs[0]) / (ms[1] - ms[0]), (logs[-1] - logs[-2]) / (ms[-1] - ms[-2])
+    exact = CubicHermiteSpline(ms, logs, slopes)
+    out = list(interpolate.cubic(zip(frames, times.tolist()), factor))
+    assert [t for _, t in out] == [int(a + (b - a) * k // factor) for a, b in zip(times, times[1:]) for k in range(factor)] + [int(times[-1])]
+    for frame, t in out:
+        assert frame.dtype == np.float32 and frame.min() >= 0
+        assert np.abs(np.log(frame + 1e-3) - exact((t - times[0]) * 1e-6)).max() < 2e-4
+
+
+def test_cubic_never_goes_below_black():
+    dark = [np.zeros((2, 2), np.float32), np.full((2, 2), 1e-9, np.float32), np.zeros((2, 2), np.float32)]
+    assert all((frame >= 0).all() for frame, _ in interpolate.cubic(zip(dark, (0, 1000, 2000)), 5))
 
 
 def test_cubic_of_two_frames_and_of_tiny_gaps():
@@ -67,6 +90,71 @@ def test_motion_recovers_the_frames_that_were_left_out():
             blend.append(np.abs((1 - s) * given[a][0] + s * given[a + 1][0] - exact)[8:-8, 16:-16].mean())
     assert np.mean(errors) < 0.3 * np.mean(blend), (np.mean(errors), np.mean(blend))
     assert "interpolated by dense-flow warp, not recorded" in str(statistics)
+
+
+def test_a_ramp_that_moves_evenly_is_met_exactly():
+    """x + 2 y, moved by (3, -1) px: both warps give the same values, whatever their weights."""
+    y, x = np.mgrid[:24, :32].astype(np.float32)
+    flow = np.broadcast_to(np.float32([3, -1]), (24, 32, 2))
+    a, b = x + 2 * y, (x - 3) + 2 * (y + 1)
+    out = list(interpolate._between(a, b, 1000, 5000, flow, -flow, 4))
+    assert [t for _, t in out] == [2000, 3000, 4000]
+    for k, (frame, _) in enumerate(out, 1):
+        exact = (x - 3 * k / 4) + 2 * (y + k / 4)
+        assert np.abs(frame - exact)[6:-6, 6:-6].max() < 0.05  # OpenCV's remap knows 1/32 px
+    assert list(interpolate._between(a, b, 0, 10, flow, -flow, 1)) == []
+
+
+def test_pictures_are_blended_by_their_distance_in_time():
+    """Nothing moves, but the light changes: a straight line in between."""
+    a, b, still = np.full((20, 20), 1.0, np.float32), np.full((20, 20), 5.0, np.float32), np.zeros((20, 20, 2), np.float32)
+    out = list(interpolate._between(a, b, 0, 8, still, still, 4))
+    assert [(float(frame.mean()), t) for frame, t in out] == [(2.0, 2), (3.0, 4), (4.0, 6)]
+
+
+def test_what_one_frame_does_not_see_comes_from_the_other():
+    """A bar moves 8 px to the right: where it was, b alone shows the background; where it comes to, a alone does."""
+    a, b = np.full((20, 40), 1.0, np.float32), np.full((20, 40), 3.0, np.float32)
+    forward, backward = np.zeros((20, 40, 2), np.float32), np.zeros((20, 40, 2), np.float32)
+    forward[:, 10:16, 0], backward[:, 18:24, 0] = 8, -8
+    early, middle, late = (frame[10] for frame, _ in interpolate._between(a, b, 0, 8, forward, backward, 4))
+    assert early[22] == pytest.approx(1.0, abs=0.02) and late[12] == pytest.approx(3.0, abs=0.02)
+    assert (early[35], middle[35], late[35]) == (1.5, 2.0, 2.5), "what both see is blended"
+
+
+def test_flows_agree_within_a_pixel_and_a_twentieth():
+    agrees = interpolate._consistent(np.zeros((2, 3, 2), np.float32), np.zeros((2, 3, 2), np.float32))
+    assert (agrees == 1).all() and agrees.dtype == np.float32
+    flow, back = np.zeros((1, 5, 2), np.float32), np.zeros((1, 5, 2), np.float32)
+    flow[0, :, 0], back[0, :, 0] = (40, 40, 0, 0, 0), (-37.1, -36.9, 0.9, 1.1, 0)
+    back[0, 4, 1] = 1.1
+    assert interpolate._consistent(flow, back)[0].tolist() == pytest.approx([1, 0.01, 1, 0.01, 0.01])
+
+
+def test_displacement_keeps_means_of_medians_and_the_largest():
+    seen = interpolate.Displacement()
+    seen.add(np.linspace(0, 10, 101))
+    seen.add(np.linspace(0, 4, 101))
+    seen.add(np.full(5, 3.0))
+    assert (seen.pairs, seen.median, seen.p99, seen.largest) == (3, pytest.approx((5 + 2 + 3) / 3), pytest.approx(9.9), 10.0)
+    seen.inserted = 7
+    assert str(seen) == ("displacement per given frame: median 3.3 px, 99th percentile 9.9 px, largest 10 px; "
+                         "7 frames interpolated by dense-flow warp, not recorded")
+
+
+def test_as_many_steps_as_the_quickest_but_a_few_pixels_ask_for(monkeypatch):
+    """The 99.5th percentile of the displacement over max_px, rounded up; never more than there are nanoseconds."""
+    flow = np.zeros((20, 50, 2), np.float32)
+    flow[..., 0] = np.linspace(0, 5, 1000).reshape(20, 50)  # 99.5 %: 4.975 px
+    monkeypatch.setattr(interpolate.cv2, "DISOpticalFlow_create", lambda preset: type("Dis", (), {"calc": lambda self, a, b, none: flow.copy()})())
+    frames = [(np.full((20, 50), 0.5, np.float32), t) for t in (0, 1000)]
+    count = lambda frames=frames, **more: len(list(interpolate.motion(frames, **more))) - 1  # noqa: E731
+    assert [count(max_px=px) for px in (1.0, 4.97, 4.98, 0.5, 100.0)] == [5, 2, 1, 10, 1]
+    assert count(max_px=0.01) == 64 and count(max_px=0.01, most=9) == 9
+    assert count([(frames[0][0], 0), (frames[0][0], 3)], max_px=0.01) == 3
+    flow[..., 0] = 0  # downwards counts as well
+    flow[..., 1] = 2.5
+    assert count(max_px=1.0) == 3
 
 
 def test_motion_inserts_nothing_where_nothing_moves():

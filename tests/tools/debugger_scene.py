@@ -70,7 +70,7 @@ def edit(path: Path, right: str, wrong: str) -> None:
 MISTAKES = {
     "sign of the flow": ("include/motion.glsl", "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next", "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next"),
     "no perspective division": ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
-    "depth off by near": ("label.glsl", "depth = 1.0 / gl_FragCoord.w", "depth = 1.0 / gl_FragCoord.w - 0.05"),
+    "depth off by near": ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),
 }
 
 _UV = "float luminance = texture(albedo, uv).r;"
@@ -81,7 +81,7 @@ LOOKUP_MISTAKES = {
         [("include/vertex.glsl", "out vec2 uv;", "noperspective out vec2 uv;"), ("include/vertex.glsl", "in vec2 uv;", "noperspective in vec2 uv;")],
         "luminance_uv", "without perspective", {"floor"}),
     "sRGB decoded twice": (
-        [("label.glsl", "radiance *= texture(albedo, uv).rgb;", "radiance *= pow(texture(albedo, uv).rgb, vec3(2.2));")],
+        [("colour.glsl", "radiance *= texture(albedo, uv).rgb;", "radiance *= pow(texture(albedo, uv).rgb, vec3(2.2));")],
         "colour_albedo", "sRGB is decoded twice", {"floor", "ball"}),
     "mip bias +1": ([("luminance.glsl", _UV, _UV.replace("uv)", "uv, 1.0)"))], "luminance_level", "a mip bias of +1", {"floor", "ball"}),
     "uv off by half a texel": (

@@ -14,15 +14,16 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl.shader import STAGES, ShaderError, ShaderLoader, expand, normalised, shader_folder
+from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render.painter import Painter
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.shader_debugger import check, diagnostics, preprocess, timing, variants
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment
 from blinkgl.tools.shader_debugger.session import DebugRenderer, moment, open_folder, open_subject
 from debugger_scene import copy_shaders, edit
 
-PRODUCTION = ("luminance.glsl", "label.glsl", "downsample.glsl")
+PRODUCTION = ("luminance.glsl", "velocity.glsl", "colour.glsl", "label.glsl", "downsample.glsl")
 
 
 def scene_of(config, **camera):
@@ -37,7 +38,7 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     status, out, _ = shader("check", "--json")
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
-    assert result["programs"] == {"debug.glsl": 8, "downsample.glsl": 2, "label.glsl": 528, "luminance.glsl": 40}
+    assert result["programs"] == {"colour.glsl": 16, "debug.glsl": 8, "downsample.glsl": 2, "label.glsl": 504, "luminance.glsl": 40, "velocity.glsl": 16}
 
 
 def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeypatch):
@@ -53,7 +54,7 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     monkeypatch.setattr(gl, "shaders", ShaderLoader(gl.ctx))
     monkeypatch.setattr(Painter, "draw", lambda self, uniforms, item: None)  # linking is enough: llvmpipe compiles at the first draw
     world = scene_of(config, width=8, height=6)
-    fields = ("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward")
+    fields = [name for name, label in LABELS.items() if label.buffer]
     t = 100_000_000
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="ssaa4")) as renderer:
         renderer.luminance(t), renderer.colour(t), renderer.velocity(t), renderer.velocity(t, 4)
@@ -61,7 +62,7 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
             tapped.luminance(t), tapped.luminance(t, rate=True)
         renderer.luminance(t, rate=True)
         renderer.brightness(t, 4)
-        for count in range(1, 7):
+        for count in range(1, len(fields) + 1):
             for names in combinations(fields, count):
                 renderer.labels(t, LabelRequest(*names), t + 10**8, t - 10**8)
     gl.shaders.clear()
@@ -107,7 +108,7 @@ def test_production_programs_are_the_same_without_the_debugger(tmp_path, gl, con
         gl.shaders = before
     shown = {(name, normalised(d)) for name in PRODUCTION for d in variants.lookups(name)}
     own = {entry for entry in compiled if entry[0] == "debug.glsl" or entry in shown}
-    assert {name for name, _ in own} == {"debug.glsl", "label.glsl", "luminance.glsl"}
+    assert {name for name, _ in own} == {"debug.glsl", "colour.glsl", "luminance.glsl"}
     assert set(compiled) - own <= {(name, normalised(d)) for name in PRODUCTION for d in variants.variants(name)}
     assert sources() == here
 
@@ -151,7 +152,7 @@ def test_an_error_is_shown_at_its_own_line_through_the_includes(shader, shaders)
     shown = next(i for i, text in enumerate(lines) if text.startswith(">"))
     assert "float w_next = depht" in lines[shown]
     assert lines[shown + 1].index("^") == lines[shown].index("depht")
-    assert "in 456 of 528 variants of label.glsl" in out  # those with a flow or a velocity
+    assert "in 448 of 504 variants of label.glsl" in out  # those with a flow or a velocity
 
 
 def test_a_link_error_is_shown_at_the_declaration(shader, shaders):
@@ -194,7 +195,7 @@ def test_files_select_programs_and_a_file_elsewhere_brings_its_folder(shader, sh
     status, out, _ = shader("check", shaders / "mine.glsl")
     assert status == 1 and "mine.glsl:8:24: error" in out
     status, out, _ = shader("check", "light.glsl", "--json")
-    assert status == 0 and set(json.loads(out)["programs"]) == {"label.glsl", "luminance.glsl"}
+    assert status == 0 and set(json.loads(out)["programs"]) == {"colour.glsl", "luminance.glsl"}
 
 
 @pytest.mark.parametrize("log, expected", [

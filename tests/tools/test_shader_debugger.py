@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl import create_context
+from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
-from blinkgl.render.renderer import LabelRequest, Renderer
+from blinkgl.render.renderer import Renderer
 from blinkgl.render.resources import SceneResources
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry.primitives import grid
@@ -374,7 +375,8 @@ def test_another_object_s_texture_is_named(shader, config, monkeypatch):
     assert first["suspicions"][0].startswith("the texture of ball (")
 
 
-@pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0")])
+@pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0"),
+                                  ("--set", "render.antialiasing=taps4", "--time", "0.1")])
 def test_right_shaders_raise_no_suspicion(shader, config, more):
     status, out, _ = shader("diff", config, *more)
     assert status == 0 and "looks as if" not in out and "FAIL" not in out

@@ -259,24 +259,24 @@ def depth_at(server) -> float:
 
 def test_edits_are_taken_errors_keep_the_last_good_program(served):
     server, folder = served
-    label = folder / "label.glsl"
+    label = folder / "include/labels/depth.glsl"
     good = label.read_text()
     state = as_json(server, "/state")
     before = depth_at(server)
 
-    edit(label, "depth = 1.0 / gl_FragCoord.w", "depth = 2.0 / gl_FragCoord.w")
+    edit(label, "1.0 / gl_FragCoord.w", "2.0 / gl_FragCoord.w")
     now = next_version(server, state["version"])
     assert now["errors"] == [] and now["generation"] == state["generation"] + 1
     assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)
     occluded = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "occluded_forward")
     assert occluded["gpu"] in (True, False)
 
-    edit(label, "depth = 2.0 / gl_FragCoord.w", "depth = 2.0 / gl_FragCord.w")
+    edit(label, "2.0 / gl_FragCoord.w", "2.0 / gl_FragCord.w")
     broken = next_version(server, now["version"])
     line = next(i for i, text in enumerate(label.read_text().splitlines(), 1) if "gl_FragCord" in text)
     error = broken["errors"][0]
     assert broken["generation"] == now["generation"]
-    assert error["where"].startswith(f"label.glsl:{line}:") and "gl_FragCord" in error["text"] and "^" in error["excerpt"]
+    assert error["where"].startswith(f"include/labels/depth.glsl:{line}:") and "gl_FragCord" in error["text"] and "^" in error["excerpt"]
     assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)  # the last good program
 
     label.write_text(good)
@@ -307,9 +307,10 @@ def test_include_cycle_and_a_vanished_file_while_serving(served):
 def test_an_edit_that_drops_a_uniform_is_drawn(served):
     """Commenting out what used a uniform is what people do; the renderer still sets it."""
     server, folder = served
-    label, good = folder / "label.glsl", (folder / "label.glsl").read_text()
+    label = folder / "include/labels/flow_forward.glsl"
+    good = label.read_text()
     state = as_json(server, "/state")
-    edit(label, "flow_forward = vec4(displacement(difference_forward, local, image_size), 1.0);", "flow_forward = vec4(1.0, 2.0, 3.0, 1.0);")
+    edit(label, "return vec4(displacement(difference_forward, local, image_size), 1.0);", "return vec4(1.0, 2.0, 3.0, 1.0);")
     now = next_version(server, state["version"])
     assert now["errors"] == []
     row = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "flow_forward")

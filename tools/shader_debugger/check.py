@@ -84,7 +84,7 @@ def check_program(ctx: moderngl.Context, folder, name: str, result: Result) -> N
                 if diagnostic.kind == "error":
                     _add(result.errors, diagnostic, name, defines)
             continue
-        for diagnostic in unused(sources, {member for member in program}):
+        for diagnostic in unused(sources, set(program)):
             _add(result.unused, diagnostic, name, defines)
     loader.clear()
 
@@ -138,7 +138,7 @@ def _programs(files: list[str], shaders: str | None):
     folder = open_folder(shaders)
     if files and shaders is None:  # a file of another folder brings its folder along
         first = Path(files[0]).resolve()
-        home = first.parent.parent if first.parent.name == "include" else first.parent
+        home = next((folder.parent for folder in first.parents if folder.name == "include"), first.parent)
         if first.is_file() and home != Path(str(folder)).resolve():
             folder = open_folder(str(home))
     known = files_of(folder)
@@ -153,14 +153,14 @@ def _programs(files: list[str], shaders: str | None):
         path = next((p for p in known if p.resolve() == Path(text).resolve() or str(p.relative_to(root)) == text or p.name == text), None)
         if path is None:
             raise ConfigError("no such shader", where="check", value=text, accepted="one of " + ", ".join(str(p.relative_to(root)) for p in known))
-        wanted = [path.name] if path.parent == root else [name for name in programs if _includes(folder, name, path.name)]
+        wanted = [path.name] if path.parent == root else [name for name in programs if _includes(folder, name, path.relative_to(root).as_posix())]
         chosen += [name for name in wanted if name not in chosen]
     return folder, chosen
 
 
 def _includes(folder, program: str, include: str) -> bool:
     try:
-        return any(file == f"include/{include}" for file, _ in expand(program, "fragment", {}, folder).origin)
+        return include in expand(program, "fragment", {}, folder).files
     except ShaderError:
         return True  # broken on the way there: compile it and say so
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json as _json
-from typing import Annotated, Optional
+from typing import Annotated
 
 import typer
 
 app = typer.Typer(name="shader", no_args_is_help=True, rich_markup_mode=None, help="See what every pass wrote at a pixel, and why.")
 
 Config = Annotated[str, typer.Argument(help="YAML file, as for `blinkgl generate`.")]
-Seed = Annotated[Optional[int], typer.Option("--seed", help="Seed of the run (default: the file's).")]
-Sequence = Annotated[Optional[int], typer.Option("--sequence", "-n", min=0, help="Number of the sequence (default: the run's first).")]
-Time = Annotated[Optional[float], typer.Option("--time", "-t", help="Moment on the sequence's clock, s (default: the first label).")]
-Step = Annotated[Optional[float], typer.Option("--step", help="Half the time step of dL/dt, µs (default: a hundredth of the label interval).")]
-Shaders = Annotated[Optional[str], typer.Option("--shaders", help="Use an edited copy of the shaders/ folder.")]
-Overrides = Annotated[Optional[list[str]], typer.Option("--set", metavar="a.b=c", help="Override a value of CONFIG; may be repeated.")]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")]
+Sequence = Annotated[int | None, typer.Option("--sequence", "-n", min=0, help="Number of the sequence (default: the run's first).")]
+Time = Annotated[float | None, typer.Option("--time", "-t", help="Moment on the sequence's clock, s (default: the first label).")]
+Step = Annotated[float | None, typer.Option("--step", help="Half the time step of dL/dt, µs (default: a hundredth of the label interval).")]
+Shaders = Annotated[str | None, typer.Option("--shaders", help="Use an edited copy of the shaders/ folder.")]
+Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value of CONFIG; may be repeated.")]
 Json = Annotated[bool, typer.Option("--json", help="Machine-readable output.")]
 DIFFERENT = 1  # exit status of `diff` over the tolerance, and of `check` with an error
 
@@ -37,7 +37,7 @@ def passes(
     config: Config,
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for the pictures and arrays.")],
     seed: Seed = None, sequence: Sequence = None, time: Time = None, step: Step = None, shaders: Shaders = None, overrides: Overrides = None,
-    names: Annotated[Optional[list[str]], typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
+    names: Annotated[list[str] | None, typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
 ) -> None:
     """Write every buffer of one moment as a labelled PNG and .npy, and a contact sheet."""
     from blinkgl.tools.shader_debugger.commands import write_passes
@@ -65,10 +65,10 @@ def probe(
 def diff(
     config: Config,
     time: Time = None, seed: Seed = None, sequence: Sequence = None, step: Step = None, shaders: Shaders = None, overrides: Overrides = None,
-    names: Annotated[Optional[list[str]], typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
-    tolerance: Annotated[Optional[list[str]], typer.Option("--tolerance", metavar="[BUFFER=]X",
+    names: Annotated[list[str] | None, typer.Option("--pass", help="Only this buffer; may be repeated.")] = None,
+    tolerance: Annotated[list[str] | None, typer.Option("--tolerance", metavar="[BUFFER=]X",
                                                            help="Allowed error in the buffer's unit (default: per buffer).")] = None,
-    out: Annotated[Optional[str], typer.Option("--out", "-o", help="Also write diff.png and the error arrays into this folder.")] = None,
+    out: Annotated[str | None, typer.Option("--out", "-o", help="Also write diff.png and the error arrays into this folder.")] = None,
     json: Json = False,
 ) -> None:
     """Compare whole images with the float64 reference. Exit status 1 when a buffer is over its tolerance."""
@@ -83,7 +83,7 @@ def diff(
 
 @app.command()
 def check(
-    files: Annotated[Optional[list[str]], typer.Argument(help="Shader files; includes stand for all that include them (default: all).")] = None,
+    files: Annotated[list[str] | None, typer.Argument(help="Shader files; includes stand for all that include them (default: all).")] = None,
     shaders: Shaders = None,
     backend: Annotated[str, typer.Option(help="OpenGL backend: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device.")] = 0,
@@ -101,7 +101,7 @@ def check(
 @app.command()
 def show(
     program: Annotated[str, typer.Argument(help="File in the shader folder, such as label.glsl.")],
-    define: Annotated[Optional[list[str]], typer.Option("--define", "-D", metavar="NAME[=VALUE]", help="May be repeated.")] = None,
+    define: Annotated[list[str] | None, typer.Option("--define", "-D", metavar="NAME[=VALUE]", help="May be repeated.")] = None,
     stage: Annotated[str, typer.Option(help="vertex, fragment or both.")] = "both",
     active: Annotated[bool, typer.Option("--active", help="Only the lines that #if and #ifdef leave alive.")] = False,
     numbers: Annotated[bool, typer.Option("--numbers", help="File and line before each line.")] = False,

@@ -27,6 +27,7 @@ def write_passes(subject: Subject, when: When, out: str, names: list[str] | None
     """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the folder ``out``. Returns the paths.
 
     Anti-aliased as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
+    from blinkgl.io import pictures
     from blinkgl.tools.shader_debugger import picture
 
     names = [check_pass(name) for name in names] if names else list(PASSES)
@@ -39,7 +40,7 @@ def write_passes(subject: Subject, when: When, out: str, names: list[str] | None
             info, array = PASSES[name], gpu[name]
             with atomic_file(folder / f"{name}.npy") as temporary, output_errors(folder / f"{name}.npy"), temporary.open("wb") as file:
                 np.save(file, np.ascontiguousarray(array), allow_pickle=False)
-            rgb, legend = picture.picture(info.kind, array, hit=_meaningful(gpu, info))
+            rgb, legend = pictures.picture(info.kind, array, hit=_meaningful(gpu, info))
             picture.save_labelled(folder / f"{name}.png", info, rgb, legend, f"{caption}, {renderer.gl.renderer}")
             paths += [folder / f"{name}.npy", folder / f"{name}.png"]
             tiles.append((info, rgb, legend))

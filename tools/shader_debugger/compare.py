@@ -24,10 +24,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from blinkgl.errors import ConfigError
+from blinkgl.labels.grading import length
+from blinkgl.labels.label import Label, View
 from blinkgl.render import reference
 from blinkgl.scene.types import Material
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
-from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, check_pass, lookup_of, luma_of
+from blinkgl.tools.shader_debugger.moments import (
+    PASSES,
+    GpuMoment,
+    OfLabels,
+    ReferenceMoment,
+    check_pass,
+    lookup_of,
+    luma_of,
+    view_of,
+)
 from blinkgl.tools.shader_debugger.poses import displaced, pose_suspicions
 from blinkgl.tools.shader_debugger.suspicions import suspicions
 
@@ -61,31 +72,8 @@ class Quantity:
         return PASSES[self.name].source
 
 
-def length(difference: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(difference, axis=-1) if difference.ndim == 3 else np.abs(difference)
-
-
 def _absolute(g, r, gpu, ref):
     return length(g.astype(np.float64) - r)
-
-
-def _relative(g, r, gpu, ref):
-    with np.errstate(divide="ignore", invalid="ignore"):
-        error = np.abs(g / r - 1.0)
-    return np.where(np.isinf(g) & np.isinf(r), 0.0, error)
-
-
-def _different(g, r, gpu, ref):
-    return (g != r).astype(np.float64)
-
-
-def _motion(g, r, gpu, ref):
-    """px; of motions longer than 100 px, px per 100 px: float32 rounds them in proportion."""
-    return length(g.astype(np.float64) - r) / np.maximum(1.0, length(r) / 100.0)
-
-
-def _per_interval(g, r, gpu, ref):
-    return _motion(g * gpu.when.interval_s, r * gpu.when.interval_s, gpu, ref)
 
 
 def _per_step(g, r, gpu, ref):
@@ -119,25 +107,25 @@ def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
             Quantity(name, unit, 1e-4, _absolute, note=_SHADING))
 
 
-QUANTITIES = {q.name: q for q in (
+_BEFORE = (
     Quantity("local", "px of misplaced surface", 0.01, _misplaced, same_triangle=False,
              note="how far from its pixel the point that was drawn lies by the true poses"),
-    Quantity("depth", "relative", 1e-5, _relative),
-    Quantity("id", "mismatch", 0.0, _different, same_triangle=False),
-    Quantity("normals", "of a unit vector", 1e-3, _absolute),
+)
+_SHADED = (
     *_shading("luminance", "linear"),
     *_shading("colour", "linear radiance"),
     Quantity("dL_dt", "luminance over the step", 0.05, _per_step, note=_MIPS),
-    Quantity("velocity", "px per label interval", 1e-2, _per_interval),
-    Quantity("flow_forward", "px", 1e-2, _motion),
-    Quantity("flow_backward", "px", 1e-2, _motion),
-    Quantity("valid_forward", "mismatch", 0.0, _different),
-    Quantity("valid_backward", "mismatch", 0.0, _different),
-    Quantity("occluded_forward", "fraction of pixels", 1e-2, _different, "mean", False,
-             "off the band at t' as well: the mask rests on one depth sample per pixel there"),
-    Quantity("occluded_backward", "fraction of pixels", 1e-2, _different, "mean", False,
-             "off the band at t' as well: the mask rests on one depth sample per pixel there"),
-)}
+)
+
+
+def _of_label(label: Label, view: View) -> Quantity:
+    def error(g, r, gpu, ref):
+        return view.error(g, r, gpu.when.interval_s)
+
+    return Quantity(view.name, view.judged_in, view.tolerance, error, view.statistic, view.same_triangle, view.note)
+
+
+QUANTITIES = OfLabels(_of_label, _BEFORE, _SHADED)
 """In the order in which a pass makes them: the first that is wrong is where to look."""
 NEEDS_ISOTROPIC = ("luminance_level", "luminance_albedo", "colour_level", "colour_albedo", "dL_dt")
 
@@ -250,6 +238,8 @@ class Comparison:
             shaded = shaded if name == "colour" else shaded[..., 0]
             hit = ref.frame.hit if name == "luminance" else ref.frame.hit[..., None]
             return gpu[name], np.where(hit, shaded, ref[name])
+        if np.shape(gpu[name]) != np.shape(ref[name]):
+            raise TypeError(f"label '{name}': `reference` gives {np.shape(ref[name])} and not {np.shape(gpu[name])}")
         return gpu[name], ref[name]
 
     def twin(self, of: str, **more) -> np.ndarray:
@@ -283,8 +273,8 @@ class Comparison:
         graded = ~self.band
         if quantity.same_triangle:
             graded &= self.same_triangle
-        if name.startswith("occluded_"):
-            graded &= ~self._band_there(name.removeprefix("occluded_"))
+        if (found := view_of(name)) is not None and found[1].band_there:
+            graded &= ~self._band_there(found[0].towards)
         if name == "dL_dt":
             for t_ns in (self.gpu.when.before_ns, self.gpu.when.after_ns):
                 other, drawn = self.ref.at(t_ns), self.gpu.renderer.inspect(t_ns)

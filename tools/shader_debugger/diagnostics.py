@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
-from blinkgl.gl.shader import STAGES, ShaderError, ShaderSource
+from blinkgl.gl.shader import STAGES, ShaderError, ShaderSource, made_includes
 
 # Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD, Intel, Apple "ERROR: 0:12: …".
 _MESSAGES = (
@@ -100,7 +100,7 @@ def excerpt(folder, file: str, line: int, column: int = 0, around: int = 2) -> s
     try:
         lines = path.read_text(encoding="utf-8").split("\n")
     except (OSError, UnicodeDecodeError):
-        return ""
+        lines = made_includes().get(file.removeprefix("include/"), "").split("\n")
     out = []
     for i in range(max(1, line - around), min(len(lines), line + around) + 1):
         out.append(f"{'>' if i == line else ' '} {i:4d} | {lines[i - 1]}")

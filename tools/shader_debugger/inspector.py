@@ -13,13 +13,14 @@ import numpy as np
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl import ShaderLoader
 from blinkgl.gl.shader import STAGES, ShaderError, expand
+from blinkgl.io import pictures
 from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison
 from blinkgl.tools.shader_debugger.diagnostics import Diagnostic, diagnose
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment, open_reference
 from blinkgl.tools.shader_debugger.probe import _numbers, _surface_text, probe
-from blinkgl.tools.shader_debugger.questions import MAPS, SOURCES
+from blinkgl.tools.shader_debugger.questions import SOURCES
 from blinkgl.tools.shader_debugger.session import (
     Snapshot,
     Subject,
@@ -107,7 +108,7 @@ class Inspector:
         return {"config": self.subject.path, "sequence": self.subject.index, "seed": config.seed, "renderer": gl.renderer,
                 "width": scene.camera.width, "height": scene.camera.height, "t0": scene.t0_ns * 1e-9, "t1": scene.t1_ns * 1e-9,
                 "t": self.first.t_ns * 1e-9, "labels": [t * 1e-9 for t in config.time.label_times_ns],
-                "interval": config.time.interval_ns * 1e-9, "maps": MAPS, "folder": str(getattr(self.folder, "path", self.folder)),
+                "interval": config.time.interval_ns * 1e-9, "maps": pictures.MAPS, "folder": str(getattr(self.folder, "path", self.folder)),
                 "passes": [{"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source} for p in PASSES.values()]}
 
     def shaders(self) -> dict:
@@ -118,7 +119,7 @@ class Inspector:
         when, name = self._when(q["t"]), q["pass"]
         source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
         info = PASSES[name]
-        rgb, legend = picture.picture(info.kind, source[name], which=q["component"], colours=q["map"], low=q["low"], high=q["high"],
+        rgb, legend = pictures.picture(info.kind, source[name], which=q["component"], colours=q["map"], low=q["low"], high=q["high"],
                                       hit=_meaningful(source, info))
         return picture.png_bytes(rgb), legend | {"unit": info.unit}
 
@@ -132,13 +133,13 @@ class Inspector:
         which = "length" if q["component"] == "auto" else q["component"]
         with np.errstate(invalid="ignore"):
             change = np.where(a == b, 0.0, a - b)
-        values = np.abs(picture.component(change, which))
+        values = np.abs(pictures.component(change, which))
         some = values[np.isfinite(values) & (values > 0)]
         low, high = (float(v) for v in (np.quantile(some, 0.01), some.max())) if some.size else (1e-12, 1.0)
         low, high = min(low, 0.999 * high) if q["low"] is None else q["low"], high if q["high"] is None else q["high"]
         if low > 0:  # logarithmic: one flipped pixel on a silhouette would hide everything else
             values = np.where(np.isnan(values), values, np.clip(values, low, None))
-        rgb, legend = picture.picture("depth", values, which="length", colours=q["map"] or picture.ERROR_MAP, low=low, high=high)
+        rgb, legend = pictures.picture("depth", values, which="length", colours=q["map"] or picture.ERROR_MAP, low=low, high=high)
         return picture.png_bytes(rgb), legend | {"unit": PASSES[q["b"][0]].unit}
 
     def verdict(self, q: dict[str, Any]) -> dict:
@@ -174,7 +175,7 @@ class Inspector:
         except ShaderError as error:
             found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
             self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
-        except Exception as error:  # an edit that compiles but cannot be drawn with: not the tool's end
+        except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
             self.errors = [Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")]
         else:
             self.errors = []
@@ -231,7 +232,7 @@ class Worker:
     def _run(self, opened: Future) -> None:
         try:
             self.inspector.open()
-        except BaseException as error:
+        except BaseException as error:  # noqa: BLE001 - raised by whoever waits
             opened.set_exception(error)
             return
         opened.set_result(None)
@@ -239,7 +240,7 @@ class Worker:
             function, arguments, answer = job
             try:
                 answer.set_result(function(*arguments))
-            except BaseException as error:
+            except BaseException as error:  # noqa: BLE001 - raised by whoever asked
                 answer.set_exception(error)
         self.inspector.close()
 

@@ -3,17 +3,22 @@ float64. Both hand out the same names, shapes and conventions, each computed whe
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from blinkgl.errors import ConfigError
+from blinkgl.labels import LABELS, LabelRequest
+from blinkgl.labels.label import Label, View
 from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
-from blinkgl.render.renderer import LabelRequest
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.mipmaps import mipmapped_albedo
 from blinkgl.tools.shader_debugger.session import LOOKUPS as LOOKUP_PASSES, DebugRenderer, Subject, When
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -40,26 +45,54 @@ def _lookups(name: str, program: str) -> tuple[Pass, ...]:
             Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source))
 
 
-PASSES = {p.name: p for p in (
+_BEFORE = (
     Pass("triangle", "triangle of its part", "0: nothing hit", "ids", "debug.glsl OUT_TRIANGLE"),
     Pass("local", "local position", "object axes", "scalar", "debug.glsl OUT_LOCAL"),
-    Pass("depth", "depth", "world units", "depth", "label.glsl OUT_DEPTH"),
-    Pass("id", "instance id", "0: nothing hit", "ids", "label.glsl OUT_ID"),
-    Pass("normals", "normals", "camera axes", "unit", "label.glsl OUT_NORMAL"),
+)
+_SHADED = (
     *_lookups("luminance", LOOKUP_PASSES["luminance"].program),
     Pass("luminance", "luminance", "linear", "scalar", "luminance.glsl"),
     *_lookups("colour", LOOKUP_PASSES["colour"].program),
-    Pass("colour", "colour", "linear radiance", "light", "label.glsl OUT_COLOUR"),
+    Pass("colour", "colour", "linear radiance", "light", "colour.glsl"),
     Pass("log_luminance", "log luminance", "ln(L + log_eps)", "scalar", "luminance.glsl, then the logarithm"),
     Pass("dL_dt", "dL/dt", "1/s", "signed", "luminance.glsl at two times, difference quotient"),
-    Pass("velocity", "velocity", "px/s", "motion", "label.glsl OUT_VELOCITY"),
-    Pass("flow_forward", "forward flow", "px", "motion", "label.glsl OUT_FLOW_FORWARD"),
-    Pass("flow_backward", "backward flow", "px", "motion", "label.glsl OUT_FLOW_BACKWARD"),
-    Pass("valid_forward", "valid, forward", "", "mask", "label.glsl OUT_FLOW_FORWARD"),
-    Pass("valid_backward", "valid, backward", "", "mask", "label.glsl OUT_FLOW_BACKWARD"),
-    Pass("occluded_forward", "occluded, forward", "", "mask", "render/occlusion.py"),
-    Pass("occluded_backward", "occluded, backward", "", "mask", "render/occlusion.py"),
-)}
+)
+
+
+class OfLabels(Mapping[str, _T]):
+    """By the name of a buffer: one of every view of the labels that are registered now, among fixed ones, in the order in which a mistake shows:
+    where the surface is (``before``, and labels of one time), what it looks like (``shaded``), how it moves.
+
+    made : entry of a label and one of its views.   before, shaded : the fixed ones."""
+
+    def __init__(self, made: Callable[[Label, View], _T], before: Iterable[_T], shaded: Iterable[_T]):
+        self._made, self._before, self._shaded = made, tuple(before), tuple(shaded)
+
+    def _all(self) -> dict[str, _T]:
+        views = [(label.towards is None and view.kind != "motion", self._made(label, view)) for label in LABELS.values() for view in label.views]
+        surface, motion = ([one for early, one in views if early is which] for which in (True, False))
+        return {one.name: one for one in (*self._before, *surface, *self._shaded, *motion)}
+
+    def __getitem__(self, name: str) -> _T:
+        return self._all()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all())
+
+    def __len__(self) -> int:
+        return len(self._all())
+
+
+def _of_label(label: Label, view: View) -> Pass:
+    return Pass(view.name, view.title, view.unit, view.kind, f"include/labels/{label.name}.glsl" if label.buffer else f"labels/{label.name}")
+
+
+PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
+
+
+def view_of(name: str) -> tuple[Label, View] | None:
+    """The label that has this buffer, and its view; None: it is no label's."""
+    return next(((label, view) for label in LABELS.values() for view in label.views if view.name == name), None)
 
 
 def lookup_of(name: str) -> tuple[str, str]:
@@ -121,8 +154,8 @@ class GpuMoment(_Lazy):
             return {f"{of}_{key}": shown[key] for key in (*LOOKUPS, "count")}
         if name.startswith("next_depth_"):
             way = name.removeprefix("next_depth_")
-            raw = draw.raw(when.t_ns, f"FLOW_{way.upper()}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
-            return {name: raw[f"FLOW_{way.upper()}"][..., 2]}
+            raw = draw.raw(when.t_ns, f"flow_{way}", forward_ns=when.forward_ns, backward_ns=when.backward_ns)
+            return {name: raw[f"flow_{way}"][..., 2]}
         return self._labels()
 
     def _inspect(self):
@@ -132,13 +165,9 @@ class GpuMoment(_Lazy):
 
     def _labels(self):
         when = self.when
-        ask = LabelRequest("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
-        labels = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
-        out = {"depth": labels.depth, "id": labels.ids, "normals": labels.normals, "velocity": labels.velocity}
-        for way in ("forward", "backward"):
-            flow = getattr(labels, way)
-            out |= {f"flow_{way}": flow.flow, f"valid_{way}": flow.valid, f"occluded_{way}": flow.occluded}
-        return out
+        ask = LabelRequest(*(name for name, label in LABELS.items() if label.views))
+        frame = self.renderer.labels(when.t_ns, ask, when.forward_ns, when.backward_ns)
+        return {view.name: view.of(frame.values[name]) for name in ask for view in LABELS[name].views}
 
 
 class ReferenceMoment(_Lazy):
@@ -174,23 +203,20 @@ class ReferenceMoment(_Lazy):
 
     def _make(self, name):
         frame = self.frame
-        if name == "depth":
-            return {name: frame.depth}
+        if (found := view_of(name)) is not None:
+            label, view = found
+            try:
+                return {name: np.asarray(view.reference(self.scene, frame))}
+            except Exception as error:
+                raise TypeError(f"label '{label.name}': `reference` fails: {error}") from error
         if name.endswith("_level0"):
             return {name: getattr(frame, name.removesuffix("_level0"))}
-        if name == "id":
-            return {name: frame.instance}
         if name == "triangle":
             return {name: frame.triangle + 1}
         if name == "part":
             return {name: frame.part}
         if name == "local":
             return {name: np.where(frame.hit[..., None], frame.local, 0.0)}
-        if name == "velocity":
-            return {name: np.where(frame.hit[..., None], frame.velocity, 0.0)}
-        if name == "normals":
-            rotation = self.scene.camera_path.pose(self.when.t_ns)[:3, :3]
-            return {name: np.where(frame.hit[..., None], frame.normal @ rotation, 0.0)}
         if name == "log_luminance":
             return {name: np.log(self["luminance"] + self.log_eps)}
         if name == "dL_dt":
@@ -201,12 +227,7 @@ class ReferenceMoment(_Lazy):
             return {name: luma_of(self["albedo"]) if name == "luminance_albedo" else self[what]}
         if name in (*LOOKUPS, "colour", "luminance", "texture_size"):
             return self._surface(self.when.t_ns)
-        flows = {}
-        for way in ("forward", "backward"):
-            flow = getattr(frame, way)
-            flows |= {f"flow_{way}": np.where(flow.valid[..., None], flow.flow, 0.0), f"valid_{way}": flow.valid,
-                      f"occluded_{way}": flow.occluded, f"next_depth_{way}": np.where(frame.hit, flow.depth, 0.0)}
-        return flows
+        return {f"next_depth_{way}": np.where(frame.hit, getattr(frame, way).depth, 0.0) for way in ("forward", "backward")}
 
     def _surface(self, t_ns: int) -> dict[str, np.ndarray]:
         frame, scene = self.at(t_ns), self.scene

@@ -5,110 +5,18 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from blinkgl.errors import ConfigError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.colour import flow_colour, flow_wheel
-from blinkgl.srgb import srgb_from_linear
+from blinkgl.io.colour import flow_wheel
+from blinkgl.io.pictures import map_scalar
 from blinkgl.tools.shader_debugger.moments import PASSES, Pass
-from blinkgl.tools.shader_debugger.questions import MAPS
 
-SCALAR_MAP, SIGNED_MAP, ERROR_MAP = "viridis", "RdBu_r", "inferno"
-EMPTY = np.array([40, 40, 40], np.uint8)  # nothing hit, or not a number
+ERROR_MAP = "inferno"
 INK, PAPER, MUTED = "#1f2933", "#ffffff", "#64748b"
-
-
-def finite_range(values: np.ndarray, signed: bool = False, share: float = 0.005) -> tuple[float, float]:
-    """A range for display: the finite values without the outermost ``share`` on either side; symmetric when signed."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 1.0
-    low, high = (float(v) for v in np.quantile(finite, [share, 1 - share]))
-    if signed:
-        low, high = -max(abs(low), abs(high)), max(abs(low), abs(high))
-    if not high > low:
-        low, high = low - 0.5 * (abs(low) or 1.0), high + 0.5 * (abs(high) or 1.0)
-    return low, high
-
-
-def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool = False) -> np.ndarray:
-    """(H, W, 3) uint8; not finite: dark grey. log : equal ratios get equal steps of colour."""
-    if log and low > 0:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return map_scalar(np.log(values), name, float(np.log(low)), float(np.log(high)))
-    if name not in MAPS:
-        raise ConfigError("unknown colour map", where="map", value=name, accepted="one of " + ", ".join(MAPS))
-    with np.errstate(invalid="ignore", over="ignore"):
-        scaled = np.clip((values.astype(np.float64) - low) / ((high - low) or 1.0), 0.0, 1.0)
-    rgb = (matplotlib.colormaps[name](np.nan_to_num(scaled))[..., :3] * 255).round().astype(np.uint8)
-    rgb[~np.isfinite(values)] = EMPTY
-    return rgb
-
-
-def id_colours(ids: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: distinct hues by the golden ratio, dark grey for 0; the same number always has the same colour."""
-    numbers = ids.astype(np.int64)
-    hue = (numbers * 0.61803398875) % 1.0
-    value = 0.62 + 0.38 * ((numbers * 0.7548776662) % 1.0)
-    rgb = matplotlib.colors.hsv_to_rgb(np.stack([hue, np.full(hue.shape, 0.62), value], axis=-1))
-    out = (rgb * 255).round().astype(np.uint8)
-    out[numbers == 0] = EMPTY
-    return out
-
-
-def component(array: np.ndarray, which: str) -> np.ndarray:
-    """(H, W) of (H, W[, C]): a component, or the length of the vector."""
-    if array.ndim == 2:
-        return array
-    if which in ("auto", "length"):
-        return np.linalg.norm(array.astype(np.float64), axis=-1)
-    k = "xyzw".find(which) if len(which) == 1 else -1
-    if not 0 <= k < array.shape[2]:
-        raise ConfigError("no such component", where="component", value=which, accepted="one of auto, length, " + ", ".join("xyzw"[: array.shape[2]]))
-    return array[..., k]
-
-
-def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str | None = None, low: float | None = None,
-            high: float | None = None, hit: np.ndarray | None = None) -> tuple[np.ndarray, dict]:
-    """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high", "log"}, {"kind": "wheel", "high"} or {"kind": kind}.
-
-    kind : as in :class:`Pass`.   which : component of a vector; "auto" takes the kind's own way.
-    hit : (H, W) bool, where scalars mean something (they set the range, the rest is dark grey)."""
-    if array.dtype == bool or kind == "mask":
-        return np.where(array[..., None], np.uint8(245), np.uint8(25)).repeat(3, axis=-1), {"kind": "mask"}
-    if which == "auto" and colours is None:
-        if kind == "ids":
-            return id_colours(array), {"kind": "ids"}
-        if kind == "light":
-            top = high if high is not None else 1.0
-            return (srgb_from_linear(array / top) * 255).round().astype(np.uint8), {"kind": "light", "high": top}
-        if kind == "unit":
-            rgb = np.clip(127.5 + 127.5 * array, 0, 255).round().astype(np.uint8)
-            rgb[(array == 0).all(axis=-1)] = EMPTY
-            return rgb, {"kind": "unit"}
-        if kind == "uv":
-            with np.errstate(invalid="ignore"):
-                fraction = np.nan_to_num(array % 1.0)
-            rgb = np.concatenate([fraction * 255, np.full((*array.shape[:2], 1), 60)], axis=-1).round().astype(np.uint8)
-            return rgb, {"kind": "uv"}
-        if kind == "motion":
-            speed = component(array, "length")
-            top = high if high is not None else finite_range(speed if hit is None or not hit.any() else speed[hit])[1]
-            return flow_colour(array, top, hit), {"kind": "wheel", "high": float(top)}
-    values = component(np.asarray(array), which).astype(np.float64)
-    if hit is not None:
-        values = np.where(hit, values, np.nan)
-    signed = kind == "signed" or (kind in ("motion", "unit") and which in ("x", "y", "z"))
-    name = colours or (SIGNED_MAP if signed else SCALAR_MAP)
-    auto = finite_range(values, signed)
-    low, high = auto[0] if low is None else low, auto[1] if high is None else high
-    log = kind == "depth" and low > 0
-    return map_scalar(values, name, low, high, log), {"kind": "bar", "map": name, "low": float(low), "high": float(high), "log": log}
 
 
 def png_bytes(rgb: np.ndarray) -> bytes:
@@ -151,7 +59,7 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
         for spine in axes.spines.values():
             spine.set_visible(False)
         return
-    x, y, w, h = box
+    x, y, _, h = box
     text = {"mask": "white: yes, black: no", "ids": "one colour per number", "unit": "r, g, b = x, y, z; grey is 0",
             "uv": "r, g = fractional part of u, v", "light": f"sRGB, white = {legend.get('high', 1):.3g}"}.get(kind, "")
     if kind == "wheel":

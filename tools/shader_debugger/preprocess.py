@@ -156,7 +156,7 @@ class _Reader:
         left = self.unary(needed)
         while self.at < len(self.tokens) and _PRECEDENCE.get(self.tokens[self.at], -1) >= lowest:
             operator = self.next()
-            matters = needed and not (operator == "&&" and left == 0 or operator == "||" and left != 0)
+            matters = needed and not ((operator == "&&" and left == 0) or (operator == "||" and left != 0))
             right = self.binary(_PRECEDENCE[operator] + 1, matters)
             left = _apply(operator, left, right, matters)
         return left

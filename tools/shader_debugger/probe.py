@@ -11,8 +11,6 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison
 from blinkgl.tools.shader_debugger.moments import PASSES, GpuMoment, ReferenceMoment
 
-PX = ("flow_forward", "flow_backward")
-
 
 def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
     """Largest |gpu - ref| in units of float32's spacing at ref (per component); inf where one is not finite."""
@@ -61,12 +59,12 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
     g, r = gpu[name][y, x], ref[name][y, x]
     row = {"name": name, "title": PASSES[name].title, "unit": PASSES[name].unit, "gpu": g.tolist(), "reference": r.tolist(),
            "error": None, "error_unit": "", "ulps": None, "ok": None, "note": ""}
-    if g.dtype == bool or name in ("id", "triangle"):
+    if PASSES[name].kind in ("mask", "ids"):
         row |= {"error": float(g != r), "error_unit": "mismatch"}
     else:
         row["ulps"] = ulps(g, r)
         row |= {"error": float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if row["ulps"] else 0.0,
-                "error_unit": "px" if name in PX else PASSES[name].unit}
+                "error_unit": PASSES[name].unit}
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
@@ -160,11 +158,11 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
         return f"outside the image at t' (x' = {xt:.3f}, y' = {yt:.3f})"
     if w < renderer.scene.camera.near:
         return f"in front of the near plane at t' (Z' = {w:.6g} < {renderer.scene.camera.near:g})"
-    there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "DEPTH", "ID")
+    there = gpu.renderer.raw(getattr(gpu.when, f"{way}_ns"), "depth", "ids")
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
-    other = int(there["ID"][yn, xn])
+    other = int(there["ids"][yn, xn])
     names = {thing.instance_id: thing.name for thing in renderer.scene.objects}
-    return (f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth {there['DEPTH'][yn, xn]:.6g}, "
+    return (f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth {there['depth'][yn, xn]:.6g}, "
             f"the point is at Z' = {w:.6g}")
 
 
@@ -174,8 +172,8 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
 def as_text(found: dict) -> str:
     """The probe as fixed-width text."""
     x, y = found["pixel"]
-    lines = [f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
-             f"{found['times_s']['backward']:.9g} s (backward)"]
+    lines = [(f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
+              f"{found['times_s']['backward']:.9g} s (backward)")]
     if found["band"]:
         lines.append("in the silhouette band: the pixel's centre may fall on either side of an edge, so nothing is graded here")
     lines += ["", f"{'':3}{'buffer':<20} {'GPU':<34} {'reference (float64)':<34} {'error':>10} {'ULPs':>9}  unit"]

@@ -9,13 +9,13 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from blinkgl.errors import ConfigError
+from blinkgl.io.pictures import MAPS
 from blinkgl.tools.shader_debugger.moments import check_pass
 
 LONGEST = 2000  # characters of a query
 LARGEST = 1e30  # ends of a colour scale: far above every buffer, and their difference is still a number
 SOURCES = ("gpu", "reference")
 COMPONENTS = ("auto", "length", "x", "y", "z", "w")
-MAPS = ("viridis", "turbo", "inferno", "gray", "RdBu_r", "coolwarm")
 
 Reader = Callable[[str, str], Any]  # (parameter's name, its text; "" when not given) -> value
 

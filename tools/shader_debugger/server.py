@@ -22,12 +22,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler
 from importlib import resources
+from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from blinkgl.errors import BlinkGLError, GLError
 from blinkgl.tools.shader_debugger.inspector import Inspector, Worker
 from blinkgl.tools.shader_debugger.questions import ROUTES, read_query
 from blinkgl.tools.shader_debugger.session import Subject, When
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
 
 PAGE = {"/": ("index.html", "text/html; charset=utf-8"), "/app.js": ("app.js", "text/javascript; charset=utf-8"),
         "/style.css": ("style.css", "text/css; charset=utf-8")}
@@ -76,9 +80,9 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "BlinkGL", ""
     timeout = SEND_S
-    server: "_Server"
+    server: _Server
 
-    def __init__(self, header: bytes, connection: socket.socket, address, server: "_Server"):
+    def __init__(self, header: bytes, connection: socket.socket, address, server: _Server):
         self._header = header
         super().__init__(connection, address, server)
 
@@ -104,7 +108,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._error(400, str(error))
         except OSError:  # a browser that left in the middle, or takes for ever
             pass
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001 - said in the answer; the server goes on
             self._error(500, f"{type(error).__name__}: {error}")
 
     do_HEAD = do_GET
@@ -134,7 +138,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _wait(self, query: dict) -> None:
         worker = self.server.worker
         if not self.server.waiting.acquire(blocking=False):
-            return self._error(503, f"{MOST_WAITING} pages wait already")
+            self._error(503, f"{MOST_WAITING} pages wait already")
+            return
         try:
             until = time.monotonic() + WAIT_S
             while (now := worker.wait(query["version"], LOOK_S)) == query["version"] and time.monotonic() < until:
@@ -303,6 +308,11 @@ class DebugServer:
         host = self._server.bound
         return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
 
+    @property
+    def folder(self) -> Traversable:
+        """Where the shaders are read."""
+        return self._server.worker.inspector.folder
+
     def __enter__(self) -> DebugServer:
         return self
 
@@ -324,7 +334,7 @@ def _listen(host: str, port: int) -> _Server:
 def serve(subject: Subject, when: When, shaders: str | None, host: str, port: int, step_us: float | None = None) -> None:
     """Serves until interrupted."""
     with DebugServer(subject, when, shaders, host, port, step_us) as server:
-        folder = server._server.worker.inspector.folder
+        folder = server.folder
         print(f"{server.url}  (Ctrl-C ends it; watching {getattr(folder, 'path', folder)})", flush=True)
         if host not in LOCAL:
             print("anybody who reaches this address can look: there is no password", flush=True)

@@ -20,7 +20,7 @@ from blinkgl.gl.shader import ShaderError, expand, shader_folder
 from blinkgl.render.painter import Painter
 from blinkgl.render.passes import Colour, Geometry, Luminance, Output, ScenePass
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.build import build_scene, check_assets
+from blinkgl.scene.build import check_assets, sequence_scene
 from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.types import Scene
 
@@ -72,8 +72,7 @@ def open_subject(config: str, *, seed: int | None = None, sequence: int | None =
     index = template.sequence(0).output.first_index if sequence is None else sequence
     one = template.sequence(index)
     check_assets(one.scene, template.base, one.output.split)
-    scene = build_scene(one.scene, one.camera, one.time.t0_ns, one.time.t1_ns, split=one.output.split, seed=one.seed, sequence=index,
-                        base=template.base)
+    scene = sequence_scene(one, index, template.base)
     # Here, and not in each renderer: the rays of the reference have to meet the triangles that are drawn.
     scene = at_level_of_detail(scene, one.render.lod)
     one = one.model_copy(update={"render": one.render.model_copy(update={"lod": LodConfig()})})
@@ -187,7 +186,7 @@ class Snapshot:
 def files_of(folder) -> list[Path]:
     """Every shader file below ``folder``, for watching and for messages."""
     root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
-    return sorted([*root.glob("*.glsl"), *(root / "include").glob("*.glsl")])
+    return sorted([*root.glob("*.glsl"), *(root / "include").rglob("*.glsl")])
 
 
 class _Nothing:
@@ -291,7 +290,7 @@ class DebugRenderer(Renderer):
                 "count": albedo[..., 3]}
 
     def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
-        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth: DEPTH, ID, FLOW_FORWARD …"""
+        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
         frame = self.draw(Geometry(names), t_ns, ends)
         return {name: frame.read(name) for name in names}

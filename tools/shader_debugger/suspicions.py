@@ -13,7 +13,7 @@ import numpy as np
 from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
 from blinkgl.srgb import srgb_from_linear
-from blinkgl.tools.shader_debugger.moments import lookup_of
+from blinkgl.tools.shader_debugger.moments import PASSES, lookup_of
 
 EXPLAINED = 0.9  # of the pixels that are wrong
 CLOSE = 1e-3  # relative: a candidate need not match to the last bit, other errors may be there, too
@@ -28,7 +28,7 @@ def suspicions(comparison, report) -> list[str]:
     comparison : of the moment.   report : of one buffer that is over its tolerance."""
     name = report.quantity.name
     gpu, right = comparison.pair(name)
-    if np.asarray(right).dtype == bool or name == "id":
+    if PASSES[name].kind in ("mask", "ids"):
         return []
     wrong = report.graded & (report.errors > report.limit)
     found = _explain(comparison, report, gpu, right, wrong)
@@ -78,7 +78,7 @@ Candidates = Iterator[tuple[str, np.ndarray]]
 def _candidates(comparison, report, r, g, on) -> Candidates:
     """(text, what the GPU would have written) pairs; r, g : (N[, C]) at the pixels ``on``."""
     name = report.quantity.name
-    of, what = lookup_of(name)
+    _, what = lookup_of(name)
     specific = {"uv": _uv, "level": _level, "albedo": _albedo, "light": _light}.get(what) or {
         "depth": _depth, "normals": _normals, "luminance": _shaded, "colour": _shaded, "velocity": _velocity,
         "flow_forward": _flow, "flow_backward": _flow}.get(name)

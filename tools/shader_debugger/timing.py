@@ -24,9 +24,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from blinkgl.labels import LABELS, LabelRequest, asked_for
+from blinkgl.labels import LABELS, asked_for
 from blinkgl.render.antialiasing import samples_of
-from blinkgl.render.labels import buffers_of
 from blinkgl.render.passes import Geometry, Pass
 from blinkgl.scene.types import Scene
 from blinkgl.tools.shader_debugger.session import DebugPainter, DebugRenderer, Subject, When, open_renderer
@@ -172,11 +171,11 @@ def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
             out["velocity (timeline)"] = (lambda r: r.velocity(when.t_ns, every), 1 / every)
     if "images" in asked or config.preview.enabled:
         out["colour"] = (lambda r: r.colour(when.t_ns), samples_of(render.image_antialiasing).grid)
-    names, ends = buffers_of(asked), {"forward": when.forward_ns, "backward": when.backward_ns}
+    names, ends = asked.buffers, {"forward": when.forward_ns, "backward": when.backward_ns}
     if names:
         out["labels"] = (lambda r: r.draw(Geometry(names), when.t_ns, ends), 1)
     if asked.there:
-        there = buffers_of(LabelRequest(*asked.there))
+        there = asked.there
         who = ", ".join(dict.fromkeys(LABELS[name].said for name in asked if LABELS[name].there))
         out[f"{who}, per direction"] = (lambda r: r.draw(Geometry(there), when.forward_ns), 1)
     return out
@@ -222,10 +221,10 @@ def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, r
 
 
 def as_text(result: dict) -> str:
-    lines = [f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x {result['height']} px, "
-             f"{result['renderer']}, median of {result['repeat']}", "",
-             f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} {'fragments':>10} "
-             f"{'overdraw':>8}"]
+    lines = [(f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x {result['height']} px, "
+              f"{result['renderer']}, median of {result['repeat']}"), "",
+             (f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} {'fragments':>10} "
+              f"{'overdraw':>8}")]
     for p in result["passes"]:
         lines.append(f"{p['pass']:<26} {p['gpu_ms']:>8.3f} {p['wall_ms']:>8.3f} {p['vertex_ms']:>8.3f} {p['fragment_ms']:>8.3f} {p['draws']:>6} "
                      f"{p['triangles']:>9} {p['fragments']:>10} {p['overdraw']:>8.2f}")

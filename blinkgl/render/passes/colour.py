@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.passes.base import Output, ScenePass, Shot
 
 if TYPE_CHECKING:
     from blinkgl.render.painter import Painter, Uniforms
-    from blinkgl.render.resources import DrawItem, Kind
+    from blinkgl.render.resources import DrawItem
     from blinkgl.scene.types import Scene
 
 
@@ -19,14 +19,11 @@ class Colour(ScenePass):
     """Output "colour", (H, W, 3) float32 linear radiance, at ``samples``."""
 
     samples: Samples = Samples()
-    program: ClassVar[str] = "label.glsl"
+    program: ClassVar[str] = "colour.glsl"
     outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
 
     def background(self, scene: Scene) -> tuple[float, ...]:
         return (scene.background,) * 3
-
-    def defines(self, kind: Kind | None) -> dict[str, Any]:
-        return {"OUT_COLOUR": 0}
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         uniforms["base_color"].value = tuple(item.material.base_color)

@@ -1,84 +1,88 @@
-"""The label pass: any subset of the buffers that ground truth is made of, drawn in one go."""
+"""The label pass: any subset of the labels that the shader draws, in one go."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from blinkgl.render.matrices import rows_xyw_bytes
+from blinkgl.gl.shader import MADE
+from blinkgl.labels import LABELS
+from blinkgl.labels.shader import define_of, includes
 from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
 
 if TYPE_CHECKING:
     from blinkgl.render.painter import Painter, Uniforms
     from blinkgl.render.resources import DrawItem, Kind
 
-
-class Buffer(NamedTuple):
-    """What label.glsl writes under OUT_<name>. set : gives it its uniforms, for each item."""
-
-    name: str
-    format: str
-    set: Callable[[Uniforms, DrawItem, Shot], None] | None = None
-
-
-def _id(uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-    uniforms["instance_id"].value = shot.scene.objects[item.object_index].instance_id
-
-
-def _normal(uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-    rotation = shot.moment.T_cam_obj[item.object_index, :3, :3]
-    uniforms["camera_from_local"].write(np.ascontiguousarray(rotation.T, np.float32).tobytes())
-
-
-def _velocity(uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-    uniforms["rate"].write(rows_xyw_bytes(shot.moment.rates.mvp[item.object_index]))
-    uniforms["image_size"].value = shot.size
-
-
-def _flow(way: str) -> Callable[[Uniforms, DrawItem, Shot], None]:
-    def set_flow(uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-        index = item.object_index
-        difference = shot.ends[way].mvp[index] - shot.moment.mvp[index]
-        uniforms[f"difference_{way}"].write(rows_xyw_bytes(difference))
-        uniforms["image_size"].value = shot.size
-
-    return set_flow
-
-
-BUFFERS = {buffer.name: buffer for buffer in (
-    Buffer("DEPTH", "R32F"),
-    Buffer("ID", "R32UI", _id),
-    Buffer("NORMAL", "RGBA32F", _normal),
-    Buffer("VELOCITY", "RG32F", _velocity),
-    Buffer("FLOW_FORWARD", "RGBA32F", _flow("forward")),
-    Buffer("FLOW_BACKWARD", "RGBA32F", _flow("backward")),
-)}
+MADE.append(includes)
+_OF_THE_PASS = {"", "mvp", "inverse_depths", "image_size"}
 
 
 @dataclass(frozen=True)
 class Geometry(ScenePass):
-    """Outputs of these names, of :data:`BUFFERS`, as the shader writes them; 0 where nothing is hit. One sample, at the pixel's centre.
-    Flow wants the moment at its other end, "forward" or "backward"."""
+    """Outputs by the names of their labels, as the shader writes them; 0 where nothing is hit. One sample, at the pixel's centre.
+    Labels that lead to another time want the moment there, "forward" or "backward".
 
-    names: tuple[str, ...] = ("DEPTH",)
+    Raises TypeError, at the first frame, for a label whose ``uniforms`` are not those of its ``glsl``."""
+
+    names: tuple[str, ...] = ("depth",)
     program: ClassVar[str] = "label.glsl"
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        return tuple(Output(name, BUFFERS[name].format) for name in self.names)
+        return tuple(Output(name, LABELS[name].buffer) for name in self.names)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        return {f"OUT_{name}": i for i, name in enumerate(self.names)}
+        return {define_of(name): i for i, name in enumerate(self.names)}
 
-    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-        for name in self.names:
-            if (set_buffer := BUFFERS[name].set) is not None:
-                set_buffer(uniforms, item, shot)
+    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        programs, values = painter.programs(self), self._values(shot)
+        checked = set()
+        for item in self.items(shot.moment) if items is None else items:
+            uniforms = programs[item.kind]
+            if item.kind not in checked:
+                checked.add(item.kind)
+                self._check(uniforms, values)
+            painter.place(uniforms, item, shot.moment)
+            if "image_size" in uniforms:
+                uniforms["image_size"].value = shot.size
+            for name, (_, rows) in values.items():
+                uniforms[name].write(rows[item.object_index])
+            painter.draw(uniforms, item)
+
+    def _values(self, shot: Shot) -> dict[str, tuple[str, list[bytes]]]:
+        """Uniform -> the label that gives it, and its bytes for each object."""
+        count, values = len(shot.scene.objects), {}
+        for label in (LABELS[name] for name in self.names):
+            given = label.uniforms(shot)
+            for name, array in given.items():
+                array = np.asarray(array)
+                if array.ndim not in (1, 2, 3) or len(array) != count:
+                    raise TypeError(f"label '{label.name}': `uniforms` gives '{name}' of shape {array.shape}, which does not begin with the {count} objects")
+                if name in values or name in _OF_THE_PASS:
+                    raise TypeError(f"label '{label.name}': `uniforms` gives '{name}', which {values[name][0] if name in values else 'the pass'} gives, too")
+                columns = np.swapaxes(array, 1, 2) if array.ndim == 3 else array  # GLSL's matrices are stored by columns
+                kind = {"u": np.uint32, "i": np.int32}.get(array.dtype.kind, np.float32)
+                values[name] = (label.name, [row.tobytes() for row in np.ascontiguousarray(columns, kind)])
+        return values
+
+    def _check(self, uniforms: Uniforms, values: dict[str, tuple[str, list[bytes]]]) -> None:
+        """Every uniform that the program has is given, and none that it has not (of shaders that somebody is editing it may have fewer)."""
+        if missing := uniforms.keys() - values.keys() - _OF_THE_PASS:
+            name = min(missing)
+            whose = [f"'{one}'" for one in self.names if name in (LABELS[one].glsl or "")]
+            raise TypeError(f"label {whose[0] if len(whose) == 1 else ' or '.join(map(repr, self.names))}: `uniforms` gives no '{name}'")
+        for name, (label, _) in values.items():
+            try:
+                uniforms[name]
+            except KeyError:
+                raise TypeError(f"label '{label}': `uniforms` gives '{name}', which its `glsl` does not use") from None
 
     @classmethod
     def every_kind(cls) -> Iterator[Pass]:
-        return (cls(names) for count in range(1, len(BUFFERS) + 1) for names in combinations(BUFFERS, count))
+        drawn = [name for name, label in LABELS.items() if label.buffer]
+        return (cls(names) for count in range(1, len(drawn) + 1) for names in combinations(drawn, count))

@@ -24,14 +24,14 @@ class Velocity(ScenePass):
 
     every: int = 1
     moving_only: bool = False
-    program: ClassVar[str] = "label.glsl"
+    program: ClassVar[str] = "velocity.glsl"
     outputs: ClassVar[tuple[Output, ...]] = (Output("velocity", "RG32F"),)
 
     def items(self, moment: Moment) -> list[DrawItem]:
         return [item for item in moment.visible if item.moves] if self.moving_only else moment.visible
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        return {"OUT_VELOCITY": 0} if self.every == 1 else {"OUT_VELOCITY": 0, "SMALL": 1}
+        return {} if self.every == 1 else {"SMALL": 1}
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         width, height = shot.size

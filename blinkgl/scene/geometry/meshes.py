@@ -3,6 +3,7 @@ coordinates, and known to be closed or not."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -325,7 +326,7 @@ def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
     return replace(mesh, vertices=mesh.vertices * scale)
 
 
-def bounds(meshes) -> tuple[np.ndarray, np.ndarray]:
+def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
     """((3,), (3,)) corners of the common bounding box."""
     return (np.min([m.vertices.min(axis=0) for m in meshes], axis=0), np.max([m.vertices.max(axis=0) for m in meshes], axis=0))
 

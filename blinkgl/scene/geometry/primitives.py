@@ -11,10 +11,13 @@ import hashlib
 import inspect
 import itertools
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import wraps
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from blinkgl.config.scene import PRIMITIVE_KINDS
 from blinkgl.errors import AssetError
@@ -40,17 +43,21 @@ _LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisio
 _MAX_SEGMENTS = 4096
 
 
-def parameter_hash(*parts) -> str:
+Surface = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""positions (V, 3), normals (V, 3), uvs (V, 2), faces (F, 3)"""
+
+
+def parameter_hash(*parts: object) -> str:
     """32 hex digits, stable across platforms and load order."""
     return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
 
 
-def _primitive(build):
+def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
     """Checks the parameters, builds, and stamps name, hash and closedness."""
     signature = inspect.signature(build)
 
     @wraps(build)
-    def made(**parameters) -> Mesh:
+    def made(**parameters: Any) -> Mesh:
         where = build.__name__
         unknown = set(parameters) - set(signature.parameters)
         if unknown:
@@ -93,7 +100,7 @@ def _lattice(columns: int, rows: int) -> np.ndarray:
     return np.stack([np.stack([i, right, up + 1], 1), np.stack([i, up + 1, up], 1)], axis=1).reshape(-1, 3)
 
 
-def square(origin, right, up, columns: int, rows: int):
+def square(origin: ArrayLike, right: ArrayLike, up: ArrayLike, columns: int, rows: int) -> Surface:
     """Flat parallelogram seen counter-clockwise; uv (0, 0) at its top left."""
     s, t = (a.ravel() for a in np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)))
     origin, right, up = (np.asarray(a, float) for a in (origin, right, up))
@@ -136,7 +143,7 @@ def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0):
 
 
 @_primitive
-def cuboid(extents=(1.0, 1.0, 1.0), subdivisions=1):
+def cuboid(extents: Sequence[float] = (1.0, 1.0, 1.0), subdivisions: int = 1) -> Surface:
     """Box of edge lengths ``extents``; the texture once on each side."""
     x, y, z = np.array(extents) / 2
     n = subdivisions
@@ -147,13 +154,13 @@ def cuboid(extents=(1.0, 1.0, 1.0), subdivisions=1):
 
 
 @_primitive
-def grid(width=1.0, depth=1.0, subdivisions=1):
+def grid(width: float = 1.0, depth: float = 1.0, subdivisions: int = 1) -> Surface:
     """Rectangle in z = 0 facing +z, ``width`` in x and ``depth`` in y; the texture once on it. Not closed."""
     return square((-width / 2, -depth / 2, 0), (width, 0, 0), (0, depth, 0), subdivisions, subdivisions)
 
 
 @_primitive
-def sphere(radius=0.5, segments=32, rings=16):
+def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
     """Sphere by longitude and latitude."""
     latitude = np.linspace(-math.pi / 2, math.pi / 2, rings + 1)
     direction = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
@@ -162,7 +169,7 @@ def sphere(radius=0.5, segments=32, rings=16):
 
 
 @_primitive
-def icosphere(radius=0.5, subdivisions=3):
+def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
     """Sphere of 20 * 4**subdivisions nearly equal triangles, box-projected texture."""
     g = (1 + math.sqrt(5)) / 2
     points = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g),
@@ -184,7 +191,7 @@ def icosphere(radius=0.5, subdivisions=3):
 
 
 @_primitive
-def cylinder(radius=0.5, height=1.0, segments=32, rings=2):
+def cylinder(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: int = 2) -> Surface:
     """Circular cylinder along z."""
     t = np.linspace(0, 1, rings)
     profile = np.stack([np.full(rings, radius), (t - 0.5) * height], axis=1)
@@ -193,7 +200,7 @@ def cylinder(radius=0.5, height=1.0, segments=32, rings=2):
 
 
 @_primitive
-def cone(radius=0.5, height=1.0, segments=32, rings=4):
+def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: int = 4) -> Surface:
     """Circular cone with its tip at z = height/2."""
     t = np.linspace(0, 1, rings)
     profile = np.stack([radius * (1 - t), (t - 0.5) * height], axis=1)
@@ -208,7 +215,7 @@ def cone(radius=0.5, height=1.0, segments=32, rings=4):
 
 
 @_primitive
-def torus(radius=0.35, tube=0.15, segments=32, tube_segments=16):
+def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_segments: int = 16) -> Surface:
     """Ring about z: ``radius`` to the middle of a tube of radius ``tube`` (< radius)."""
     if tube >= radius:
         raise AssetError("bad parameter", where="torus.tube", value=tube, accepted=f"less than radius {radius:g}")
@@ -219,7 +226,7 @@ def torus(radius=0.35, tube=0.15, segments=32, tube_segments=16):
 
 
 @_primitive
-def capsule(radius=0.25, height=0.5, segments=32, rings=16):
+def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
     """Cylinder of ``height`` between two half spheres; ``rings`` rows of the two together."""
     half = max(rings // 2, 1)
     latitude = np.linspace(0, math.pi / 2, half + 1)
@@ -232,7 +239,7 @@ def capsule(radius=0.25, height=0.5, segments=32, rings=16):
 
 
 @_primitive
-def prism(sides=6, radius=0.5, height=1.0):
+def prism(sides: int = 6, radius: float = 0.5, height: float = 1.0) -> Surface:
     """Upright prism over a regular polygon of circumradius ``radius``, flat-shaded; the texture once on each side."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)
@@ -242,7 +249,7 @@ def prism(sides=6, radius=0.5, height=1.0):
 
 
 @_primitive
-def pyramid(sides=4, radius=0.5, height=1.0):
+def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface:
     """Pyramid over a regular polygon, flat-shaded; each side carries the texture's triangle."""
     angle = 2 * math.pi * np.arange(sides + 1) / sides
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, -height / 2)], axis=1)

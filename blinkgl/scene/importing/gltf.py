@@ -20,6 +20,7 @@ from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from blinkgl.errors import AssetError
@@ -87,7 +88,7 @@ class Node:
     scale: tuple
     matrix: np.ndarray | None
 
-    def local(self, translation=None, rotation=None, scale=None) -> np.ndarray:
+    def local(self, translation: ArrayLike | None = None, rotation: ArrayLike | None = None, scale: ArrayLike | None = None) -> np.ndarray:
         """(4, 4) transform to the parent, with animated values in place of the resting ones."""
         if self.matrix is not None:
             return self.matrix
@@ -427,8 +428,10 @@ def buffer_contents(path: Path, data: bytes) -> list[bytes]:
         return [_fetch(uri, path, "buffer") for uri in uris if uri and not uri.startswith("data:")]
 
 
-def to_linear(srgb) -> tuple[float, float, float]:
-    return tuple(float(c) for c in linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1)))
+def to_linear(srgb: ArrayLike) -> tuple[float, float, float]:
+    """Linear light of an sRGB colour (3,), what lies outside 0 to 1 cut off."""
+    r, g, b = (float(c) for c in linear_from_srgb(np.clip(np.asarray(srgb, float), 0, 1)))
+    return r, g, b
 
 
 def _parse(data: bytes, where: str) -> tuple[dict, bytes]:

@@ -12,6 +12,7 @@ import re
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import trimesh
@@ -192,7 +193,7 @@ def _material(visual, max_texture: int, where: str, omissions: Omissions,
     return Material(texture=texture, base_color=colour, double_sided=bool(getattr(material, "doubleSided", False)))
 
 
-def texture_of(image, max_texture: int, where: str) -> Texture:
+def texture_of(image: Image.Image, max_texture: int, where: str) -> Texture:
     """A Pillow image that somebody else opened, as a texture. AssetError when its file turns out to be broken."""
     with reading("image", where):
         pixels = np.ascontiguousarray(np.asarray(image.convert("RGB")))
@@ -259,13 +260,13 @@ class FolderResolver(trimesh.resolvers.Resolver):
                 if asked:
                     self.omissions.add(what)
 
-    def write(self, name, data):
+    def write(self, name: str, data: bytes) -> NoReturn:
         raise AssetError("a mesh loader wanted to write", where=self.where, value=name)
 
-    def namespaced(self, namespace):
+    def namespaced(self, namespace: str) -> FolderResolver:
         return FolderResolver(gltf.inside(self.folder, namespace, self.where), self.where, self.kind, self.omissions)
 
-    def keys(self):
+    def keys(self) -> list[str]:
         return [p.name for p in self.folder.iterdir() if p.suffix.lower() in (".mtl", *IMAGE_SUFFIXES)]
 
 

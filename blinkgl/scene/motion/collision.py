@@ -74,7 +74,7 @@ class CollisionResult:
     camera_path: PosePath
     events: tuple[Collision, ...]
     at_start: tuple[Collision, ...]
-    distance_queries: int = 0
+    distance_queries: int
 
     @property
     def log(self) -> tuple[str, ...]:

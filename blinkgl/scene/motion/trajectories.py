@@ -53,7 +53,7 @@ class FreeSpace:
     centres: ArrayLike = field(default_factory=lambda: np.zeros((0, 3)))
     radii: ArrayLike = field(default_factory=lambda: np.zeros(0))
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name, shape in (("low", (3,)), ("high", (3,)), ("centres", (-1, 3)), ("radii", (-1,))):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64).reshape(shape))
         if not (self.low <= self.high).all() or len(self.centres) != len(self.radii):

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,6 +33,9 @@ from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObj
 from blinkgl.scene.worlds.explicit import motion_path
 from blinkgl.scene.worlds.pool import resolve
 from blinkgl.scene.worlds.random_world import make_light
+
+if TYPE_CHECKING:
+    import trimesh
 
 CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])    # its own inverse
 _ANIMATION_STEP = 1 / 60                         # s between the samples that a spline is laid through
@@ -96,7 +100,7 @@ def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, c
                   document.omissions)
 
 
-def from_trimesh(scene, camera: CameraModel | None = None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
+def from_trimesh(scene: trimesh.Scene | trimesh.Trimesh, camera: CameraModel | None = None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
                  near: float = 0.05, light: Light = Light(), background: float = 0.2, max_faces: int = 5_000_000,
                  max_texture: int = 2048) -> Scene:
     """A ``trimesh.Scene``.
@@ -132,7 +136,7 @@ def from_trimesh(scene, camera: CameraModel | None = None, t0_ns: int = 0, t1_ns
     return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, log, omissions)
 
 
-def from_pyrender(scene, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
+def from_pyrender(scene: Any, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
                   intrinsics: str = "file", up: str = "z", light: Light | None = None, background: float | None = None, max_texture: int = 2048) -> Scene:
     """A ``pyrender.Scene`` (pyrender itself is not imported here).
 

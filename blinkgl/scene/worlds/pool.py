@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,7 +86,7 @@ class Pool:
                               value=self.test_fraction, accepted="another fraction, or a larger pool")
         return {source: tuple(entries) for source, entries in sides.items()}
 
-    def load(self, entry: Entry):
+    def load(self, entry: Entry) -> Any:
         """The entry's content, from a cache of the last ones within ``cache_bytes``."""
         if entry.source_hash in self._cache:
             self._cache.move_to_end(entry.source_hash)
@@ -97,7 +98,7 @@ class Pool:
             self._cached_bytes -= _bytes_of(self._cache.popitem(last=False)[1])
         return loaded
 
-    def draw(self, rng: np.random.Generator, split: str, log: list[str] | None = None):
+    def draw(self, rng: np.random.Generator, split: str, log: list[str] | None = None) -> Any:
         """A random entry's content. The number of draws from ``rng`` does not depend on what the cache holds."""
         sides = self.split(split)
         sources = list(sides)

@@ -1,4 +1,5 @@
 // u, v in px, Z at the other time; 0 in .w of pixels that nothing writes.
+#include "image_size.glsl"
 #include "motion.glsl"
 uniform mat4x3 difference_backward;
 

@@ -1,4 +1,5 @@
 // Image velocity, px/s.
+#include "image_size.glsl"
 #include "motion.glsl"
 uniform mat4x3 rate;
 

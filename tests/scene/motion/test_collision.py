@@ -313,6 +313,14 @@ def test_time_origin_does_not_matter():
 
 
 def test_wrong_parameters_are_programming_errors():
-    for settings in ({"tolerance": 0}, {"tolerance": 1}, {"rest_margin": 0}, {"radius": 0}, {"t1": -1}):
-        with pytest.raises(ValueError):
+    for settings in ({"tolerance": 0}, {"tolerance": 0.101}, {"rest_margin": 0}, {"rest_margin": 0.101}, {"radius": 0}, {"t1": -1}):
+        with pytest.raises(ValueError, match="tolerance and rest_margin in"):
             resolve([ground()], **settings)
+    for settings in ({"tolerance": 0.1}, {"rest_margin": 0.1}, {"t1": 0}):
+        assert resolve([ground()], **settings).events == ()
+
+
+def test_how_many_exact_distances_it_took_is_said():
+    """None for bodies whose bounding spheres never meet."""
+    assert resolve([body("a", plane(1.0), StaticPath())]).distance_queries == 0
+    assert resolve([ground(), body("ball", trimesh.creation.icosphere(), line([0, 0, 3], [0, 0, -4]))]).distance_queries >= 1

@@ -1,0 +1,199 @@
+"""What lenses that distort have in common: inverses by Newton's method, and bounds found along the border of the
+picture."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from blinkgl.camera.model import CameraModel
+from blinkgl.errors import ConfigError
+
+STEPS = 100
+"""Steps of a solver at most; five or six are usual, halving brackets takes about sixty where the derivative
+vanishes."""
+_GRID = 33  # places along either side of the picture where the magnification is looked at
+_SIDE = 65  # points along either side of the rectangle whose image bounds a body
+
+
+def radius_limit(coefficients: tuple[float, ...]) -> float:
+    """Where ``g(r) = r (1 + k1 r^2 + k2 r^4 + …)`` stops growing: the smallest r > 0 with g'(r) = 0; inf where it
+    grows for ever."""
+    slopes = [(2 * i + 3) * k for i, k in enumerate(coefficients)]
+    roots = np.roots([*reversed(slopes), 1.0])
+    real = roots.real[(np.abs(roots.imag) <= 1e-9 * np.abs(roots)) & (roots.real > 0)]
+    return float(np.sqrt(real.min())) if len(real) else math.inf
+
+
+def radial(r: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """``g(r) / r = 1 + k1 r^2 + k2 r^4 + …`` and g'(r)."""
+    squared = np.square(r)
+    ratio, slope = np.zeros_like(squared), np.zeros_like(squared)
+    for i in range(len(coefficients) - 1, -1, -1):  # Horner, from the highest power
+        ratio = (ratio + coefficients[i]) * squared
+        slope = (slope + (2 * i + 3) * coefficients[i]) * squared
+    return 1.0 + ratio, 1.0 + slope
+
+
+def radial_inverse(y: np.ndarray, coefficients: tuple[float, ...], limit: float) -> np.ndarray:
+    """(...) r in [0, limit] with g(r) = y for (...) y >= 0; nan above g(limit).
+
+    Newton's method inside a bracket that every step tightens, halving it where a step would leave it (and every other
+    time once there were many, which is where a high power slows Newton's method down): g grows up to the limit, so
+    this converges from anywhere, quadratically but for the limit itself, where g' = 0; to the last place or two, in
+    :data:`STEPS` steps at most."""
+    y = np.asarray(y, np.float64)
+    low, high = np.zeros_like(y), np.full_like(y, min(1.0, limit))
+    for _ in range(STEPS):
+        short = (high < limit) & (high * radial(high, coefficients)[0] < y)
+        if not short.any():
+            break
+        high = np.where(short, np.minimum(2 * high, limit), high)
+    end = limit * radial(np.float64(limit), coefficients)[0] if math.isfinite(limit) else math.inf
+    r = np.minimum(y, high)
+    for step in range(STEPS):
+        ratio, slope = radial(r, coefficients)
+        excess = r * ratio - y
+        low, high = np.where(excess < 0, r, low), np.where(excess > 0, r, high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            new = r - excess / slope
+        halve = (new < low) | (new > high) | np.isnan(new) | (step > STEPS // 4 and step % 2 == 1)
+        new = np.where(excess == 0, r, np.where(halve, 0.5 * (low + high), new))
+        still = np.abs(new - r) > 4e-16 * r
+        r = new
+        if not still.any():
+            break
+    return np.where(y <= end, r, np.nan)
+
+
+@dataclass(frozen=True)
+class DistortedModel(CameraModel):
+    """Bounds of models that are smooth and one-to-one in the whole picture: what is farthest out is then seen on its
+    border.
+
+    Raises ConfigError for a picture with pixels through which no ray goes, because the distortion turns back before
+    its corners."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in self.coefficients:
+            if not math.isfinite(getattr(self, name)):
+                self._refuse(name, "not a coefficient", "a finite number")
+        sides = self._border
+        blind = ~np.isfinite(self.rays(sides)).all(axis=-1)
+        if blind.any():
+            away = np.linalg.norm(sides - [self.cx, self.cy], axis=-1)
+            raise ConfigError(
+                "the distortion turns back inside the picture",
+                where=type(self).__name__,
+                value=f"{min(self.reach * min(self.fx, self.fy), away[blind].min()):.1f} px from the principal point",
+                accepted=f"coefficients that reach the picture's corners, up to {away.max():.1f} px",
+            )
+
+    @property
+    @abstractmethod
+    def coefficients(self) -> tuple[str, ...]:
+        """Names of the distortion's parameters."""
+
+    @property
+    @abstractmethod
+    def reach(self) -> float:
+        """Radius on the image plane up to which the radial distortion grows; inf where it does for ever."""
+
+    # ---- the border of the picture -----------------------------------------------------------------------------
+
+    @cached_property
+    def _border(self) -> np.ndarray:
+        """(4, n, 2) px along the picture's sides, top, bottom, left, right, a pixel apart or less."""
+        n = max(self.width, self.height) + 1
+        x, y = np.linspace(-0.5, self.width - 0.5, n), np.linspace(-0.5, self.height - 0.5, n)
+        ends = [np.full(n, v) for v in (-0.5, self.height - 0.5, self.width - 0.5)]
+        return np.stack([np.stack(s, axis=-1) for s in ((x, ends[0]), (x, ends[1]), (ends[0], y), (ends[2], y))])
+
+    @cached_property
+    def _edges(self) -> tuple[float, float, float, float] | None:
+        """Least and greatest X / Z, least and greatest Y / Z in the picture; None where it sees half of space."""
+        rays = self.rays(self._border)
+        if not (rays[..., 2] > 0).all():
+            return None
+        (left, top), (right, bottom) = _extremes(rays[..., :2] / rays[..., 2:])
+        return left, right, top, bottom
+
+    @cached_property
+    def half_angle(self) -> float:
+        """Largest angle between the optical axis and what is in the picture, rad, or a little more."""
+        rays = self.rays(self._border)
+        angles = np.arctan2(np.hypot(rays[..., 0], rays[..., 1]), rays[..., 2])
+        return float(angles.max() + np.abs(np.diff(angles, axis=-1)).max())
+
+    @cached_property
+    def magnification(self) -> float:
+        """A displacement d at depth Z > 0 moves the image by at most ``magnification * d / Z`` px."""
+        x, y = np.linspace(-0.5, self.width - 0.5, _GRID), np.linspace(-0.5, self.height - 0.5, _GRID)
+        rays = self.rays(np.stack(np.meshgrid(x, y), axis=-1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            points = np.where(rays[..., 2:] > 0, rays / rays[..., 2:], np.nan)
+        most = np.full(points.shape[:2], np.nan)
+        ahead = np.isfinite(points).all(axis=-1)
+        most[ahead] = largest_stretch(self.jacobian(points[ahead]))
+        between = max(np.nanmax(np.abs(np.diff(most, axis=axis)), initial=0.0) for axis in (0, 1))
+        return float(np.nanmax(most) + between)
+
+    @cached_property
+    def near_corner(self) -> float:
+        """Distance from the camera's centre to the farthest point of the near plane that is in the picture."""
+        return math.inf if self.half_angle >= math.pi / 2 else self.near / math.cos(self.half_angle)
+
+    def frustum_planes(self) -> np.ndarray:
+        """(5, 3): of the narrowest pin-hole picture that holds this one; (0, 3) where this one sees half of space."""
+        if self._edges is None:
+            return np.zeros((0, 3))
+        left, right, top, bottom = self._edges
+        planes = np.array([[1, 0, -left], [-1, 0, right], [0, 1, -top], [0, -1, bottom], [0, 0, 1]], float)
+        return planes / np.linalg.norm(planes, axis=1, keepdims=True)
+
+    def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
+        """Pixels that the hull can touch: those of the rectangle that holds its picture by a pin-hole camera."""
+        whole = (0, 0, self.width, self.height)
+        if self._edges is None:
+            return whole
+        if points[:, 2].min() <= self.near:
+            return whole if points[:, 2].max() > self.near else None
+        left, right, top, bottom = self._edges
+        flat = points[:, :2] / points[:, 2:]
+        low, high = np.maximum(flat.min(axis=0), [left, top]), np.minimum(flat.max(axis=0), [right, bottom])
+        if (low > high).any():
+            return None
+        u, v = np.linspace(low[0], high[0], _SIDE), np.linspace(low[1], high[1], _SIDE)
+        one = np.ones(_SIDE)
+        sides = np.stack(
+            [
+                np.stack([*s, one], axis=-1)
+                for s in ((u, low[1] * one), (u, high[1] * one), (low[0] * one, v), (high[0] * one, v))
+            ]
+        )
+        seen = self.project(sides)
+        if not np.isfinite(seen).all():  # a corner of the rectangle lies beyond what the model sees
+            return whole
+        (x_low, y_low), (x_high, y_high) = _extremes(seen)
+        x0, x1 = max(0, math.floor(x_low) - 1), min(self.width, math.ceil(x_high) + 2)
+        y0, y1 = max(0, math.floor(y_low) - 1), min(self.height, math.ceil(y_high) + 2)
+        return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+
+
+def largest_stretch(J: np.ndarray) -> np.ndarray:
+    """(n,) largest singular values of (n, 2, 3) Jacobians: by how much the longest step is lengthened."""
+    a, b, c = (J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)
+    return np.sqrt(0.5 * (a + c) + np.hypot(0.5 * (a - c), b))
+
+
+def _extremes(sides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest coordinates, (2,) each, of curves through (4, n, 2) points. A curve leaves the chord between
+    neighbours by an
+    eighth of its second difference; a quarter is allowed for."""
+    bow = 0.25 * np.abs(np.diff(sides, n=2, axis=1)).max(axis=(0, 1)) if sides.shape[1] > 2 else 0.0
+    return sides.min(axis=(0, 1)) - bow, sides.max(axis=(0, 1)) + bow

@@ -1,0 +1,119 @@
+"""The fisheye of Kannala and Brandt (2006), as OpenCV's ``fisheye`` and Kalibr's ``equidistant`` have it.
+
+A point whose direction makes the angle theta with the optical axis is seen at the distance
+
+    theta' = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+
+from the principal point (times fx in x, fy in y), in the direction of (X, Y). The angle is that of the point,
+atan2(hypot(X, Y), Z), up to 180 degrees, so that a camera may see more than half of space (OpenCV takes atan of the
+tangent and does not). The model is used as far out as theta' grows with theta; a point beyond is not seen (nan).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from blinkgl.camera.distorted import DistortedModel, radial, radial_inverse, radius_limit
+
+
+@dataclass(frozen=True)
+class Equidistant(DistortedModel):
+    """Coefficients without unit: k1 … k4. Rays are unit vectors, and Z <= 0 in them beyond 90 degrees."""
+
+    kind: ClassVar[str] = "equidistant"
+    sample: ClassVar[dict[str, float]] = {"k1": -0.02, "k2": 0.005, "k3": -0.003, "k4": 0.0005}
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
+
+    k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
+    k4: float = 0.0
+
+    @property
+    def _k(self) -> tuple[float, ...]:
+        return self.k1, self.k2, self.k3, self.k4
+
+    @cached_property
+    def _limit(self) -> float:
+        """Largest angle, rad."""
+        return min(math.pi, radius_limit(self._k))
+
+    @property
+    def reach(self) -> float:
+        """theta' of the largest angle."""
+        return self._limit * float(radial(np.float64(self._limit), self._k)[0])
+
+    def _polar(self, points: np.ndarray) -> tuple[np.ndarray, ...]:
+        """rho, cos and sin of the direction of (X, Y) (1, 0 on the axis), theta; nan where the model does not see."""
+        x, y, z = np.moveaxis(points, -1, 0)
+        rho = np.hypot(x, y)
+        theta = np.arctan2(rho, z)
+        theta = np.where((theta < self._limit) & (rho + np.abs(z) > 0), theta, np.nan)
+        off = rho > 0
+        return (
+            rho,
+            np.divide(x, rho, out=np.ones_like(rho), where=off),
+            np.divide(y, rho, out=np.zeros_like(rho), where=off),
+            theta,
+        )
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """(..., 2) px; nan beyond the largest angle."""
+        points = np.asarray(points, np.float64)
+        _, c, s, theta = self._polar(points)
+        distance = theta * radial(theta, self._k)[0]
+        return np.stack([self.fx * distance * c + self.cx, self.fy * distance * s + self.cy], axis=-1)
+
+    def jacobian(self, points: np.ndarray) -> np.ndarray:
+        """(..., 2, 3): theta' changes along (X, Y) with d theta = (Z d rho - rho dZ) / R^2, the direction across it
+        with 1 / rho."""
+        points = np.asarray(points, np.float64)
+        rho, c, s, theta = self._polar(points)
+        z = points[..., 2]
+        squared = rho**2 + z**2
+        ratio, slope = radial(theta, self._k)
+        along = slope * z / squared
+        with np.errstate(divide="ignore", invalid="ignore"):
+            across = np.where(rho > 0, theta * ratio / rho, 1 / z)  # the limit on the axis
+        out = np.empty((*z.shape, 2, 3))
+        out[..., 0, 0] = along * c * c + across * s * s
+        out[..., 1, 1] = along * s * s + across * c * c
+        out[..., 0, 1] = out[..., 1, 0] = (along - across) * c * s
+        out[..., 0, 2], out[..., 1, 2] = -slope * rho / squared * c, -slope * rho / squared * s
+        out[np.isnan(theta)] = np.nan
+        return np.array([[self.fx], [self.fy]]) * out
+
+    def _angles(self, xy: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Distance on the image plane, cos and sin of the direction, theta; nan where the model has no ray."""
+        u, v = np.moveaxis((xy - [self.cx, self.cy]) / [self.fx, self.fy], -1, 0)
+        distance = np.hypot(u, v)
+        off = distance > 0
+        cos, sin = (
+            np.divide(w, distance, out=np.full_like(distance, on_axis), where=off)
+            for w, on_axis in ((u, 1.0), (v, 0.0))
+        )
+        return distance, cos, sin, radial_inverse(distance, self._k, self._limit)
+
+    def rays(self, xy: np.ndarray) -> np.ndarray:
+        """(..., 3) unit vectors; nan where the model has none."""
+        _, c, s, theta = self._angles(np.asarray(xy, np.float64))
+        return np.stack([np.sin(theta) * c, np.sin(theta) * s, np.cos(theta)], axis=-1)
+
+    def ray_jacobian(self, xy: np.ndarray) -> np.ndarray:
+        """(..., 3, 2): along the direction by d theta = d theta' / theta''s slope, across it by sin theta / theta'."""
+        distance, c, s, theta = self._angles(np.asarray(xy, np.float64))
+        slope = radial(theta, self._k)[1]
+        across = np.divide(np.sin(theta), distance, out=np.ones_like(distance), where=distance > 0)
+        out = np.empty((*distance.shape, 3, 2))
+        along = np.cos(theta) / slope
+        out[..., 0, 0] = along * c * c + across * s * s
+        out[..., 1, 1] = along * s * s + across * c * c
+        out[..., 0, 1] = out[..., 1, 0] = (along - across) * c * s
+        out[..., 2, 0], out[..., 2, 1] = -np.sin(theta) / slope * c, -np.sin(theta) / slope * s
+        out[np.isnan(theta)] = np.nan
+        return out / [self.fx, self.fy]

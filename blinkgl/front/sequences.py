@@ -1,0 +1,119 @@
+"""A sequence as it happens, and one held in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from blinkgl.config.sequence import SequenceConfig
+from blinkgl.errors import ConfigError
+from blinkgl.events.types import Events
+from blinkgl.front import arguments as check
+from blinkgl.front.runs import MAX_INDEX, EmulatorSettings, Source, Timeline, configured
+from blinkgl.front.scenes import Scene
+from blinkgl.labels import Flow, LabelFrame
+from blinkgl.sequence import EventChunk, Simulation, simulate as core
+from blinkgl.srgb import to_srgb8
+
+
+def simulate_sequence(source: Source, *, index: int = 0, emulator: EmulatorSettings | None = None, sensor: str | None = None,
+                      timeline: Timeline | None = None, quality: str | None = None, labels: Sequence[str] | None = None, events: bool = True,
+                      pictures_hz: float | None = None) -> Simulation:
+    """What happens in one sequence, in the order of time; nothing is written and nothing kept:
+
+        for item in simulate_sequence(scene):
+            match item:
+                case EventChunk(): item.events                        # of about one frame, t in µs
+                case GroundTruth(): item.frame.forward.flow           # (H, W, 2) float32 px
+
+    All events before a label's time come before its :class:`GroundTruth`, and no others. OpenGL is held until the loop ends, however it does.
+
+    source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``) included.   index : number of the sequence.
+    emulator, sensor, timeline, quality, labels : as of :func:`record`; what ``labels`` does not name is not drawn.
+    events : False leaves them out.   pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
+    The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``, ``labels``. Iterate over it once,
+    or use it in ``with`` where it may never be. Raises ConfigError, AssetError, GLError and, as it goes, EventDataError."""
+    config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
+    check.one_of(events, "events", bool, "True or False")
+    if pictures_hz is not None:
+        pictures_hz = check.number(pictures_hz, "pictures_hz", above=0, most=1e4)
+    return _simulation(source, config, index, events=events, pictures_hz=pictures_hz)
+
+
+def _configured(source: Source, index: int, **sections) -> SequenceConfig:
+    return configured(source, **sections).sequence(check.whole(index, "index", 0, MAX_INDEX))
+
+
+def _simulation(source: Source, config: SequenceConfig, index: int, **wanted) -> Simulation:
+    if isinstance(source, Scene):
+        return core.simulate_sequence(config, index, scene=source.build(config), **wanted)
+    return core.simulate_sequence(config, index, base=source.base, **wanted)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A sequence in memory.
+
+    events : all of them, t in µs on the scene's clock.   t_us : (K,) int64, times of the labels.
+    labels : K times :class:`LabelFrame`; what was not asked for is None in it.
+    images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones as they are), or None.
+    config : every value as drawn.   frames : how many the emulator saw.   lost : events that its limit and the read-out swallowed."""
+
+    events: Events
+    t_us: np.ndarray
+    labels: tuple[LabelFrame, ...]
+    image_t_us: np.ndarray
+    images: np.ndarray | None
+    config: SequenceConfig = field(repr=False)
+    frames: int
+    lost: int
+
+    @property
+    def flow(self) -> np.ndarray:
+        """(K, H, W, 2) float32 px, +x right, +y down, from each label's time to the next; 0 where :attr:`valid` is False."""
+        return np.stack([flow.flow for flow in self._forward()])
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(K, H, W) bool."""
+        return np.stack([flow.valid for flow in self._forward()])
+
+    def window(self, k: int) -> Events:
+        """Events from label ``k``'s time until the next one's, those that flow ``k`` spans."""
+        k = check.whole(k, "k", 0, len(self.t_us) - 1)
+        return self.events.window(int(self.t_us[k]), int(self.image_t_us[k + 1]))
+
+    def _forward(self) -> list[Flow]:
+        flows = [label.forward for label in self.labels if label.forward is not None]
+        if len(flows) < len(self.labels):
+            raise ConfigError("the recording has no forward flow", where="labels", accepted="'flow' among them")
+        return flows
+
+
+def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None,
+           quality: str | None = None, labels: Sequence[str] | None = None) -> Recording:
+    """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
+
+    source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.
+    emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
+    sensor : camera whose size, emulator values and read-out are taken, such as "davis346".   timeline : :class:`Timeline`.
+    quality : "fast", "balanced", "accurate" or "reference".
+    labels : of images, flow, flow_backward, occlusion, depth, ids, normals, velocity; default: the source's (images, flow, occlusion).
+    Raises ConfigError, AssetError, GLError, EventDataError."""
+    config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
+    images, frames, chunks, times = [], [], [], []
+    with _simulation(source, config, index) as sequence:
+        for item in sequence:
+            if isinstance(item, EventChunk):
+                chunks.append(item.events)
+                continue
+            image = item.frame.values.pop("images", None)
+            if image is not None:
+                images.append(to_srgb8(image) if image.dtype.kind == "f" else image)
+            frames.append(item.frame)
+            times.append(item.t_ns // 1000)
+    t_us, camera = np.array(times, np.int64), sequence.camera
+    return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames[:-1]), t_us, np.stack(images) if images else None, sequence.config,
+                     sequence.frames, camera.saturated + camera.dropped)

@@ -1,0 +1,1 @@
+uniform vec2 image_size; // of the target, px

@@ -1,0 +1,26 @@
+#version 430 core
+// Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small picture of the image, whose
+// pixels are image_scale px of the image apart; velocity is still the image's.
+
+#define NEEDS_LOCAL
+#include "vertex.glsl"
+
+#ifdef FRAGMENT_SHADER
+layout(location = 0) out vec2 image_velocity;
+uniform vec2 image_size;
+uniform mat4x3 rate;
+#ifdef SMALL
+uniform vec2 image_scale;
+#endif
+#include "motion.glsl"
+#include "guard.glsl"
+
+void main()
+{
+    image_velocity = velocity(rate, local, image_size);
+#ifdef SMALL
+    image_velocity *= image_scale;
+#endif
+    drop_artefact();
+}
+#endif

@@ -1,0 +1,255 @@
+"""What every camera model of the table promises, and the pin-hole camera by hand."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan, focal_length
+from blinkgl.errors import ConfigError
+
+SIZE = {
+    "width": 120,
+    "height": 90,
+    "fx": 95.0,
+    "fy": 110.0,
+    "cx": 52.0,
+    "cy": 48.5,
+    "near": 0.1,
+}  # nothing about it is symmetric
+CAMERAS = [model(**SIZE, **getattr(model, "sample", {})) for model in CAMERA_MODELS.values()]
+CAMERAS += [
+    Radtan(**SIZE),
+    Radtan(**SIZE, k1=0.4, k2=-0.02, p1=-0.01, p2=0.004),
+    Equidistant(**SIZE),
+    Equidistant(200, 150, 60.0, 62.0, 101.0, 70.0),
+]  # sees 110 degrees off its axis
+every = pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: f"{c.kind}-{math.degrees(c.half_angle):.0f}-degrees")
+
+
+def pixels(camera, count=2000, seed=0):
+    dice = np.random.default_rng(seed)
+    return dice.uniform([-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5], (count, 2))
+
+
+def differences(function, at, h=1e-6):
+    return np.stack([(function(at + h * e) - function(at - h * e)) / (2 * h) for e in np.eye(at.shape[-1])], axis=-1)
+
+
+@every
+def test_rays_and_projection_are_each_others_inverse(camera):
+    xy = pixels(camera)
+    rays = camera.rays(xy)
+    assert rays.shape == (2000, 3) and rays.dtype == np.float64
+    for depth in (1e-3, 1.0, 1e6):
+        np.testing.assert_allclose(camera.project(depth * rays), xy, atol=1e-10)
+    again = camera.rays(camera.project(rays))
+    np.testing.assert_allclose(np.cross(again, rays), 0, atol=1e-12)
+    assert (np.sum(again * rays, axis=1) > 0).all()
+    assert camera.rays(xy.reshape(50, 40, 2)).shape == (50, 40, 3) and camera.rays(xy[0]).shape == (3,)
+    np.testing.assert_array_equal(camera.rays(xy[0]), rays[0])
+    np.testing.assert_array_equal(camera.project(rays[0]), camera.project(rays)[0])
+
+
+@every
+def test_jacobians_are_the_derivatives(camera):
+    xy = pixels(camera, 300)
+    points = np.random.default_rng(1).uniform(0.5, 20, (300, 1)) * camera.rays(xy)
+    J = camera.jacobian(points)
+    assert J.shape == (300, 2, 3)
+    np.testing.assert_allclose(J, differences(camera.project, points), rtol=1e-5, atol=2e-6 * np.abs(J).max())
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", J, points), 0, atol=1e-9)  # along the ray nothing moves
+    R = camera.ray_jacobian(xy)
+    np.testing.assert_allclose(R, differences(camera.rays, xy, 1e-4), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(camera.jacobian(camera.rays(xy)) @ R, np.tile(np.eye(2), (300, 1, 1)), atol=1e-9)
+
+
+@every
+def test_on_the_axis(camera):
+    np.testing.assert_allclose(camera.project(np.array([0.0, 0.0, 2.0])), [camera.cx, camera.cy], atol=1e-12)
+    np.testing.assert_allclose(
+        camera.jacobian(np.array([0.0, 0.0, 2.0])), [[camera.fx / 2, 0, 0], [0, camera.fy / 2, 0]], atol=1e-12
+    )
+    np.testing.assert_allclose(camera.rays(np.array([camera.cx, camera.cy])), [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(
+        camera.ray_jacobian(np.array([camera.cx, camera.cy])),
+        [[1 / camera.fx, 0], [0, 1 / camera.fy], [0, 0]],
+        atol=1e-15,
+    )
+
+
+@every
+def test_displacement_is_the_difference_of_projections(camera):
+    xy = pixels(camera, 300)
+    rays = camera.rays(xy)
+    ahead = rays[:, 2] > 0.05
+    xy, rays = xy[ahead], rays[ahead]
+    dice = np.random.default_rng(2)
+    depth, change = dice.uniform(1, 4, len(xy)), dice.normal(0, 0.05, (len(xy), 3))
+    points = rays * (depth / rays[:, 2])[:, None]
+    np.testing.assert_allclose(
+        camera.displacement(rays, depth, change), camera.project(points + change) - camera.project(points), atol=1e-9
+    )
+
+
+@every
+def test_everything_in_the_picture_is_inside_of_its_bounds(camera):
+    xy = pixels(camera, 4000)
+    rays = camera.rays(xy) / np.linalg.norm(camera.rays(xy), axis=1, keepdims=True)
+    assert (
+        np.arccos(np.clip(rays[:, 2], -1, 1)).max()
+        <= camera.half_angle
+        <= 1.1
+        * np.arccos(
+            np.clip(camera.rays(corners(camera))[:, 2] / np.linalg.norm(camera.rays(corners(camera)), axis=1), -1, 1)
+        ).max()
+    )
+    assert (rays @ camera.frustum_planes().T >= 0).all()
+    ahead = rays[rays[:, 2] > 1e-3]
+    flat = ahead / ahead[:, 2:]
+    stretch = np.linalg.norm(camera.jacobian(flat), ord=2, axis=(1, 2))
+    assert stretch.max() <= camera.magnification
+    if camera.half_angle < math.pi / 2:
+        assert (
+            camera.near * np.linalg.norm(flat, axis=1).max()
+            <= camera.near_corner
+            <= 1.1
+            * camera.near
+            * np.linalg.norm(camera.rays(corners(camera)) / camera.rays(corners(camera))[:, 2:], axis=1).max()
+        )
+        assert camera.magnification <= 1.5 * stretch.max()
+    else:
+        assert camera.near_corner == math.inf
+
+
+def corners(camera):
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    return np.array([[-0.5, -0.5], [right, -0.5], [-0.5, bottom], [right, bottom]])
+
+
+@every
+def test_bounds_hold_whatever_is_in_the_hull(camera):
+    """Boxes anywhere, some half out of the picture, some through the near plane: no point of them is seen outside of
+    the rectangle."""
+    dice = np.random.default_rng(3)
+    tight = 0
+    for _ in range(150):
+        centre = dice.uniform([-4, -3, -1], [4, 3, 8])
+        box = (
+            centre
+            + dice.uniform(0.01, 1.5)
+            * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            @ np.linalg.qr(dice.normal(size=(3, 3)))[0]
+        )
+        inner = dice.dirichlet(np.full(8, 0.3), 3000) @ box
+        seen = camera.project(inner[inner[:, 2] > camera.near])
+        seen = seen[((seen >= -0.5) & (seen < [camera.width - 0.5, camera.height - 0.5])).all(axis=1)]
+        bounds = camera.bounds(box)
+        if bounds is None:
+            assert not len(seen)
+            continue
+        x0, y0, x1, y1 = bounds
+        assert 0 <= x0 < x1 <= camera.width and 0 <= y0 < y1 <= camera.height
+        if len(seen):
+            assert (seen >= [x0 - 0.5, y0 - 0.5]).all() and (seen < [x1 - 0.5, y1 - 0.5]).all()
+            tight += (x1 - x0) * (y1 - y0) < camera.width * camera.height
+    assert tight > 20 or camera.half_angle > math.pi / 2
+
+
+@every
+def test_a_part_and_another_size_see_the_same(camera):
+    part = camera.part(20, 10, 60, 50, 3)
+    assert (part.width, part.height, part.near) == (120, 120, camera.near) and type(part) is type(camera)
+    xy = pixels(part, 200)
+    inside = (xy + 0.5) / 3 - 0.5 + [20, 10]
+    np.testing.assert_allclose(part.rays(xy), camera.rays(inside), atol=1e-12)
+    small = camera.resized(60, 30)
+    xy = pixels(small, 200)
+    np.testing.assert_allclose(
+        small.rays(xy), camera.rays((xy + 0.5) * [camera.width / 60, camera.height / 30] - 0.5), atol=1e-12
+    )
+
+
+@every
+def test_pixels_per_unit_is_the_most_that_a_sphere_shows(camera):
+    dice = np.random.default_rng(4)
+    for _ in range(40):
+        centre, radius = dice.uniform([-3, -3, 0.8], [3, 3, 6]), 0.5
+        bound = camera.pixels_per_unit(centre[None], radius)[0]
+        directions = dice.normal(size=(500, 3))
+        surface = centre + radius * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        xy = camera.project(surface)
+        on = (surface[:, 2] > camera.near) & ((xy >= -0.5) & (xy < [camera.width - 0.5, camera.height - 0.5])).all(
+            axis=1
+        )
+        if on.any():
+            assert np.linalg.norm(camera.jacobian(surface[on]), ord=2, axis=(1, 2)).max() <= bound
+    assert camera.pixels_per_unit(np.array([[0, 0, 0.3]]), 0.5)[0] == np.inf
+    if camera.half_angle < math.pi / 2:
+        np.testing.assert_array_equal(camera.pixels_per_unit(np.array([[0, 0, -5.0], [90, 0, 1]]), 0.5), 0)
+
+
+@every
+def test_K(camera):
+    np.testing.assert_array_equal(camera.K, [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"width": 0}, ".width: not a size \\(got 0\\); expected a whole number of px, 1 or more"),
+        ({"height": 2.5}, ".height: not a size \\(got 2.5\\)"),
+        ({"fx": -3.0}, ".fx: not a length \\(got -3.0\\); expected a finite number above 0"),
+        ({"fy": math.inf}, ".fy: not a length \\(got inf\\)"),
+        ({"near": 0.0}, ".near: not a length \\(got 0.0\\)"),
+        ({"cy": math.nan}, ".cy: not a position \\(got nan\\); expected a finite number of px"),
+    ],
+)
+@every
+def test_what_no_camera_has(camera, changes, message):
+    with pytest.raises(ConfigError, match=f"^{type(camera).__name__}{message}"):
+        replace(camera, **changes)
+
+
+# ---- pin-hole, by hand ---------------------------------------------------------------------------------------------
+
+
+PIN_HOLE = PinHole(**SIZE)
+
+
+def test_pin_hole_by_hand():
+    assert PinHole(640, 480, 500.0, 510.0, 300.0, 250.0).project(np.array([1.0, -2.0, 4.0])).tolist() == [425.0, -5.0]
+    assert PIN_HOLE.rays(np.array([52.0 + 95.0, 48.5 - 55.0])).tolist() == [1.0, -0.5, 1.0]
+    assert np.isnan(PIN_HOLE.project(np.array([[1.0, 1.0, 0.0], [1.0, 1.0, -1.0]]))).all()
+    assert np.isnan(PIN_HOLE.jacobian(np.array([1.0, 1.0, -1.0]))).all()
+    camera = PinHole(3, 1, 1.5, 1.0, 1.0, 0.0, near=2.0)
+    assert camera.near_corner == pytest.approx(2 * math.sqrt(1 + 1 + 0.25)) and camera.half_angle == pytest.approx(
+        math.atan(math.sqrt(1.25))
+    )
+    assert camera.magnification == pytest.approx(1.5 * 1.5)
+
+
+def test_pin_hole_displacement_subtracts_no_projections():
+    """A point that moves along its own ray stays where it is, to the last bits; so does one that hardly moves."""
+    rays, depth = PIN_HOLE.rays(pixels(PIN_HOLE, 100)), np.full(100, 3.0)
+    assert np.abs(PIN_HOLE.displacement(rays, depth, 0.7 * rays)).max() < 1e-14
+    tiny = np.tile([1e-14, 0, 0], (100, 1))
+    np.testing.assert_allclose(PIN_HOLE.displacement(rays, depth, tiny), np.tile([95e-14 / 3, 0], (100, 1)), rtol=1e-12)
+    assert np.isnan(PIN_HOLE.displacement(rays[:1], depth[:1], np.array([[0, 0, -3.0]]))).all()  # behind the camera
+
+
+def test_pin_hole_of_a_field_of_view():
+    assert focal_length(640, math.radians(90)) == pytest.approx(320)
+    camera = PinHole.centred(640, 480, focal_length(640, math.radians(60)))
+    assert (camera.cx, camera.cy, camera.fy) == (319.5, 239.5, camera.fx)
+    assert 2 * math.atan(camera.rays(np.array([639.5, 0.0]))[0]) == pytest.approx(math.radians(60))
+
+
+@pytest.mark.parametrize("camera", [c for c in CAMERAS if c.kind != "pinhole"], ids=lambda c: c.kind)
+def test_only_a_pin_hole_camera_is_drawn(camera):
+    with pytest.raises(
+        ConfigError,
+        match=rf"camera: this camera model cannot be drawn \(got '{camera.kind}'\); expected a pin-hole camera",
+    ):
+        camera.clip_from_cam()

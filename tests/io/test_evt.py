@@ -1,0 +1,202 @@
+"""EVT2 and EVT3 words against decoders and encoders in plain Python, written from the formats' pages."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.evt import EvtReader, EvtWriter
+
+WORD = {"evt2": "<u4", "evt3": "<u2"}
+
+
+def decoded(path, version: str, words, block: int = 1 << 17, header: bytes = b"") -> list[tuple[int, int, int, int]]:
+    path.write_bytes(b"% evt " + version[-1].encode() + b".0\n" + header + b"% end\n" + np.array(words, WORD[version]).tobytes())
+    return [row for e in EvtReader(path).chunks(block) for row in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist())]
+
+
+def slow_evt2(words) -> list[tuple[int, int, int, int]]:
+    rows, high, turns = [], None, 0
+    for word in words:
+        kind, rest = divmod(word, 1 << 28)
+        if kind == 8:
+            turns += high is not None and high - rest > 2**27
+            high = rest
+        elif kind < 2 and high is not None:
+            rows.append((rest // 2**11 % 2**11, rest % 2**11, (turns * 2**28 + high) * 64 + rest // 2**22, kind))
+    return rows
+
+
+def slow_evt3(words) -> list[tuple[int, int, int, int]]:
+    rows, high, turns, row, low, base, polarity = [], None, 0, 0, 0, 0, 0
+    for word in words:
+        kind, rest = divmod(word, 1 << 12)
+        found = []
+        if kind == 0:
+            row = rest % 2048
+        elif kind == 2:
+            found = [(rest % 2048, rest // 2048)]
+        elif kind == 3:
+            base, polarity = rest % 2048, rest // 2048
+        elif kind in (4, 5):
+            wide = 12 if kind == 4 else 8
+            found = [(base + k, polarity) for k in range(wide) if rest >> k & 1]
+            base += wide
+        elif kind == 6:
+            low = rest
+        elif kind == 8:
+            turns += high is not None and high - rest > 2**11
+            high = rest
+        if high is not None:
+            rows += [(x, row, (turns * 2**12 + high) * 4096 + low, p) for x, p in found]
+    return rows
+
+
+@pytest.mark.parametrize("block", [1, 7, 1 << 17])
+def test_random_words_of_evt2(tmp_path, block):
+    rng = np.random.default_rng(1)
+    words = [int(rng.integers(0, 2)) << 28 | int(rng.integers(0, 1 << 28)) for _ in range(5)]  # before any time
+    for _ in range(400):
+        kind = int(rng.choice([0, 1, 8, 10, 14, 15], p=[0.35, 0.35, 0.15, 0.05, 0.05, 0.05]))
+        words.append(kind << 28 | int(rng.integers(0, 1 << 28)))
+    rows = decoded(tmp_path / "e.raw", "evt2", words, block)
+    assert rows == slow_evt2(words) and len(rows) > 200
+
+
+@pytest.mark.parametrize("block", [1, 7, 1 << 17])
+def test_random_words_of_evt3(tmp_path, block):
+    """Times that go on and that fall (a turn of the counter, or a word out of order), vectors one after the other."""
+    rng = np.random.default_rng(2)
+    words = [0x2005, 0x3003, 0x4FFF]
+    for _ in range(600):
+        kind = int(rng.choice([0, 2, 3, 4, 5, 6, 8, 7, 10, 14, 15], p=[0.1, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.025, 0.025, 0.025, 0.025]))
+        rest = int(rng.integers(0, 1 << 12))
+        words.append(kind << 12 | (rest % 512 | rest & 0x800 if kind == 3 else rest & 0xFF if kind == 5 else rest))
+    rows = decoded(tmp_path / "e.raw", "evt3", words, block)
+    assert rows == slow_evt3(words) and len(rows) > 400
+
+
+@pytest.mark.parametrize("before, after, turns", [(2047, 0, 0), (2048, 0, 0), (2049, 0, 1), (4095, 0, 1), (4095, 2047, 0), (4095, 2046, 1), (0, 4095, 0)])
+def test_evt3s_counter_has_turned_when_it_falls_by_more_than_half(tmp_path, before, after, turns):
+    rows = decoded(tmp_path / "e.raw", "evt3", [0x8000 | before, 0x8000 | after, 0x2001])
+    assert rows == [(1, 0, (turns << 24) + (after << 12), 0)]
+
+
+@pytest.mark.parametrize("fall, turns", [(1 << 27, 0), ((1 << 27) + 1, 1)])
+def test_evt2s_counter_has_turned_when_it_falls_by_more_than_half(tmp_path, fall, turns):
+    rows = decoded(tmp_path / "e.raw", "evt2", [8 << 28 | fall, 8 << 28, 1 << 28 | 5 << 22 | 3 << 11 | 4])
+    assert rows == [(3, 4, (turns << 34) + 5, 1)]
+
+
+@pytest.mark.parametrize("words, bad", [([0x8000, 0x3000 | 2047, 0x4001, 0x4001], 3), ([0x8000, 0x3000 | 2046, 0x4006], 2), ([0x8000, 0x3000 | 2041, 0x5080], 2)])
+def test_a_vector_may_not_leave_the_row(tmp_path, words, bad):
+    """The last pixel is 2047; a bit beyond it is damage, a clear one is nothing."""
+    with pytest.raises(AssetError, match=rf"damaged at byte {len(b'% evt 3.0' + b'% end') + 2 + 2 * bad}: no EVT3 word can stand here .got '0x{words[bad]:04x}'"):
+        decoded(tmp_path / "e.raw", "evt3", words)
+    assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3800 | 2046, 0x4003, 0x4000]) == [(2046, 0, 0, 1), (2047, 0, 0, 1)]
+    assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3000 | 2040, 0x5080]) == [(2047, 0, 0, 0)]
+
+
+@pytest.mark.parametrize("version, kinds", [("evt2", (2, 3, 7, 9, 11, 13)), ("evt3", (1, 9, 11, 12, 13))])
+def test_kinds_of_words_that_do_not_exist(tmp_path, version, kinds):
+    shift = 28 if version == "evt2" else 12
+    for kind in kinds:
+        with pytest.raises(AssetError, match=f"damaged at byte .*no {version.upper()} word"):
+            decoded(tmp_path / "e.raw", version, [8 << shift, kind << shift])
+
+
+@pytest.mark.parametrize("version", ["evt2", "evt3"])
+def test_events_that_never_get_a_time(tmp_path, version):
+    words = [1 << 28] * 3 if version == "evt2" else [0x2001, 0x3000, 0x4003]
+    with pytest.raises(AssetError, match="3 events and no TIME_HIGH word, so no times"):
+        decoded(tmp_path / "e.raw", version, words)
+    assert decoded(tmp_path / "e.raw", version, []) == []
+
+
+def some_events() -> Events:
+    """Times that stay, go on by 1, cross 64 and 4096 µs and leap; rows that stay and change."""
+    t = np.array([0, 0, 1, 63, 64, 64, 4095, 4096, 4096, 50_000, 16_777_215, 16_777_216, 16_777_300])
+    n = len(t)
+    return Events((np.arange(n) * 57 % 640).astype(np.uint16), np.repeat([3, 3, 9, 479], 4)[:n].astype(np.uint16), t, (np.arange(n) % 3 == 0).astype(np.uint8))
+
+
+def written(path, version: str, chunks: list[Events]) -> list[int]:
+    with contextlib.closing(EvtWriter(path, 480, 640, version)) as writer:
+        for events in chunks:
+            writer.append(events)
+    return np.frombuffer(path.read_bytes().split(b"% end\n")[1], WORD[version]).tolist()
+
+
+def cut(events: Events, size: int) -> list[Events]:
+    return [Events(*(getattr(events, k)[i:i + size] for k in "xytp")) for i in range(0, len(events), size)]
+
+
+@pytest.mark.parametrize("size", [1, 3, 100])
+def test_evt2_as_written(tmp_path, size):
+    """A TIME_HIGH where the 64 µs have changed, at the beginning also for 0; then the event."""
+    events, expected, high = some_events(), [], None
+    for x, y, t, p in zip(events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist()):
+        if t // 64 != high:
+            high = t // 64
+            expected.append(8 << 28 | high)
+        expected.append(p << 28 | t % 64 << 22 | x << 11 | y)
+    assert written(tmp_path / "e.raw", "evt2", cut(events, size)) == expected
+
+
+@pytest.mark.parametrize("size", [1, 3, 100])
+def test_evt3_as_written(tmp_path, size):
+    """Every step of 4096 µs, the low bits where the time has changed, the row where it has, then the column."""
+    events, expected, high, low, row = some_events(), [0x8000], 0, None, None
+    for x, y, t, p in zip(events.x.tolist(), events.y.tolist(), events.t.tolist(), events.p.tolist()):
+        while high < t // 4096:
+            high += 1
+            expected.append(0x8000 | high % 4096)
+        if low != t:
+            expected.append(0x6000 | t % 4096)
+            low = t
+        if row != y:
+            expected.append(y)
+            row = y
+        expected.append(0x2000 | p << 11 | x)
+    assert written(tmp_path / "e.raw", "evt3", cut(events, size)) == expected
+
+
+def test_the_writers_limits(tmp_path):
+    one = lambda t: Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.array([t]), np.ones(1, np.uint8))  # noqa: E731
+    for t, said in ((-1, "-1"), (1 << 34, str(1 << 34))):
+        with contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640, "evt2")) as writer, pytest.raises(EventDataError, match=f"got {said}.; expected 0 to less"):
+            writer.append(one(t))
+    with contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640, "evt2")) as writer:
+        writer.append(one((1 << 34) - 1))
+        with pytest.raises(EventDataError, match="backwards at event 1"):
+            writer.append(one(5))
+    EvtWriter(tmp_path / "f.raw", 2048, 2048).close()
+    for size in ((2049, 10), (10, 2049)):
+        with pytest.raises(EventDataError, match="EVT3 has 11-bit coordinates"):
+            EvtWriter(tmp_path / "f.raw", *size)
+
+
+@pytest.mark.parametrize("header, size", [
+    (b"% geometry 640x480\n", (480, 640)), (b"% format EVT3;height=480;width=640\n", (480, 640)), (b"% geometry 640x480\n% format EVT3;height=1;width=2\n", (480, 640)),
+    (b"% height=480\n", (480, None)), (b"% width=640\n", (None, 640)), (b"% anything else\n", (None, None))])
+def test_the_size_in_the_header(tmp_path, header, size):
+    decoded(tmp_path / "e.raw", "evt3", [0x8000], header=header)
+    reader = EvtReader(tmp_path / "e.raw")
+    assert (reader.height, reader.width) == size
+
+
+def test_headers_without_an_end_and_with_lines_too_long(tmp_path):
+    path, word = tmp_path / "e.raw", np.array([0x8000, 0x2001], "<u2").tobytes()
+    path.write_bytes(b"% evt 3.0\n% camera x\n" + word)
+    assert [len(e) for e in EvtReader(path).chunks()] == [1]
+    path.write_bytes(b"% evt 3.0\n" + np.array([0x8000 | 0x25, 0x2001], "<u2").tobytes())  # a word that begins with the byte of '%'
+    assert [e.t.tolist() for e in EvtReader(path).chunks()] == [[0x25 << 12]]
+    path.write_bytes(b"% evt 3.0\n% " + b"x" * 4000 + b"\n% end\n" + word)
+    assert [len(e) for e in EvtReader(path).chunks()] == [1]
+    path.write_bytes(b"% evt 3.0\n% " + b"x" * 5000 + b"\n% end\n" + word)
+    with pytest.raises(AssetError, match="header line 2 is longer than 4096 bytes"):
+        EvtReader(path)

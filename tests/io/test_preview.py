@@ -1,0 +1,242 @@
+"""The preview's picture, pixel by pixel, and its clock; colours of flow against the published wheel."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from blinkgl.events.types import Events
+from blinkgl.io import preview as module
+from blinkgl.io.colour import INVALID, count_events, event_colour, flow_colour, flow_wheel
+from blinkgl.io.preview import PreviewWriter
+from blinkgl.srgb import to_srgb8
+
+
+class Film:
+    """Stands for the encoder: keeps every picture."""
+
+    def __init__(self, path, height, width, fps, **options):
+        self.size, self.fps, self.pictures, self.ended = (height, width), fps, [], None
+
+    def write(self, picture):
+        assert picture.shape == (*self.size, 3) and picture.dtype == np.uint8
+        self.pictures.append(picture.copy())
+
+    def close(self):
+        self.ended = "closed"
+
+    def abort(self):
+        self.ended = "aborted"
+
+
+@pytest.fixture(autouse=True)
+def film(monkeypatch):
+    monkeypatch.setattr(module, "VideoWriter", Film)
+
+
+def some_events(count: int, height: int, width: int) -> Events:
+    dice = np.random.default_rng(0)
+    return Events(dice.integers(0, width, count).astype(np.uint16), dice.integers(0, height, count).astype(np.uint16), np.zeros(count, np.int64),
+                  dice.integers(0, 2, count).astype(np.uint8))
+
+
+@pytest.mark.parametrize("height, width, panel", [
+    (48, 64, (96, 128)), (199, 300, (398, 600)), (200, 300, (200, 300)), (360, 480, (360, 480)), (480, 640, (360, 480)), (720, 1280, (360, 640)), (261, 347, (260, 348)), (1, 1, (2, 2)),
+])
+@pytest.mark.parametrize("flow", [True, False])
+def test_panels_are_enlarged_below_200_rows_and_no_higher_than_360(height, width, panel, flow):
+    """Sides are even, as the codec needs them; 4 px between the panels, 30 rows of captions above."""
+    made = PreviewWriter("p.mp4", height, width, flow=flow)
+    count = 3 if flow else 2
+    assert made._panel == panel[::-1] and made._video.size == (panel[0] + 30, count * panel[1] + 4 * (count - 1))
+    for k in range(count):
+        assert made._panel_view(k).shape == (*panel, 3)
+    made.frame(0, np.full((height, width), 0.5, np.float32))
+    [picture] = made._video.pictures
+    for k in range(count - 1):
+        gap = picture[:, (k + 1) * (panel[1] + 4) - 4 : (k + 1) * (panel[1] + 4)]
+        assert (gap == (22, 24, 28)).all()
+    assert (picture[30:, : panel[1]] == to_srgb8(np.float32([0.5]))[0]).all(), "light is shown as sRGB"
+    assert (picture[30:, panel[1] + 4 : 2 * panel[1] + 4] == 255).all(), "no events: white"
+    if flow:
+        assert (picture[30:, -panel[1]:] == (32, 34, 38)).all(), "no flow yet"
+
+
+@pytest.mark.parametrize("image", [np.random.default_rng(1).random((50, 60)).astype(np.float32), np.random.default_rng(1).random((50, 60, 3)).astype(np.float32),
+                                   np.random.default_rng(1).integers(0, 256, (50, 60, 3), np.uint8)])
+def test_frames_and_events_are_enlarged_pixel_by_pixel(image):
+    made = PreviewWriter("p.mp4", 50, 60, flow=False)
+    events = some_events(700, 50, 60)
+    made.add_events(events)
+    made.frame(0, image)
+    picture = made._video.pictures[0]
+    shown = to_srgb8(image) if image.dtype == np.float32 else image
+    shown = np.repeat(shown[..., None], 3, 2) if shown.ndim == 2 else shown
+    np.testing.assert_array_equal(picture[30:, :120], np.kron(shown, np.ones((2, 2, 1), np.uint8)))
+    counts = np.zeros((2, 50, 60), np.uint16)
+    np.add.at(counts, (events.p, events.y, events.x), 1)
+    np.testing.assert_array_equal(picture[30:, 124:], np.kron(event_colour(counts), np.ones((2, 2, 1), np.uint8)))
+    made.frame(25_000, image)
+    assert (made._video.pictures[1][30:, 124:] == 255).all(), "events are shown once"
+
+
+def test_large_frames_are_averaged_in_linear_light():
+    made = PreviewWriter("p.mp4", 720, 40, flow=False)
+    stripes = np.zeros((720, 40), np.float32)
+    stripes[::2] = 1.0
+    made.frame(0, stripes)
+    assert (made._video.pictures[0][30:, :20] == to_srgb8(np.float32([0.5]))[0]).all()
+
+
+def test_the_clock():
+    """40 pictures per second of the sequence, played at 20: slowed twice. Late frames are shown as often as they are late."""
+    made = PreviewWriter("p.mp4", 48, 64, t0_us=5_000, flow=False)
+    black = np.zeros((48, 64), np.float32)
+    assert made._video.fps == 20 and made._slow == 2
+    assert not made.due(4_999) and made.due(5_000)
+    made.frame(4_999, black)
+    assert not made._video.pictures
+    made.frame(5_000, black)
+    assert len(made._video.pictures) == 1 and not made.due(29_999) and made.due(30_000)
+    made.frame(30_000, black)
+    made.frame(54_000, black)
+    assert len(made._video.pictures) == 2
+    made.frame(130_000, black)
+    assert len(made._video.pictures) == 6 and not made.due(154_999) and made.due(155_000)
+    with made:
+        pass
+    assert made._video.ended == "closed"
+    with pytest.raises(ZeroDivisionError), PreviewWriter("p.mp4", 48, 64) as other:
+        1 / 0
+    assert other._video.ended == "aborted"
+
+
+def test_captions(monkeypatch):
+    said = []
+    monkeypatch.setattr(PreviewWriter, "_caption", lambda self, panel, detail: said.append((panel, self._names[panel], detail)))
+    made = PreviewWriter("p.mp4", 48, 64, t0_us=1_000, rate_hz=100, fps=40, label="camera")
+    made.add_events(some_events(1234, 48, 64))
+    made.add_events(some_events(6, 48, 64))
+    made.frame(13_345, np.zeros((48, 64), np.float32))
+    made.frame(24_000, np.zeros((48, 64), np.float32))
+    made.set_flow(np.full((48, 64, 2), 3.0, np.float32))
+    assert said == [(2, "optical flow", ""), (0, "camera", "12.3 ms   slowed 2.5x"), (1, "events", "ON blue, OFF red   1,240"),
+                    (0, "camera", "23.0 ms   slowed 2.5x"), (1, "events", "ON blue, OFF red   0"), (2, "optical flow", "full colour = 4.24 px")]
+
+
+def test_captions_are_written_above_their_panel():
+    made = PreviewWriter("p.mp4", 48, 64, flow=True)
+    back = np.array([22, 24, 28])
+    before = made._canvas.copy()
+    made._caption(1, "details")
+    changed = (made._canvas != before).any(axis=2)
+    rows, columns = np.nonzero(changed)
+    assert 0 <= rows.min() and rows.max() < 30 and 132 <= columns.min() and columns.max() < 260
+    strip = made._canvas[:30, 132:260]
+    dark = (np.abs(strip.astype(int) - back).max(axis=2) > 20).any(axis=0)
+    assert 6 <= np.flatnonzero(dark)[0] <= 10 and 128 - 11 <= np.flatnonzero(dark)[-1] <= 128 - 7, "name at the left edge, detail at the right one"
+    lit = (np.abs(strip.astype(int) - back).max(axis=2) > 20).any(axis=1)
+    assert abs(np.flatnonzero(lit).mean() - 15) < 4
+
+
+def test_full_colour_follows_speed_up_at_once_and_down_slowly():
+    made = PreviewWriter("p.mp4", 40, 40)
+    for speed, full in ((2.0, 2.0), (8.0, 8.0), (1.0, 7.6), (0.0, 7.22)):
+        made.set_flow(np.full((40, 40, 2), (speed, 0), np.float32))
+        assert made._flow_max == pytest.approx(full)
+    spread = np.zeros((40, 40, 2), np.float32)
+    spread[::4, ::4, 1] = np.linspace(0, 100, 100).reshape(10, 10)
+    made.set_flow(spread)
+    assert made._flow_max == pytest.approx(95.0)
+    made.set_flow(spread * 100, np.zeros((40, 40), bool))
+    assert made._flow_max == pytest.approx(95.0), "nothing is valid: nothing is learned"
+    spread[0, 0] = np.inf
+    made.set_flow(spread)
+    assert np.isfinite(made._flow_max)
+
+
+def test_flow_is_shown_by_its_colour_and_what_is_invalid_is_grey():
+    made = PreviewWriter("p.mp4", 30, 40)
+    flow, valid = np.zeros((30, 40, 2), np.float32), np.ones((30, 40), bool)
+    flow[:, 20:, 0], valid[:10] = 4.0, False
+    made.set_flow(flow, valid)
+    expected = np.kron(flow_colour(flow, made._flow_max, valid), np.ones((2, 2, 1), np.uint8))
+    np.testing.assert_array_equal(made._panel_view(2), expected)
+    made = PreviewWriter("p.mp4", 30, 40, flow=False)
+    made.set_flow(flow, valid)
+    assert made._canvas.shape == (90, 164, 3), "no panel for it"
+
+
+def test_the_legend_is_the_wheel_in_the_lower_right_corner():
+    made = PreviewWriter("p.mp4", 220, 230)
+    made.set_flow(np.zeros((220, 230, 2), np.float32))
+    view = made._panel_view(2)
+    y, x = np.mgrid[:220, :230]
+    far = np.hypot(y - (220 - 6 - 28), x - (230 - 6 - 28))  # its centre
+    assert (view[far > 29] == 255).all()
+    wheel = cv2.resize(flow_wheel(), (55, 55), interpolation=cv2.INTER_AREA)
+    box = view[220 - 61 : 220 - 6, 230 - 61 : 230 - 6]
+    inner = far[220 - 61 : 220 - 6, 230 - 61 : 230 - 6] < 25
+    assert np.abs(box[inner].astype(int) - wheel[inner]).max() <= 1
+    rim = np.abs(far - 27) < 0.4
+    assert np.abs(view[rim].astype(int) - 60).max() <= 1
+    small = PreviewWriter("p.mp4", 82, 300)
+    small.set_flow(np.zeros((82, 300, 2), np.float32))
+    assert (small._panel_view(2) == 255).all(), "164 rows are too few for it"
+    enough = PreviewWriter("p.mp4", 83, 300)
+    enough.set_flow(np.zeros((83, 300, 2), np.float32))
+    assert not (enough._panel_view(2) == 255).all()
+
+
+# --- colours -----------------------------------------------------------------------------------------------------------
+
+
+def middlebury(u: float, v: float) -> np.ndarray:
+    """Colour of a flow of at most unit length, by the published bands of hue (Baker et al. 2011)."""
+    bands = [(15, (255, 0, 0), (0, 1, 0)), (6, (255, 255, 0), (-1, 0, 0)), (4, (0, 255, 0), (0, 0, 1)), (11, (0, 255, 255), (0, -1, 0)), (13, (0, 0, 255), (1, 0, 0)), (6, (255, 0, 255), (0, 0, -1))]
+    ring = [np.array(start) + 255 * k / steps * np.array(way) for steps, start, way in bands for k in range(steps)]
+    turn = (np.arctan2(-v, -u) / np.pi + 1) / 2 * 55
+    low = int(turn) % 55
+    hue = ring[low] * (1 - turn % 1) + ring[(low + 1) % 55] * (turn % 1)
+    return 255 - np.hypot(u, v) * (255 - hue)
+
+
+def test_flow_by_the_published_wheel():
+    dice = np.random.default_rng(0)
+    flow = dice.uniform(-5, 5, (30, 40, 2)).astype(np.float32)
+    rgb = flow_colour(flow, 10.0)
+    for y, x in dice.integers(0, 30, (200, 2)):
+        u, v = np.round(flow[y, x] / 10.0 * 255) / 255
+        np.testing.assert_allclose(rgb[y, x], middlebury(u, v), atol=0.51)
+
+
+def test_full_saturation():
+    """Of the largest valid speed unless it is said; what is faster keeps its hue."""
+    flow = np.zeros((2, 3, 2), np.float32)
+    flow[0, :, 0], flow[1, 0] = (1, 2, 4), (np.nan, 1)
+    flow[1, 1, 1] = 100.0
+    valid = np.ones((2, 3), bool)
+    valid[1, 1] = False
+    np.testing.assert_array_equal(flow_colour(flow, None, valid), flow_colour(flow, 4.0, valid))
+    rgb = flow_colour(flow, 2.0, valid)
+    assert rgb[0, 1].tolist() == rgb[0, 2].tolist() == [255, 0, 0] and rgb[1, 2].tolist() == [255, 255, 255]
+    assert (rgb[1, :2] == INVALID).all()
+    assert (flow_colour(np.zeros((2, 2, 2))) == 255).all()
+
+
+def test_event_counts_saturate_and_darken():
+    counts = np.zeros((2, 3, 4), np.uint16)
+    x, y, p = np.uint16([0, 0, 3, 3]), np.uint16([0, 0, 2, 2]), np.uint8([0, 0, 1, 0])
+    count_events(x, y, p, counts)
+    assert counts[0, 0, 0] == 2 and counts[1, 2, 3] == counts[0, 2, 3] == 1 and counts.sum() == 4
+    counts[1, 1, 1] = 65_534
+    for _ in range(3):
+        count_events(np.uint16([1]), np.uint16([1]), np.uint8([1]), counts)
+    assert counts[1, 1, 1] == 65_535
+    shade = np.rint(255 * (1 - np.exp(-0.9 * np.arange(9)))).astype(int)
+    for off in (0, 1, 3, 8, 500):
+        for on in (0, 2, 9):
+            rgb = event_colour(np.array([[[off]], [[on]]], np.uint16))[0, 0].tolist()
+            a, b = shade[min(off, 8)], shade[min(on, 8)]
+            assert rgb == [255 - b, 255 - max(a, b), 255 - a]

@@ -1,0 +1,130 @@
+"""A read-out, a refractory period and recorded frames through every door: files, arrays, the loop itself, explain, trade."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+import blinkgl
+from blinkgl import EventChunk, Events, GroundTruth, Picture
+from blinkgl.config.sequence import load_run
+from blinkgl.dataset import explain as explain_module
+from blinkgl.dataset.explain import explain
+from blinkgl.dataset.generate import generate_run
+from blinkgl.rng import Role, kernel_seed
+from blinkgl.trade.measure import Bench, Options
+from blinkgl.trade.settings import Setting
+
+BUS = {"events_per_second": 20_000, "row_ns": 300, "queue_events": 40}
+DRAWN = {
+    "camera": {"width": 48, "height": 36}, "time": {"duration": 0.1, "label_rate": 30},
+    "scene": {"kind": "random", "objects": {"count": 3, "distance": [2, 4]}, "pool": {"primitives": ["cuboid"], "variants": 1, "urdfs": False},
+              "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 32}},
+    "timeline": {"kind": "uniform", "fps": 170, "reconstruction": "pchip"},
+}
+EVENTS = {"emulator": "esim", "contrast_threshold": 0.1, "refractory_us": 1500, "threshold_sigma": 0.03}
+COMMON = {"seed": 6, "events": EVENTS, "readout": BUS, "preview": {"enabled": False}, "labels": {"flow": ["forward"], "occlusion": False}}
+FRAMES, FPS = 8, 50
+
+
+@pytest.fixture
+def run(request, tmp_path):
+    """A configuration that is drawn, or one of recorded frames with their flow."""
+    tree = COMMON | (DRAWN if request.param == "drawn" else {"frames": {"folders": ["clip"], "fps": FPS, "max_px": 0.5, "interpolate": request.param}})
+    if request.param != "drawn":
+        write_frames(tmp_path / "clip")
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return load_run(path)
+
+
+def write_frames(folder: Path) -> None:
+    rng = np.random.default_rng(1)
+    texture = cv2.GaussianBlur(rng.random((80, 100)).astype(np.float32), (0, 0), 1.5)
+    texture = (texture - texture.min()) / np.ptp(texture)
+    for name in ("image_left", "flow"):
+        (folder / name).mkdir(parents=True)
+    for k in range(FRAMES):
+        image = cv2.warpAffine(texture, np.float32([[1, 0, 1.5 * k - 30], [0, 1, -20]]), (48, 36))
+        cv2.imwrite(str(folder / f"image_left/{k:03d}.png"), np.round(255 * image).astype(np.uint8))
+        if k:
+            np.save(folder / f"flow/{k:03d}.npy", np.full((36, 48, 2), (1.5, 0), np.float32))
+
+
+def same(a: Events, b: Events) -> bool:
+    return len(a) == len(b) > 100 and all(np.array_equal(getattr(a, name), getattr(b, name)) for name in "xytp")
+
+
+@pytest.mark.parametrize("run", ["drawn", "linear", "cubic", "motion"], indirect=True)
+def test_every_door_gives_the_same(run, tmp_path):
+    (report,) = generate_run(run, tmp_path / "out")
+    written = blinkgl.read_events(report.path / "events.h5")
+    recording = blinkgl.record(run)
+    sequence = blinkgl.simulate_sequence(run)
+    items = list(sequence)
+    assert same(Events.concatenate([item.events for item in items if isinstance(item, EventChunk)]), written)
+    assert same(recording.events, written)
+    assert sequence.camera.dropped == recording.lost > 50 and sequence.camera.late > 0
+    assert recording.frames == report.frames == sequence.frames
+    by_pixel = np.lexsort((written.t, written.x, written.y))
+    gaps = np.diff(written.t[by_pixel])[(np.diff(written.x[by_pixel].astype(int)) == 0) & (np.diff(written.y[by_pixel].astype(int)) == 0)]
+    assert gaps.min() > 1500 - 1e6 * BUS["queue_events"] / BUS["events_per_second"] and len(gaps) > 100, "the refractory period, as late as the bus may be"
+    truths = [item for item in items if isinstance(item, GroundTruth)]
+    flows = [truth.frame.forward for truth in truths if truth.forward_ns is not None]
+    assert len(flows) == report.labels == len(recording.flow)
+    for k, flow in enumerate(flows):
+        np.testing.assert_array_equal(flow.flow, recording.flow[k])
+        saved, valid = blinkgl.read_flow(report.path / f"flow/forward/{k:06d}.png")
+        assert np.array_equal(valid, flow.valid) and np.abs(saved - flow.flow)[valid].max() <= 1 / 256 + 1e-6
+    for k in range(len(truths)):
+        assert np.array_equal(cv2.imread(str(report.path / f"images/{k:06d}.png"))[..., ::-1].max(-1), np.atleast_3d(recording.images[k]).max(-1))
+    assert recording.image_t_us.tolist() == [truth.t_ns // 1000 for truth in truths]
+    assert len(recording.window(0)) == np.count_nonzero((written.t >= recording.t_us[0]) & (written.t < recording.t_us[1]))
+
+
+@pytest.mark.parametrize("run", ["linear", "motion"], indirect=True)
+def test_frames_of_a_folder_are_frames_of_any_source(run, tmp_path):
+    """The same pictures given to the simulator of videos, with the sequence's own seed."""
+    from blinkgl.recordings.simulation import simulate
+
+    config = run.sequence(0)
+    frames = [cv2.imread(str(path)) for path in sorted((tmp_path / "clip/image_left").iterdir())]
+    given = ((frame[..., 0], round(k * 1e9 / FPS)) for k, frame in enumerate(frames))
+    events = Events.concatenate(list(simulate(given, emulator=config.events, gamma="srgb", interpolate=config.frames.interpolate, max_px=0.5,
+                                              readout=config.readout, seed=kernel_seed(config.seed, 0, Role.EVENTS))))
+    assert same(blinkgl.record(run).events, events)
+
+
+@pytest.mark.parametrize("run", ["drawn", "linear"], indirect=True)
+def test_pictures_come_after_the_events_until_then(run):
+    items = list(blinkgl.simulate_sequence(run, pictures_hz=20, labels=[]))
+    pictures = [k for k, item in enumerate(items) if isinstance(item, Picture)]
+    assert len(pictures) > 2 and all(isinstance(items[k - 1], EventChunk) and items[k - 1].t_ns == items[k].t_ns for k in pictures)
+    times = [items[k].t_ns / 1e9 for k in pictures]
+    assert times[0] == 0 and np.diff(times).max() < 0.05 + 1 / 50 + 1e-9
+    drawn = items[pictures[0]].velocity is not None
+    assert all(items[k].image.dtype == np.float32 and (items[k].velocity is not None) == drawn for k in pictures)
+
+
+@pytest.mark.parametrize("run", ["drawn", "motion"], indirect=True)
+def test_explain_sees_the_events_that_leave_the_sensor(run, monkeypatch):
+    seen = []
+    monkeypatch.setattr(explain_module, "simulate_sequence",
+                        lambda *args, _door=explain_module.simulate_sequence, **kwargs: seen.append(_door(*args, **kwargs)) or seen[0])
+    explain(run)
+    assert seen[0].camera.dropped > 0 and 0 < seen[0].events < seen[0].frames * BUS["queue_events"] * 10
+
+
+@pytest.mark.parametrize("run", ["drawn"], indirect=True)
+def test_trade_judges_what_the_pixels_see(run, gl):
+    """A bus makes events late, which is no error of a setting: it is left out, as noise is."""
+    options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), rounds=1)
+    events = []
+    for tree in (run.tree, {**run.tree, "readout": None}):
+        (measured,) = Bench(gl, type(run)(tree, run.base), options).measure([Setting("displacement 1 px")])
+        events.append(measured.events)
+    assert len(events[0]) == len(events[1]) > 10 and np.array_equal(events[0].t, events[1].t)

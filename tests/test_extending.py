@@ -1,0 +1,89 @@
+"""The code of docs/extending.md runs as it stands. Emulators and labels have a file of their own, test_seams.py."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from blinkgl import AssetError, EventDataError, Events
+from blinkgl.io.formats import EventFile
+
+PAGE = (Path(__file__).parents[1] / "docs/extending.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def code(tmp_path, monkeypatch):
+    """The Python of a section, as a module."""
+
+    def module(section: str) -> ModuleType:
+        text = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+        path = tmp_path / "of_the_page.py"
+        path.write_text(re.search(r"```python\n(.*?)```", text, re.S)[1])
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        made = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, path.stem, made)  # where pydantic looks up the names of annotations
+        spec.loader.exec_module(made)
+        return made
+
+    return module
+
+
+def test_a_file_format(code, tmp_path):
+    made = code("A file format of events")
+    rng = np.random.default_rng(0)
+    events = Events(
+        rng.integers(0, 64, 3000).astype(np.uint16),
+        rng.integers(0, 48, 3000).astype(np.uint16),
+        np.sort(rng.integers(0, 10**6, 3000)),
+        rng.integers(0, 2, 3000).astype(np.uint8),
+    )
+    path = tmp_path / "e.nine"
+    for recording in (events, Events.empty()):
+        writer = made.NineWriter(path, 48, 64)
+        for i in range(0, len(recording), 1000):
+            writer.append(Events(*(getattr(recording, k)[i : i + 1000] for k in "xytp")))
+        writer.close()
+        reader = made.NineReader(path)
+        file = EventFile(path, "nine", reader.height, reader.width, 0, reader)
+        assert (file.height, file.width) == (48, 64)
+        assert all(np.array_equal(getattr(file.read(), k), getattr(recording, k)) for k in "xytp")
+    writer = made.NineWriter(path, 48, 32)
+    with pytest.raises(EventDataError):
+        writer.append(events)
+    writer.abort()
+    path.write_bytes(path.read_bytes() + b"x")
+    with pytest.raises(AssetError, match="truncated"):
+        made.NineReader(path)
+    path.write_bytes(b"ELEVEN")
+    with pytest.raises(AssetError):
+        made.NineReader(path)
+
+
+def test_a_network(code):
+    torch = pytest.importorskip("torch")
+    from eflow.losses import sequence_loss
+
+    made = code("A network")
+    model = made.Tiny(made.TinyConfig(width=8))
+    batch = {k: torch.randn(2, 5, 48, 64) for k in ("old", "new")}
+    prediction = model(batch)
+    assert prediction.flow.shape == (2, 2, 48, 64)
+    loss = sequence_loss(prediction, torch.ones(2, 2, 48, 64), torch.ones(2, 48, 64, dtype=torch.bool))
+    (loss[0] if isinstance(loss, tuple) else loss).backward()
+    assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in model.parameters())
+    with pytest.raises(EventDataError, match="multiples of 8"):
+        model({k: torch.randn(1, 5, 50, 64) for k in ("old", "new")})
+
+
+PLACES = set(re.findall(r"`((?:blinkgl|eflow|shaders|tools|tests|configs|docs)/[\w./]*)`", PAGE))
+
+
+@pytest.mark.parametrize("place", sorted(place for place in PLACES if "NAME" not in place))
+def test_every_place_is_there(place):
+    assert (Path(__file__).parents[1] / place).exists(), f"docs/extending.md names {place}"

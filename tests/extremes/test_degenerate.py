@@ -15,10 +15,9 @@ from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.sequence_dir import verify_sequence
-from blinkgl.labels import LabelRequest
+from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import renderer as module
 from blinkgl.render.passes import Geometry
-from blinkgl.render.passes.geometry import BUFFERS
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
@@ -29,7 +28,7 @@ from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scen
 from tests.shared_data import shared
 
 MS = 1_000_000
-RAW = Geometry(tuple(BUFFERS))
+RAW = Geometry(tuple(name for name, label in LABELS.items() if label.buffer))
 
 
 def sheet(corners: np.ndarray, seed: int = 1):

@@ -268,7 +268,7 @@ def test_a_moment_is_computed_once_and_shared(gl):
     with Renderer(gl, world, PLAIN) as renderer:
         asked.clear()
         for t in range(interval, 6 * interval, interval):
-            renderer.motion(t, 4), renderer.luminance(t, rate=True), renderer.brightness(t, 2), renderer.colour(t)
+            renderer.velocity_of_movers(t, 4), renderer.luminance(t, rate=True), renderer.brightness(t, 2), renderer.colour(t)
             renderer.labels(t, LabelRequest("flow_forward", "flow_backward", "occlusion_forward", "velocity"), t + interval, t - interval)
     assert set(asked.values()) == {1}, asked
     assert {t for what, t in asked if what == "pose"} == {k * interval for k in range(7)}

@@ -28,12 +28,9 @@ class PinHole(CameraModel):
         return cls(width, height, fx, fx if fy is None else fy, (width - 1) / 2, (height - 1) / 2, near)
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        points = np.asarray(points, np.float64)
-        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
-        out = np.empty((*points.shape[:-1], 2))
-        out[..., 0] = self.fx * points[..., 0] / z + self.cx
-        out[..., 1] = self.fy * points[..., 1] / z + self.cy
-        return out
+        x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
+        z = np.where(z > 0, z, np.nan)
+        return np.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], axis=-1)
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
@@ -86,13 +83,14 @@ class PinHole(CameraModel):
         return planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        if points[:, 2].min() <= self.near:
-            return (0, 0, self.width, self.height) if points[:, 2].max() > self.near else None
-        # Of a convex body in front of the camera the corners are seen farthest out.
-        seen = self.project(points)
-        (left, top), (right, bottom) = seen.min(axis=0).tolist(), seen.max(axis=0).tolist()
-        x0, x1 = max(0, math.floor(left) - 1), min(self.width, math.ceil(right) + 2)
-        y0, y1 = max(0, math.floor(top) - 1), min(self.height, math.ceil(bottom) + 2)
+        """Of a convex body in front of the camera the corners are seen farthest out."""
+        z = points[:, 2]
+        if z.min() <= self.near:
+            return (0, 0, self.width, self.height) if z.max() > self.near else None
+        # Not by `project`: asked of every moving thing in every frame, and nothing here is behind the camera.
+        x, y = self.fx * points[:, 0] / z + self.cx, self.fy * points[:, 1] / z + self.cy
+        x0, x1 = max(0, math.floor(x.min()) - 1), min(self.width, math.ceil(x.max()) + 2)
+        y0, y1 = max(0, math.floor(y.min()) - 1), min(self.height, math.ceil(y.max()) + 2)
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
     def clip_from_cam(self) -> np.ndarray:

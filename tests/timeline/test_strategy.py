@@ -188,6 +188,18 @@ def test_as_many_events_are_beyond_the_target_as_the_percentile_says(fast, targe
     assert said["percentile"] == 75 and said["p75_us"] == pytest.approx(target, rel=0.06)
 
 
+def test_a_frame_is_judged_by_the_speed_at_the_nearest_time_that_was_looked_at():
+    world, seen = SimpleNamespace(motion=lambda t, n: picture(np.full((2, 2, 2), (float(t), 0.0), np.float32))), []
+    timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0), 0, 10 * MS, world, Esim.response(ESIM))
+    timeline.error.observe = lambda t_ns, signal, slope, speed: seen.append((t_ns, speed.max()))
+    timeline.observe(7, np.ones((2, 2), np.float32))  # nothing looked at yet: it looks itself
+    for t in (1000, 2000, 5000):
+        timeline.pace(t)
+    for t in (1000, 1400, 1600, 4000, 9000, 300):
+        timeline.observe(t, np.ones((2, 2), np.float32))
+    assert seen == [(7, 7), (1000, 1000), (1400, 1000), (1600, 2000), (4000, 5000), (9000, 5000), (300, 7)]
+
+
 def test_nothing_moves_nothing_is_measured():
     still = SimpleNamespace(velocity_of_movers=lambda t, n: picture(np.zeros((3, 4, 2), np.float32)))
     timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, Esim.response(ESIM))

@@ -172,7 +172,8 @@ from blinkgl.events.types import Events
 from blinkgl.io.formats import open_events, write_events
 before = dict(os.environ)
 rng, n = np.random.default_rng(0), 150_000
-events = Events(rng.integers(0, 64, n).astype("u2"), rng.integers(0, 48, n).astype("u2"), np.sort(rng.integers(0, 10**6, n)), rng.integers(0, 2, n).astype("u1"))
+x, y, p = rng.integers(0, 64, n).astype("u2"), rng.integers(0, 48, n).astype("u2"), rng.integers(0, 2, n).astype("u1")
+events = Events(x, y, np.sort(rng.integers(0, 10**6, n)), p)
 write_events(sys.argv[1], events, 48, 64)
 assert len(open_events(sys.argv[1]).read()) == n and dict(os.environ) == before, "the environment was changed"
 print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())

@@ -31,7 +31,7 @@ class Output(NamedTuple):
 
 class Input(NamedTuple):
     """What a pass reads of another one, at the same moment. sampler : the uniform that gets it.
-    output : name of an output of ``of`` (default: its first), or "depth", where ``of`` keeps its depth as a texture."""
+    output : name of an output of ``of`` (default: its first), or ``DEPTH_BUFFER``, where ``of`` keeps that as a texture."""
 
     sampler: str
     of: Pass
@@ -76,7 +76,7 @@ class Pass:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Of its target, px, for an image of width x height: ``samples.grid`` times as fine, or every n-th pixel, at least one."""
-        return tuple(max(1, side * self.samples.grid // self.every) for side in (width, height))
+        return max(1, width * self.samples.grid // self.every), max(1, height * self.samples.grid // self.every)
 
     def background(self, scene: Scene) -> tuple[float, ...]:
         """The first output where nothing is hit; 0 where it ends, and in all others."""
@@ -87,7 +87,7 @@ class Pass:
         return {}
 
     def seen(self, moment: Moment) -> Moment:
-        """The moment as this pass looks at it: the camera's, unless it draws for another one (``moment.through``)."""
+        """The moment as this pass looks at it: the camera's, unless it draws for another one (``moment.from_place``)."""
         return moment
 
     def begin(self, painter: Painter, shot: Shot) -> None:

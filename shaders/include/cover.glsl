@@ -1,4 +1,5 @@
-// The vertex stage of a pass over all pixels of its target: one triangle that covers them, from the vertex number alone.
+// The vertex stage of a pass over all pixels of its target: one triangle that covers them, from the vertex number
+// alone.
 #ifdef VERTEX_SHADER
 void main()
 {

@@ -1,6 +1,7 @@
 """One YAML in, a DSEC-layout sequence out: read back by independent readers, reproducible, whole or not at all."""
 
 import hashlib
+import itertools
 import json
 import os
 import subprocess
@@ -371,8 +372,8 @@ def test_progress_grows_and_says_what_each_stage_has_taken(tmp_path, gl):
     assert len(told) > 20 and report.frames == 51 and report.simulated_s == pytest.approx(0.25)
     for stage in ("render", "read-back", "events"):
         taken = [seconds.get(stage, 0.0) for *_, seconds in told[1:]]
-        assert taken[0] > 0 and all(a <= b for a, b in zip(taken, taken[1:])), stage
+        assert taken[0] > 0 and all(a <= b for a, b in itertools.pairwise(taken)), stage
     for column in range(3):
         values = [row[column] for row in told]
-        assert all(a <= b for a, b in zip(values, values[1:])) and values[0] < values[-1]
+        assert all(a <= b for a, b in itertools.pairwise(values)) and values[0] < values[-1]
     assert 0 <= told[0][0] < 0.1 and sum(report.seconds.values()) <= report.total_s * 1.05

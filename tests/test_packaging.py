@@ -1,13 +1,14 @@
 """The wheel and the editable install are complete: command, shaders, configs, tools, outside the repository too.
 
 Both go into fresh virtual environments that see this one's packages (through a .pth, which does not activate this one's
-editable install), so nothing is fetched.
+editable install), so nothing is fetched; but for the slow test, whose environment is empty.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+import yaml
+
+import blinkgl
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGES = {"blinkgl": "blinkgl", "eflow": "eflow", "shaders": "blinkgl/shaders", "configs": "blinkgl/configs", "tools": "blinkgl/tools"}
@@ -91,7 +95,8 @@ def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
 def test_wheel(source, tmp_path):
     pytest.importorskip("build")
     run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
-    wheel = next((tmp_path / "dist").glob("blinkgl-*.whl"))
+    wheel, = (tmp_path / "dist").iterdir()
+    assert wheel.name == f"blinkgl-{blinkgl.__version__}-py3-none-any.whl"
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
     missing = expected_files() - names
@@ -101,6 +106,26 @@ def test_wheel(source, tmp_path):
     bin_ = fresh_environment(tmp_path / "venv")
     run(sys.executable, "-m", "pip", "--python", bin_ / "python", "install", "--no-deps", "--no-index", wheel, cwd=tmp_path)
     check_installation(bin_, tmp_path / "venv", tmp_path)
+
+
+@pytest.mark.slow
+def test_wheel_in_an_empty_environment_runs_the_demo(source, tmp_path):
+    """Everything comes from the wheel and from the package index, at the versions of constraints.txt."""
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
+    wheel, = (tmp_path / "dist").iterdir()
+    run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
+    bin_ = tmp_path / "venv" / "bin"
+    command = [bin_ / "pip", "install", "-q", "-c", REPOSITORY / "constraints.txt", wheel]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    if done.returncode and re.search(r"No matching distribution|Could not find|Connection|Temporary failure", done.stderr):
+        pytest.skip(f"the package index cannot be reached: {done.stderr.splitlines()[-1]}")
+    assert done.returncode == 0, done.stderr
+    check_installation(bin_, tmp_path / "venv", tmp_path)
+    demo = run(bin_ / "python", "-c", "import blinkgl.configs as c; print(c.__path__[0] + '/demo.yaml')", cwd=tmp_path).strip()
+    run(bin_ / "blinkgl", "generate", demo, "--out", tmp_path / "demo", "--set", "time.duration=0.3", cwd=tmp_path)
+    assert "1 sequence" in run(bin_ / "blinkgl", "verify", tmp_path / "demo", cwd=tmp_path)
+    made = tmp_path / "demo/train/demo_000000"
+    assert {"events.h5", "flow", "images", "manifest.json", "preview.mp4"} <= {path.name for path in made.iterdir()}
 
 
 def test_editable(source, tmp_path):
@@ -116,7 +141,6 @@ def test_editable(source, tmp_path):
 def test_constraints_pin_what_setup_cfg_asks_for():
     """Every direct dependency has a pin, and the pin satisfies the lower bound."""
     import configparser
-    import re
 
     from packaging.requirements import Requirement
 
@@ -139,3 +163,72 @@ def test_constraints_pin_what_setup_cfg_asks_for():
         requirement = Requirement(line)
         assert key(requirement.name) in pins, f"{line} has no pin"
         assert requirement.specifier.contains(pins[key(requirement.name)]), line
+
+
+def test_citation():
+    """What the format 1.2.0 asks for and allows, and what we say of ourselves. (cffconvert knows all of it, but wants a
+    jsonschema that Ray refuses.)"""
+    told = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text(encoding="utf-8"))
+    assert (told["cff-version"], told["type"], told["license"]) == ("1.2.0", "software", "MIT")
+    assert told["message"] and told["title"]
+    keys = """cff-version message title type authors version date-released license keywords references abstract url doi contact
+              repository-code identifiers preferred-citation commit license-url repository repository-artifact""".split()
+    assert set(told) <= set(keys)
+    assert len(set(told["keywords"])) == len(told["keywords"])
+    for work in [told, *told["references"]]:
+        for author in work["authors"]:
+            assert set(author) in ({"name"}, {"family-names", "given-names"})
+            assert all(isinstance(name, str) and name for name in author.values())
+    for work in told["references"]:
+        assert {"type", "title", "authors", "year"} <= set(work) and isinstance(work["year"], int)
+        assert work["type"] in ("conference-paper", "article")
+    assert told["version"] == blinkgl.__version__
+    changes = (REPOSITORY / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"## {told['version']} ({told['date-released']})" in changes, "a release is dated once"
+
+
+def test_changes_are_of_known_kinds():
+    text = (REPOSITORY / "towncrier.toml").read_text(encoding="utf-8")
+    kinds = re.findall(r'^directory = "(\w+)"$', text.partition("[[tool.towncrier.type]]")[2], re.M)
+    names = {path.name for path in (REPOSITORY / "changes").iterdir()} - {".gitkeep"}
+    odd = [name for name in names if not re.fullmatch(rf"\+?\w+\.({'|'.join(kinds)})\.md", name)]
+    assert kinds and odd == [], f"a fragment is called NAME.KIND.md, KIND one of {kinds}"
+
+
+def test_the_container_installs_what_setup_sh_asks_for():
+    """The Dockerfile, without Docker: it copies what a build reads, and installs the packages that tools/setup.sh would."""
+    from blinkgl.tools.recipe import stage
+
+    image, cpu = stage((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"), "cpu")
+    assert image == "debian:bookworm-slim"
+    copied = {name for step in cpu if step.instruction == "COPY" for name in step.text.split()[:-1]}
+    assert copied == {*PACKAGES, "setup.cfg", "pyproject.toml", "constraints.txt", "README.md", "LICENSE"}
+    ignored = (REPOSITORY / ".dockerignore").read_text(encoding="utf-8").split()
+    assert {line[1:] for line in ignored if line.startswith("!")} == copied
+    setup = (REPOSITORY / "tools/setup.sh").read_text(encoding="utf-8")
+    wanted = set(re.search(r'packages="([^$"]+)"', setup)[1].split()) | {"python3-venv", "libosmesa6"}
+    installed = {word for step in cpu if step.instruction == "RUN" and "apt-get install" in step.text for word in step.text.split()}
+    assert wanted <= installed
+    nvidia = stage((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"), "nvidia")[1]
+    assert nvidia[: len(cpu)] == cpu and any("graphics" in step.text for step in nvidia if step.instruction == "ENV")
+    assert [step.text for step in nvidia if step.instruction == "USER"][-1] == "blinkgl"
+
+
+def test_the_recipe_copies_and_sets_as_docker_does(tmp_path):
+    from blinkgl.tools.recipe import State, Step, copy, stage, steps
+
+    recipe = "# a\nFROM x:1 AS a\nENV A=1 B=$A:2\nRUN one \\\n  two\nFROM a AS b\nUSER me\n"
+    assert stage(recipe, "b") == ("x:1", [Step("ENV", "A=1 B=$A:2"), Step("RUN", "one    two"), Step("USER", "me")])
+    with pytest.raises(ValueError, match="ADD"):
+        steps("FROM x\nADD y z\n")
+    state = State()
+    for step in (Step("ENV", "A=1"), Step("ENV", "B=$A:2"), Step("WORKDIR", "/src"), Step("ENTRYPOINT", '["run"]')):
+        state.set(step)
+    assert (state.environment["B"], state.folder, state.command) == ("1:2", "/src", ["run"])
+    context, root = tmp_path / "context", tmp_path / "root"
+    (context / "d/e").mkdir(parents=True)
+    for name in ("f", "d/g", "d/e/h"):
+        (context / name).write_text(name)
+    copy(context, root, state, "f ./")
+    copy(context, root, state, "d /there")
+    assert sorted(p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file()) == ["src/f", "there/e/h", "there/g"]

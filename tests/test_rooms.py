@@ -31,6 +31,13 @@ def test_every_room_is_installed():
     assert named == {"blinkgl"} | {name if name.startswith(("blinkgl", "eflow")) else f"blinkgl.{name}" for name in here}
 
 
+def test_every_room_is_on_the_map():
+    map_, pages = ((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("architecture.md", "rooms.md"))
+    for room in {p.relative_to(ROOT / "blinkgl").parts[0] for p in ROOMS if p.is_relative_to(ROOT / "blinkgl")}:
+        assert re.search(rf"\b{room}/", map_), f"docs/architecture.md says nothing of {room}/"
+        assert f"`blinkgl.{room}`" in pages, f"docs/rooms.md says nothing of {room}"
+
+
 def _room(module: str) -> str:
     """The files at the top of scene/ and config/ are looked at one by one: scene/types.py comes before the rooms inside and scene/build.py after
     them, config/labels.py before the table of labels and config/sequence.py after it."""

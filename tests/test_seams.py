@@ -30,10 +30,10 @@ from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.gl import ShaderError, create_context
 from blinkgl.io.formats import open_events
-from blinkgl.labels import LABELS, Form, Label, LabelRequest, register as register_label, unregister as unregister_label
+from blinkgl.labels import LABELS, Form, Label, LabelFrame, LabelRequest, register as register_label, unregister as unregister_label
 from blinkgl.labels.files import npy
 from blinkgl.labels.label import Key
-from blinkgl.recordings.simulation import simulate
+from blinkgl.recordings.simulation import frames_to_events
 from blinkgl.render.reference import scene_parts
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
@@ -146,8 +146,8 @@ def test_a_toy_emulator_simulates(toy, tmp_path, capsys):
 
     assert emulator_options("toy", None, [], "davis346")["emulator"] == Toy.Config(contrast_threshold=0.2, dead_us=500)
     frames = [np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)]
-    assert sum(len(e) for e in simulate(frames, fps=1000, emulator="toy")) == 24
-    assert sum(len(e) for e in simulate(frames, fps=1000, emulator=Toy.Config(dead_us=1500))) == 12
+    assert sum(len(e) for e in frames_to_events(frames, fps=1000, emulator="toy")) == 24
+    assert sum(len(e) for e in frames_to_events(frames, fps=1000, emulator=Toy.Config(dead_us=1500))) == 12
 
 
 def test_a_sensor_sets_a_toy_emulator(toy, tmp_path):
@@ -425,7 +425,7 @@ def test_what_has_no_labels_is_not_disturbed_by_one(command, position, tmp_path)
         options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5),), rounds=1)
         assert trade(load_run(labelled(tmp_path)), options=options, settings=(Setting("displacement 2 px"),))["settings"]
     else:
-        assert sum(len(e) for e in simulate([np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)], fps=1000)) > 0
+        assert sum(len(e) for e in frames_to_events([np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)], fps=1000)) > 0
 
 
 def shader(*arguments):
@@ -632,8 +632,9 @@ def test_a_label_may_look_at_others_and_at_another_time(drawing):
             renderer.labels(t_ns, LabelRequest("next_depth"))
     finally:
         unregister_label("next_depth")
+    assert frame.next_depth is frame.values["next_depth"]
     with pytest.raises(AttributeError, match="no label 'next_depth'"):
-        frame.next_depth
+        LabelFrame(0, {}).next_depth
 
 
 @pytest.mark.parametrize("reference, said", [

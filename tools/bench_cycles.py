@@ -39,11 +39,11 @@ from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.srgb import to_srgb8
 from blinkgl.timeline.sampling import displacement_times
+from blinkgl.timeline.speed import largest_speed
 from blinkgl.tools.peer_cycles import Cost, CyclesSettings, available, frames
 from blinkgl.trade.metrics import SpeedMaps, event_errors
 
@@ -72,7 +72,7 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     config = EsimConfig(threshold_sigma=0.0)
     height, width = scene.camera.height, scene.camera.width
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(islice(displacement_times(options.max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t).read())), options.frames))
+        times = list(islice(displacement_times(options.max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t).read())), options.frames))
         maps = np.stack([np.linalg.norm(renderer.velocity(t).read(), axis=-1) for t in times])
     speeds = SpeedMaps(np.array(times) // 1000, maps)
     step = float(np.median(np.diff(times)))
@@ -115,7 +115,7 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
 def speed(gl, scene: Scene, max_px: float, options) -> dict:
     """Part 2. EEVEE and Cycles draw two frames; the first (shader compilation, acceleration structure) is set apart."""
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(displacement_times(max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t).read())))
+        times = list(displacement_times(max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t).read())))
         triangles = renderer.triangles
     few = [times[0], times[len(times) // 2]]
     rows = []

@@ -27,10 +27,10 @@ from blinkgl.events.camera import EventCamera, EventFrame
 from blinkgl.gl import create_context
 from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.build import sequence_scene
 from blinkgl.scene.types import Scene
 from blinkgl.timeline import displacement_times
+from blinkgl.timeline.speed import largest_speed
 from blinkgl.trade.matching import match_events
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -112,7 +112,7 @@ def judge(gl, scene: Scene, settings: dict, times: list[int], factor: int, limit
 def displacement_frames(gl, scene: Scene, max_px: float, count: int) -> list[int]:
     """The first ``count`` times, ns, between which nothing moves further than ``max_px``."""
     with Renderer(gl, scene, PLAIN) as renderer:
-        return list(islice(displacement_times(max_px, 200_000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.motion(t, 4).read())), count))
+        return list(islice(displacement_times(max_px, 200_000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t, 4).read())), count))
 
 
 def main() -> None:

@@ -34,8 +34,8 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.dataset.report import STAGES, Totals
 from blinkgl.events.camera import EventCamera, emulate
 from blinkgl.gl import create_context
-from blinkgl.machine import bench
 from blinkgl.labels import LabelRequest
+from blinkgl.machine import bench
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry import primitives

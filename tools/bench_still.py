@@ -66,8 +66,8 @@ class Way:
         stats = self.renderer.stats
         drawn, read = stats.render_s, stats.readback_s
         wall, cpu = time.perf_counter(), time.process_time()
-        before, self.frame = self.frame, self.renderer.luminance(t_ns).read()
-        luminance = self.frame.view()
+        before, self.frame = self.frame, self.renderer.luminance(t_ns)
+        luminance = self.frame.read()
         done = time.perf_counter()
         self.events.append(self.camera.step(EventFrame(t_ns, luminance, rows=self.frame.rows_changed_since(before))))
         end = time.perf_counter()

@@ -17,10 +17,11 @@ from eflow.cli import app as eflow_app
 
 HEADER = """# Commands
 
-Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `--help` after any of them prints the same.
+Made from the commands by `python -m blinkgl.tools.command_docs`; do not edit. `--help` prints the same.
 
-`--debug`, before or after a command, shows the traceback of an error. Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 your
-input or the machine (`error: …`, one line); 3 done but for sequences that were set aside; 130 interrupted.
+`--debug`, before or after a command, shows the traceback of an error. Exit status: 0 done; 1 `shader diff` or
+`shader check` found something wrong; 2 your input or the machine (`error: …`, one line); 3 done but for sequences that
+were set aside; 130 interrupted.
 """
 REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 """What ``--help`` says last of an option, ``[default: 4; 1<=x<=1000]``."""
@@ -29,7 +30,9 @@ REMARKS = re.compile(r"\s*\[([^\]]*)\]$")
 def page() -> str:
     """The page as Markdown."""
     roots = (("blinkgl", blinkgl_app), ("eflow", eflow_app))
-    return HEADER + "".join(_section(name, command) for root, app in roots for name, command in _commands(root, typer.main.get_command(app)))
+    return HEADER + "".join(
+        _section(name, command) for root, app in roots for name, command in _commands(root, typer.main.get_command(app))
+    )
 
 
 def _commands(name: str, command) -> Iterator[tuple[str, object]]:

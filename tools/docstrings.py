@@ -1,6 +1,6 @@
 """Reads BlinkGL's docstrings for the documentation site: a Griffe extension, named in mkdocs.yml.
 
-The docstrings are written to be read in the source. Two habits in them mean nothing to Markdown and are translated here:
+The docstrings are written to be read in the source. Two habits in them mean nothing to Markdown and are translated:
 ``:class:`~blinkgl.events.types.Events```, which becomes code, and the lines that explain arguments,
 
     width, height : px.   fov : horizontal field of view, degrees,
@@ -88,12 +88,14 @@ def _listed(lines: list[str]) -> list[str]:
 
 
 class Docstrings(griffe.Extension):
-    """Translates every docstring once, when its object has been read; a room shows its modules, not besides what it hands on of them."""
+    """Translates every docstring once. A room shows its modules, not besides what it hands on of them."""
 
     def on_module(self, *, mod: griffe.Module, **_: Any) -> None:
         if mod.is_init_module and mod.parent is not None:
             mod.exports = None
-            modules = {name: member for name, member in sorted(mod.members.items()) if isinstance(member, griffe.Module)}
+            modules = {
+                name: member for name, member in sorted(mod.members.items()) if isinstance(member, griffe.Module)
+            }
             mod.members = {name: member for name, member in mod.members.items() if name not in modules} | modules
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:

@@ -24,12 +24,13 @@ PAGE = Path("docs/examples.md")
 PICTURES = {
     "scene_in_python": ("scene.png", "example_scene.png", "a checked ball, a red ring and a box with a photograph on a brick floor"),
     "frame_with_labels": ("labels.png", "example_labels.png", "image, depth, instance ids and flow of one frame"),
+    "own_label": ("position.png", "example_own_label.png", "a frame, and a map of where its surfaces are"),
     "events_over_frame": ("events.png", "example_events.png", "a frame, and the events that follow it drawn over it"),
     "event_tensors": ("tensors.png", "example_tensors.png", "a time surface and the five bins of a voxel grid"),
 }
 """Of an example: the picture it makes, its name in docs/images, and what it shows."""
-ORDER = ("scene_in_python", "frame_with_labels", "own_trajectory", "video_to_events", "events_over_frame", "event_tensors", "dataset_from_yaml",
-         "torch_dataloader", "online_windows", "compare_recordings", "convert_formats", "sensors")
+ORDER = ("scene_in_python", "frame_with_labels", "own_label", "own_trajectory", "video_to_events", "events_over_frame", "event_tensors",
+         "dataset_from_yaml", "torch_dataloader", "online_windows", "compare_recordings", "convert_formats", "sensors")
 
 HEADER = """# Examples
 

@@ -76,7 +76,7 @@ def frames(scratch: Path) -> dict[str, str]:
     """A folder of frames, converted by ``generate`` and by ``simulate`` with each emulator."""
     import cv2
 
-    from blinkgl.recordings.simulation import simulate_file
+    from blinkgl.recordings.simulation import file_to_events
 
     folder = scratch / "clip" / "image_left"
     folder.mkdir(parents=True)
@@ -85,7 +85,7 @@ def frames(scratch: Path) -> dict[str, str]:
         picture = 128 + 90 * np.sin((x + 1.3 * k) / 5) * np.cos((y - 0.4 * k) / 7)
         cv2.imwrite(str(folder / f"{k:06d}.png"), np.round(picture).astype(np.uint8))
     for emulator in EMULATORS:
-        simulate_file(folder, scratch / "out" / f"{emulator}.npz", fps=100, emulator=emulator, seed=3)
+        file_to_events(folder, scratch / "out" / f"{emulator}.npz", fps=100, emulator=emulator, seed=3)
     return sums(scratch / "out")
 
 

@@ -41,7 +41,7 @@ import numpy as np
 
 from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError, ConfigError
-from blinkgl.render.colour import LUMA, decode_image
+from blinkgl.render.colour import LUMA, linear_image
 from blinkgl.scene.types import Material, Scene
 
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
@@ -252,7 +252,7 @@ def _paint(material: Material, culled: bool, textures: _Numbered, arrays: dict) 
     if material.texture is not None:
         index, new = textures.number(id(material.texture))
         if new:
-            arrays[f"texture{index}"] = decode_image(material.texture.image)
+            arrays[f"texture{index}"] = linear_image(material.texture.image)
     return {"texture": index, "base_color": [float(c) for c in material.base_color], "unlit": material.unlit, "culled": culled}
 
 

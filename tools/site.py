@@ -1,9 +1,9 @@
-"""Builds the documentation site and looks at every page of it: no dead link, nothing fetched from the network, no page that none leads to.
+"""Builds the documentation site and looks at every page: no dead link, nothing fetched, no page that none leads to.
 
     python -m blinkgl.tools.site [--out out/site]
 
-Runs in the repository (`make docs`); a test builds a copy. Zensical's own `--strict` stops at what it can see in the Markdown; what is
-checked here is what a reader gets.
+Runs in the repository (`make docs`); a test builds a copy. Zensical's own `--strict` stops at what it can see in the
+Markdown; what is checked here is what a reader gets.
 """
 
 from __future__ import annotations
@@ -21,7 +21,15 @@ from urllib.parse import unquote, urlsplit
 
 SOURCES = ("mkdocs.yml", "docs", "blinkgl", "eflow", "tools/docstrings.py", "CHANGELOG.md", "changes", "towncrier.toml")
 """What the site is made of."""
-FETCHED = {("script", "src"), ("link", "href"), ("img", "src"), ("source", "src"), ("video", "src"), ("iframe", "src"), ("object", "data")}
+FETCHED = {
+    ("script", "src"),
+    ("link", "href"),
+    ("img", "src"),
+    ("source", "src"),
+    ("video", "src"),
+    ("iframe", "src"),
+    ("object", "data"),
+}
 """What a browser loads when it shows a page, unlike what a reader may click."""
 NOT_LOADED = {"canonical", "prev", "next", "alternate", "author"}
 """Of `<link rel=…>`: says something, loads nothing."""
@@ -58,7 +66,9 @@ class _Page(HTMLParser):
 def build(root: Path, out: Path) -> None:
     """The site of the repository at ``root``, in ``out``, which is replaced. Raises BuildError for any warning."""
     if importlib.util.find_spec("zensical") is None:
-        raise BuildError("error: Zensical is not installed; run pip install -c constraints.txt -e '.[docs]' (Python 3.11 or newer)")
+        raise BuildError(
+            "error: Zensical is not installed; run pip install -c constraints.txt -e '.[docs]' (Python 3.11 or newer)"
+        )
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         for name in SOURCES:
@@ -69,7 +79,13 @@ def build(root: Path, out: Path) -> None:
             else:
                 shutil.copy(source, target)
         (copy / "docs/changelog.md").write_text(changelog(copy), encoding="utf-8")
-        done = subprocess.run([sys.executable, "-m", "zensical", "build", "--clean", "--strict"], cwd=copy, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, "-m", "zensical", "build", "--clean", "--strict"],
+            cwd=copy,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if done.returncode:
             raise BuildError(re.sub(r"\x1b\[[0-9;]*m", "", done.stdout + done.stderr).partition("Traceback")[0].strip())
         if out.exists():
@@ -80,7 +96,13 @@ def build(root: Path, out: Path) -> None:
 
 def changelog(root: Path) -> str:
     """CHANGELOG.md with what has not been released, from the fragments in ``changes/``. Raises BuildError."""
-    done = subprocess.run([sys.executable, "-m", "towncrier", "build", "--draft", "--version", "next"], cwd=root, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-m", "towncrier", "build", "--draft", "--version", "next"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         raise BuildError(done.stdout + done.stderr)
     coming = re.sub(r"\A.*?^## next.*?$", "## Not released yet", done.stdout, count=1, flags=re.S | re.M)
@@ -89,7 +111,10 @@ def changelog(root: Path) -> str:
 
 def problems(site: Path) -> list[str]:
     """What is wrong with a built site, one line each: ``page: what``. ``site``: its folder."""
-    pages = {path.relative_to(site).as_posix(): _Page(path.read_text(encoding="utf-8")) for path in sorted(site.rglob("*.html"))}
+    pages = {
+        path.relative_to(site).as_posix(): _Page(path.read_text(encoding="utf-8"))
+        for path in sorted(site.rglob("*.html"))
+    }
     pages.pop(ERROR_PAGE, None)
     found, led_to = [], {name: set() for name in pages}
     for name, page in pages.items():
@@ -101,7 +126,9 @@ def problems(site: Path) -> list[str]:
                 if link in page.loads:
                     found.append(f"{name}: loads {link}")
                 continue
-            target = (site / name).parent.joinpath(unquote(parts.path)).resolve() if parts.path else site.resolve() / name
+            target = (
+                (site / name).parent.joinpath(unquote(parts.path)).resolve() if parts.path else site.resolve() / name
+            )
             try:
                 inside = target.relative_to(site.resolve()).as_posix()
             except ValueError:
@@ -114,7 +141,10 @@ def problems(site: Path) -> list[str]:
                 if parts.fragment and unquote(parts.fragment) not in pages[inside].anchors:
                     found.append(f"{name}: {link} leads to no such place on the page")
     for style in sorted(site.rglob("*.css")):
-        found += [f"{style.relative_to(site).as_posix()}: loads {url}" for url in re.findall(r"url\([\"']?((?:https?:)?//[^)\"']+)", style.read_text(encoding="utf-8"))]
+        found += [
+            f"{style.relative_to(site).as_posix()}: loads {url}"
+            for url in re.findall(r"url\([\"']?((?:https?:)?//[^)\"']+)", style.read_text(encoding="utf-8"))
+        ]
     seen, ahead = set(), ["index.html"]
     while ahead:
         name = ahead.pop()
@@ -127,7 +157,11 @@ def problems(site: Path) -> list[str]:
 def markdown_problems(path: Path) -> list[str]:
     """Links of a Markdown file to files that are not there, as a code host shows it: ``file: link``."""
     links = re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8"))
-    return [f"{path.name}: {link} leads nowhere" for link in links if not urlsplit(link).scheme and not (path.parent / urlsplit(link).path).exists()]
+    return [
+        f"{path.name}: {link} leads nowhere"
+        for link in links
+        if not urlsplit(link).scheme and not (path.parent / urlsplit(link).path).exists()
+    ]
 
 
 def main() -> int:

@@ -83,12 +83,14 @@ class PinHole(CameraModel):
         return planes / np.linalg.norm(planes, axis=1, keepdims=True)
 
     def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
-        if points[:, 2].min() <= self.near:
-            return (0, 0, self.width, self.height) if points[:, 2].max() > self.near else None
-        # Of a convex body in front of the camera the corners are seen farthest out.
-        (left, top), (right, bottom) = (of(self.project(points), axis=0) for of in (np.min, np.max))
-        x0, x1 = max(0, int(np.floor(left)) - 1), min(self.width, int(np.ceil(right)) + 2)
-        y0, y1 = max(0, int(np.floor(top)) - 1), min(self.height, int(np.ceil(bottom)) + 2)
+        """Of a convex body in front of the camera the corners are seen farthest out."""
+        z = points[:, 2]
+        if z.min() <= self.near:
+            return (0, 0, self.width, self.height) if z.max() > self.near else None
+        # Not by `project`: asked of every moving thing in every frame, and nothing here is behind the camera.
+        x, y = self.fx * points[:, 0] / z + self.cx, self.fy * points[:, 1] / z + self.cy
+        x0, x1 = max(0, math.floor(x.min()) - 1), min(self.width, math.ceil(x.max()) + 2)
+        y0, y1 = max(0, math.floor(y.min()) - 1), min(self.height, math.ceil(y.max()) + 2)
         return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
 
     def clip_from_cam(self) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.errors import ConfigError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import Emulator, events_tree
+from blinkgl.front.runs import EmulatorSettings, events_tree
 from blinkgl.io import flow as flow_files, formats
 from blinkgl.io.formats import EventFile
 
@@ -106,7 +106,7 @@ def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames:
                               fps=_fps(fps), interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7), zero_time=bool(zero_time))
 
 
-def simulate(frames: Iterable, *, fps: float | None = None, emulator: Emulator = "esim", gamma: str | float | None = None,
+def simulate(frames: Iterable, *, fps: float | None = None, emulator: EmulatorSettings = "esim", gamma: str | float | None = None,
              interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, sensor: str | None = None,
              report: SimulationReport | None = None) -> Iterator[Events]:
     """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
@@ -120,10 +120,10 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: Emulator =
 
     if not isinstance(frames, Iterable):
         raise ConfigError("not frames", where="frames", value=frames, accepted="an iterable of arrays")
-    return simulation.simulate(_frames(frames), fps=_fps(fps), gamma=gamma, interpolate=interpolate, report=report, **_options(emulator, sensor, factor, max_px, seed))
+    return simulation.frames_to_events(_frames(frames), fps=_fps(fps), gamma=gamma, interpolate=interpolate, report=report, **_options(emulator, sensor, factor, max_px, seed))
 
 
-def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None, emulator: Emulator = "esim",
+def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None, emulator: EmulatorSettings = "esim",
                   gamma: str | float | None = None, interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
                   sensor: str | None = None, timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None,
                   overwrite: bool = True) -> SimulationReport:
@@ -133,13 +133,13 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
-    return simulation.simulate_file(check.path(source, "source"), check.path(target, "target"), fps=_fps(fps), gamma=gamma, interpolate=interpolate,
+    return simulation.file_to_events(check.path(source, "source"), check.path(target, "target"), fps=_fps(fps), gamma=gamma, interpolate=interpolate,
                                     timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
                                     preview=None if preview is None else check.path(preview, "preview"), overwrite=overwrite,
                                     **_options(emulator, sensor, factor, max_px, seed))
 
 
-def _options(emulator: Emulator, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
+def _options(emulator: EmulatorSettings, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
     from blinkgl.config.sensor import load_sensor
     from blinkgl.recordings import simulation
 

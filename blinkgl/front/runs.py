@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
-Emulator = str | Mapping[str, Any] | Config
+EmulatorSettings = str | Mapping[str, Any] | Config
 
 
 class Timeline:
@@ -56,7 +56,7 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
 
 
 def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, workers: int = 1, resume: bool = False,
-             emulator: Emulator | None = None, sensor: str | None = None, timeline: Timeline | None = None, quality: str | None = None,
+             emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None, quality: str | None = None,
              labels: Sequence[str] | None = None) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
@@ -86,7 +86,7 @@ def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verifi
     return verify_dataset(check.path(folder, "folder"), deep=check.whole(deep, "deep", 0, 2**31), seed=check.seed(seed))
 
 
-def configured(source: Source, *, emulator: Emulator | None = None, sensor: str | None = None, timeline: Timeline | None = None,
+def configured(source: Source, *, emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None,
                quality: str | None = None, labels: Sequence[str] | None = None) -> RunTemplate:
     """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load() gives")
@@ -113,7 +113,7 @@ def scene_of(source: Source, config: SequenceConfig, index: int) -> SceneData:
     return sequence_scene(config, index, source.base)
 
 
-def events_tree(emulator: Emulator) -> dict[str, Any]:
+def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
     """``events:`` of a name, a table with ``emulator``, or a configuration. Raises ConfigError."""
     from blinkgl.recordings.simulation import emulator_config
 

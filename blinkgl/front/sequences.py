@@ -11,14 +11,14 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import MAX_INDEX, Emulator, Source, Timeline, configured
+from blinkgl.front.runs import MAX_INDEX, EmulatorSettings, Source, Timeline, configured
 from blinkgl.front.scenes import Scene
 from blinkgl.labels import Flow, LabelFrame
 from blinkgl.sequence import EventChunk, Simulation, simulate as core
 from blinkgl.srgb import to_srgb8
 
 
-def simulate_sequence(source: Source, *, index: int = 0, emulator: Emulator | None = None, sensor: str | None = None,
+def simulate_sequence(source: Source, *, index: int = 0, emulator: EmulatorSettings | None = None, sensor: str | None = None,
                       timeline: Timeline | None = None, quality: str | None = None, labels: Sequence[str] | None = None, events: bool = True,
                       pictures_hz: float | None = None) -> Simulation:
     """What happens in one sequence, in the order of time; nothing is written and nothing kept:
@@ -92,7 +92,7 @@ class Recording:
         return flows
 
 
-def record(source: Source, *, index: int = 0, emulator: Emulator | None = None, sensor: str | None = None, timeline: Timeline | None = None,
+def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None,
            quality: str | None = None, labels: Sequence[str] | None = None) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 

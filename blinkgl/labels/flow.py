@@ -14,8 +14,8 @@ from blinkgl.labels.frames import Flow
 from blinkgl.labels.label import Drawn, Key, Label, Towards, View
 
 if TYPE_CHECKING:
-    from blinkgl.render.passes import Shot
     from blinkgl.config.labels import LabelsConfig
+    from blinkgl.render.passes import Shot
 
 _KEYS = {
     "flow": Key(tuple[Literal["forward", "backward"], ...], Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"), "depth"),
@@ -55,7 +55,9 @@ class FlowTo(Label):
 
     def wrong(self, value: Flow, height: int, width: int) -> str | None:
         shapes = np.shape(value.flow), np.shape(value.valid)
-        return None if shapes == ((height, width, 2), (height, width)) else f"{shapes[0]} and valid {shapes[1]}, not {(height, width, 2)} and {(height, width)}"
+        if shapes == ((height, width, 2), (height, width)):
+            return None
+        return f"not {width}x{height} px: flow {shapes[0]}, valid {shapes[1]}"
 
     def own(self, value: Flow) -> Flow:
         return Flow(np.array(value.flow), np.array(value.valid).astype(bool))

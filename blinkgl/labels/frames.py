@@ -77,7 +77,7 @@ class LabelFrame:
         self.t_ns, self.values = t_ns, values
 
     def __getattr__(self, name: str) -> Any:
-        if name in LABELS:
+        if name != "values" and (name in self.values or name in LABELS):
             return self.values.get(name)
         raise AttributeError(f"no label '{name}'; there are {', '.join(LABELS)}")
 

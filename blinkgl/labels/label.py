@@ -186,6 +186,8 @@ class Label:
     def wrong(self, value: Any, height: int, width: int) -> str | None:
         """What is wrong with the shape or the kind of number of a value, in words; None: nothing."""
         array = np.asarray(value)
+        if array.shape[:2] != (height, width):
+            return f"not {width}x{height} px: {array.shape}"
         shapes = [(height, width), (height, width, 3)] if self.channels is None else [(height, width, self.channels) if self.channels else (height, width)]
         kind = "" if self.dtype is None else np.dtype(self.dtype).kind
         if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):

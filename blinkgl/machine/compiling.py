@@ -59,12 +59,12 @@ def compile_ahead(emulators: tuple[str, ...] = ()) -> float:
     from blinkgl.dataset.generate import generate_run
     from blinkgl.errors import GLError
     from blinkgl.events.table import EMULATORS
-    from blinkgl.recordings.simulation import simulate
+    from blinkgl.recordings.simulation import frames_to_events
 
     before, waves = compiled_s(), np.sin(np.arange(64 * 64, dtype=np.float32).reshape(64, 64) / 9)
     for emulator in emulators or EMULATORS:
         for frames in ([0.5 + 0.4 * np.roll(waves, k) for k in range(4)], [np.uint8(127 + 90 * np.roll(waves, k)) for k in range(4)]):
-            for _ in simulate(frames, fps=100, emulator=emulator):
+            for _ in frames_to_events(frames, fps=100, emulator=emulator):
                 pass
     # What else a sequence needs: paths, occlusion, preview.
     small = {"camera": {"width": 64, "height": 48}, "time": {"duration": 0.02, "label_rate": 50}, "labels": {"flow": ["forward", "backward"]},

@@ -1,10 +1,10 @@
 """Any video to events: frames in, events out.
 
-    for events in simulate(frames, fps=1000, emulator="v2e"):
+    for events in frames_to_events(frames, fps=1000, emulator="v2e"):
         ...
 
-``frames`` is any iterable, a generator included; nothing but the current frames is kept. :func:`simulate_file` is the
-same from file to file (``blinkgl simulate``).
+``frames`` is any iterable, a generator included; nothing but the current frames is kept. :func:`file_to_events` is the
+same from file to file (``blinkgl simulate``). :func:`blinkgl.simulate` and :func:`blinkgl.simulate_file` are these behind the front door.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ class SimulationReport:
         return (self.last_ns - self.first_ns) * 1e-9
 
 
-def simulate(frames: Iterable, *, fps: float | None = None, emulator: str | EmulatorConfig = EmulatorConfig.members.default, gamma: str | float | None = None,
-             interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, readout: ReadoutConfig | None = None,
-             report: SimulationReport | None = None) -> Iterator[Events]:
+def frames_to_events(frames: Iterable, *, fps: float | None = None, emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+                     gamma: str | float | None = None, interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
+                     readout: ReadoutConfig | None = None, report: SimulationReport | None = None) -> Iterator[Events]:
     """Events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
 
     Parameters
@@ -100,7 +100,7 @@ def simulated_steps(frames: Iterable, *, report: SimulationReport, fps: float | 
                     emulator: str | EmulatorConfig = EmulatorConfig.members.default, gamma: str | float | None = None,
                     interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
                     readout: ReadoutConfig | None = None) -> Iterator[Step]:
-    """As :func:`simulate`, every step of it."""
+    """As :func:`frames_to_events`, every step of it."""
     config = emulator_config(emulator)
     if interpolate not in INTERPOLATIONS:
         raise ConfigError("unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS))
@@ -118,7 +118,7 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
 
 def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, *, gamma: str | float | None, interpolate: str, factor: int,
             max_px: float, report: SimulationReport | None = None) -> Iterator[Step]:
-    """Frames (array, t_ns, name), those in between included, through an event camera. Raises EventDataError as :func:`simulate`."""
+    """Frames (array, t_ns, name), those in between included, through an event camera. Raises EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
     first = next(frames)
     decode = Decoder(gamma)
@@ -163,11 +163,11 @@ def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, 
         yield Step(t_ns, events, seen[0])
 
 
-def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None,
-                  timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None, overwrite: bool = True,
-                  progress: Callable[[SimulationReport, float | None], None] | None = None, **options: Any) -> SimulationReport:
+def file_to_events(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None,
+                   timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None, overwrite: bool = True,
+                   progress: Callable[[SimulationReport, float | None], None] | None = None, **options: Any) -> SimulationReport:
     """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format (.h5 .raw .aedat4
-    .txt .csv .npz .npy); options as :func:`simulate`. The files appear whole or not at all.
+    .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
 
     preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
     """
@@ -214,7 +214,7 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
 
 
 class Decoder:
-    """Frames as stored to linear luminance (H, W) float32. gamma as :func:`simulate`."""
+    """Frames as stored to linear luminance (H, W) float32. gamma as :func:`frames_to_events`."""
 
     def __init__(self, gamma: str | float | None):
         self._gamma = gamma
@@ -287,7 +287,7 @@ def _checked_gamma(gamma: str | float | None) -> str | float | None:
 
 
 def timed(frames: Iterable, fps: float | None = None) -> Iterator[tuple[np.ndarray, int, str]]:
-    """(frame, t_ns, name) from the three kinds of iterables :func:`simulate` takes."""
+    """(frame, t_ns, name) from the three kinds of iterables :func:`frames_to_events` takes."""
     for i, item in enumerate(frames):
         if isinstance(item, tuple):
             frame, t_ns = np.asarray(item[0]), int(item[1])

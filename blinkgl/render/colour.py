@@ -10,7 +10,7 @@ LUMA = np.array([0.2126, 0.7152, 0.0722], np.float64)
 """Rec. 709 weights of linear r, g, b."""
 
 
-def decode_image(image: np.ndarray) -> np.ndarray:
+def linear_image(image: np.ndarray) -> np.ndarray:
     """(h, w, 3) uint8 sRGB or float32 linear -> (h, w, 3) float32 linear."""
     return DECODE_8BIT[image] if image.dtype == np.uint8 else np.ascontiguousarray(image, np.float32)
 

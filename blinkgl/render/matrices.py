@@ -11,16 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 
-def invert_rigid(T: np.ndarray) -> np.ndarray:
-    """Inverse of (..., 4, 4) rigid transforms, exact transpose for the rotation."""
-    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
-    inverse = np.zeros_like(T)
-    inverse[..., :3, :3] = R_t
-    inverse[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
-    inverse[..., 3, 3] = 1.0
-    return inverse
-
-
 def cam_from_obj(T_world_cam: np.ndarray, T_world_obj: np.ndarray) -> np.ndarray:
     """(..., 4, 4) float64 T_cam_obj. The translations are subtracted before they are rotated, so that a scene
     far from the origin loses no more than the rounding of its own coordinates."""

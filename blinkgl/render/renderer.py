@@ -143,7 +143,7 @@ class Renderer:
         :meth:`brightness`: a few pixels are enough to find the largest motion."""
         return self.draw(Velocity(every), t_ns)
 
-    def motion(self, t_ns: int, every: int = 1) -> Frame:
+    def velocity_of_movers(self, t_ns: int, every: int = 1) -> Frame:
         """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone, those behind
         something included: still a bound."""
         return self.draw(Velocity(every, moving_only=not self.whole), t_ns)

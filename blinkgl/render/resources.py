@@ -12,7 +12,7 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.gl import GLContext
-from blinkgl.render.colour import LUMA, decode_image, luminance_image
+from blinkgl.render.colour import LUMA, linear_image, luminance_image
 from blinkgl.scene.types import Material, Mesh, Scene
 
 _TEXTURE_2D, _TEXTURE_LOD_BIAS = 0x0DE1, 0x8501
@@ -123,7 +123,7 @@ class SceneResources:
         if key not in self._textures:
             image = material.texture.image
             srgb8 = image.dtype == np.uint8
-            self._textures[key] = self._upload(image if srgb8 else decode_image(image), material.texture.name,
+            self._textures[key] = self._upload(image if srgb8 else linear_image(image), material.texture.name,
                                                internal_format=0x8C41 if srgb8 else None)  # GL_SRGB8
         return self._textures[key]
 

@@ -186,7 +186,7 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
 
 def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
     """Pictures of the labels besides those that every example shows."""
-    from blinkgl.labels.pictures import picture
+    from blinkgl.io.pictures import picture
 
     pictures = []
     for name, label in LABELS.items():

@@ -36,9 +36,9 @@ def emulator_options(name: str, config: str | None, overrides: Sequence[str], se
 
 def run(source: str, target: str, *, emulator: str, sensor: str | None = None, config: str | None = None, overrides: Sequence[str] = (),
         quiet: bool = False, **options: Any) -> int:
-    """``options``: of :func:`~blinkgl.recordings.simulation.simulate_file`."""
+    """``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
     from blinkgl.machine.compiling import compiled_s, compiling_line
-    from blinkgl.recordings.simulation import simulate_file
+    from blinkgl.recordings.simulation import file_to_events
 
     console = plain_console(quiet=quiet)
     bar = Progress(plain_column("{task.description}"), BarColumn(), plain_column("{task.fields[detail]}"), TimeElapsedColumn(),
@@ -50,7 +50,7 @@ def run(source: str, target: str, *, emulator: str, sensor: str | None = None, c
             bar.update(task, total=1.0 if fraction is not None else None, completed=fraction or 0.0,
                        detail=f"{report.frames} frames, {report.events / 1e6:.2f} M events")
 
-        report = simulate_file(source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options)
+        report = file_to_events(source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options)
     rate = report.events / report.duration_s if report.duration_s else 0.0
     say(console, f"{target}: {report.events:,} events in {report.duration_s:.6g} s ({rate / 1e6:.3g} M/s, "
         f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator steps")

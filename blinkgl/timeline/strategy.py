@@ -20,27 +20,27 @@ from blinkgl.timeline.budget import TimeError, contraharmonic_mean
 from blinkgl.timeline.sampling import bounded_times, uniform_times
 
 
-class Picture(Protocol):
+class Drawn(Protocol):
     """What has been drawn, wherever it is."""
 
     def read(self) -> np.ndarray: ...
 
 
-class Scene(Protocol):
-    """What a timeline asks of a renderer: small pictures, every n-th pixel in x and y."""
+class SmallPictures(Protocol):
+    """What a timeline asks of a renderer: every n-th pixel in x and y."""
 
-    def motion(self, t_ns: int, every: int) -> Picture:
+    def velocity_of_movers(self, t_ns: int, every: int) -> Drawn:
         """(h, w, 2) float32 image velocity, px/s of the whole image."""
 
-    def brightness(self, t_ns: int, every: int) -> Picture:
+    def brightness(self, t_ns: int, every: int) -> Drawn:
         """(h, w, 2) float32 luminance and its rate of change per second."""
 
 
 class Timeline:
     """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when asked for."""
 
-    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
-        self.config, self.t0_ns, self.t1_ns, self.scene, self.response = config, t0_ns, t1_ns, scene, response
+    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response):
+        self.config, self.t0_ns, self.t1_ns, self.pictures, self.response = config, t0_ns, t1_ns, pictures, response
         self.looks = 0
         """Small pictures asked for so far."""
 
@@ -71,7 +71,7 @@ class Uniform(Timeline):
 
 class Displacement(Timeline):
     def pace(self, t_ns: int) -> float:
-        speeds = moving(np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every).read(), axis=-1))
+        speeds = moving(np.linalg.norm(self.pictures.velocity_of_movers(t_ns, self.config.sample_every).read(), axis=-1))
         if not len(speeds):
             return 0.0
         pace = percentile(speeds, self.config.percentile) / self.config.max_px
@@ -80,7 +80,7 @@ class Displacement(Timeline):
 
 class Brightness(Timeline):
     def pace(self, t_ns: int) -> float:
-        picture = self.scene.brightness(t_ns, self.config.sample_every).read()
+        picture = self.pictures.brightness(t_ns, self.config.sample_every).read()
         changes = moving(np.abs(self.response.change(picture[..., 0], picture[..., 1])))
         return percentile(changes, self.config.percentile) / (self.config.max_fraction_of_threshold * self.response.threshold)
 
@@ -88,8 +88,8 @@ class Brightness(Timeline):
 class Budget(Timeline):
     """The step whose estimated error is what was asked for: :mod:`blinkgl.timeline.budget`."""
 
-    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, scene: Scene, response: Response):
-        super().__init__(config, t0_ns, t1_ns, scene, response)
+    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response):
+        super().__init__(config, t0_ns, t1_ns, pictures, response)
         in_px = config.max_time_error_px is not None
         self.error = TimeError(config.reconstruction, config.max_time_error_px if in_px else config.max_time_error_us * 1e-6, in_px,
                                config.percentile)
@@ -104,7 +104,7 @@ class Budget(Timeline):
             last = t
 
     def pace(self, t_ns: int) -> float:
-        speed = np.linalg.norm(self.scene.motion(t_ns, self.config.sample_every).read(), axis=-1)
+        speed = np.linalg.norm(self.pictures.velocity_of_movers(t_ns, self.config.sample_every).read(), axis=-1)
         self._speeds = {**dict(list(self._speeds.items())[-7:]), t_ns: speed}
         return self.error.pace(contraharmonic_mean(speed))
 
@@ -128,9 +128,9 @@ PROBE_EVERY = 12
 _KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness, "budget": Budget}
 
 
-def make_timeline(config: TimelineConfig, t0_ns: int, t1_ns: int, scene: Scene, response: Response) -> Timeline:
+def make_timeline(config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response) -> Timeline:
     """Of any ``timeline:`` configuration."""
-    return _KINDS[config.kind](config, t0_ns, t1_ns, scene, response)
+    return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response)
 
 
 def moving(values: np.ndarray) -> np.ndarray:

@@ -19,9 +19,9 @@ from blinkgl.events.types import Events
 from blinkgl.gl import GLContext
 from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.types import Scene
 from blinkgl.timeline.sampling import displacement_times
+from blinkgl.timeline.speed import largest_speed
 from blinkgl.trade.metrics import masked
 
 FrameSource = Callable[[Iterable[int]], Iterator[np.ndarray]]
@@ -80,7 +80,7 @@ class FineTiles:
         largest = 0.0
         for camera in self._cameras:
             self._renderer.look_through(camera)
-            largest = max(largest, largest_speed(self._renderer.motion(t_ns, self._scale).read()) / self._scale)
+            largest = max(largest, largest_speed(self._renderer.velocity_of_movers(t_ns, self._scale).read()) / self._scale)
         return largest
 
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:

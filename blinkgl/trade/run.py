@@ -17,8 +17,8 @@ from blinkgl.events import emulator_of
 from blinkgl.gl import create_context
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.machine.bench import machine_line
-from blinkgl.trade.front import front
 from blinkgl.trade.measure import ENOUGH, QUICK, Bench, Options
+from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.settings import SIZES, Setting, design
 
 COLUMNS = ("name", "wall_s", "cpu_s", "frames_per_s", "triangles", "time_median_us", "time_p95_us", "shift_median_px", "shift_p95_px", "missed",
@@ -65,7 +65,7 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
                 "levels": [level.to_dict() for level in levels], "converged": levels[-1].converged}
         machine = machine_line(gl.renderer)
     main = rows[0]["size"]  # sizes are different data sets: one front, over the largest
-    best = {r["name"] for r in front([r for r in rows if r["size"] == main], cost, "voxel")}
+    best = {r["name"] for r in pareto_front([r for r in rows if r["size"] == main], cost, "voxel")}
     for r in rows:
         r["on_front"] = r["name"] in best
     return {"machine": machine, "config": template.tree, "sequence": options.sequence, "quick": quick, "reference": options.reference, "only": only or [], "skip": skip or [], "cost": cost,

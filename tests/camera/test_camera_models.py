@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from blinkgl.camera import CAMERA_MODELS, Equidistant, PinHole, Radtan, focal_length
+from blinkgl.camera.distorted import _extremes
 from blinkgl.errors import ConfigError
 
 SIZE = {
@@ -253,3 +254,11 @@ def test_only_a_pin_hole_camera_is_drawn(camera):
         match=rf"camera: this camera model cannot be drawn \(got '{camera.kind}'\); expected a pin-hole camera",
     ):
         camera.clip_from_cam()
+
+
+@pytest.mark.parametrize("points", [4, 9, 65])
+def test_extremes_between_samples_are_not_missed(points):
+    """Arcs whose farthest points lie between two samples of them."""
+    angles = np.linspace(0.1, 2.9, points) + math.pi / 2 * np.arange(4)[:, None]
+    low, high = _extremes(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
+    assert (low <= -1).all() and (high >= 1).all() and np.abs([low, high]).max() < 1 + 20 / points**2

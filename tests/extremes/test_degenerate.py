@@ -15,10 +15,10 @@ from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.labels import LabelRequest
 from blinkgl.render import renderer as module
 from blinkgl.render.passes import Geometry
 from blinkgl.render.passes.geometry import BUFFERS
-from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32

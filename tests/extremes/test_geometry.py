@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import AssetError, GLError
-from blinkgl.render import reference
 from blinkgl.labels import LabelRequest
+from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material
 from tests.extremes.measures import FACING, MOTION, compare, length, moving_camera

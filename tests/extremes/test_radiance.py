@@ -10,8 +10,8 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events import Esim
-from blinkgl.render import reference
 from blinkgl.labels import LabelRequest
+from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Light, Material, Texture
 from tests.extremes.measures import FACING

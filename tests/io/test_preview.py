@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+
 from blinkgl.events.types import Events
 from blinkgl.io import preview as module
 from blinkgl.io.colour import INVALID, count_events, event_colour, flow_colour, flow_wheel

@@ -19,7 +19,7 @@ from blinkgl.errors import AssetError, ConfigError, EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.io.formats import open_events
 from blinkgl.io.video import VideoReader, VideoWriter
-from blinkgl.recordings.simulation import Decoder, SimulationReport, simulate, simulate_file
+from blinkgl.recordings.simulation import Decoder, SimulationReport, file_to_events, frames_to_events
 from blinkgl.srgb import DECODE_8BIT
 from tests.shared_data import shared
 
@@ -42,7 +42,7 @@ def same(a: Events, b: Events) -> bool:
 
 
 def all_of(*args, **kw) -> Events:
-    return Events.concatenate(list(simulate(*args, **kw)))
+    return Events.concatenate(list(frames_to_events(*args, **kw)))
 
 
 def test_generator_equals_the_emulator_by_hand():
@@ -116,13 +116,13 @@ def test_bad_streams():
     with pytest.raises(EventDataError, match="frames without times"):
         all_of([good, good])
     with pytest.raises(ConfigError, match="unknown emulator.*esim, v2e, voltmeter"):
-        simulate([good], fps=1, emulator="iebcs")
+        frames_to_events([good], fps=1, emulator="iebcs")
     with pytest.raises(ConfigError, match="unknown interpolation"):
-        simulate([good], fps=1, interpolate="spline")
+        frames_to_events([good], fps=1, interpolate="spline")
     with pytest.raises(ConfigError, match="unknown transfer curve"):
-        simulate([good], fps=1, gamma="rec709")
+        frames_to_events([good], fps=1, gamma="rec709")
     with pytest.raises(ConfigError, match="esim.contrast_threshold"):
-        simulate([good], fps=1, emulator={"emulator": "esim", "contrast_threshold": 0})
+        frames_to_events([good], fps=1, emulator={"emulator": "esim", "contrast_threshold": 0})
 
 
 def test_zero_intensity_is_fine():
@@ -142,8 +142,8 @@ def test_video_to_every_format(tmp_path, ending):
     if ending == ".aedat4":
         pytest.importorskip("dv_processing", reason="optional extra [formats]")
     write_video(tmp_path / "v.mp4", frames8(10))
-    expected = Events.concatenate(list(simulate(VideoReader(tmp_path / "v.mp4"), fps=100)))
-    report = simulate_file(tmp_path / "v.mp4", tmp_path / f"e{ending}", preview=tmp_path / "p.mp4")
+    expected = Events.concatenate(list(frames_to_events(VideoReader(tmp_path / "v.mp4"), fps=100)))
+    report = file_to_events(tmp_path / "v.mp4", tmp_path / f"e{ending}", preview=tmp_path / "p.mp4")
     assert report.events == len(expected) > 1000 and report.frames == 10
     assert same(open_events(tmp_path / f"e{ending}").read(), expected)
     assert len(list(VideoReader(tmp_path / "p.mp4"))) >= 9
@@ -157,7 +157,7 @@ def test_dsec_output_covers_the_video(tmp_path):
         cv2.imwrite(str(folder / f"{i}.png"), f)
     start = 1_600_000_000_000_000
     (folder / "timestamps.txt").write_text("\n".join(str(start + 10_000 * i) for i in range(7)))
-    simulate_file(folder, tmp_path / "e.h5")
+    file_to_events(folder, tmp_path / "e.h5")
     with h5py.File(tmp_path / "e.h5") as file:
         assert file["t_offset"][()] == start and len(file["ms_to_idx"]) == 61, "the still end is covered, too"
 
@@ -172,12 +172,12 @@ def truncated_video(tmp_path):
 def test_bad_input_leaves_no_output(tmp_path):
     truncated_video(tmp_path)
     with pytest.raises(AssetError, match="v.mp4: video truncated or corrupt after frame"):
-        simulate_file(tmp_path / "v.mp4", tmp_path / "e.h5", preview=tmp_path / "p.mp4")
+        file_to_events(tmp_path / "v.mp4", tmp_path / "e.h5", preview=tmp_path / "p.mp4")
     np.save(tmp_path / "f.npy", np.array([np.ones((H, W)), np.full((H, W), np.nan)]))
     with pytest.raises(EventDataError, match=r"f.npy: frame 1 \(#1\): intensity"):
-        simulate_file(tmp_path / "f.npy", tmp_path / "e.h5", fps=10)
+        file_to_events(tmp_path / "f.npy", tmp_path / "e.h5", fps=10)
     with pytest.raises(OutputError, match="unknown event file ending"):
-        simulate_file(tmp_path / "f.npy", tmp_path / "e.xyz", fps=10)
+        file_to_events(tmp_path / "f.npy", tmp_path / "e.xyz", fps=10)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.npy", "v.mp4"]
 
 
@@ -193,7 +193,7 @@ def test_full_disk_leaves_no_output(tmp_path):
         np.save(tmp_path / "f.npy", noise)
         for name in ("e.h5", "e.raw", "e.txt", "e.npy"):
             with pytest.raises(OutputError, match=f"{name}: cannot write: no space left on the device"):
-                simulate_file(tmp_path / "f.npy", small / name, fps=100)
+                file_to_events(tmp_path / "f.npy", small / name, fps=100)
             assert list(small.iterdir()) == []
     finally:
         subprocess.run(["umount", "-l", small], check=True)
@@ -203,7 +203,7 @@ def test_memory_does_not_grow_with_the_clip():
     def peak(count: int) -> int:
         frames = frames8(12)
         tracemalloc.start()
-        for _ in simulate((frames[i % 12] for i in range(count)), fps=100):
+        for _ in frames_to_events((frames[i % 12] for i in range(count)), fps=100):
             pass
         size = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
@@ -222,7 +222,7 @@ def test_commands(tmp_path, capsys):
     assert "output file exists; expected a new name, or --overwrite" in capsys.readouterr().err
     (tmp_path / "c.yaml").write_text("emulator: v2e\ncontrast_threshold: 1e-1\n")
     assert run(["simulate", str(tmp_path / "v.mp4"), "--out", out, "--config", str(tmp_path / "c.yaml"), "--overwrite", "-q"]) == 0
-    expected = Events.concatenate(list(simulate(VideoReader(tmp_path / "v.mp4"), fps=100, emulator=V2eConfig(contrast_threshold=0.1))))
+    expected = Events.concatenate(list(frames_to_events(VideoReader(tmp_path / "v.mp4"), fps=100, emulator=V2eConfig(contrast_threshold=0.1))))
     assert capsys.readouterr().out == "" and same(open_events(out).read(), expected)
     assert run(["convert", out, str(tmp_path / "e.raw"), "--format", "evt2"]) == 0
     assert "40x30, from dsec" in capsys.readouterr().out
@@ -243,7 +243,7 @@ def test_real_frames_against_the_real_recording():
     root = shared("data/events/slider_depth")
     import tempfile
     with tempfile.TemporaryDirectory() as folder:
-        simulate_file(root, f"{folder}/e.h5", gamma="linear", interpolate="motion",
+        file_to_events(root, f"{folder}/e.h5", gamma="linear", interpolate="motion",
                       emulator=EsimConfig(contrast_threshold=0.5, log_eps=10 / 255))
         result = compare(root / "events_chunk.txt", f"{folder}/e.h5", frames=root)
     assert len(result.edges_us) == 5 and result.polarity_correlation.min() > 0.8

@@ -7,8 +7,8 @@ from blinkgl.camera import PinHole
 from blinkgl.config.base import validate
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import ConfigError, GLError
-from blinkgl.render.antialiasing import ANTIALIASING, samples_of
 from blinkgl.labels import LabelRequest
+from blinkgl.render.antialiasing import ANTIALIASING, samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Material, Scene, Texture

@@ -18,8 +18,8 @@ from shared_data import shared
 
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl.shader import ShaderLoader, shader_folder
-from blinkgl.render import reference
 from blinkgl.labels import LabelRequest
+from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.scene.types import Light, Material

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from blinkgl.config.sequence import RenderConfig
-from blinkgl.render import reference
 from blinkgl.labels import LabelRequest
+from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Material, Texture
 from blinkgl.tools import peer_pyrender

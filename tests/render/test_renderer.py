@@ -7,14 +7,14 @@ from blinkgl.camera import PinHole
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LABELS, LabelRequest
-from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate, invert_rigid
+from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate
 from blinkgl.render.moment import Moment
 from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.types import Light, Material, Part, Scene, SceneObject, Texture
+from blinkgl.timeline.speed import largest_speed
 from render_scenes import LEVEL, SECOND, curve, drift, still
 
 PLAIN = RenderConfig(image_antialiasing="none")
@@ -163,7 +163,7 @@ def test_small_pictures_cover_the_whole_image(gl, width, height, every):
     camera = Rig.alone(PinHole(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2), still(rotation=LEVEL))
     scene = Scene((wall,), camera, 0, SECOND)
     with Renderer(gl, scene, PLAIN) as renderer:
-        made = renderer.velocity(0, every).read(), renderer.motion(0, every).read(), renderer.brightness(0, every).read()
+        made = renderer.velocity(0, every).read(), renderer.velocity_of_movers(0, every).read(), renderer.brightness(0, every).read()
         assert all(a.shape == (*small, 2) and a.dtype == np.float32 for a in made)
     fewer = PinHole.centred(small[1], small[0], 0.2 * small[1], 0.2 * width * small[0] / height)
     with Renderer(gl, scene.with_camera(fewer), PLAIN) as renderer:
@@ -192,7 +192,6 @@ def test_relative_poses_keep_their_precision_far_from_the_origin():
     moved = cam_from_obj(far.pose(SECOND // 2) + shift, b + shift)
     np.testing.assert_allclose(moved, cam_from_obj(a, b), atol=1e-9)
     np.testing.assert_allclose(cam_from_obj(a, b), np.linalg.inv(a) @ b, atol=1e-12)
-    np.testing.assert_allclose(invert_rigid(a), np.linalg.inv(a), atol=1e-14)
 
 
 def test_rate_of_relative_pose_is_its_derivative_to_second_order():
@@ -211,13 +210,12 @@ def test_rate_of_relative_pose_is_its_derivative_to_second_order():
 # ---- per-pixel helpers -------------------------------------------------------------------------------------------
 
 
-def test_largest_speed_and_percentile():
+def test_largest_speed():
     velocity = np.zeros((3, 4, 2), np.float32)
     velocity[1, 2] = (3, 4)
     velocity[0, 0] = (np.inf, 0)
     velocity[0, 1] = (np.nan, 0)
     assert largest_speed(velocity) == 5.0
-    assert largest_speed(velocity, 50) == 0.0
     assert largest_speed(np.zeros((2, 2, 2), np.float32)) == 0.0
 
 

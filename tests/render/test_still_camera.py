@@ -12,14 +12,14 @@ from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import GLError
 from blinkgl.events import Esim
+from blinkgl.labels import LabelRequest
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.passes import Luminance
 from blinkgl.render.rectangles import Rectangle, merged
-from blinkgl.labels import LabelRequest
 from blinkgl.render.renderer import Renderer
-from blinkgl.render.statistics import largest_speed
 from blinkgl.render.still import screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath
+from blinkgl.timeline.speed import largest_speed
 from blinkgl.tools import bench_still
 from render_scenes import LEVEL, SECOND, cube, curve, drift, mixed_scene, scene, sphere, still, thing
 
@@ -212,10 +212,10 @@ def test_speed_is_a_bound_and_exact_where_nothing_is_hidden(gl):
     world = mixed_scene(camera_moves=False)
     with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
         for t in range(0, SECOND, SECOND // 5):
-            assert largest_speed(quick.motion(t).read()) >= largest_speed(slow.motion(t).read()) * (1 - 1e-6)
+            assert largest_speed(quick.velocity_of_movers(t).read()) >= largest_speed(slow.velocity_of_movers(t).read()) * (1 - 1e-6)
     alone = scene([thing("wall", 1, cube(2.0), still((0, 30, 0))), thing("ball", 2, sphere(0.5), drift((-1, 4, 0), (1, 4, 0), LEVEL))])
     with Renderer(gl, alone, PLAIN) as quick, full_redraw(gl, alone) as slow:
-        moved = [largest_speed(renderer.motion(SECOND // 2).read()) for renderer in (quick, slow)]
+        moved = [largest_speed(renderer.velocity_of_movers(SECOND // 2).read()) for renderer in (quick, slow)]
         assert moved[0] == pytest.approx(moved[1], rel=1e-6)
 
 

@@ -83,13 +83,13 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
             return draw(self, *args, **kwargs)
         monkeypatch.setattr(Renderer, name, spied)
 
-    for name in ("luminance", "colour", "labels", "velocity", "motion"):
+    for name in ("luminance", "colour", "labels", "velocity", "velocity_of_movers"):
         spy(name, getattr(Renderer, name))
     made = {}
     for name, wanted in (("everything", {"pictures_hz": 40}), ("events", {"labels": False}), ("labels", {"events": False})):
         drawn.clear()
         made[name] = list(simulate_sequence(config, 0, gl, **wanted))
-        expected = {"everything": {"luminance", "motion", "colour", "labels", "velocity"}, "events": {"luminance", "motion"},
+        expected = {"everything": {"luminance", "velocity_of_movers", "colour", "labels", "velocity"}, "events": {"luminance", "velocity_of_movers"},
                     "labels": {"colour", "labels"}}
         assert set(drawn) == expected[name], "motion: what the timeline looks at"
     assert_same(events_of(made["everything"]), events_of(made["events"]))

@@ -65,7 +65,7 @@ def test_displacement_over_whole_intervals(gl, world, config, inside):
 
 def test_a_still_background_has_no_say_in_the_percentile():
     class Picture:
-        def motion(self, t_ns, every):
+        def velocity_of_movers(self, t_ns, every):
             speed = np.zeros((10, 10, 2), np.float32)
             speed[0, :5, 0] = [100, 100, 100, 100, np.inf]
             return picture(speed)
@@ -163,7 +163,7 @@ def drifting(config: BudgetTimeline, fast: float = 1.0, seconds: float = 1.5):
     that is said to be 50 px/s all the time."""
     x, rate, half = np.linspace(0, 2 * np.pi, 600, endpoint=False)[None], 40.0, 0.04
     speed = np.full((1, 600, 2), (50.0, 0.0), np.float32)
-    timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(motion=lambda t, n: picture(speed)), Esim.response(ESIM))
+    timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(velocity_of_movers=lambda t, n: picture(speed)), Esim.response(ESIM))
     for t_ns in timeline:
         k, t = divmod(t_ns * 1e-9, 2 * half)
         x_now = x - rate * (k * half * (1 + fast) + min(t, half) + fast * max(t - half, 0.0))
@@ -189,7 +189,7 @@ def test_as_many_events_are_beyond_the_target_as_the_percentile_says(fast, targe
 
 
 def test_nothing_moves_nothing_is_measured():
-    still = SimpleNamespace(motion=lambda t, n: picture(np.zeros((3, 4, 2), np.float32)))
+    still = SimpleNamespace(velocity_of_movers=lambda t, n: picture(np.zeros((3, 4, 2), np.float32)))
     timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, Esim.response(ESIM))
     count = 0
     for t in timeline:
@@ -202,7 +202,7 @@ def test_nothing_moves_nothing_is_measured():
 @pytest.mark.parametrize("shape, small", [((1, 1), (1, 1)), ((1, 16), (1, 4)), ((24, 1), (6, 1)), ((15, 23), (3, 5)), ((3, 5), (1, 1))])
 def test_images_smaller_than_the_sampling_or_no_multiple_of_it(shape, small):
     """The small picture of speeds is max(1, size // n) pixels a side; the signal is looked up at the same places."""
-    world = SimpleNamespace(motion=lambda t, n: picture(np.full((*small, 2), 50.0, np.float32)))
+    world = SimpleNamespace(velocity_of_movers=lambda t, n: picture(np.full((*small, 2), 50.0, np.float32)))
     timeline = make_timeline(BudgetTimeline(max_time_error_us=100.0, max_step_us=1000), 0, 10 * MS, world, Esim.response(ESIM))
     for t in timeline:
         timeline.observe(t, np.full(shape, 1 + 0.5 * math.sin(t * 1e-6), np.float32))

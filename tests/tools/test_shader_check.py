@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl.shader import STAGES, ShaderError, ShaderLoader, expand, normalised, shader_folder
-from blinkgl.render.painter import Painter
 from blinkgl.labels import LABELS, LabelRequest
+from blinkgl.render.painter import Painter
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import build_scene
 from blinkgl.tools.shader_debugger import check, diagnostics, preprocess, timing, variants

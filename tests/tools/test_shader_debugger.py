@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import PinHole
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.gl import create_context
-from blinkgl.render import reference
 from blinkgl.labels import LabelRequest
+from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.render.resources import SceneResources
 from blinkgl.scene.build import build_scene

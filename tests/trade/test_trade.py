@@ -20,8 +20,8 @@ from blinkgl.render.rectangles import Rectangle
 from blinkgl.render.renderer import Renderer
 from blinkgl.show.trade import show
 from blinkgl.tools import peer_cycles
-from blinkgl.trade.front import front
 from blinkgl.trade.measure import Bench, Level, Options
+from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.reference import FineTiles, lattice, mask_of
 from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
@@ -45,7 +45,7 @@ def config(tmp_path_factory):
 def test_front_by_hand():
     rows = [dict(n=n, c=c, e=e) for n, c, e in (("a", 1, 9), ("b", 2, 5), ("worse than b", 3, 5), ("c", 4, 1), ("slow", 9, 2), ("equal to c", 4, 1),
                                                ("unknown", 0, float("nan")))]
-    assert [r["n"] for r in front(rows, "c", "e")] == ["a", "b", "c"]
+    assert [r["n"] for r in pareto_front(rows, "c", "e")] == ["a", "b", "c"]
 
 
 def test_lattice_covers_what_it_says():

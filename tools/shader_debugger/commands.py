@@ -27,7 +27,7 @@ def write_passes(subject: Subject, when: When, out: str, names: list[str] | None
     """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the folder ``out``. Returns the paths.
 
     Anti-aliased as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
-    from blinkgl.labels import pictures
+    from blinkgl.io import pictures
     from blinkgl.tools.shader_debugger import picture
 
     names = [check_pass(name) for name in names] if names else list(PASSES)

@@ -13,7 +13,7 @@ import numpy as np
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl import ShaderLoader
 from blinkgl.gl.shader import STAGES, ShaderError, expand
-from blinkgl.labels import pictures
+from blinkgl.io import pictures
 from blinkgl.tools.shader_debugger import picture
 from blinkgl.tools.shader_debugger.commands import _finite, _meaningful
 from blinkgl.tools.shader_debugger.compare import Comparison

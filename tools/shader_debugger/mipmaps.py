@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from blinkgl.render import reference
-from blinkgl.render.colour import decode_image
+from blinkgl.render.colour import linear_image
 from blinkgl.scene.types import Material, Texture
 
 _chains: WeakKeyDictionary = WeakKeyDictionary()
@@ -22,7 +22,7 @@ _chains: WeakKeyDictionary = WeakKeyDictionary()
 def mip_chain(texture: Texture) -> list[Texture]:
     """Linear-light float32 levels 0, 1, … down to 1 x 1."""
     if texture not in _chains:
-        levels = [decode_image(texture.image)]
+        levels = [linear_image(texture.image)]
         while max(levels[-1].shape[:2]) > 1:
             levels.append(_half(_half(levels[-1]).swapaxes(0, 1)).swapaxes(0, 1))
         _chains[texture] = [Texture(np.ascontiguousarray(level), texture.name) for level in levels]

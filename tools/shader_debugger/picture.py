@@ -12,7 +12,7 @@ from PIL import Image
 
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.colour import flow_wheel
-from blinkgl.labels.pictures import map_scalar
+from blinkgl.io.pictures import map_scalar
 from blinkgl.tools.shader_debugger.moments import PASSES, Pass
 
 ERROR_MAP = "inferno"

@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from blinkgl.errors import ConfigError
-from blinkgl.labels.pictures import MAPS
+from blinkgl.io.pictures import MAPS
 from blinkgl.tools.shader_debugger.moments import check_pass
 
 LONGEST = 2000  # characters of a query

@@ -1,7 +1,9 @@
 """The passes: each is a value that says what is drawn, by which program, from which other passes, into what.
 
-In: a :class:`~blinkgl.render.moment.Moment` and frames of other passes. Out: a :class:`~blinkgl.render.canvas.Frame`, by
-``Renderer.draw``. Start at ``base.py``, then ``luminance.py``."""
+In:    a :class:`~blinkgl.render.moment.Moment` and frames of other passes.
+Out:   a :class:`~blinkgl.render.canvas.Frame`, by ``Renderer.draw``.
+Start: base.py, then luminance.py.
+"""
 
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, ScreenPass, Shot
 from blinkgl.render.passes.colour import Colour

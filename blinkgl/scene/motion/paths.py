@@ -204,12 +204,6 @@ def rigid(T: ArrayLike, where: str | None = None) -> np.ndarray:
     return T
 
 
-def body_rate(T: np.ndarray, dT: np.ndarray) -> np.ndarray:
-    """(3,) body-frame angular rate in rad/s of a pose and its derivative: dR/dt = R [w]x."""
-    W = T[:3, :3].T @ dT[:3, :3]
-    return 0.5 * np.array([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
-
-
 def _checked_keys(times_ns, positions, rotations, where):
     try:
         times = np.asarray(times_ns)

@@ -7,8 +7,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import CutPath, KeyframePath, OffsetPath, SplinePath, StaticPath, body_rate, rigid
+from blinkgl.scene.motion.paths import CutPath, KeyframePath, OffsetPath, SplinePath, StaticPath, rigid
 from blinkgl.scene.types import PosePath
+from tests.scene.motion.rates import body_rate
 
 SECOND = 1_000_000_000
 MILLION_SECONDS = 1_000_000 * SECOND

@@ -1,7 +1,6 @@
 """Random trajectories: what was configured is what they do."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -10,37 +9,13 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.base import validate
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import SplinePath, StaticPath, body_rate
+from blinkgl.scene.motion.paths import SplinePath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
-from blinkgl.scene.types import PosePath
+from tests.scene.motion.rates import statistics
 
 SECOND = 1_000_000_000
 SPACE = FreeSpace((-4, -4, 0), (4, 4, 3), 0.0, [[0, 0, 0.5], [2, 2, 0.5], [-2, 1, 1]], [0.5, 0.6, 0.4])
 TARGET = np.array([0.0, 0.0, 0.5])
-
-
-@dataclass(frozen=True)
-class PathStatistics:
-    """mean_speed, peak_speed in units/s; mean_rate, peak_rate in rad/s. The peaks are upper bounds (tight to ~1 %)."""
-
-    mean_speed: float
-    peak_speed: float
-    mean_rate: float
-    peak_rate: float
-
-
-def statistics(path: PosePath, t0_ns: int, t1_ns: int, samples: int = 512) -> PathStatistics:
-    """What a path really does over [t0, t1]: midpoint rule and interval bounds on ``samples`` intervals."""
-    edges = np.linspace(0, t1_ns - t0_ns, samples + 1).astype(np.int64) + t0_ns
-    speed, rate = 0.0, 0.0
-    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist()):
-        mid = (a + b) // 2
-        D = path.derivative(mid)
-        speed += (b - a) * float(np.linalg.norm(D[:3, 3]))
-        rate += (b - a) * float(np.linalg.norm(body_rate(path.pose(mid), D)))
-    bounds = np.array([path.speed_bound(a, b) for a, b in zip(edges[:-1].tolist(), edges[1:].tolist())])
-    length = max(t1_ns - t0_ns, 1)
-    return PathStatistics(speed / length, float(bounds[:, 0].max()), rate / length, float(bounds[:, 1].max()))
 
 
 def rng(seed=0):

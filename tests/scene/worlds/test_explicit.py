@@ -11,9 +11,9 @@ from blinkgl.config.scene import ExplicitSceneConfig, PoseConfig
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
-from blinkgl.scene.motion.paths import body_rate
 from blinkgl.scene.worlds.explicit import pose_matrix
 from tests.scene.gltf_files import GltfBuilder
+from tests.scene.motion.rates import body_rate
 
 CAMERA = CameraConfig(width=64, height=48)
 

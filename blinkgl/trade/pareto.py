@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 
-def front(rows: Sequence[dict], cost: str, error: str) -> list[dict]:
+def pareto_front(rows: Sequence[dict], cost: str, error: str) -> list[dict]:
     """The non-dominated rows, cheapest first. A row is dominated when another is no worse in both and better in one; of rows that are
     equal in both the first stays. Rows whose error is not a number are left out."""
     result: list[dict] = []

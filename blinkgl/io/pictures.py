@@ -1,4 +1,4 @@
-"""A label as a picture, by its kind."""
+"""Arrays as pictures, by their kind: what a label or a buffer of the shader debugger looks like."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import matplotlib
 import numpy as np
 
 from blinkgl.errors import ConfigError
-from blinkgl.io.colour import flow_colour
 from blinkgl.srgb import srgb_from_linear
 
 MAPS = ("viridis", "turbo", "inferno", "gray", "RdBu_r", "coolwarm")
@@ -90,6 +89,8 @@ def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str |
         if kind == "motion":
             speed = component(array, "length")
             top = high if high is not None else finite_range(speed if hit is None or not hit.any() else speed[hit])[1]
+            from blinkgl.io.colour import flow_colour  # files know labels, so labels ask for them late
+
             return flow_colour(array, top, hit), {"kind": "wheel", "high": float(top)}
     values = component(np.asarray(array), which).astype(np.float64)
     if hit is not None:

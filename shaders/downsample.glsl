@@ -1,13 +1,7 @@
 #version 430 core
 // Box filter: mean of FACTOR x FACTOR texels of a super-sampled linear-light image.
 
-#ifdef VERTEX_SHADER
-void main()
-{
-    // One triangle that covers the screen, from the vertex number alone.
-    gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.5, 1.0);
-}
-#endif
+#include "cover.glsl"
 
 #ifdef FRAGMENT_SHADER
 layout(location = 0) out vec4 mean_value;

@@ -106,7 +106,7 @@ class Run:
 
 def simulate(timeline, renderer: Renderer) -> tuple[Events, Simulation]:
     run = simulate_sequence(SequenceConfig(timeline=timeline, events=EMULATOR), labels=False, renderer=renderer)
-    return Events.concatenate([chunk.events for chunk in run]), run
+    return Events.concatenate([chunk.events for chunk in run.chunks()]), run
 
 
 def measure(scene: Scene, gl, antialiasing: str, thin: int, say) -> dict[str, list[Run]]:

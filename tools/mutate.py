@@ -48,7 +48,7 @@ from typing import ClassVar
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("render", "timeline", "events", "scene", "io", "dataset")
+ROOMS = ("render", "timeline", "events", "scene", "io", "dataset", "sequence", "camera", "labels", "recordings")
 MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
 SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",
@@ -384,6 +384,13 @@ class Kernels:
                     os.link(file, inner / file.name)
 
 
+def _remembered(mutant: Mutant) -> bool:
+    """Whether the line is in a function whose results are kept: then only the first test that asked in a process ran it."""
+    tree = ast.parse((ROOT / mutant.path).read_text())
+    return any(isinstance(node, ast.FunctionDef) and node.lineno <= mutant.line <= node.end_lineno and any("cache" in ast.unparse(d) for d in node.decorator_list)
+               for node in ast.walk(tree) if not COMPILED.search(" ".join(ast.unparse(d) for d in getattr(node, "decorator_list", ()))))
+
+
 class Reach:
     """Test ids by line, from :func:`make_map`."""
 
@@ -436,7 +443,7 @@ class Reach:
                 callers = self.kernels.users(mutant.path) & self.kernels.holders
                 contexts = set().union(*(self.anywhere(path) for path in callers))
             else:
-                contexts = self._around(mutant)
+                contexts = reached if _remembered(mutant) else self._around(mutant)
         ids = (set(contexts) & self.seconds.keys()) - self.idle
         chosen, together = [], 0.0
         for test in sorted(ids, key=lambda t: (self._distance(mutant, t), self.seconds.get(t, 1.0), t)):

@@ -87,7 +87,7 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
         "not used": "camera, time, timeline, scene and render: nothing is rendered"}
     count = min(PROBES, len(files)) - 1
     until_ns, started, steps = round(count * 1e9 / frames.fps), time.perf_counter(), 0
-    for chunk in probe:
+    for chunk in probe.chunks():
         steps += 1
         if chunk.t_ns >= until_ns:
             break
@@ -158,7 +158,7 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     event_s = _timed(drawn, times)
     fine = samples_of(config.render.antialiasing).stored
     probe = simulate_sequence(config, index, labels=False, scene=scene, renderer=renderer)
-    seen = [chunk.t_ns for chunk in islice(probe, 2 * PROBES)]  # a short stretch of it, as it will be
+    seen = [chunk.t_ns for chunk in islice(probe.chunks(), 2 * PROBES)]  # a short stretch of it, as it will be
     if timeline.kind == "uniform":
         result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:

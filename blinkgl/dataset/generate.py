@@ -87,7 +87,7 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
 
 
 def _write_labels(writer: SequenceWriter, truth: GroundTruth) -> None:
-    leads_to = {"forward": truth.forward_ns, "backward": truth.backward_ns}
+    leads_to: dict[str | None, int | None] = {"forward": truth.forward_ns, "backward": truth.backward_ns}
     for name, value in truth.frame.values.items():
         to_ns = leads_to.get(LABELS[name].towards)
         writer.label(name, truth.k, value, truth.t_ns // 1000, None if to_ns is None else to_ns // 1000)
@@ -97,7 +97,7 @@ def manifest_info(sequence: Simulation) -> dict:
     """What a person needs to know where the sequence came from; no clock times (same seed, same manifest)."""
     import numba
 
-    config, camera = sequence.config, sequence.camera
+    config = sequence.config
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
     return {
         "blinkgl": blinkgl.__version__,
@@ -109,6 +109,6 @@ def manifest_info(sequence: Simulation) -> dict:
         "frames": sequence.frames,
         "labels": sequence.labels,
         "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,  # between whole microseconds, as every time in the files
-        **losses(camera.saturated, camera.dropped, camera.late),
+        **losses(*sequence.losses),
         **sequence.facts(),
     }

@@ -31,6 +31,8 @@ class PreviewRecorder:
 
     def show(self, picture: Picture) -> None:
         """Every picture, after the events up to then."""
+        if self._video is None:
+            return
         with self._clock("preview"):
             if picture.velocity is not None:
                 self._video.set_flow(picture.velocity * self._interval_s)

@@ -83,7 +83,9 @@ class EventCamera:
         return self._read_out(self.emulator.flush())
 
     def _read_out(self, events: Events) -> Events:
-        return events if self._readout is None else self._readout.step(events, self.done_ns // 1000)
+        if self._readout is None or self.done_ns is None:
+            return events
+        return self._readout.step(events, self.done_ns // 1000)
 
 
 def emulate(frames: Iterable[EventFrame], camera: EventCamera,

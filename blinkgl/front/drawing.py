@@ -73,7 +73,7 @@ def _ns(seconds: float, where: str) -> int:
 def render_frame(source: Source, t: float, labels: Sequence[str] = ("images",), *, index: int = 0, to: float | None = None) -> LabelFrame:
     """One :class:`LabelFrame` at t s; for many, a :class:`Renderer` saves making OpenGL's context each time.
 
-    labels : of images (``.colour``, (H, W, 3) float32 linear), flow (``.forward``, px), flow_backward, occlusion, depth (m), ids, normals,
-    velocity (px/s).   to : s, where the flow leads; default: one label interval on.   Raises as :class:`Renderer`."""
+    labels : as of :func:`record`; images are ``.colour``, (H, W, 3) float32 linear, flow is ``.forward``, px, others have their own names.
+    to : s, where the flow leads; default: one label interval on.   Raises as :class:`Renderer`."""
     with Renderer(source, index=index) as renderer:
         return renderer.frame(t, labels, to=to)

@@ -14,7 +14,7 @@ from blinkgl.front import arguments as check
 from blinkgl.front.runs import MAX_INDEX, EmulatorSettings, Source, Timeline, configured
 from blinkgl.front.scenes import Scene
 from blinkgl.labels import Flow, LabelFrame
-from blinkgl.sequence import EventChunk, Simulation, simulate as core
+from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate as core
 from blinkgl.srgb import to_srgb8
 
 
@@ -100,7 +100,7 @@ def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None 
     emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
     sensor : camera whose size, emulator values and read-out are taken, such as "davis346".   timeline : :class:`Timeline`.
     quality : "fast", "balanced", "accurate" or "reference".
-    labels : of images, flow, flow_backward, occlusion, depth, ids, normals, velocity; default: the source's (images, flow, occlusion).
+    labels : names of labels, such as images, flow, flow_backward, occlusion, depth (docs/configuration.md has all); default: the source's.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
     images, frames, chunks, times = [], [], [], []
@@ -108,12 +108,12 @@ def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None 
         for item in sequence:
             if isinstance(item, EventChunk):
                 chunks.append(item.events)
-                continue
-            image = item.frame.values.pop("images", None)
-            if image is not None:
-                images.append(to_srgb8(image) if image.dtype.kind == "f" else image)
-            frames.append(item.frame)
-            times.append(item.t_ns // 1000)
-    t_us, camera = np.array(times, np.int64), sequence.camera
+            elif isinstance(item, GroundTruth):
+                image = item.frame.values.pop("images", None)
+                if image is not None:
+                    images.append(to_srgb8(image) if image.dtype.kind == "f" else image)
+                frames.append(item.frame)
+                times.append(item.t_ns // 1000)
+    t_us = np.array(times, np.int64)
     return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames[:-1]), t_us, np.stack(images) if images else None, sequence.config,
-                     sequence.frames, camera.saturated + camera.dropped)
+                     sequence.frames, sum(sequence.losses[:2]))

@@ -9,7 +9,7 @@ import sys
 
 EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "check": (("pyrender",), "an independent renderer to compare with"),
-    "cycles": (("bpy",), "Blender's path tracer to compare with; better in an environment of its own, see README"),
+    "cycles": (("bpy",), "Blender's path tracer to compare with; better in an environment of its own, see docs/install.md"),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
     "cluster": (("ray",), "many machines"),
     "formats": (("faery", "dv-processing"), "dv-processing: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing"),

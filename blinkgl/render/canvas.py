@@ -6,7 +6,6 @@ next frame; whoever reads a frame after that is told so.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,18 +19,28 @@ if TYPE_CHECKING:
     import moderngl
 
     from blinkgl.gl import Target
+    from blinkgl.render.moment import Moment
     from blinkgl.render.painter import Painter
     from blinkgl.render.passes.base import Pass, Shot
 
 
-class Frame:
-    """What a pass drew at ``t_ns``, on the card, until the same pass draws its next frame; GLError for whoever asks afterwards.
+DEPTH_BUFFER = "depth buffer"
+"""What an input says for its ``output`` to read the depth buffer of a pass that keeps it as a texture."""
 
-    names : of its pictures; where none is said the first is meant.   width, height : px.
+
+class Frame:
+    """What a pass drew of a moment, on the card, until the same pass draws its next frame; GLError for whoever asks afterwards.
+
+    moment : as the pass saw it.   t_ns : its time.   names : of its pictures; where none is said the first is meant.
+    width, height : px.
     changed : rectangles in which it may differ from the same pass's frame before it; None: anywhere. See :meth:`changed_since`."""
 
-    def __init__(self, canvas: Canvas, number: int, t_ns: int, changed: list[Rectangle] | None):
-        self._canvas, self._number, self.t_ns, self.changed = canvas, number, t_ns, changed
+    def __init__(self, canvas: Canvas, number: int, moment: Moment, changed: list[Rectangle] | None):
+        self._canvas, self._number, self.moment, self.changed = canvas, number, moment, changed
+
+    @property
+    def t_ns(self) -> int:
+        return self.moment.t_ns
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -52,9 +61,14 @@ class Frame:
         return self._canvas.target
 
     def texture(self, output: str = "") -> moderngl.Texture:
-        """Of an output of the pass (default: its first), or "depth", for another pass or a compute shader. As the program wrote it: all
-        components of its format."""
-        return self.target.depth if output == "depth" else self.target.colour[self._canvas.attachment(output)]
+        """Of an output of the pass (default: its first), or :data:`DEPTH_BUFFER`, for another pass or a compute shader. As the program
+        wrote it: all components of its format."""
+        if output == DEPTH_BUFFER:
+            if self._canvas.pass_.depth != "texture":
+                raise GLError("the pass keeps no depth buffer that can be read", where=type(self._canvas.pass_).__name__, value=output,
+                              accepted='one with `depth = "texture"`')
+            return self.target.depth
+        return self.target.colour[self._canvas.attachment(output)]
 
     def read(self, name: str = "", out: np.ndarray | None = None) -> np.ndarray:
         """A picture as an array of the caller's own, (H, W) or (H, W, C), dtype of its format; row 0 is the top row.
@@ -107,10 +121,9 @@ class Canvas:
                                            samples=pass_.samples.multi)
 
     def draw(self, shot: Shot) -> Frame:
-        """shot : its target is not looked at."""
-        shot = replace(shot, target=self.target)
+        """What the pass draws of a moment into :attr:`target`."""
         changed = self._changed(shot)
-        self._used = dict(shot.inputs)
+        self._used = dict(shot.inputs) if self.pass_.pointwise else {}
         if changed is None or changed:
             self.pass_.begin(self.painter, shot)
             self.pass_.paint(self.painter, shot)
@@ -119,7 +132,7 @@ class Canvas:
     def frame(self, shot: Shot, changed: list[Rectangle] | None) -> Frame:
         """The handle of what has been drawn just now."""
         self.number += 1
-        return Frame(self, self.number, shot.moment.t_ns, changed)
+        return Frame(self, self.number, shot.moment, changed)
 
     def _changed(self, shot: Shot) -> list[Rectangle] | None:
         if not self.pass_.pointwise or not self._used:
@@ -130,8 +143,8 @@ class Canvas:
     # ---- read-back -----------------------------------------------------------------------------------------------
 
     def attachment(self, output: str) -> int:
-        names = [o.name for o in self.pass_.outputs]
-        return names.index(output) if output else 0
+        """Number of an output (default: the first). Raises GLError."""
+        return self._known([o.name for o in self.pass_.outputs], output)[0]
 
     def read(self, name: str, out: np.ndarray | None) -> np.ndarray:
         i, component = self._place(name)
@@ -184,9 +197,13 @@ class Canvas:
         return array[..., : self.pass_.outputs[i].components or None]
 
     def _place(self, name: str) -> tuple[int, int | None]:
-        if name and name not in self.planes:
-            raise GLError("the pass has no such output", where=type(self.pass_).__name__, value=name, accepted=", ".join(self.planes))
-        return self.planes[name] if name else next(iter(self.planes.values()))
+        return self.planes[self._known(list(self.planes), name)[1]]
+
+    def _known(self, names: list[str], name: str) -> tuple[int, str]:
+        """(number, name) of ``name``, "" standing for the first."""
+        if not names or (name and name not in names):
+            raise GLError("the pass has no such output", where=type(self.pass_).__name__, value=name, accepted=", ".join(names) or "none")
+        return (names.index(name), name) if name else (0, names[0])
 
     def release(self) -> None:
         self.number = -1

@@ -53,13 +53,22 @@ class Moment:
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
         self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = t_ns, view, T_world_cam, T_world_obj, stage
 
-    def through(self, view: View, T_world_cam: np.ndarray | None = None) -> Moment:
-        """The same instant through another camera; without ``T_world_cam`` at the same place. (A light that casts shadows is one.)"""
-        here = T_world_cam is None
-        other = Moment(self.t_ns, view, self.T_world_cam if here else T_world_cam, self.T_world_obj, self._stage)
-        if here:
-            other.__dict__.update({name: value for name, value in self.__dict__.items() if name in ("T_cam_obj", "centres")})
+    def through(self, view: View) -> Moment:
+        """The same instant through another camera at the same place."""
+        other = Moment(self.t_ns, view, self.T_world_cam, self.T_world_obj, self._stage)
+        other.__dict__.update({name: self.__dict__[name] for name in _OF_THE_PLACE if name in self.__dict__})
         return other
+
+    def from_place(self, view: View, T_world_cam: np.ndarray, dT_world_cam: np.ndarray | None = None) -> Moment:
+        """The same instant through a camera elsewhere, such as a lamp that casts shadows; dT_world_cam : (4, 4) 1/s, None: it stands still."""
+        other = Moment(self.t_ns, view, T_world_cam, self.T_world_obj, self._stage)
+        other.__dict__["dT_world_cam"] = np.zeros((4, 4)) if dT_world_cam is None else dT_world_cam
+        return other
+
+    @cached_property
+    def dT_world_cam(self) -> np.ndarray:
+        """(4, 4) float64 d(T_world_cam)/dt, 1/s."""
+        return self._stage.camera_path.derivative(self.t_ns)
 
     @cached_property
     def T_cam_obj(self) -> np.ndarray:
@@ -71,10 +80,9 @@ class Moment:
         return self.view.projection @ self.T_cam_obj
 
     @cached_property
-    def mvp_bytes(self) -> list[bytes]:
-        """Of every object, as GLSL's mat4 (column-major float32)."""
-        columns = np.ascontiguousarray(np.swapaxes(self.mvp, 1, 2), np.float32)
-        return [matrix.tobytes() for matrix in columns]
+    def mvp_columns(self) -> np.ndarray:
+        """(n, 4, 4) float32 the same as GLSL has it, column by column."""
+        return np.ascontiguousarray(self.mvp.swapaxes(1, 2), np.float32)
 
     @cached_property
     def rates(self) -> Rates:
@@ -82,7 +90,7 @@ class Moment:
         dT_world_obj = np.zeros_like(self.T_world_obj)
         for i in stage.moving:
             dT_world_obj[i] = stage.paths[i].derivative(self.t_ns)
-        dT_cam_obj = cam_from_obj_rate(self.T_world_cam, stage.camera_path.derivative(self.t_ns), self.T_world_obj, dT_world_obj)
+        dT_cam_obj = cam_from_obj_rate(self.T_world_cam, self.dT_world_cam, self.T_world_obj, dT_world_obj)
         return Rates(self.view.projection @ dT_cam_obj, dT_world_obj)
 
     @cached_property
@@ -92,10 +100,9 @@ class Moment:
         return (T[:, :3, :3] @ self._stage.item_centre[..., None])[..., 0] + T[:, :3, 3]
 
     @cached_property
-    def inverse_depths(self) -> list[bytes]:
-        """Of every item: ``inverse_depths`` of guard.glsl, a uvec2."""
-        bits = inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
-        return [row.tobytes() for row in bits]
+    def inverse_depths(self) -> np.ndarray:
+        """(m, 2) uint32: ``inverse_depths`` of guard.glsl, a uvec2 per item."""
+        return inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
 
     @cached_property
     def visible(self) -> list[DrawItem]:
@@ -107,6 +114,9 @@ class Moment:
         nearest = self.centres[:, 2] - stage.item_radius
         order = np.lexsort((nearest, stage.item_layer))
         return [stage.items[i] for i in order if inside[i]]
+
+
+_OF_THE_PLACE = ("T_cam_obj", "dT_world_cam", "centres")
 
 
 class Stage:

@@ -46,7 +46,7 @@ class Painter:
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
         """Draw into ``target`` from now on, which is cleared: the first attachment to ``background``, 0 where it ends, the others to 0."""
         self.prepare(target)
-        target.clear((*background, 0.0, 0.0, 0.0, 0.0)[: target.formats[0].components], depth=0.0)
+        target.clear(*([*background, 0.0, 0.0, 0.0, 0.0][: pixel.components] for pixel in target.formats[:1]), depth=0.0)
         self.stats.frames += 1
 
     def prepare(self, target: Target) -> None:
@@ -72,7 +72,7 @@ class Painter:
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what every program that draws the scene takes: matrices, depths and, where it has them, the light."""
         index = item.object_index
-        uniforms["mvp"].write(moment.mvp_bytes[index])
+        uniforms["mvp"].write(moment.mvp_columns[index])
         uniforms["inverse_depths"].write(moment.inverse_depths[item.number])
         if "sun_direction" in uniforms:
             # Every time: the context's programs are shared with other renderers, their uniforms included.

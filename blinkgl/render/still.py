@@ -43,7 +43,6 @@ class StillCanvas(Canvas):
     _covered: tuple[Rectangle, ...] = ()  # by what moves, in the last frame
 
     def draw(self, shot: Shot) -> Frame:
-        shot = replace(shot, target=self.target)
         pass_, painter, moment = self.pass_, self.painter, shot.moment
         visible = pass_.items(moment)
         movers = []

@@ -83,8 +83,9 @@ class RecordedSequence(Simulation):
     Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them."""
 
     def __init__(self, config: SequenceConfig, index: int, *, base: Path, events: bool, labels: bool, pictures_hz: float | None):
-        frames = config.frames
-        clock = StageClock()
+        clock, frames = StageClock(), config.frames
+        assert frames is not None
+        self._recorded = frames
         self.folder = folder_of(frames, index, base)
         self.files = used_images(frames, self.folder)
         self.flows, self.masks = flow_files(self.folder, frames, len(self.files))
@@ -109,10 +110,10 @@ class RecordedSequence(Simulation):
             frame = self._kept.pop(0) if k == 0 else read_frame(file)
             if keep and k:
                 self._kept[k] = frame
-            yield frame, self._time_of(k, self.config.frames.fps), str(file)
+            yield frame, self._time_of(k, self._recorded.fps), str(file)
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
-        frames = self.config.frames
+        frames = self._recorded
         steps = stepped(timed(self._given()), self.camera, gamma=frames.gamma, interpolate=frames.interpolate, factor=frames.factor,
                         max_px=frames.max_px)
         while True:
@@ -124,7 +125,7 @@ class RecordedSequence(Simulation):
             yield step.t_ns, step.events
 
     def _label_times(self) -> Iterator[tuple[int, int]]:
-        return ((k - 1, self._time_of(k, self.config.frames.fps)) for k in range(1, len(self.files)))
+        return ((k - 1, self._time_of(k, self._recorded.fps)) for k in range(1, len(self.files)))
 
     def _truth(self, k: int, t_ns: int) -> GroundTruth:
         number, request, values = k + 1, asked_for(self.config.labels), {}  # number: of the frame
@@ -136,11 +137,11 @@ class RecordedSequence(Simulation):
         values["flow_forward"] = Flow(*_flow(self.flows[number], size))
         if self.masks and "occlusion_forward" in request:
             values["occlusion_forward"] = _mask(self.masks[number], size)
-        return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self.config.frames.fps))
+        return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self._recorded.fps))
 
     def _picture(self, t_ns: int) -> Picture:
         frame = self._luminance
-        return Picture(t_ns, Decoder(self.config.frames.gamma)(frame, "") if frame.dtype == np.uint8 else frame)
+        return Picture(t_ns, Decoder(self._recorded.gamma)(frame, "") if frame.dtype == np.uint8 else frame)
 
     def poses(self) -> dict[str, np.ndarray]:
         return {}

@@ -77,7 +77,7 @@ class RenderedSequence(Simulation):
 
     def _explained(self, error: EventDataError) -> EventDataError:
         """The error with the time and, where a pixel is at fault, what is seen there."""
-        if error.pixel is None:
+        if error.pixel is None or error.t_ns is None:
             return error
         seen = self.renderer.shown_at(*error.pixel, error.t_ns)
         explained = EventDataError(f"{error.problem}: it shows {seen}", where=f"{error.where} at {error.t_ns * 1e-9:.9g} s", value=error.value,

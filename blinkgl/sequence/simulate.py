@@ -99,6 +99,10 @@ class Simulation(ABC):
         self._begun = True
         return self._items()
 
+    def chunks(self) -> Iterator[EventChunk]:
+        """The events alone."""
+        return (item for item in self if isinstance(item, EventChunk))
+
     def _items(self) -> Iterator[Item]:
         with self:
             self._resume()
@@ -133,6 +137,11 @@ class Simulation(ABC):
     def frames(self) -> int:
         """That the emulator has seen so far."""
         return 0 if self.camera is None else self.camera.frames
+
+    @property
+    def losses(self) -> tuple[int, int, int]:
+        """Events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's queue full, and that are on its bus still."""
+        return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
 
     @property
     def seconds(self) -> dict[str, float]:

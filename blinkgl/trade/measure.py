@@ -189,7 +189,7 @@ class Bench:
         run, drawn = clip(self.t1_ns), renderer.stats.triangles
         chunks: list[Events] = []
         wall, cpu = time.perf_counter(), time.process_time()
-        for chunk in run:
+        for chunk in run.chunks():
             if first:
                 paused = time.perf_counter(), time.process_time()
                 chunks.append(masked(chunk.events, self.mask))

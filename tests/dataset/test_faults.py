@@ -146,8 +146,10 @@ def test_workers_that_cannot_start_leave_the_log_their_error_names(tmp_path, mon
     (tmp_path / "blinkgl").mkdir()
     (tmp_path / "blinkgl/__init__.py").write_text("raise ImportError('half an installation')")
     monkeypatch.chdir(tmp_path)  # where 'python -m' looks first
+    before = len(os.listdir("/proc/self/fd"))
     with pytest.raises(BlinkGLError, match="workers cannot start: .*worker-0.log") as failure:
         run_dataset(recipe, tmp_path / "out", Local(1))
+    assert len(os.listdir("/proc/self/fd")) == before, "a worker that is gone keeps no pipe open"
     assert "half an installation" in Path(failure.value.accepted.removeprefix("see ")).read_text()
 
 

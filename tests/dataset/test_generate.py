@@ -356,3 +356,23 @@ def test_peak_memory_does_not_grow_with_the_sequence(tmp_path):
                               check=True, capture_output=True, text=True)
         peaks[seconds] = int(done.stdout.split()[-1])
     assert peaks[20] < 1.05 * peaks[1] + 8_000, f"peak resident memory, KiB: {peaks}"
+
+
+def test_progress_grows_and_says_what_each_stage_has_taken(tmp_path, gl):
+    """The same account while it is made and in the end: drawing and reading back among the stages, never less than before."""
+    told = []
+
+    def progress(report, fraction):
+        told.append((fraction, report.frames, report.events, dict(report.seconds)))
+
+    config = load_run(config_file(tmp_path)).sequence(0)
+    report = generate_module.generate_sequence(config, 0, tmp_path / "out", gl, progress=progress)
+    told.append((1.0, report.frames, report.events, dict(report.seconds)))
+    assert len(told) > 20 and report.frames == 51 and report.simulated_s == pytest.approx(0.25)
+    for stage in ("render", "read-back", "events"):
+        taken = [seconds.get(stage, 0.0) for *_, seconds in told[1:]]
+        assert taken[0] > 0 and all(a <= b for a, b in zip(taken, taken[1:])), stage
+    for column in range(3):
+        values = [row[column] for row in told]
+        assert all(a <= b for a, b in zip(values, values[1:])) and values[0] < values[-1]
+    assert 0 <= told[0][0] < 0.1 and sum(report.seconds.values()) <= report.total_s * 1.05

@@ -15,10 +15,9 @@ from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.io.sequence_dir import verify_sequence
-from blinkgl.labels import LabelRequest
+from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render import renderer as module
 from blinkgl.render.passes import Geometry
-from blinkgl.render.passes.geometry import BUFFERS
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.geometry.meshes import faces_in_float32
@@ -29,7 +28,7 @@ from tests.render.render_scenes import LEVEL, cube, drift, mesh, quad, rig, scen
 from tests.shared_data import shared
 
 MS = 1_000_000
-RAW = Geometry(tuple(BUFFERS))
+RAW = Geometry(tuple(name for name, label in LABELS.items() if label.buffer))
 
 
 def sheet(corners: np.ndarray, seed: int = 1):
@@ -113,13 +112,13 @@ def test_slivers_have_the_depth_and_the_light_of_what_they_are(gl, seed):
     world = scene([thing("slivers", 1, sheet(corners), drift((0, 0, 0), (0.02, 0.01, 0.03)), Material(texture=smooth_texture(1)))], rig(near=0.01))
     with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
         buffers = raw_buffers(renderer)
-    hit = buffers["ID"] > 0
+    hit = buffers["ids"] > 0
     assert 10 < hit.sum() < 300 and all(np.isfinite(b).all() for b in buffers.values())
-    depth, reach = buffers["DEPTH"][hit], corners[..., 1]
+    depth, reach = buffers["depth"][hit], corners[..., 1]
     assert depth.min() > 0.99 * reach.min() and depth.max() < 1.01 * reach.max()
     np.testing.assert_array_equal(buffers["luminance"] > 0, hit)
     assert buffers["luminance"].max() < 0.85 * (world.light.sun + world.light.sky)
-    np.testing.assert_allclose(np.linalg.norm(buffers["NORMAL"][hit], axis=-1), 1, atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(buffers["normals"][hit], axis=-1), 1, atol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -141,8 +140,8 @@ def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing,
     paint = smooth_texture(1)
     with Renderer(gl, scene([thing("ground", 1, ground, still(), Material(texture=paint, unlit=unlit))], eye, Light(sun=0.0, sky=1.0)), RenderConfig(antialiasing=antialiasing)) as renderer:
         buffers = raw_buffers(renderer)
-    last = buffers["ID"][33] > 0
-    assert last.sum() > 100 and not buffers["ID"][:33].any()
+    last = buffers["ids"][33] > 0
+    assert last.sum() > 100 and not buffers["ids"][:33].any()
     for name, buffer in buffers.items():
         assert np.isfinite(buffer).all(), name
     mean = paint.image.mean(axis=(0, 1)) @ (0.2126, 0.7152, 0.0722)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
+from pathlib import Path
 
 import cv2
 import imageio_ffmpeg
@@ -153,3 +155,10 @@ def test_bad_arrays_and_files(tmp_path):
     (tmp_path / "t.txt").write_text("time\n0\nx\n")
     with pytest.raises(EventDataError, match="line 3 is not a time stamp"):
         read_timestamps(tmp_path / "t.txt")
+
+
+def test_one_file_may_hold_half_of_the_memory():
+    from blinkgl.io.images import memory_limit
+
+    total = int(re.search(r"MemTotal:\s+(\d+) kB", Path("/proc/meminfo").read_text())[1]) * 1024
+    assert memory_limit() == pytest.approx(total / 2, rel=0.05)

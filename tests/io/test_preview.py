@@ -89,6 +89,14 @@ def test_large_frames_are_averaged_in_linear_light():
     assert (made._video.pictures[0][30:, :20] == to_srgb8(np.float32([0.5]))[0]).all()
 
 
+def test_a_panel_of_as_many_rows_but_fewer_columns_is_averaged():
+    made = PreviewWriter("p.mp4", 200, 301, flow=False)
+    image = np.random.default_rng(2).random((200, 301)).astype(np.float32)
+    made.frame(0, image)
+    shown = to_srgb8(cv2.resize(image, (300, 200), interpolation=cv2.INTER_AREA))
+    np.testing.assert_array_equal(made._video.pictures[0][30:, :300, 0], shown)
+
+
 def test_the_clock():
     """40 pictures per second of the sequence, played at 20: slowed twice. Late frames are shown as often as they are late."""
     made = PreviewWriter("p.mp4", 48, 64, t0_us=5_000, flow=False)

@@ -43,6 +43,14 @@ def test_acceleration_inside_a_step_is_noticed():
         assert max(speed(a), speed(b)) * (b - a) <= 0.5 * 1e9 * 1.001 or b - a <= MS // 10 + 1
 
 
+def test_a_rejected_step_is_cut_at_once_to_what_the_faster_end_asks_for():
+    """One look at the end that refused it and one at the new end, for every frame: no creeping up by tenths."""
+    calls = []
+    speed = lambda t: calls.append(t) or (10.0 if t < 50 * MS else 1000.0)  # noqa: E731
+    times = list(displacement_times(0.5, MS // 10, 20 * MS, 0, 60 * MS, speed))
+    assert len(calls) <= 2 * len(times) and times[3] - times[2] == pytest.approx(0.475 * MS, abs=1)
+
+
 def test_one_speed_per_frame_when_nothing_is_rejected():
     calls = []
     times = list(displacement_times(0.5, MS // 10, 20 * MS, 0, 1000 * MS, lambda t: calls.append(t) or 100.0))

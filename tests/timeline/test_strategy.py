@@ -115,7 +115,7 @@ def test_budget_keeps_to_its_target_and_its_estimate_to_the_truth(gl, world, rec
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="none")) as renderer:
         dense = Events.concatenate([chunk.events for chunk in run_of(UniformTimeline(fps=8000), renderer)])
         run = run_of(config, renderer)
-        events = Events.concatenate([chunk.events for chunk in run])
+        events = Events.concatenate([chunk.events for chunk in run.chunks()])
     matching = match_events(dense, events, 72, 96, 3_000)
     true, median = (np.percentile(np.abs(matching.dt_us[matching.matched]), q) for q in (75, 50))
     said = run.timeline.info()["time_error"]
@@ -186,6 +186,18 @@ def test_as_many_events_are_beyond_the_target_as_the_percentile_says(fast, targe
     too small where nothing changes, and 1.6 to 1.9 times too large where motion comes in bursts that the image speed does not tell of."""
     said = drifting(BudgetTimeline(max_time_error_us=target, min_step_us=20, max_step_us=40_000, sample_every=1), fast)
     assert said["percentile"] == 75 and said["p75_us"] == pytest.approx(target, rel=0.06)
+
+
+def test_a_frame_is_judged_by_the_speed_at_the_nearest_time_that_was_looked_at():
+    world, seen = SimpleNamespace(motion=lambda t, n: picture(np.full((2, 2, 2), (float(t), 0.0), np.float32))), []
+    timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0), 0, 10 * MS, world, Esim.response(ESIM))
+    timeline.error.observe = lambda t_ns, signal, slope, speed: seen.append((t_ns, speed.max()))
+    timeline.observe(7, np.ones((2, 2), np.float32))  # nothing looked at yet: it looks itself
+    for t in (1000, 2000, 5000):
+        timeline.pace(t)
+    for t in (1000, 1400, 1600, 4000, 9000, 300):
+        timeline.observe(t, np.ones((2, 2), np.float32))
+    assert seen == [(7, 7), (1000, 1000), (1400, 1000), (1600, 2000), (4000, 5000), (9000, 5000), (300, 7)]
 
 
 def test_nothing_moves_nothing_is_measured():

@@ -31,7 +31,7 @@ class Output(NamedTuple):
 
 class Input(NamedTuple):
     """What a pass reads of another one, at the same moment. sampler : the uniform that gets it.
-    output : name of an output of ``of`` (default: its first), or "depth", where ``of`` keeps its depth as a texture."""
+    output : name of an output of ``of`` (default: its first), or ``DEPTH_BUFFER``, where ``of`` keeps that as a texture."""
 
     sampler: str
     of: Pass
@@ -87,7 +87,7 @@ class Pass:
         return {}
 
     def seen(self, moment: Moment) -> Moment:
-        """The moment as this pass looks at it: the camera's, unless it draws for another one (``moment.through``)."""
+        """The moment as this pass looks at it: the camera's, unless it draws for another one (``moment.from_place``)."""
         return moment
 
     def begin(self, painter: Painter, shot: Shot) -> None:

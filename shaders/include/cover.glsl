@@ -1,0 +1,7 @@
+// The vertex stage of a pass over all pixels of its target: one triangle that covers them, from the vertex number alone.
+#ifdef VERTEX_SHADER
+void main()
+{
+    gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.5, 1.0);
+}
+#endif

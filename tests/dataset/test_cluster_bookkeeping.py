@@ -1,0 +1,163 @@
+"""What the driver keeps of tasks on Ray, with a Ray that only writes down what it is asked."""
+
+from __future__ import annotations
+
+import os
+from types import SimpleNamespace
+
+import pytest
+
+from blinkgl.dataset import cluster as module
+from blinkgl.dataset.cluster import RayCluster
+from blinkgl.errors import BlinkGLError
+
+
+class RayError(Exception):
+    pass
+
+
+class NodeDiedError(RayError):
+    pass
+
+
+class WorkerCrashedError(RayError):
+    pass
+
+
+class FakeRay:
+    """``results``: reference -> what getting it gives, an exception to raise or a message. ``done``: what waiting finds."""
+
+    exceptions = SimpleNamespace(RayError=RayError, NodeDiedError=NodeDiedError, WorkerCrashedError=WorkerCrashedError)
+    __version__ = "0"
+
+    def __init__(self):
+        self.results, self.done, self.calls, self.alive = {}, [], [], True
+
+    def is_initialized(self):
+        return self.alive
+
+    def cluster_resources(self):
+        return {"CPU": 6.0}
+
+    def wait(self, references, num_returns, timeout):
+        assert references, "Ray refuses to wait for nothing"
+        self.calls.append(("wait", num_returns))
+        ready = [r for r in references if r in self.done][:num_returns]
+        return ready, [r for r in references if r not in ready]
+
+    def get(self, reference, timeout=None):
+        found = self.results[reference]
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def cancel(self, reference, force=False):
+        self.calls.append(("cancel", reference, force))
+
+    def kill(self, actor):
+        self.calls.append(("kill", actor))
+
+    def shutdown(self):
+        self.calls.append(("shutdown",))
+
+
+@pytest.fixture
+def ray(monkeypatch):
+    fake = FakeRay()
+    monkeypatch.setitem(__import__("sys").modules, "ray", fake)
+    monkeypatch.setattr(module.time, "sleep", lambda seconds: fake.calls.append(("sleep", seconds)))
+    return fake
+
+
+def with_tasks(*tasks: int, workers=None) -> RayCluster:
+    cluster = RayCluster(workers)
+    cluster._tasks = {f"r{task}": task for task in tasks}
+    return cluster
+
+
+@pytest.mark.parametrize("found, reason, error, lost", [
+    (NodeDiedError("node 7 is gone\nmore"), None, "the node was lost: node 7 is gone", True), (NodeDiedError("x"), "too slow", "the node was lost: x", True),
+    (WorkerCrashedError("boom"), None, "the worker was ended", False), (WorkerCrashedError("boom"), "took too long", "took too long", False),
+    (RayError("out of memory"), None, "out of memory", False), (RayError("out of memory"), "took too long", "took too long", False),
+    (RayError("the Node has DIED"), None, "the Node has DIED", True), (RayError("the node has died"), "took too long", "took too long", False),
+    (RayError("the node is well"), None, "the node is well", False), (RayError("the task died"), None, "the task died", False),
+])
+def test_what_became_of_a_task(ray, found, reason, error, lost):
+    """A node that is lost is nobody's fault; a worker that was ended has the reason it was ended for."""
+    cluster = with_tasks(3, 4)
+    ray.results["r3"] = found
+    if reason:
+        cluster._reasons[3] = reason
+    message = cluster._collect("r3")
+    assert message["task"] == 3 and error in message["error"] and bool(message.get("lost")) is lost and message["kind"] == "failed"
+    assert cluster._tasks == {"r4": 4} and 3 not in cluster._reasons
+
+
+def test_a_message_is_passed_on_and_a_refusal_is_raised(ray):
+    cluster = with_tasks(1, 2)
+    ray.results = {"r1": {"kind": "done", "task": 1}, "r2": {"kind": "refused", "error": "another version"}}
+    assert cluster._collect("r1") == {"kind": "done", "task": 1}
+    with pytest.raises(BlinkGLError, match="another version"):
+        cluster._collect("r2")
+
+
+def test_polling(ray, monkeypatch):
+    """Of what is done, all at once; of news, those of tasks that still run."""
+    heard = []
+    cluster = with_tasks(1, 2, 3)
+    cluster.listener = heard.append
+    monkeypatch.setattr(cluster, "_news", lambda: [{"task": 2, "n": 1}, {"task": 9, "n": 2}])
+    ray.done, ray.results = ["r1", "r3"], {"r1": {"kind": "done", "task": 1}, "r3": {"kind": "done", "task": 3}}
+    assert [m["task"] for m in cluster.poll(0.1)] == [1, 3] and heard == [{"task": 2, "n": 1}] and ray.calls == [("wait", 1), ("wait", 3)]
+    ray.done, ray.calls = [], []
+    assert cluster.poll(0.1) == [] and len(ray.calls) == 2
+    cluster._tasks = {}
+    ray.calls = []
+    assert cluster.poll(0.1) == [] and ray.calls == [], "nothing to wait for"
+
+
+def test_places_that_are_free(ray):
+    assert with_tasks(1, 2).free() == 4 and with_tasks(1, 2, workers=3).free() == 1 and with_tasks(workers=2).free() == 2
+
+
+def test_a_task_is_killed_once_and_for_its_first_reason(ray):
+    cluster = with_tasks(1, 2)
+    for reason in ("slow", "slower"):
+        cluster.kill(2, reason)
+    cluster.kill(7, "unknown")
+    assert ray.calls == [("cancel", "r2", True)] and cluster._reasons == {2: "slow"}
+
+
+@pytest.mark.parametrize("done, forced", [(["r1", "r2"], []), (["r1"], ["r2"]), ([], ["r1", "r2"])])
+@pytest.mark.parametrize("ours", [True, False])
+def test_closing(ray, tmp_path, done, forced, ours):
+    """All are asked to end, those that do not are made to, and only for them it waits; a cluster of one's own ends with its folder."""
+    cluster = with_tasks(1, 2)
+    cluster._board, cluster._ours, cluster._folder = "board", ours, str(tmp_path / "ray")
+    (tmp_path / "ray").mkdir()
+    ray.done = done
+    cluster.close()
+    assert ray.calls == [("cancel", "r1", False), ("cancel", "r2", False), ("wait", 2), *(("cancel", r, True) for r in forced), *([("sleep", 1.0)] if forced else []),
+                         ("kill", "board"), *([("shutdown",)] if ours else [])]
+    assert not cluster._tasks and not (tmp_path / "ray").exists()
+
+
+def test_closing_what_is_idle_or_gone(ray, tmp_path):
+    cluster = with_tasks()
+    cluster.close()
+    assert ray.calls == []
+    ray.alive = False
+    cluster = with_tasks(1)
+    cluster._folder, cluster._ours = str(tmp_path / "ray"), True
+    (tmp_path / "ray").mkdir()
+    cluster.close()
+    assert ray.calls == [] and not (tmp_path / "ray").exists(), "nobody is left to be asked"
+
+
+def test_the_environment_is_as_it_was(ray, monkeypatch):
+    monkeypatch.delenv("RAY_USAGE_STATS_ENABLED", raising=False)
+    monkeypatch.setenv("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "1")
+    cluster = RayCluster()
+    assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0" and os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] == "1"
+    cluster.close()
+    assert "RAY_USAGE_STATS_ENABLED" not in os.environ and os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] == "1"

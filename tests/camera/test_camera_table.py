@@ -113,7 +113,7 @@ def test_a_part_that_is_missing_or_wrong_is_named(part, value, problem):
     before = dict(CAMERA_MODELS)
     with pytest.raises(TypeError, match=problem):
         register(without(part, value))
-    assert CAMERA_MODELS == before
+    assert before == CAMERA_MODELS
 
 
 def test_what_is_no_model_and_what_is_there_already(stereographic):

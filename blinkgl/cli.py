@@ -296,6 +296,7 @@ def is_out_of_memory(error: BaseException | None) -> bool:
 
 
 def main() -> None:
+    """The console script."""
     sys.exit(run(sys.argv[1:]))
 
 

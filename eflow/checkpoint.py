@@ -46,6 +46,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
+    """Tensors by name as safetensors. Raises OutputError."""
     with output_errors(path):
         try:
             save_file({k: v.detach().contiguous().cpu() for k, v in tensors.items()}, path, metadata)
@@ -55,6 +56,7 @@ def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, st
 
 
 def metadata_of(model: FlowModel) -> dict[str, str]:
+    """What a file of weights says of the network that they are of."""
     return {"format": FORMAT, "model": model.config.model_dump_json()}
 
 

@@ -298,6 +298,7 @@ def run(arguments: list[str]) -> int:
 
 
 def main() -> None:
+    """The console script."""
     sys.exit(run(sys.argv[1:]))
 
 

@@ -1,6 +1,6 @@
 #version 430 core
-// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED. SHOW_LOOKUP, the
-// shader debugger's: also writes what was looked up, see lookup.glsl.
+// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED.
+// SHOW_LOOKUP, the shader debugger's: also writes what was looked up, see lookup.glsl.
 
 #ifdef LIT
 #define NEEDS_NORMAL

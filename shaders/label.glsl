@@ -1,7 +1,8 @@
 #version 430 core
-// Label pass: any subset of the labels that the shader draws, in one go. The renderer defines OUT_<NAME> as the attachment number of each
-// label that somebody asks for; the others do not exist. What a label writes stands in include/labels/<name>.glsl, or with its row
-// (blinkgl/labels); the includes labels_need.glsl and labels.glsl are made from the table of labels (blinkgl/labels/shader.py).
+// Label pass: any subset of the labels that the shader draws, in one go. The renderer defines OUT_<NAME> as the
+// attachment number of each label that somebody asks for; the others do not exist. What a label writes stands in
+// include/labels/<name>.glsl, or with its row (blinkgl/labels); the includes labels_need.glsl and labels.glsl are made
+// from the table of labels (blinkgl/labels/shader.py).
 //
 // A label is a function label_<name>(), which may look at
 //   local        object-local position, and uniform vec2 image_size (include/image_size.glsl), px of the target

@@ -6,7 +6,8 @@
 //            TAPS4      four texture lookups per pixel instead of one, each one mip level finer
 //            TWO_SIDED  the normal is turned towards the camera on back faces
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
-//            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's pixels
+//            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
+//                       pixels
 //            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT))
@@ -59,10 +60,13 @@ void main()
 #ifdef TEXTURED
     vec2 uv = within_reach(uv); // hides the varying
 #ifdef TAPS4
+    // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples of the
+    // texture.
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
     float luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).r + texture(albedo, uv + right - down, -1.0).r
                             + texture(albedo, uv - right + down, -1.0).r + texture(albedo, uv + right + down, -1.0).r);
 #elif defined(EVERY)
+    // Neighbours in the target are n px of the image apart; the level is chosen as if they were one.
     float luminance = texture(albedo, uv, -log2(every)).r;
 #else
     float luminance = texture(albedo, uv).r;
@@ -86,13 +90,17 @@ void main()
 #ifdef TEXTURED
 #ifdef TAPS4
     // One mip level finer is what every second pixel would see.
-    change = 0.25 * (texture_rate(albedo, uv - right - down, motion, 2.0) + texture_rate(albedo, uv + right - down, motion, 2.0)
-                   + texture_rate(albedo, uv - right + down, motion, 2.0) + texture_rate(albedo, uv + right + down, motion, 2.0));
+    change = 0.25 * (texture_rate(albedo, uv - right - down, motion, 2.0)
+                   + texture_rate(albedo, uv + right - down, motion, 2.0)
+                   + texture_rate(albedo, uv - right + down, motion, 2.0)
+                   + texture_rate(albedo, uv + right + down, motion, 2.0));
 #else
     change = texture_rate(albedo, uv, motion, every);
 #endif
 #endif
 #ifdef LIT
+    // L = albedo E(n): the product rule. ``luminance`` is still the albedo here, and the normal seen changes as the
+    // surface slides by.
     change = change * light + luminance * irradiance_rate(facing, seen_rate(facing, motion));
 #endif
 #endif

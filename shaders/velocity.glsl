@@ -1,6 +1,6 @@
 #version 430 core
-// Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small picture of the image, whose
-// pixels are image_scale px of the image apart; velocity is still the image's.
+// Velocity pass: image velocity, px/s, for the time sampling and the preview. SMALL: the target is a small picture of
+// the image, whose pixels are image_scale px of the image apart; velocity is still the image's.
 
 #define NEEDS_LOCAL
 #include "vertex.glsl"

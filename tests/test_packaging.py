@@ -171,8 +171,9 @@ def test_citation():
     told = yaml.safe_load((REPOSITORY / "CITATION.cff").read_text(encoding="utf-8"))
     assert (told["cff-version"], told["type"], told["license"]) == ("1.2.0", "software", "MIT")
     assert told["message"] and told["title"]
-    keys = """cff-version message title type authors version date-released license keywords references abstract url doi contact
-              repository-code identifiers preferred-citation commit license-url repository repository-artifact""".split()
+    keys = """cff-version message title type authors version date-released license keywords references
+              abstract url doi contact repository-code identifiers preferred-citation commit license-url
+              repository repository-artifact""".split()
     assert set(told) <= set(keys)
     assert len(set(told["keywords"])) == len(told["keywords"])
     for work in [told, *told["references"]]:

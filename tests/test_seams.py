@@ -30,7 +30,15 @@ from blinkgl.events.response import Response
 from blinkgl.events.table import EMULATORS, unregister
 from blinkgl.gl import ShaderError, create_context
 from blinkgl.io.formats import open_events
-from blinkgl.labels import LABELS, Form, Label, LabelFrame, LabelRequest, register as register_label, unregister as unregister_label
+from blinkgl.labels import (
+    LABELS,
+    Form,
+    Label,
+    LabelFrame,
+    LabelRequest,
+    register as register_label,
+    unregister as unregister_label,
+)
 from blinkgl.labels.files import npy
 from blinkgl.labels.label import Key
 from blinkgl.recordings.simulation import frames_to_events
@@ -367,7 +375,7 @@ def test_a_toy_label_is_generated_verified_shown_and_exported(made, capsys, tmp_
 
 
 def test_what_verify_says_of_a_toy_label(position, made, monkeypatch):
-    (folder,) = (made / "train").iterdir()
+    (_folder,) = (made / "train").iterdir()
     assert verify_dataset(made).clean
     monkeypatch.setattr(Position, "problem", lambda self, value: "below the floor" if value.min() < 99 else None)
     assert verify_dataset(made).problems == {"train/sequence_000000": [f"position/{k:06d}.npy: below the floor" for k in range(2)]}
@@ -635,7 +643,7 @@ def test_a_label_may_look_at_others_and_at_another_time(drawing):
         unregister_label("next_depth")
     assert frame.next_depth is frame.values["next_depth"]
     with pytest.raises(AttributeError, match="no label 'next_depth'"):
-        LabelFrame(0, {}).next_depth
+        LabelFrame(0, {}).next_depth  # noqa: B018
 
 
 @pytest.mark.parametrize("reference, said", [

@@ -27,14 +27,17 @@ HEADER = """# Every key of the YAML
 
 Made from the configuration models by `python -m blinkgl.tools.config_docs`; do not edit.
 
-Keys that are left out have the default, and a table may say only what it changes: without `kind` (or `emulator`) it is of the default one. Where a plain value stands, a distribution may stand instead and is drawn once per
-sequence: `{uniform: [a, b]}`, `{log_uniform: [a, b]}`, `{integer: [a, b]}` (both ends included), `{choice: [x, y, …]}`,
-`{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (dealt out, not rolled). Every sequence's own `config.yaml` records what was drawn. When the file is read, everything
-that can be drawn is checked: every choice and both ends of every range, in all combinations of those that are looked at together.
+Keys that are left out have the default, and a table may say only what it changes: without `kind` (or `emulator`) it is
+of the default one. Where a plain value stands, a distribution may stand instead and is drawn once per sequence:
+`{uniform: [a, b]}`, `{log_uniform: [a, b]}`, `{integer: [a, b]}` (both ends included), `{choice: [x, y, …]}`,
+`{weighted: {x: 3, y: 1}}`, `{shares: [{share: 0.8, value: x}, …]}` (dealt out, not rolled). Every sequence's own
+`config.yaml` records what was drawn. When the file is read, everything that can be drawn is checked: every choice and
+both ends of every range, in all combinations of those that are looked at together.
 `seed`, `output` and `gl` belong to the whole run and cannot be drawn.
 
-`groups: {name: {…}}` at the top level makes a recipe of several groups of sequences: each is what stands at the top level with
-the group's own keys laid over it, and `enabled: false` leaves a group out (`blinkgl/config/recipe.py`, `configs/blinkflow.yaml`).
+`groups: {name: {…}}` at the top level makes a recipe of several groups of sequences: each is what stands at the top
+level with the group's own keys laid over it, and `enabled: false` leaves a group out (`blinkgl/config/recipe.py`,
+`configs/blinkflow.yaml`).
 """
 
 
@@ -42,8 +45,8 @@ EFLOW_HEADER = """# Every key of eflow's YAML
 
 Made from the configuration models by `python -m blinkgl.tools.config_docs eflow`; do not edit.
 
-What `eflow train CONFIG` reads; `--set a.b=c` overrides any of it. Keys that are left out have the default; unknown keys are refused with the
-nearest known one. Paths start from the YAML file's folder. Examples: `configs/eflow/`.
+What `eflow train CONFIG` reads; `--set a.b=c` overrides any of it. Keys that are left out have the default; unknown
+keys are refused with the nearest known one. Paths start from the YAML file's folder. Examples: `configs/eflow/`.
 """
 
 

@@ -169,7 +169,7 @@ def differences(golden: Any, now: Any, where: str = "") -> list[str]:
         return lines + [line for key in golden.keys() & now.keys() for line in differences(golden[key], now[key], f"{where}/{key}")]
     same = golden == now
     if isinstance(golden, list) and isinstance(now, list) and len(golden) == len(now):
-        near = lambda a: CLOSE_PIXELS if where.startswith("/textures/") else CLOSE * max(abs(a), 1e-3)  # noqa: E731
+        near = lambda a: CLOSE_PIXELS if where.startswith("/textures/") else CLOSE * max(abs(a), 1e-3)
         same = all(abs(a - b) <= near(a) if isinstance(a, float) and isinstance(b, float) else a == b for a, b in zip(golden, now))
     return [] if same else [f"{where}: {golden!r} became {now!r}"]
 

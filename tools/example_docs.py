@@ -34,14 +34,16 @@ ORDER = ("scene_in_python", "frame_with_labels", "own_label", "own_trajectory", 
 
 HEADER = """# Examples
 
-Each is a program of its own in `examples/`, does one thing, and ends with a check (`test_final`) that the tests run. Copy one and change it:
+Each is a program of its own in `examples/`, does one thing, and ends with a check (`test_final`) that the tests run.
+Copy one and change it:
 
 ```
 .venv/bin/python examples/scene_in_python.py        # writes below out/examples/
 ```
 
-This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit. `examples/demo.ipynb` is a notebook that
-walks through the demo. All names come from `import blinkgl`; what they take is in their docstrings (`help(blinkgl.Scene)`).
+This page is made by `python -m blinkgl.tools.example_docs`, outputs included; do not edit.
+`examples/demo.ipynb` is a notebook that walks through the demo. All names come from `import blinkgl`; what they take is
+in their docstrings (`help(blinkgl.Scene)`).
 """
 
 

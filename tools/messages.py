@@ -20,7 +20,8 @@ ROOT = Path(__file__).resolve().parent.parent
 GOLDEN = ROOT / "tests" / "golden" / "messages.txt"
 PACKAGES = ("blinkgl", "eflow", "tools")
 HEAD = """\
-# Every sentence that BlinkGL and eflow refuse something with. Made by `python -m blinkgl.tools.messages`; a test compares.
+# Every sentence that BlinkGL and eflow refuse something with. Made by `python -m blinkgl.tools.messages`; a test
+# compares.
 # {…} stands where a value goes. Reading this file is reviewing the messages: would a stranger know what to do?
 """
 

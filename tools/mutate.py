@@ -93,7 +93,7 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        shorten = lambda text: " ".join(text.split())[:60]  # noqa: E731
+        shorten = lambda text: " ".join(text.split())[:60]
         return f"{self.path}:{self.line}:{self.column}: {shorten(self.before)} -> {shorten(self.after) or '(nothing)'}"
 
     def apply(self, source: str) -> str:
@@ -176,7 +176,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_BinOp(self, node) -> None:
         symbol = ARITHMETIC.get(type(node.op))
-        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))  # noqa: E731
+        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
         if symbol and not literal(node.left) and not literal(node.right):
             self.between(node.left, node.right, symbol, "arithmetic")
         self.generic_visit(node)
@@ -196,7 +196,7 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node) -> None:
-        start, end = self.span(node)
+        start, _end = self.span(node)
         inner = self.span(node.operand)[0]
         if isinstance(node.op, (ast.Not, ast.USub)):
             self.add(start, inner, "", "negation left out")
@@ -230,7 +230,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_Attribute(self, node) -> None:
         if node.attr in NAMES:
-            start, end = self.span(node)
+            _start, end = self.span(node)
             self.add(end - len(node.attr), end, NAMES[node.attr], "function")
         self.visit(node.value)
 
@@ -554,9 +554,10 @@ def _run_tests(order: dict) -> int:
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]
-    original, stamp = order["original"], caching._SourceFileBackedLocatorMixin.get_source_stamp
+    locator = caching._SourceFileBackedLocatorMixin  # noqa: SLF001 - there is no other way to a kernel's stamp
+    original, stamp = order["original"], locator.get_source_stamp
     # An edit that no kernel contains leaves those of its file as they are, though the file is another.
-    caching._SourceFileBackedLocatorMixin.get_source_stamp = lambda self: bytes.fromhex(original[self._py_file]) if self._py_file in original else stamp(self)
+    locator.get_source_stamp = lambda self: bytes.fromhex(original[self._py_file]) if self._py_file in original else stamp(self)
     sys.argv = ["pytest"]
     import pytest
 

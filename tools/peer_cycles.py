@@ -219,7 +219,7 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
         "background": float(scene.background), "frames": len(times_ns), "settings": asdict(settings),
         "light": {"sun_direction": [float(s) for s in light.sun_direction], "sun": float(light.sun), "sky": float(light.sky)},
         "materials": paints, "bodies": bodies,
-    }  # fmt: skip
+    }
     np.savez(folder / "job.npz", **arrays)
     (folder / "job.json").write_text(json.dumps(job))
 
@@ -237,7 +237,7 @@ def blender_camera(camera: PinHole) -> dict[str, float | str]:
         "pixel_aspect_x": max(1.0, 1.0 / tall), "pixel_aspect_y": max(1.0, tall),  # Blender takes nothing below 1
         "shift_x": ((camera.width - 1) / 2 - camera.cx) / camera.width,
         "shift_y": (camera.cy - (camera.height - 1) / 2) * tall / camera.width,
-    }  # fmt: skip
+    }
 
 
 class _Numbered(dict):

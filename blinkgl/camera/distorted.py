@@ -29,7 +29,7 @@ def radius_limit(coefficients: tuple[float, ...]) -> float:
     return float(np.sqrt(real.min())) if len(real) else math.inf
 
 
-def radial(r: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+def radial(r: np.ndarray | float, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """``g(r) / r = 1 + k1 r^2 + k2 r^4 + …`` and g'(r)."""
     squared = np.square(r)
     ratio, slope = np.zeros_like(squared), np.zeros_like(squared)

@@ -225,7 +225,7 @@ class Growing(Config):
     def __get_pydantic_core_schema__(cls, source: Any, handler: Any) -> core_schema.CoreSchema:
         if not vars(cls).get("_made", False):
             return handler(source)
-        return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))  # noqa: PLW0108 - the class as it then is
+        return core_schema.no_info_plain_validator_function(lambda data: cls.model_validate(data))  # noqa: PLW0108
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: core_schema.CoreSchema, handler: Any) -> dict[str, Any]:
@@ -258,6 +258,7 @@ def members(annotation: Any) -> list[Any]:
 
 
 def is_model(annotation: Any) -> bool:
+    """Whether it is a pydantic model and nothing more."""
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
 
 
@@ -330,7 +331,8 @@ def validate_field(model: type[Config], name: str, value: Any) -> Any:
     """``value`` as the model's field ``name`` alone would hold it. Raises ConfigError as :func:`validate`."""
     info = model.model_fields[name]
     try:
-        kind: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation  # type: ignore[not-a-type]
+        parts = (info.annotation, *info.metadata)
+        kind: Any = Annotated[parts] if info.metadata else info.annotation  # type: ignore[not-a-type]
         return TypeAdapter(kind).validate_python(value)
     except ValidationError as error:
         raise _translate(model, error, "", (name,)) from None

@@ -33,6 +33,7 @@ _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: k times this, modulo 2^64, 
 
 
 def is_distribution(node: Any) -> bool:
+    """Whether plain data is a distribution: a table of one key that names a kind."""
     return isinstance(node, dict) and len(node) == 1 and next(iter(node)) in _KINDS
 
 

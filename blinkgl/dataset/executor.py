@@ -39,6 +39,8 @@ class StartError(BlinkGLError):
 
 
 class Executor(Protocol):
+    """Who makes the tasks of a run: :class:`Inline`, :class:`Local`, and Ray's in :mod:`blinkgl.dataset.cluster`."""
+
     listener: Callable[[Message], None]
     """Called with progress that does not come by ``poll`` (:class:`Inline`)."""
 

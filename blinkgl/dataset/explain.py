@@ -44,6 +44,8 @@ class Pass:
 
 @dataclass
 class Explanation:
+    """What a run will model, leave out and cost, in words and numbers."""
+
     scene: dict[str, str] = field(default_factory=dict)
     passes: list[Pass] = field(default_factory=list)
     left_out: list[tuple[str, str]] = field(default_factory=list)

@@ -22,6 +22,7 @@ _ALIVE_EVERY_S = 1.0
 
 
 def main() -> int:
+    """Makes tasks until the driver's end of standard input closes; the exit status."""
     faulthandler.enable()
     signal.signal(signal.SIGTERM, _interrupt)
     channel = int(sys.argv[1])

@@ -62,6 +62,8 @@ class Emulator(ABC):
     then untouched and the next good frame goes on.
     """
 
+    config: Any
+    """The configuration it was made with, of its own ``Config``."""
     Config: ClassVar[type[EmulatorConfig]]
     """Its configuration: name, keys, the paths between frames that it can follow, and what a sensor sets."""
     _still_pixels_sleep = False
@@ -164,7 +166,7 @@ class Emulator(ABC):
 
     def _checked_rate(self, rate: np.ndarray | None) -> np.ndarray:
         shape, dtype = (None, None) if rate is None else (np.shape(rate), np.asarray(rate).dtype)
-        if shape != (self.height, self.width) or dtype != np.float32:
+        if rate is None or shape != (self.height, self.width) or dtype != np.float32:
             raise EventDataError("hermite wants the rate of change of every pixel", where=f"frame {self.frames}", value=(shape, str(dtype)),
                                  accepted=f"({self.height}, {self.width}) float32")
         return _flat(rate)

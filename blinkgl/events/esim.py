@@ -56,6 +56,8 @@ class Levels(NamedTuple):
 
 
 class Interval(NamedTuple):
+    """What is the same for all pixels of a step; thresholds in 2^-25 ln units."""
+
     t0_ns: int
     dt_ns: int
     base_us: int

@@ -82,6 +82,8 @@ class Pixels(NamedTuple):
 
 
 class Interval(NamedTuple):
+    """What is the same for all pixels of a step."""
+
     t0_ns: int
     dt_ns: int
     base_us: int
@@ -299,7 +301,7 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
             if from_noise or p.release.size:  # noise, and the end of a dead time, leave the reference wherever the signal is
                 reference = signal_at(s, c, rise, fall, k)
             up, down = reference + on, reference - off
-        if dead:  # both levels passed, whatever the signal does: the pixel is looked at in every interval until it is released
+        if dead:  # both levels are passed, whatever comes: the pixel is looked at until it is released
             p.upper[i], p.lower[i] = -_INF, _INF
         else:
             p.upper[i], p.lower[i] = np.float32(up), np.float32(down)

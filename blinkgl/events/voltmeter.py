@@ -135,6 +135,8 @@ class Pixels(NamedTuple):
 
 
 class Interval(NamedTuple):
+    """What is the same for all pixels of a step; k1 to k6 are the model's parameters, times in µs."""
+
     t0_ns: int
     dt_ns: int
     base_us: int

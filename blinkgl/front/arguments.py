@@ -56,6 +56,7 @@ def whole(value: Any, where: str, least: int, most: int) -> int:
 
 
 def seed(value: Any, where: str = "seed") -> int:
+    """A whole number that a seed can be. Raises ConfigError."""
     return whole(value, where, 0, 2**63 - 1)
 
 

@@ -13,11 +13,11 @@ from blinkgl.recordings.simulation import emulator_config
 _STEP = """
 
     height, width : px.   seed : of its noise.   sensor : a camera whose values are the defaults, such as "davis346".
-    reconstruction : log intensity between frames, "linear", or for Esim "pchip" and "hermite".   values : keys of ``events:``
-    (docs/configuration.md).
+    reconstruction : log intensity between frames, "linear", or for Esim "pchip" and "hermite".
+    values : keys of ``events:`` (docs/configuration.md).
 
-    Returns an emulator: ``emulator.step(luminance, t_ns)`` takes (H, W) float32 linear luminance, or uint8, at increasing int ns, and gives
-    :class:`Events` since the step before, t in µs; the first step sets the reference.
+    Returns an emulator: ``emulator.step(luminance, t_ns)`` takes (H, W) float32 linear luminance, or uint8, at
+    increasing int ns, and gives :class:`Events` since the step before, t in µs; the first step sets the reference.
     Raises ConfigError and, from ``step``, EventDataError."""
 
 

@@ -22,6 +22,7 @@ _MEMORY = 1 << 28
 
 
 def main(path: str) -> None:
+    """Writes the file's events to standard output, as the reader beside it takes them."""
     import dv_processing
 
     # The library allocates what a packet's header claims before it looks whether the file is that long.

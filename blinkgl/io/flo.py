@@ -25,6 +25,7 @@ def encode_flo(flow: np.ndarray, valid: np.ndarray | None = None) -> bytes:
 
 
 def write_flo(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
+    """See :func:`encode_flo`. Raises OutputError."""
     with output_errors(path):
         Path(path).write_bytes(encode_flo(flow, valid))
 

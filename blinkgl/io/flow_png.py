@@ -108,7 +108,7 @@ def _image_problem(data: bytes) -> str | None:
                 warnings.simplefilter("ignore")
                 with Image.open(io.BytesIO(data)) as opened:  # reads the header only
                     size = opened.size
-        except Exception:  # noqa: BLE001 - unknown to Pillow, or damaged, for which its plug-ins raise anything: OpenCV has the last word
+        except Exception:  # noqa: BLE001 - unknown to Pillow, or damaged: its plug-ins raise anything; OpenCV decides
             return "cannot decode image (corrupt or truncated)" if not len(data) else None
     return _size_problem(*size) if size else "cannot decode image (no size in its header)"
 

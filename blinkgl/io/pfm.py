@@ -24,6 +24,7 @@ def encode_pfm(image: np.ndarray) -> bytes:
 
 
 def write_pfm(path: str | os.PathLike, image: np.ndarray) -> None:
+    """See :func:`encode_pfm`. Raises OutputError."""
     with output_errors(path):
         Path(path).write_bytes(encode_pfm(image))
 

@@ -111,7 +111,7 @@ class SequenceWriter:
             try:
                 self._finish()
                 return
-            except BaseException as failure:  # noqa: BLE001 - Ctrl-C during the last flush must not leave anything either
+            except BaseException as failure:  # noqa: BLE001 - Ctrl-C while flushing leaves nothing either
                 error = failure
         self._discard()
         if isinstance(error, OutputError) and str(self._tmp) in (error.where or ""):

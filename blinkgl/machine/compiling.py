@@ -79,6 +79,7 @@ def compile_ahead(emulators: tuple[str, ...] = ()) -> float:
 
 
 if __name__ == "__main__":
-    from blinkgl.machine import compiling  # noqa: PLW0406 - the module that numba's events are told, not this second copy of it
+    # The module that numba's events are told, not this second copy of it.
+    from blinkgl.machine import compiling  # noqa: PLW0406
 
     print(compiling.compiling_line(compiling.compile_ahead()) or "kernels: compiled before")  # noqa: T201

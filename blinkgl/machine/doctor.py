@@ -36,6 +36,8 @@ class Check:
 
 @dataclass(frozen=True)
 class Report:
+    """What was found, check by check."""
+
     checks: tuple[Check, ...]
 
     @property

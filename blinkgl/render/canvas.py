@@ -86,7 +86,10 @@ class Frame:
     def changed_since(self, before: Frame | None) -> list[Rectangle] | None:
         """Rectangles outside of which this frame equals ``before``; None: it may differ anywhere, since nothing is known of two frames
         that are not of the same pass, one right after the other."""
-        follows = before is not None and before._canvas is self._canvas and before._number == self._number - 1  # noqa: SLF001 - its own kind
+        if before is None:
+            return None
+        # Another of its own kind: its members are no secret.
+        follows = before._canvas is self._canvas and before._number == self._number - 1  # noqa: SLF001
         return self.changed if follows else None
 
     def rows_changed_since(self, before: Frame | None) -> tuple[int, int] | None:

@@ -110,7 +110,7 @@ class Moment:
         stage = self._stage
         if not stage.items:
             return []
-        inside = (self.centres @ self.view.frustum.T >= -stage.item_radius[:, None]).all(axis=1)
+        inside = np.all(self.centres @ self.view.frustum.T >= -stage.item_radius[:, None], axis=1).tolist()
         nearest = self.centres[:, 2] - stage.item_radius
         order = np.lexsort((nearest, stage.item_layer))
         return [stage.items[i] for i in order if inside[i]]

@@ -184,7 +184,7 @@ def _local_ray(axes, rx, ry, d):
 def nearest_tree(
     triangles: np.ndarray, face: np.ndarray, lower: np.ndarray, upper: np.ndarray, child: np.ndarray, count: np.ndarray, root: np.ndarray, first: np.ndarray, size: np.ndarray, cull: np.ndarray, extent: np.ndarray,
     origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: np.ndarray, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """Nearest hit of each ray through the hierarchy.
 
     origins : (P, 3) camera centre and axes : (P, 3, 3) camera axes (columns) in each part's frame.
@@ -257,7 +257,7 @@ def nearest_tree(
 def nearest_exhaustive(
     triangles: np.ndarray, face: np.ndarray, lower: np.ndarray, upper: np.ndarray, child: np.ndarray, count: np.ndarray, root: np.ndarray, first: np.ndarray, size: np.ndarray, cull: np.ndarray, extent: np.ndarray,
     origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: np.ndarray, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """The slow twin of :func:`nearest_tree`: every triangle against every ray; the same arguments and answer."""
     d = np.empty(3)
     for i in range(rays.shape[0]):

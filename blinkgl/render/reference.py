@@ -193,7 +193,7 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
         forest.triangles, forest.face, forest.lower, forest.upper, forest.child, forest.count,
         forest.root, forest.first, forest.size, forest.cull, forest.extent,
         origins, np.ascontiguousarray(axes), np.ascontiguousarray(rays), float(scene.camera.near), far, skip, hit, bary, depth,
-    )  # fmt: skip
+    )
     return hit, bary, depth
 
 

@@ -53,6 +53,8 @@ class Parameter:
 
 @dataclass
 class Collected:
+    """What the page of a data set is made of."""
+
     root: Path
     sequences: list[dict[str, Any]]
     plan: Plan | None
@@ -191,7 +193,7 @@ def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
     pictures = []
     for name, label in LABELS.items():
         form = label.forms[0]
-        if name in ("images", _FLOW.name) or not (folder / form.file(index)).is_file():
+        if name in ("images", _FLOW.name) or form.read is None or not (folder / form.file(index)).is_file():
             continue
         value = form.read(folder / form.file(index))
         pictures += [(view.title, picture(view.kind, view.of(value))[0]) for view in label.views if not (view.kind == "mask" and len(label.views) > 1)]

@@ -7,6 +7,7 @@ configuration names, is :class:`blinkgl.config.sensor.SensorConfig`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,7 @@ class Rig:
             return self.path
         return OffsetPath(self.path, sensor.T_rig_cam)
 
-    def with_first(self, **changes: object) -> Rig:
+    def with_first(self, **changes: Any) -> Rig:
         """With other values in the first sensor."""
         return replace(self, sensors=(replace(self.sensors[0], **changes), *self.sensors[1:]))
 

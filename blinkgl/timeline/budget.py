@@ -67,6 +67,7 @@ def contraharmonic_mean(speed: np.ndarray) -> float:
 
 
 def weighted_percentile(values: np.ndarray, weights: np.ndarray, percent: float) -> float:
+    """The smallest value that, with all below it, has ``percent`` % of the weight."""
     order = np.argsort(values)
     cumulative = np.cumsum(weights[order])
     return float(values[order[min(np.searchsorted(cumulative, percent / 100 * cumulative[-1]), len(values) - 1)]])

@@ -65,11 +65,15 @@ class Timeline:
 
 
 class Uniform(Timeline):
+    """``fps`` frames a second, whatever happens."""
+
     def __iter__(self) -> Iterator[int]:
         return uniform_times(self.config.fps, self.t0_ns, self.t1_ns)
 
 
 class Displacement(Timeline):
+    """Steps in which pixels move ``max_px``, by the image velocity of those that move."""
+
     def pace(self, t_ns: int) -> float:
         speeds = moving(np.linalg.norm(self.pictures.velocity_of_movers(t_ns, self.config.sample_every).read(), axis=-1))
         if not len(speeds):
@@ -79,6 +83,8 @@ class Displacement(Timeline):
 
 
 class Brightness(Timeline):
+    """Steps in which the emulator's signal changes by a fraction of its threshold."""
+
     def pace(self, t_ns: int) -> float:
         picture = self.pictures.brightness(t_ns, self.config.sample_every).read()
         changes = moving(np.abs(self.response.change(picture[..., 0], picture[..., 1])))

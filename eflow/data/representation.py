@@ -13,6 +13,8 @@ from eflow.ops import voxel
 
 
 class Representation(Protocol):
+    """Events of a window as a tensor."""
+
     @property
     def channels(self) -> int: ...
 

@@ -18,6 +18,8 @@ FEATURES, HIDDEN, CONTEXT = 256, 128, 128
 
 
 class ResidualBlock(nn.Module):
+    """Two convolutions beside a shortcut (He et al., CVPR 2016)."""
+
     def __init__(self, inputs: int, outputs: int, stride: int, norm: type[nn.Module]):
         super().__init__()
         self.conv1, self.norm1 = nn.Conv2d(inputs, outputs, 3, stride, 1), norm(outputs)
@@ -143,7 +145,7 @@ class Eraft(FlowModel):
         for i in range(iterations):
             flow = flow.detach()
             wanted = self.training or self.plain or i == iterations - 1
-            step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: B023 - called at once
+            step = lambda h, flow: self.update(h, context, correlation.lookup(grid + flow), flow, wanted)  # noqa: B023
             if self.training and self.config.checkpoint_iterations:
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
             else:

@@ -1,25 +1,30 @@
-// Keeps out what a rasteriser makes of triangles without width: collinear ones, and any seen from its edge. Corners are snapped
-// to a fraction of a pixel and may then cover a pixel's centre, while gradients are divided by the area before the snapping:
-// 1/w and all that is interpolated with it may be anything there, NaN included.
+// Keeps out what a rasteriser makes of triangles without width: collinear ones, and any seen from its edge. Corners are
+// snapped to a fraction of a pixel and may then cover a pixel's centre, while gradients are divided by the area before
+// the snapping: 1/w and all that is interpolated with it may be anything there, NaN included.
 //
-// Bit patterns of floats >= 0 are ordered as the numbers are, and those of negative numbers, infinities and NaN are larger.
-// So everything is compared as unsigned integers: compilers may turn !(a < b) into a >= b, which NaN does not survive.
+// Bit patterns of floats >= 0 are ordered as the numbers are, and those of negative numbers, infinities and NaN are
+// larger. So everything is compared as unsigned integers: compilers may turn !(a < b) into a >= b, which NaN does not
+// survive.
 
-uniform uvec2 inverse_depths; // smallest 1/Z of the part in this frame, as bits; by how much the largest's bits exceed them
+// Smallest 1/Z of the part in this frame, as bits; by how much the largest's bits exceed them.
+uniform uvec2 inverse_depths;
 
 // Corners are snapped to 1/256 px: where depth changes by more than a quarter over so little, it is not known at all.
 const float STEEPEST = 64.0; // of its own value per pixel
 
-// A fragment at no depth that the part has is not of the part. To be called last: derivatives are undefined after a discard.
+// A fragment at no depth that the part has is not of the part. To be called last: derivatives are undefined after a
+// discard.
 void drop_artefact()
 {
-    float W = gl_FragCoord.w;
+    float W = gl_FragCoord.w; // 1/Z: the projection's w is the depth along the optical axis
+    // Below the smallest, the unsigned difference wraps round and is large, too: one comparison for both ends and for
+    // NaN.
     if (floatBitsToUint(W) - inverse_depths.x > inverse_depths.y || fwidth(W) > STEEPEST * W)
         discard;
 }
 
-// Texture coordinates that differences between neighbours may be taken of. Beside a surface that ends at the horizon the
-// neighbour outside may have 1/w = 0; it then counts as far away, so that the coarsest mip level is chosen.
+// Texture coordinates that differences between neighbours may be taken of. Beside a surface that ends at the horizon
+// the neighbour outside may have 1/w = 0; it then counts as far away, so that the coarsest mip level is chosen.
 const uint REPEATS = 0x4e6e6b28u; // bits of 1e9, beyond which a float tells nothing about a texture
 vec2 within_reach(vec2 at)
 {

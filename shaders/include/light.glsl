@@ -22,6 +22,7 @@ float irradiance_rate(vec3 normal, vec3 normal_rate)
 {
     float scale = inversesqrt(max(dot(normal, normal), 1e-30));
     vec3 n = normal * scale;
+    // d(N/|N|)/dt = (N' - n (n.N')) / |N|; then the product rule on n.s and n.up, whose axes turn with the object.
     vec3 turn = (normal_rate - n * dot(n, normal_rate)) * scale;
     float facing = dot(n, sun_direction);
     return (facing > 0.0 ? light_strength.x * (dot(turn, sun_direction) + dot(n, sun_rate)) : 0.0)

@@ -29,7 +29,9 @@ float texture_rate(sampler2D image, vec2 uv, vec2 v, float every)
     if (!(speed > 0.0))
         return 0.0;
     vec2 along_x = seen_rate(uv, vec2(-1.0 / every, 0.0)), along_y = seen_rate(uv, vec2(0.0, -1.0 / every));
+    // The surface comes from where the motion points away from: what lies REACH px back is seen next.
     vec2 aside = mat2(along_x, along_y) * (v / speed) * REACH;
-    float ahead = textureGrad(image, uv - aside, along_x, along_y).r, behind = textureGrad(image, uv + aside, along_x, along_y).r;
+    float ahead = textureGrad(image, uv - aside, along_x, along_y).r;
+    float behind = textureGrad(image, uv + aside, along_x, along_y).r;
     return (ahead - behind) * speed * every * (0.5 / REACH);
 }

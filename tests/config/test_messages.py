@@ -15,7 +15,8 @@ from blinkgl.errors import ConfigError
 from eflow.config import TrainConfig
 
 ROOTS = (SequenceConfig, TrainConfig, SensorConfig)
-FOREIGN = re.compile(r"input should|valid (dictionary|tuple|integer|number|string|boolean|list)|\btuple\b|\bdict\b|instance of|unable to|pars(e|ing)|pydantic"
+FOREIGN = re.compile(r"input should|valid (dictionary|tuple|integer|number|string|boolean|list)|\btuple\b|\bdict\b|instance of"
+                     r"|unable to|pars(e|ing)|pydantic"
                      r"|NoneType|[a-z]Config\b|extra input|field required|discriminator|\bstr\b|\bfloat\b|\bint\b|\bbool\b|not accepted$")
 BAD = [None, True, 7, -7, 2.5, float("nan"), float("inf"), -1e30, 1e30, 10**30, "", "word", "9" * 5000, b"bytes", [], [1], [1, 2, 3, 4, 5], ["x"], [[1]], [None] * 3,
        {}, {"x": 1}, {1: 2}, {"kind": "x"}, {"kind": []}, {"emulator": 3}, {"name": None}, {"preset": []}, {"x": {"y": 1}}, [{}], [{"x": 1}], {"a": {"x": 1}}, 1 + 2j]

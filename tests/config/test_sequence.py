@@ -126,7 +126,8 @@ def test_a_resolved_explicit_scene_reads_again(tmp_path):
     from blinkgl.dataset.report import config_yaml
 
     text = """
-scene: {kind: explicit, meshes: {m: {primitive: cuboid}}, materials: {}, objects: [{mesh: m, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 90]}]}],
+scene: {kind: explicit, meshes: {m: {primitive: cuboid}}, materials: {},
+        objects: [{mesh: m, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 90]}]}],
         camera: {position: [-3, 0, 0], look_at: [0, 0, 0]}}"""
     first = load_run(write(tmp_path, text)).sequence(0)
     assert load_run(write(tmp_path, config_yaml(first, 0))).sequence(0) == first

@@ -6,7 +6,13 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from eflow.ops import attention, correlation  # noqa: E402
-from eflow.ops.correlation import DenseCorrelation, OnDemandCorrelation, local_correlation, lookup_slow, pixel_grid  # noqa: E402
+from eflow.ops.correlation import (  # noqa: E402
+    DenseCorrelation,
+    OnDemandCorrelation,
+    local_correlation,
+    lookup_slow,
+    pixel_grid,
+)
 from eflow.ops.upsample import bilinear_upsample, convex_upsample, convex_upsample_slow  # noqa: E402
 from eflow.ops.warp import backward_warp, forward_warp  # noqa: E402
 

@@ -120,7 +120,7 @@ def test_slopes_are_those_of_the_parabola_through_three_frames():
         secant = np.diff(v) / np.diff(t)
         assert slope_between(secant[0], secant[1], a, b) == pytest.approx(parabola(zip(t[:3], v[:3]))(a))
         assert slope_at_end(secant[0], secant[1], a, b) == pytest.approx(parabola(zip(t[:3], v[:3]))(0))
-        cut = lambda slope: min(max(slope / secant[1], 0.0), 3.0)  # noqa: E731
+        cut = lambda slope: min(max(slope / secant[1], 0.0), 3.0)
         before, after = parabola(zip(t[:3], v[:3])), parabola(zip(t[1:], v[1:]))
         for older, newer, alpha, beta in ((a, c, before(a), after(a + b)), (0.0, c, after(a), after(a + b)), (a, 0.0, before(a), before(a + b))):
             assert end_slopes(v[0], v[1], v[2], v[3], b, older, newer) == pytest.approx((cut(alpha), cut(beta)))
@@ -256,7 +256,7 @@ def test_tables_of_who_makes_noise():
 
 def test_leaks():
     on = np.full(40_000, 0.2, np.float32)
-    draw = lambda **keys: v2e_model.draw_leaks(200, 200, V2eConfig(**{**dict(leak_rate_hz=0.0, leak_cov_decades=0.0), **keys}), on, np.uint64(1))  # noqa: E731
+    draw = lambda **keys: v2e_model.draw_leaks(200, 200, V2eConfig(**{**dict(leak_rate_hz=0.0, leak_cov_decades=0.0), **keys}), on, np.uint64(1))
     assert draw().shape == (0,) and draw().dtype == np.float32
     np.testing.assert_allclose(draw(leak_rate_hz=2.0), 0.4, rtol=1e-6)
     hot = draw(leak_rate_hz=2.0, hot_pixel_fraction=0.1, hot_pixel_rate_hz=50.0)

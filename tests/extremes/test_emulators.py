@@ -166,7 +166,7 @@ def test_a_still_day_of_v2e_noise_keeps_its_rate(promise):
     """Leak and shot noise over 24 h at their configured rates, to the counting error: nothing accumulates in float32 (the leak's
     epoch moves along)."""
     config = V2eConfig(leak_rate_hz=0.02, leak_cov_decades=0.0, leak_jitter=0.1, shot_noise_rate_hz=0.01, threshold_sigma=0.0,
-                       cutoff_hz=0.0, refractory_us=0.0)  # fmt: skip
+                       cutoff_hz=0.0, refractory_us=0.0)
     run, frame = make_emulator(config, 8, 8, 4), np.zeros((8, 8), np.float32)
     run.step(frame, 0)
     halves = np.zeros((2, 2))

@@ -49,7 +49,7 @@ def movers(px: float):
             thing("wall", 4, quad(30, 30, 8), drift((0, 9, 0), (s, 9 - 0.3 * s, 0), FACING)),
         ],
         rig(path=drift((0, 0, 0), (0.3 * s, 0, 0.2 * s), LEVEL, pan)),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("px", [1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e3])
@@ -78,7 +78,7 @@ def test_far_from_the_origin(gl, promise, offset):
     change = length(here.forward.flow - e.frame.forward.flow)[same]
     # silhouettes inside one object (the box's edges) may fall on the other side of a pixel's centre: hence a quantile
     promise(f"{offset:g} units from the origin: flow against the scene at the origin", np.quantile(change, 0.999),
-            max(1e-4, 10 * offset * 2.0**-53 * world.camera.fx), "px")  # fmt: skip
+            max(1e-4, 10 * offset * 2.0**-53 * world.camera.fx), "px")
 
 
 @pytest.mark.parametrize("interval_ns", [1, 1000, 100 * SECOND])
@@ -155,7 +155,7 @@ def test_surfaces_crossing_the_camera_plane(gl, promise, name):
         "close ground": thing("ground", 1, quad(40, 40), drift((0, 0, -0.051), (0.1, 0, -0.051))),
         "wall comes through": thing("wall", 1, quad(3, 3, 4), drift((0, 1.5, -0.3), (0, -1, -0.3), tip, tip * Rotation.from_rotvec([0, 0, 0.2]))),
         "inside a box": thing("box", 1, room, drift((0, 0, 0), (0.3, -2.5, 0.1), turn, turn * Rotation.from_rotvec([0.01, -0.02, 0.03]))),
-    }[name]], moving_camera())  # fmt: skip
+    }[name]], moving_camera())
     e = compare(gl, world)  # valid (in front of the camera then) agrees pixel by pixel, or compare() fails
     assert e.wrong_ids == 0
     promise(f"crossing the camera plane, {name}: error / (flow (1 + Z/Z'))", (e.flow / (e.size * (1 + e.approach))).max(), 5e-6)

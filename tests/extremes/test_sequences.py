@@ -32,7 +32,7 @@ def moving(seconds: float, distance: float, start: float = 0.0) -> dict:
 
 def generate(gl, out: Path, **tree):
     defaults = {"camera": {"width": 32, "height": 24}, "scene": BOX, "preview": {"enabled": False}, "timeline": {"kind": "uniform", "fps": 20},
-                "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True}}  # fmt: skip
+                "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True}}
     config = RunTemplate({**defaults, **tree}, Path(".")).sequence(0)
     report = generate_sequence(config, 0, out, gl)
     assert verify_sequence(report.path) == []
@@ -66,7 +66,7 @@ def test_longer_than_the_event_format_can_hold(gl, tmp_path):
 
 def test_a_start_at_a_million_seconds_shifts_the_clock_and_nothing_else(gl, tmp_path, promise):
     runs = [generate(gl, tmp_path / str(start), time={"duration": 0.2, "label_rate": 10, "start": start}, scene=moving(0.5, 2.0, start),
-                     timeline={"kind": "displacement"}) for start in (0, 1_000_000)]  # fmt: skip
+                     timeline={"kind": "displacement"}) for start in (0, 1_000_000)]
     (a, _, _), (b, offset, _) = (events_of(run.path) for run in runs)
     assert offset == 10**12 and len(a) == len(b) > 300
     promise("a run from 1e6 s on: shift of any event time, less 1e6 s", np.abs(b - a - 10**12).max(), 0, "us")
@@ -75,10 +75,10 @@ def test_a_start_at_a_million_seconds_shifts_the_clock_and_nothing_else(gl, tmp_
 
 
 @pytest.mark.parametrize("camera", [{"width": 1, "height": 1}, {"width": 1, "height": 30}, {"width": 30, "height": 1}, {"width": 24, "height": 16, "fov": 170},
-                                    {"width": 24, "height": 16, "fov": 1}])  # fmt: skip
+                                    {"width": 24, "height": 16, "fov": 1}])
 def test_images_and_lenses(gl, tmp_path, camera):
     report = generate(gl, tmp_path, camera=camera, time={"duration": 0.2, "label_rate": 10}, scene=moving(0.4, 2.0), timeline={"kind": "displacement"},
-                      preview={"enabled": True}, render={"antialiasing": "ssaa4"})  # fmt: skip
+                      preview={"enabled": True}, render={"antialiasing": "ssaa4"})
     assert report.labels == 2 and (report.path / "preview.mp4").stat().st_size > 500
 
 
@@ -87,9 +87,9 @@ def test_a_million_pixels_per_second(gl, tmp_path, promise):
     speed, focal = 1e6, 27.7  # 32 px wide, 60 degrees
     wide = {**moving(0.004, 0.004 * speed * 3 / focal)}
     wide["objects"] = [{**wide["objects"][0], "scale": 1e4, "keyframes": [{**k, "position": [k["position"][0] + 5e3, *k["position"][1:]]} for k in
-                                                                      wide["objects"][0]["keyframes"]]}]  # a wall 3 units ahead  # fmt: skip
+                                                                      wide["objects"][0]["keyframes"]]}]  # a wall 3 units ahead
     report = generate(gl, tmp_path, time={"duration": 0.001, "label_rate": 1000}, scene=wide, camera={"width": 32, "height": 24, "near": 0.01},
-                      timeline={"kind": "displacement", "min_step_us": 0.5, "max_px": 1.0})  # fmt: skip
+                      timeline={"kind": "displacement", "min_step_us": 0.5, "max_px": 1.0})
     flow = np.load(report.path / "flow/forward_npy/000000.npy")
     assert flow[..., 2].all()
     exact = -0.001 * speed * (32 / 2 / np.tan(np.pi / 6)) / focal
@@ -114,7 +114,7 @@ def test_a_million_pixels_per_second(gl, tmp_path, promise):
     ({"scene": {**BOX, "background": 1e39}}, "scene.background"),
     ({"scene": {**BOX, "objects": [{"mesh": "box", "scale": 1e300}]}}, "scene.objects.0.scale"),
     ({"camera": {"near": 5.0, "fov": 179}, "scene": {"kind": "random"}}, "scene.region.height"),
-])  # fmt: skip
+])
 def test_beyond_the_ranges_there_is_a_message(gl, tmp_path, change, message):
     with pytest.raises(ConfigError, match=message.replace(".", "\\.")) as caught:
         generate(gl, tmp_path, **change)

@@ -166,7 +166,7 @@ def test_evt3_as_written(tmp_path, size):
 
 
 def test_the_writers_limits(tmp_path):
-    one = lambda t: Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.array([t]), np.ones(1, np.uint8))  # noqa: E731
+    one = lambda t: Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.array([t]), np.ones(1, np.uint8))
     for t, said in ((-1, "-1"), (1 << 34, str(1 << 34))):
         with contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640, "evt2")) as writer, pytest.raises(EventDataError, match=f"got {said}.; expected 0 to less"):
             writer.append(one(t))

@@ -172,7 +172,8 @@ from blinkgl.events.types import Events
 from blinkgl.io.formats import open_events, write_events
 before = dict(os.environ)
 rng, n = np.random.default_rng(0), 150_000
-events = Events(rng.integers(0, 64, n).astype("u2"), rng.integers(0, 48, n).astype("u2"), np.sort(rng.integers(0, 10**6, n)), rng.integers(0, 2, n).astype("u1"))
+x, y, p = rng.integers(0, 64, n).astype("u2"), rng.integers(0, 48, n).astype("u2"), rng.integers(0, 2, n).astype("u1")
+events = Events(x, y, np.sort(rng.integers(0, 10**6, n)), p)
 write_events(sys.argv[1], events, 48, 64)
 assert len(open_events(sys.argv[1]).read()) == n and dict(os.environ) == before, "the environment was changed"
 print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())
@@ -193,3 +194,15 @@ def test_hdf5plugin_is_all_that_h5py_needs(tmp_path):
         assert file["events/x"][()].tolist() == GOOD["x"] and hdf5plugin.Blosc.filter_id in [int(k) for k in file["events/x"]._filters]
     with DsecEventReader(tmp_path / "e.h5") as reader:
         assert reader.count == 3
+
+
+def test_a_file_that_was_refused_is_closed(tmp_path):
+    """It can be written anew at once, although the error is still being looked at."""
+    path = tmp_path / "e.h5"
+    with h5py.File(path, "w") as file:
+        for name in "xytp":
+            file[f"events/{name}"] = np.zeros(3 if name != "p" else 4, np.int64)
+    with pytest.raises(AssetError, match="event columns differ in length") as caught:
+        DsecEventReader(path)
+    h5py.File(path, "w").close()
+    assert caught.value.__traceback__ is not None

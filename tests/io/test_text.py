@@ -145,7 +145,7 @@ def test_the_writer_refuses(tmp_path):
     with pytest.raises(EventDataError, match="unit of time .got 'ms'.; expected s or us"):
         TextWriter(tmp_path / "e.txt", 10, 10, unit="ms")
     writer = TextWriter(tmp_path / "e.txt", 10, 10)
-    one = lambda t, x=0, y=0: Events(np.array([x], np.uint16), np.array([y], np.uint16), np.array([t]), np.ones(1, np.uint8))  # noqa: E731
+    one = lambda t, x=0, y=0: Events(np.array([x], np.uint16), np.array([y], np.uint16), np.array([t]), np.ones(1, np.uint8))
     with pytest.raises(EventDataError, match="negative time .got -1."):
         writer.append(one(-1))
     writer.append(one(5))

@@ -38,7 +38,7 @@ from render_scenes import (
     sphere,
     still,
     thing,
-)  # fmt: skip
+)
 
 MS = 1_000_000
 T0, T1, T_BACK = 300 * MS, 400 * MS, 200 * MS
@@ -60,7 +60,7 @@ def shapes():
         "sphere": scene([thing("ball", 3, sphere(1.0, 4), drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), turn, spin), red)], moving_camera()),
         "cube": scene([thing("box", 70000, cube(1.0), drift((0.3, 5, -0.2), (-0.2, 4.5, 0.1), turn, spin), red)], moving_camera()),
         "everything": mixed_scene(textured=False),
-    }  # fmt: skip
+    }
 
 
 def drawn(gl, world, t=T0, request=EVERYTHING, forward=T1, backward=T_BACK, **config):
@@ -162,7 +162,7 @@ def test_back_faces_and_two_sided_light(gl):
             thing("hollow", 3, cube(40.0), still()),  # closed, seen from inside: culled
         ],
         moving_camera(), light,
-    )  # fmt: skip
+    )
     ref = reference.render(inside, T0, forward_ns=T1, backward_ns=T_BACK)
     labels, luminance = drawn(gl, inside)
     off = off_silhouettes(ref)
@@ -358,7 +358,7 @@ def test_curved_paths_of_many_objects(gl):
         thing(f"{k}", 10 + k, (sphere(0.25, 2), cube(0.2), quad(0.3, 0.2))[k % 3], curve(50 + k, rng.uniform([-1.5, 3, -1], [1.5, 6, 1]), 0.3, 1.0),
               Material(double_sided=k % 3 == 2))
         for k in range(24)
-    ]  # fmt: skip
+    ]
     world = scene(crowd, moving_camera())
     ref = reference.render(world, T0, forward_ns=T1, backward_ns=T_BACK)
     labels, _ = drawn(gl, world)
@@ -405,7 +405,7 @@ def test_random_world_of_real_meshes_and_photographs(gl):
         ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),
     ],
     ids=["sign of the flow", "no perspective division", "division by the old depth", "depth off by the near plane"],
-)  # fmt: skip
+)
 def test_the_oracle_finds_a_broken_shader(gl, tmp_path, monkeypatch, file, right, wrong):
     """Mistakes that give plausible pictures fail the bounds above by orders of magnitude."""
     shutil.copytree(shader_folder(), tmp_path, dirs_exist_ok=True)

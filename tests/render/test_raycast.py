@@ -116,7 +116,7 @@ def test_of_equal_depths_the_lower_part_and_triangle_is_hit(kernel, reverse):
 def test_near_and_far_are_half_open(kernel):
     """A hit at the near distance counts, one at the far distance does not."""
     forest = forest_of([np.array([[[-1, -1, 2], [1, -1, 2], [0, 1, 2.0]]])], [False])
-    at = lambda near, far: ask(kernel, forest, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 2)), near, np.array([far]))[0][0, 0]  # noqa: E731
+    at = lambda near, far: ask(kernel, forest, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 2)), near, np.array([far]))[0][0, 0]
     assert at(2.0, 3.0) == 0 and at(0.0, 2.0) == -1 and at(np.nextafter(2.0, 3), 3.0) == -1 and at(0.0, np.nextafter(2.0, 3)) == 0
 
 

@@ -28,7 +28,7 @@ from render_scenes import (
     sphere,
     still,
     thing,
-)  # fmt: skip
+)
 
 MS = 1_000_000
 
@@ -148,7 +148,7 @@ def test_camera_rotation_is_the_homography():
     eye = drift((1, 2, 3), (1, 2, 3), LEVEL, LEVEL * Rotation.from_rotvec([0.06, -0.09, 0.2]))
     base = mixed_scene()
     frozen = tuple(replace(o, path=still(o.path.pose(0)[:3, 3] + [1, 2, 3], Rotation.from_matrix(o.path.pose(0)[:3, :3])))
-                   for o in base.objects)  # fmt: skip
+                   for o in base.objects)
     world = scene(frozen, rig(path=eye))
     cam, t0, t1 = world.camera, 0, 800 * MS
     frame = reference.render(world, t0, forward_ns=t1)

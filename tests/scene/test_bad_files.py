@@ -23,11 +23,15 @@ from tests.scene.gltf_files import GltfBuilder, triangle
 CAMERA = CameraConfig(width=64, height=48).model
 
 
+PIXEL = "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4z8AAAAMBAQDJ/pLvAAAAAElFTkSuQmCC"
+"""A PNG of one pixel, base64."""
+
+
 def everything() -> GltfBuilder:
     """A file with a bit of all that the reader reads."""
     builder = GltfBuilder()
     builder.tree["materials"] = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": {"KHR_texture_transform": {"scale": [2, 2]}}}}}]
-    builder.tree["images"] = [{"uri": "data:image/png;base64,iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAIAAACQd1PeAAAADElEQVR4nGP4z8AAAAMBAQDJ/pLvAAAAAElFTkSuQmCC"}]
+    builder.tree["images"] = [{"uri": "data:image/png;base64," + PIXEL}]
     builder.tree["samplers"] = [{"wrapS": 33071}]
     builder.tree["textures"] = [{"source": 0, "sampler": 0}]
     builder.tree["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, "znear": 0.02}}]

@@ -67,7 +67,7 @@ class SlowTimeError:
             if self.kind == "hermite":
                 alpha, beta = a[2][i] * step / change, b[2][i] * step / change
             elif self.kind == "pchip":
-                at = lambda frame: (frame[0], frame[1][i])  # noqa: E731
+                at = lambda frame: (frame[0], frame[1][i])
                 alpha = parabola_slope([at(f) for f in ((older, a, b) if older else (a, b, newer))], a[0]) * step / change
                 beta = parabola_slope([at(f) for f in (a, b, newer)], b[0]) * step / change
             alpha, beta = (min(max(v, 0.0), 3.0) for v in (alpha, beta))

@@ -42,7 +42,7 @@ def test_cubic_is_the_hermite_spline_of_pchips_slopes_and_of_the_outer_secants(f
     slopes[0], slopes[-1] = (logs[1] - logs[0]) / (ms[1] - ms[0]), (logs[-1] - logs[-2]) / (ms[-1] - ms[-2])
     exact = CubicHermiteSpline(ms, logs, slopes)
     out = list(interpolate.cubic(zip(frames, times.tolist()), factor))
-    assert [t for _, t in out] == [int(a + (b - a) * k // factor) for a, b in zip(times, times[1:]) for k in range(factor)] + [int(times[-1])]
+    assert [t for _, t in out] == [int(a + (b - a) * k // factor) for a, b in itertools.pairwise(times) for k in range(factor)] + [int(times[-1])]
     for frame, t in out:
         assert frame.dtype == np.float32 and frame.min() >= 0
         assert np.abs(np.log(frame + 1e-3) - exact((t - times[0]) * 1e-6)).max() < 2e-4
@@ -148,7 +148,7 @@ def test_as_many_steps_as_the_quickest_but_a_few_pixels_ask_for(monkeypatch):
     flow[..., 0] = np.linspace(0, 5, 1000).reshape(20, 50)  # 99.5 %: 4.975 px
     monkeypatch.setattr(interpolate.cv2, "DISOpticalFlow_create", lambda preset: type("Dis", (), {"calc": lambda self, a, b, none: flow.copy()})())
     frames = [(np.full((20, 50), 0.5, np.float32), t) for t in (0, 1000)]
-    count = lambda frames=frames, **more: len(list(interpolate.motion(frames, **more))) - 1  # noqa: E731
+    count = lambda frames=frames, **more: len(list(interpolate.motion(frames, **more))) - 1
     assert [count(max_px=px) for px in (1.0, 4.97, 4.98, 0.5, 100.0)] == [5, 2, 1, 10, 1]
     assert count(max_px=0.01) == 64 and count(max_px=0.01, most=9) == 9
     assert count([(frames[0][0], 0), (frames[0][0], 3)], max_px=0.01) == 3

@@ -42,9 +42,13 @@ scene:
       material: lamp
       name: passing
       interpolation: linear
-      keyframes: [{time: 0, position: [-0.5, 3.3, 1.4], euler: [90, 0, 0]}, {time: 0.4, position: [-0.5, -3.9, 1.4], euler: [90, 0, 0]}]
+      keyframes:
+      - {time: 0, position: [-0.5, 3.3, 1.4], euler: [90, 0, 0]}
+      - {time: 0.4, position: [-0.5, -3.9, 1.4], euler: [90, 0, 0]}
   camera:
-    keyframes: [{time: 0, position: [0, 0, 1], look_at: [0, 4, 0.9]}, {time: 0.4, position: [0.1, 0.1, 1.05], look_at: [0.1, 4, 0.9]}]
+    keyframes:
+    - {time: 0, position: [0, 0, 1], look_at: [0, 4, 0.9]}
+    - {time: 0.4, position: [0.1, 0.1, 1.05], look_at: [0.1, 4, 0.9]}
 """
 
 
@@ -97,7 +101,7 @@ LOOKUP_MISTAKES = {
     "two-sided normal reversed": (
         [("luminance.glsl", "gl_FrontFacing ? normal : -normal", "gl_FrontFacing ? -normal : normal")],
         "luminance_light", "the normal points the other way", {"floor"}),
-}  # fmt: skip
+}
 
 
 class LatePath:

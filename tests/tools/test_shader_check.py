@@ -128,7 +128,8 @@ def recorded(name, stage, defines=None, folder=None):
 shader.expand = recorded
 from blinkgl.config.sequence import load_run
 from blinkgl.dataset.generate import generate_run
-list(generate_run(load_run({config!r}, ["camera.width=32", "camera.height=24", "time.duration=0.1"]), {str(tmp_path / "out")!r}, 1))
+template = load_run({config!r}, ["camera.width=32", "camera.height=24", "time.duration=0.1"])
+list(generate_run(template, {str(tmp_path / "out")!r}, 1))
 assert not [m for m in sys.modules if m.startswith("blinkgl.tools.")]
 print(json.dumps(seen))
 """
@@ -206,7 +207,9 @@ def test_files_select_programs_and_a_file_elsewhere_brings_its_folder(shader, sh
 def test_messages_of_other_drivers(log, expected, tmp_path):
     (tmp_path / "p.glsl").write_text("\n" * 7 + "float a; // nothing\nvoid main() { float x = foo; }\n\n\n\n")
     source = expand("p.glsl", "fragment", {}, tmp_path)
-    error = ShaderError("x", log=f"GLSL Compiler failed\n\nfragment_shader\n===============\n{log.replace('12', str(source.text.splitlines().index('void main() { float x = foo; }') + 1), 1)}")
+    line = source.text.splitlines().index("void main() { float x = foo; }") + 1
+    said = log.replace("12", str(line), 1)
+    error = ShaderError("x", log=f"GLSL Compiler failed\n\nfragment_shader\n===============\n{said}")
     found = diagnostics.diagnose(error, {"fragment": source}, tmp_path)[0]
     assert (found.file, found.line, found.column, found.kind, found.stage) == ("p.glsl", 9, 25, "error", "fragment")
 
@@ -243,7 +246,7 @@ def test_active_lines_compile_to_the_same_interface(gl, name):
     ("1 || 1 / 0", {}, True), ("1 / 0", {}, False), ("0x1F == 31 && 017 == 15 && 7u == 7", {}, True), ("09", {}, False), ("1.5", {}, False),
     ("7 / 2 == 3 && -7 / 2 == -3 && -7 % 2 == -1", {}, True), ("2147483647 + 1 < 0", {}, True), ("0x80000000 >> 31 == -1", {}, True),
     ("~0 == -1 && !!5 == 1", {}, True), ("1 - 1 - 1 == -1", {}, True), ("A", {"A": ""}, False), ("defined A B", {}, False),
-])  # fmt: skip
+])
 def test_conditions(expression, macros, truth):
     assert preprocess.evaluate(expression, macros) is truth
 

@@ -61,7 +61,7 @@ def test_passes_writes_every_buffer_that_generation_renders(written, world):
         "luminance": luminance, "colour": colour, "depth": labels.depth, "id": labels.ids, "normals": labels.normals, "velocity": labels.velocity,
         "flow_forward": labels.forward.flow, "valid_forward": labels.forward.valid, "occluded_forward": labels.forward.occluded,
         "flow_backward": labels.backward.flow, "valid_backward": labels.backward.valid, "occluded_backward": labels.backward.occluded,
-    }.items():  # fmt: skip
+    }.items():
         assert arrays[name].dtype == expected.dtype, name
         np.testing.assert_array_equal(arrays[name], expected, err_msg=name)
     np.testing.assert_allclose(arrays["log_luminance"], np.log(luminance + np.float32(config.events.log_eps)), rtol=1e-6)
@@ -303,7 +303,7 @@ def test_tolerances(shader, config):
 
 EXPECTED = {"sign of the flow": ("flow_forward", "the sign is wrong", "forward flow"),
             "no perspective division": ("flow_forward", "the perspective division is missing", "forward flow"),
-            "depth off by near": ("depth", "off by the near plane: near = 0.05 is subtracted", "depth")}  # fmt: skip
+            "depth off by near": ("depth", "off by the near plane: near = 0.05 is subtracted", "depth")}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)

@@ -138,7 +138,7 @@ def test_other_methods_are_refused(served, method):
 def test_foreign_hosts_are_refused(served):
     server, _ = served
     for host in ("evil.example", f"evil.example:{server.port}", "127.0.0.1.evil.example", f"127.0.0.1:{server.port + 1}", "", "localhost@evil.example",
-                 "0.0.0.0", "169.254.169.254", "[::1", "127.0.0.1/x", "localhost.", "127.1"):  # fmt: skip
+                 "0.0.0.0", "169.254.169.254", "[::1", "127.0.0.1/x", "localhost.", "127.1"):
         status, _, body = ask(server, "/state", host=host)
         assert status == 403 and b"passes" not in body, host
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:  # two of them, the first one local

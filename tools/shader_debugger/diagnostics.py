@@ -86,7 +86,8 @@ def _column(text: str, message: str, column: int) -> int:
 def _declaration(source: ShaderSource, name: str) -> tuple[str, int, int] | None:
     for number, line in enumerate(source.text.split("\n"), 1):
         file, own = source.locate(number)
-        declares = rf"\s*(layout\s*\(.*?\)\s*)?(flat\s+|smooth\s+|noperspective\s+|invariant\s+)*(in|out|uniform)\b.*\b{re.escape(name)}\b"
+        qualifiers = r"\s*(layout\s*\(.*?\)\s*)?(flat\s+|smooth\s+|noperspective\s+|invariant\s+)*(in|out|uniform)\b"
+        declares = rf"{qualifiers}.*\b{re.escape(name)}\b"
         if file and re.match(declares, line):
             return file, own, line.index(name) + 1
     return None

@@ -76,7 +76,7 @@ class Pass:
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Of its target, px, for an image of width x height: ``samples.grid`` times as fine, or every n-th pixel, at least one."""
-        return tuple(max(1, side * self.samples.grid // self.every) for side in (width, height))
+        return max(1, width * self.samples.grid // self.every), max(1, height * self.samples.grid // self.every)
 
     def background(self, scene: Scene) -> tuple[float, ...]:
         """The first output where nothing is hit; 0 where it ends, and in all others."""

@@ -323,6 +323,7 @@ def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
 
 
 def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
+    """The mesh, ``scale`` times as large."""
     return replace(mesh, vertices=mesh.vertices * scale)
 
 

@@ -86,10 +86,11 @@ def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
     return made
 
 
-def _join(pieces):
+def _join(pieces: Sequence[Surface]) -> Surface:
     """One body of several (positions, normals, uvs, faces)."""
     offsets = np.cumsum([0] + [len(p[0]) for p in pieces[:-1]])
-    return (*(np.concatenate([p[i] for p in pieces]) for i in range(3)), np.concatenate([p[3] + o for p, o in zip(pieces, offsets)]))
+    positions, normals, uvs = (np.concatenate([p[i] for p in pieces]) for i in range(3))
+    return positions, normals, uvs, np.concatenate([p[3] + o for p, o in zip(pieces, offsets)])
 
 
 def _lattice(columns: int, rows: int) -> np.ndarray:
@@ -110,7 +111,7 @@ def square(origin: ArrayLike, right: ArrayLike, up: ArrayLike, columns: int, row
     return positions, np.broadcast_to(normal, positions.shape), np.stack([s, 1 - t], 1), _lattice(columns, rows)
 
 
-def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: int):
+def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: int) -> Surface:
     """Surface of revolution about z.
 
     profile : (K, 2) r, z from bottom to top as seen with the outside on the right.   normals : (K, 2) likewise.
@@ -130,7 +131,7 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
 
 
-def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0):
+def _disc(radius: float, z: float, up: bool, segments: int, turn: float = 0.0) -> Surface:
     """Flat cap: the texture's inscribed disc, seen from outside."""
     angle = turn + 2 * math.pi * np.arange(segments) / segments
     rim = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(segments, z)], axis=1)
@@ -300,4 +301,5 @@ def random_primitive(kind: str, index: int) -> Mesh:
 
 
 def random_primitive_hash(kind: str, index: int) -> str:
+    """``source_hash`` of :func:`random_primitive`, without making it."""
     return parameter_hash("random primitive", 1, kind, index)

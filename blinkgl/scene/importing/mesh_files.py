@@ -149,7 +149,8 @@ def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: s
     file_normals : use normals that came with the mesh; trimesh's own smooth ones would round off a cuboid.
     max_texture : None leaves the material out.   resolver : what the mesh was loaded with; it knows the images.
     """
-    normals = mesh._cache.cache.get("vertex_normals") if file_normals else None  # noqa: SLF001 - .vertex_normals would make them up
+    # mesh.vertex_normals would make up what the file does not have.
+    normals = mesh._cache.cache.get("vertex_normals") if file_normals else None  # noqa: SLF001
     uvs = getattr(mesh.visual, "uv", None)
     if uvs is not None and len(uvs) == len(mesh.vertices):
         uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]      # trimesh has v upwards

@@ -2,8 +2,8 @@
 
     import blinkgl
 
-gives every name in ``__all__``, each by this one path; what lies in the rooms below may move. Names are loaded when they are first
-used, so that ``import blinkgl`` itself takes no time.
+gives every name in ``__all__``, each by this one path; what lies in the rooms below may move. Names are loaded when
+they are first used, so that ``import blinkgl`` itself takes no time.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The ``blinkgl`` command: thin functions over the library, one line per error.
 
-Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine (``error: …`` on
-stderr, one line); 3 done but for sequences that were set aside; 130 interrupted. A traceback means a bug in BlinkGL, or
-``--debug``. What a command does and prints is ``blinkgl.show.COMMAND.run``, which returns the status; it is imported inside the function, so that
-``--help`` answers at once.
+Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine
+(``error: …`` on stderr, one line); 3 done but for sequences that were set aside; 130 interrupted. A traceback means a
+bug in BlinkGL, or ``--debug``. What a command does and prints is ``blinkgl.show.COMMAND.run``, which returns the
+status; it is imported inside the function, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ def doctor(
     backend: Annotated[str, typer.Option(help="OpenGL backend to examine: auto, egl or osmesa.")] = "auto",
     device: Annotated[int, typer.Option(min=0, help="EGL device to examine.")] = 0,
 ) -> int:
-    """Say what this machine offers, what is missing, and the command that mends it. Exit status 2 if something required is missing."""
+    """Say what this machine offers, what is missing, and the command that mends it. Exit
+    status 2 if something required is missing."""
     from blinkgl.show import doctor as command
 
     return command.run(backend, device, as_json)
@@ -71,7 +72,8 @@ def generate(
     mixed: Annotated[bool, typer.Option("--mixed", help="Go on although recipe, assets or software have changed since the run began.")] = False,
     time_limit: Annotated[float, typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers.")] = 3600.0,
 ) -> int:
-    """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but some sequences were set aside."""
+    """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but
+    some sequences were set aside."""
     from blinkgl.show import generate as command
     from blinkgl.show.executors import choose_executor
 
@@ -88,8 +90,8 @@ def verify(
     seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
     base: Annotated[str | None, typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
 ) -> int:
-    """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is wrong; what could not be compared
-    is noted, and said in the last line."""
+    """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is
+    wrong; what could not be compared is noted, and said in the last line."""
     from blinkgl.show import verify as command
 
     return command.run(folder, deep=sample if deep else 0, seed=seed, base=base)
@@ -126,7 +128,8 @@ def trade(
     reference: Annotated[str, typer.Option(help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
                                            "small camera and a short --clip).")] = "raster",
 ) -> int:
-    """Measure what accuracy costs: settings timed and judged against a converged reference, as a table, a plot and a page."""
+    """Measure what accuracy costs: settings timed and judged against a converged reference,
+    as a table, a plot and a page."""
     from blinkgl.show import trade as command
 
     return command.run(config, out, overrides=overrides or [], quick=quick, only=only or [], skip=skip or [], sequence=sequence, clip=clip,
@@ -198,7 +201,8 @@ def compare(
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
 ) -> int:
-    """Describe a recording, or compare it with another or with frames: counts, rates, intervals, polarity against brightness."""
+    """Describe a recording, or compare it with another or with frames: counts, rates,
+    intervals, polarity against brightness."""
     from blinkgl.show import compare as command
 
     return command.run(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
@@ -254,7 +258,8 @@ def run(arguments: list[str]) -> int:
         return BlinkGLError.exit_status
 
 
-OUT_OF_MEMORY = "out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process ('ulimit -v' shows it)"
+OUT_OF_MEMORY = ("out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process "
+                 "('ulimit -v' shows it)")
 _MACHINE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG,
                    errno.EMFILE, errno.ENFILE, errno.EFBIG}
 
@@ -281,7 +286,8 @@ def _user_line(error: Exception) -> str | None:
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
-    """MemoryError (NumPy's too), ENOMEM, and what C++ libraries make of it: OpenCV, LLVM, torch and HDF5 say it in words only."""
+    """MemoryError (NumPy's too), ENOMEM, and what C++ libraries make of it: OpenCV, LLVM,
+    torch and HDF5 say it in words only."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))

@@ -42,7 +42,8 @@ class BlinkGLError(Exception):
 
     exit_status = 2
     passing = False
-    """Whether the same work may succeed when it is tried again without anybody mending anything; see :func:`may_pass`."""
+    """Whether the same work may succeed when it is tried again without anybody mending anything;
+    see :func:`may_pass`."""
 
     def __init__(self, problem: str, *, where: str | None = None, value: Any = ..., accepted: str | None = None):
         self.problem, self.where, self.value, self.accepted = problem, where, value, accepted
@@ -77,7 +78,8 @@ class OutputError(BlinkGLError):
 class EventDataError(BlinkGLError):
     """Frames or events outside the emulator's or a format's contract (time order, range, shape).
 
-    pixel : (x, y) of the pixel of a frame that is at fault, where it is one.   t_ns : time of the frame that is, where it is known."""
+    pixel : (x, y) of the pixel of a frame that is at fault, where it is one.   t_ns : time of
+    the frame that is, where it is known."""
 
     pixel: tuple[int, int] | None = None
     t_ns: int | None = None
@@ -91,9 +93,9 @@ _BUGS = (TypeError, ValueError, LookupError, ArithmeticError, AttributeError, As
 def may_pass(error: BaseException) -> bool:
     """Whether work that failed with ``error`` is worth another attempt with the same input.
 
-    True for what the machine did: memory, a file system that did not answer (also as the cause of another error: an asset that a network
-    disk would not give), output, OpenGL, and whatever has no name here (moderngl and drivers raise bare exceptions). False for what
-    the input decides alone: configuration, assets, events, and bugs."""
+    True for what the machine did: memory, a file system that did not answer (also as the cause of another error: an
+    asset that a network disk would not give), output, OpenGL, and whatever has no name here (moderngl and drivers raise
+    bare exceptions). False for what the input decides alone: configuration, assets, events, and bugs."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _MACHINE_TROUBLE):

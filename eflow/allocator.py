@@ -1,7 +1,7 @@
 """glibc's allocator told to keep large blocks.
 
-Activations of tens of MB are, by default, mapped afresh and faulted in page by page for every layer and handed back at once; on a
-CPU that costs a fifth of a forward pass (measured, 480x640). Keeping them costs no more than the peak."""
+Activations of tens of MB are, by default, mapped afresh and faulted in page by page for every layer and handed back at
+once; on a CPU that costs a fifth of a forward pass (measured, 480x640). Keeping them costs no more than the peak."""
 
 from __future__ import annotations
 

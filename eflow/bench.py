@@ -49,9 +49,11 @@ def machine() -> str:
 
 def measure(name: str, height: int, width: int, *, training: bool = False, plain: bool = False, repeats: int = 5, warmup: int = 1,
             precision: str = "fp32", batch: int = 1) -> dict[str, Any]:
-    """Median (and smallest) milliseconds of a forward pass (or forward + backward + AdamW step), GMACs of the forward pass and peak memory in MiB.
+    """Median (and smallest) milliseconds of a forward pass (or forward + backward + AdamW step),
+    GMACs of the forward pass and peak memory in MiB.
 
-    On the CPU the peak is the process's resident set, so :func:`isolated` measures each model in a process of its own."""
+    On the CPU the peak is the process's resident set, so :func:`isolated` measures each
+    model in a process of its own."""
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not plain:  # the allocator's setting is part of the fast path, and lasts for the process
         keep_memory()
@@ -93,7 +95,8 @@ def isolated(**options) -> dict[str, Any]:
     """:func:`measure` in a fresh process."""
     import json
 
-    code = f"import json\nfrom eflow.bench import measure\nprint(json.dumps(measure(**json.loads({json.dumps(json.dumps(options))}))))"
+    code = ("import json\nfrom eflow.bench import "
+            f"measure\nprint(json.dumps(measure(**json.loads({json.dumps(json.dumps(options))}))))")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:
         tail = done.stderr.strip().splitlines()

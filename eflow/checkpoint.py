@@ -1,4 +1,5 @@
-"""Checkpoints: a folder that appears whole, of safetensors files and one JSON file. Nothing here can execute what it reads.
+"""Checkpoints: a folder that appears whole, of safetensors files and one JSON file.
+Nothing here can execute what it reads.
 
     000500/weights.safetensors      parameters and buffers; the metadata holds the model configuration
            ema.safetensors          the same, averaged (what evaluation uses), where averaging is on
@@ -28,7 +29,8 @@ FORMAT = "eflow-1"
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Tensors and metadata of a safetensors file. Raises AssetError: missing, truncated, or something else, e.g. a pickle."""
+    """Tensors and metadata of a safetensors file. Raises AssetError: missing, truncated, or
+    something else, e.g. a pickle."""
     try:
         with open(path, "rb") as file:
             head = file.read(9)
@@ -69,7 +71,8 @@ class Checkpoint:
 
 
 def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkpoint:
-    """``path``: a .safetensors file, a checkpoint folder, or a run folder (its newest checkpoint). Raises AssetError."""
+    """``path``: a .safetensors file, a checkpoint folder, or a run folder (its newest
+    checkpoint). Raises AssetError."""
     path = Path(path)
     if path.is_file():
         return Checkpoint(None, path)

@@ -136,7 +136,8 @@ def predict(
             flow, tensor = predictor(window)
             flow = flow * np.float32(factor)
             count += 1
-            line = f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed {np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px"
+            line = (f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
+                    f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px")
             if gt is not None:
                 valid = np.isfinite(gt).all(-1)
                 hit = np.zeros_like(valid)
@@ -145,7 +146,8 @@ def predict(
                 for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
                     m, zero = frame_metrics(flow, gt, mask), frame_metrics(np.zeros_like(flow), gt, mask)
                     if m:
-                        line += f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE {zero['AEE']:.3f} px"
+                        line += (f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE "
+                                 f"{zero['AEE']:.3f} px")
             typer.echo(line)
             if writer:
                 writer.add(window, flow, tensor, gt)

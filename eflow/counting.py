@@ -9,8 +9,8 @@ from eflow.models import build_model, parameters_of
 
 
 def count(config, height: int = 480, width: int = 640, *, plain: bool = True) -> tuple[int, float]:
-    """(parameters, GMACs of one forward pass at batch 1): convolutions and matrix products, attention's included; gathers,
-    normalisations and pointwise work are not counted.
+    """(parameters, GMACs of one forward pass at batch 1): convolutions and matrix products, attention's included;
+    gathers, normalisations and pointwise work are not counted.
 
     plain : the paper's arithmetic, i.e. mask head in every iteration and no hoisting; False: what inference here does.
     """

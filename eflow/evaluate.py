@@ -27,20 +27,23 @@ from eflow.pictures import comparison, events_of, write_picture
 
 MEDIAN_FRAMES = 64
 BASELINES = ("zero flow", "median of the set", "median of the frame")
-"""Zero; one constant flow, the component-wise median of the set's own ground truth; and, frame by frame, the median of that frame's
-ground truth: the best a network could say that saw only the global motion. The medians know the answer, so they are no methods."""
+"""Zero; one constant flow, the component-wise median of the set's own ground truth; and, frame by frame, the median of
+that frame's ground truth: the best a network could say that saw only the global motion. The
+medians know the answer, so they are no methods."""
 
 
 def evaluate(model: FlowModel, source: Source, out: str | os.PathLike | None = None, *, pictures: int = 12, empty: str = "error",
              precision: str = "fp32", limit: int | None = None, progress: Callable[[int, int, float], None] | None = None) -> dict[str, Any]:
     """Scores ``model`` on every labelled sample of ``source``.
 
-    out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error map); None:
-    nothing is written. limit : score only so many samples, evenly spaced. progress : called with (done, of, AEE so far).
-    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics as in
-    :mod:`eflow.metrics`.
+    out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
+    map); None: nothing is written. limit : score only so many samples, evenly spaced.
+    progress : called with (done, of, AEE so far).
+    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics
+    as in :mod:`eflow.metrics`.
 
-    Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events (unless ``empty="skip"``)."""
+    Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events
+    (unless ``empty="skip"``)."""
     if out is not None:
         refuse_existing(out)
     out = Path(out) if out is not None else None
@@ -108,7 +111,8 @@ def show(result: dict[str, Any], console: Console | None = None) -> None:
     """Two tables: all metrics of the network and the baselines; the network scene by scene. Fits 80 columns."""
     console = console or plain_console()
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
-    table = Table(title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on {result['device']}")
+    table = Table(title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on "
+                        f"{result['device']}")
     table.add_column("")
     for name in result["methods"]:
         table.add_column(name, justify="right")

@@ -26,8 +26,8 @@ from eflow.pictures import comparison, events_of, write_picture
 
 
 def pad_batch(batch: dict, divisor: int) -> dict:
-    """old and new padded at the bottom and right with empty pixels to multiples of ``divisor``. Less than one low-resolution token is
-    added on a side, so no token of padding alone enters the network."""
+    """old and new padded at the bottom and right with empty pixels to multiples of ``divisor``. Less than one
+    low-resolution token is added on a side, so no token of padding alone enters the network."""
     height, width = batch["new"].shape[-2:]
     pad = (0, -width % divisor, 0, -height % divisor)
     return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}
@@ -64,7 +64,8 @@ class StreamWindow:
 
 
 def windows(file: EventFile, span_us: int, *, start_us: int | None = None, end_us: int | None = None) -> Iterator[StreamWindow]:
-    """Successive windows of an event file: reference times start + Δ, start + 2Δ, … while both windows lie inside [start, end).
+    """Successive windows of an event file: reference times start + Δ, start + 2Δ, … while
+    both windows lie inside [start, end).
 
     start_us, end_us : default the first event's time and the last's + 1. Streams; holds two windows and a chunk."""
     pending, t = Events.empty(), None
@@ -86,8 +87,8 @@ def windows(file: EventFile, span_us: int, *, start_us: int | None = None, end_u
 
 
 def whole_file(file: EventFile) -> tuple[StreamWindow, float]:
-    """The file as one pair: its first half is the old window, its second the new. Also gives the factor from the flow over the
-    second half to the flow over the whole file at constant image velocity."""
+    """The file as one pair: its first half is the old window, its second the new. Also gives the factor from the flow
+    over the second half to the flow over the whole file at constant image velocity."""
     events = file.read()
     if len(events) < 2:
         raise EventDataError("no events", where=str(file.path))
@@ -103,8 +104,9 @@ def _pair(events: Events, t: int, span: int) -> StreamWindow:
 
 
 class Predictor:
-    """A model over a stream of windows. ``warm_start`` carries each flow along itself to the next reference time (networks with an
-    iterated low-resolution flow only). empty : "error", or "zero" flow for a window without events."""
+    """A model over a stream of windows. ``warm_start`` carries each flow along itself to the next reference time
+    (networks with an iterated low-resolution flow only). empty : "error", or "zero" flow for
+    a window without events."""
 
     def __init__(self, model: FlowModel, height: int, width: int, *, warm_start: bool = False, precision: str = "fp32", empty: str = "error"):
         self.model, self.height, self.width = model, height, width
@@ -139,8 +141,8 @@ def open_sized(path: str | os.PathLike, size: tuple[int, int] | None = None) -> 
 
 
 def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
-    """Ground truth of one window: .npy (H, W, 2), (2, H, W) or (1, 2, H, W), .png (DSEC), .flo. Returns (H, W, 2) with NaN where
-    there is none. Raises AssetError."""
+    """Ground truth of one window: .npy (H, W, 2), (2, H, W) or (1, 2, H, W), .png (DSEC), .flo. Returns (H, W, 2) with
+    NaN where there is none. Raises AssetError."""
     path = Path(path)
     if path.suffix == ".npy":
         from blinkgl.io.images import read_npy

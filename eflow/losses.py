@@ -13,8 +13,8 @@ def sequence_loss(prediction: FlowPrediction, flow: Tensor, valid: Tensor, *, ga
     """sum over i of w_i · mean over valid pixels of |V_i - V_gt|_1 (both components summed).
 
     flow : (N, 2, H, W) px. valid : (N, H, W) bool; what lies outside (|gt| >= 400 included) may hold anything, NaN too.
-    w_i = gamma^(N - i) for refinements 0 … N of one field (the BlinkFlow paper's exponent N - 1 is a misprint), w_0 times
-    ``match_weight`` when it is the matching layer's; w_i = 1 / (number of fields) for decoder scales.
+    w_i = gamma^(N - i) for refinements 0 … N of one field (the BlinkFlow paper's exponent N - 1 is a misprint), w_0
+    times ``match_weight`` when it is the matching layer's; w_i = 1 / (number of fields) for decoder scales.
     count : number to divide by instead of the batch's valid pixels (data-parallel training: the mean over ranks).
 
     The mean is over *valid* pixels, so that sparse ground truth has the gradient scale of dense. No valid pixel: 0.

@@ -1,7 +1,7 @@
 """Error measures, defined once. NumPy, float64 sums.
 
-Averages follow BlinkFlow: over the valid pixels of a frame, over the frames of a scene, over scenes. A frame without a valid pixel
-is left out and counted.
+Averages follow BlinkFlow: over the valid pixels of a frame, over the frames of a scene, over scenes. A frame without a
+valid pixel is left out and counted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ MAX_FLOW = 400.0
 def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -> dict[str, float] | None:
     """All of :data:`NAMES` of one frame.
 
-    predicted, truth : (H, W, 2) px. valid : (H, W) bool; pixels with |gt| >= 400 are left out too, occluded ones are not.
+    predicted, truth : (H, W, 2) px. valid : (H, W) bool; pixels with |gt| >= 400 are left
+    out too, occluded ones are not.
     Returns None when no pixel is left. A NaN prediction gives NaN, not a better mean.
     """
     gt = np.asarray(truth, np.float64)[valid]
@@ -50,8 +51,8 @@ def frame_metrics(predicted: np.ndarray, truth: np.ndarray, valid: np.ndarray) -
 
 
 def angle_2d(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle in radians between vectors (..., 2), by atan2(|cross|, dot): exact where arccos of a rounded cosine is not. Where one
-    is zero no direction is right: 90 degrees; where both are, 0."""
+    """Angle in radians between vectors (..., 2), by atan2(|cross|, dot): exact where arccos of a rounded cosine is not.
+    Where one is zero no direction is right: 90 degrees; where both are, 0."""
     cross, dot = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0], (a * b).sum(-1)
     angle = np.arctan2(np.abs(cross), dot)
     zero_a, zero_b = (a == 0).all(-1), (b == 0).all(-1)

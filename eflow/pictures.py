@@ -16,7 +16,8 @@ _HEAT = np.array([[0, 0, 0], [70, 0, 90], [190, 40, 60], [250, 150, 30], [255, 2
 
 
 def error_colour(error: np.ndarray, largest: float, valid: np.ndarray) -> np.ndarray:
-    """(H, W) px error to (H, W, 3) uint8: black none, through red, to pale yellow at ``largest`` and beyond; invalid grey."""
+    """(H, W) px error to (H, W, 3) uint8: black none, through red, to pale yellow at
+    ``largest`` and beyond; invalid grey."""
     at = np.clip(np.nan_to_num(error, nan=largest) / max(largest, 1e-9), 0, 1) * (len(_HEAT) - 1)
     low = np.minimum(at.astype(int), len(_HEAT) - 2)
     rgb = _HEAT[low] + (_HEAT[low + 1] - _HEAT[low]) * (at - low)[..., None]
@@ -32,8 +33,8 @@ def events_of(tensor: np.ndarray) -> np.ndarray:
 
 
 def comparison(events: np.ndarray, predicted: np.ndarray, truth: np.ndarray | None = None, valid: np.ndarray | None = None) -> np.ndarray:
-    """One RGB strip: events | ground truth | prediction | error (without truth: events | prediction). Flow panels share one scale:
-    the 99th percentile of the true speed. events : (H, W, 3) uint8; flows (H, W, 2) px."""
+    """One RGB strip: events | ground truth | prediction | error (without truth: events | prediction). Flow panels share
+    one scale: the 99th percentile of the true speed. events : (H, W, 3) uint8; flows (H, W, 2) px."""
     if truth is None or valid is None or not valid.any():
         panels = [events, flow_colour(predicted)]
     else:

@@ -10,8 +10,8 @@ from blinkgl.machine.cpu import bf16_instructions
 
 
 def lacks_bf16(device: torch.device) -> str:
-    """Why bf16 makes no sense on the device, in words; "" where it does. By the instruction set, not by a timed probe: two probes on a
-    busy machine may differ, and a run that is resumed should compute as it did."""
+    """Why bf16 makes no sense on the device, in words; "" where it does. By the instruction set, not by a timed probe:
+    two probes on a busy machine may differ, and a run that is resumed should compute as it did."""
     if device.type == "cuda":
         if torch.cuda.is_bf16_supported(including_emulation=False):
             return ""

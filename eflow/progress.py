@@ -15,8 +15,8 @@ _QUIET_S = 10.0
 
 
 class TrainProgress:
-    """Shows step, loss, EPE (smoothed), samples/s and time left: until the last step or, where that comes first, the time limit.
-    The first line comes before the first step, the next after it.
+    """Shows step, loss, EPE (smoothed), samples/s and time left: until the last step or, where that comes first, the
+    time limit. The first line comes before the first step, the next after it.
 
     where : device and precision, in words.   minutes : time limit, counted from ``began`` (s on ``clock``).
     rate : samples/s over the last steps."""

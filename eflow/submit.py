@@ -27,10 +27,11 @@ Progress = Callable[[int, int], None]
 
 def submit_dsec(model: FlowModel, root: str | os.PathLike, out: str | os.PathLike, *, sequences: tuple[str, ...] = DSEC_SEQUENCES,
                 precision: str = "fp32", progress: Progress | None = None) -> int:
-    """Zip of ``<sequence>/<file_index:06d>.png`` for every row of each test sequence's CSV. Returns the number of files.
+    """Zip of ``<sequence>/<file_index:06d>.png`` for every row of each test sequence's
+    CSV. Returns the number of files.
 
-    Raises AssetError: a test sequence is missing, or there are others. OutputError: the file exists, or the check of what was
-    written failed (then nothing is left)."""
+    Raises AssetError: a test sequence is missing, or there are others. OutputError: the file exists, or the check of
+    what was written failed (then nothing is left)."""
     source = open_source(root, "dsec")
     assert isinstance(source, FolderSource)
     found = {s.name for s in source.sequences}
@@ -76,7 +77,8 @@ def check_dsec(path: str | os.PathLike, wanted: set[str], shape: tuple[int, int]
 
 def submit_blinkflow(model: FlowModel, root: str | os.PathLike, out: str | os.PathLike, *, full: bool = False, precision: str = "fp32",
                      progress: Progress | None = None) -> int:
-    """Zip of ``<scene>/<seq>/<t0 ms>_<t1 ms>.flo`` in the benchmark's own format, one sampled pixel per 4x4 cell unless ``full``.
+    """Zip of ``<scene>/<seq>/<t0 ms>_<t1 ms>.flo`` in the benchmark's own format, one
+    sampled pixel per 4x4 cell unless ``full``.
     Raises as :func:`submit_dsec`."""
     source = open_source(root, "blinkflow")
     assert isinstance(source, FolderSource)
@@ -112,7 +114,8 @@ def encode_full(flow: np.ndarray) -> bytes:
 
 
 def encode_sampled(flow: np.ndarray) -> bytes:
-    """int32 tag 2502002, int32 contains_vis = 0, int32 n, then n (u, v) float32: the top-left pixel of every 4x4 cell, row-major."""
+    """int32 tag 2502002, int32 contains_vis = 0, int32 n, then n (u, v) float32: the top-left
+    pixel of every 4x4 cell, row-major."""
     picked = np.ascontiguousarray(flow[::CELL, ::CELL], "<f4").reshape(-1, 2)
     return struct.pack("<iii", SAMPLED, 0, len(picked)) + picked.tobytes()
 

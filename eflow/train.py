@@ -3,9 +3,10 @@
     eflow train configs/eflow/smoke.yaml --out out/smoke
     torchrun --nproc-per-node 8 -m eflow.cli train configs/eflow/eflowformer.yaml --out out/base
 
-A run folder holds config.yaml, log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and SIGTERM end the current
-step, write a checkpoint and exit 0; ``--resume`` goes on from the newest one and is, on the CPU, bit for bit what the
-uninterrupted run would have been: data order and augmentation are functions of (seed, step), the rate of the step alone.
+A run folder holds config.yaml, log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and SIGTERM end
+the current step, write a checkpoint and exit 0; ``--resume`` goes on from the newest one and is, on the CPU, bit for
+bit what the uninterrupted run would have been: data order and augmentation are functions of
+(seed, step), the rate of the step alone.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class TrainResult:
 
 
 def learning_rate(step: int, steps: int, peak: float, warmup: float) -> float:
-    """One cycle, linear: from peak / 25 up to ``peak`` over the first ``warmup`` of the steps, then down to 1e-4 of the start."""
+    """One cycle, linear: from peak / 25 up to ``peak`` over the first ``warmup`` of the
+    steps, then down to 1e-4 of the start."""
     start, end, top = peak / 25, peak / 25e4, max(warmup * steps, 1)
     if step < top:
         return start + (peak - start) * step / top
@@ -68,8 +70,8 @@ def learning_rate(step: int, steps: int, peak: float, warmup: float) -> float:
 def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, stop_after: int | None = None, quiet: bool = False) -> TrainResult:
     """Trains to ``config.optim.steps``. ``stop_after``: leave after this many steps of this call, as a signal would.
 
-    Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not finite: the batch's
-    sample names are in ``nan_batch.json``)."""
+    Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
+    finite: the batch's sample names are in ``nan_batch.json``)."""
     out = Path(out)
     rank, world, device = _setup(config)
     lead = rank == 0
@@ -370,7 +372,8 @@ class _Signals:
 
 
 class _Log:
-    """log.jsonl, one object per line, and tensorboard. On resuming, lines past the checkpoint are dropped: those steps run again."""
+    """log.jsonl, one object per line, and tensorboard. On resuming, lines past the checkpoint
+    are dropped: those steps run again."""
 
     def __init__(self, out: Path, start: int, enabled: bool):
         self.path, self.start, self.enabled = out / "log.jsonl", start, enabled

@@ -27,7 +27,8 @@ def main(out: Path) -> None:
     for ending in (".raw", ".csv", ".npz"):
         count = convert(out / "events.h5", out / f"events{ending}", size=(90, 120))
         with open_events(out / f"events{ending}") as file:
-            print(f"{file.path.name:10} {file.format:5} {count} events, {file.path.stat().st_size / count:5.1f} bytes each")
+            print(f"{file.path.name:10} {file.format:5} {count} events, {file.path.stat().st_size / count:5.1f} bytes "
+                  "each")
 
 
 def test_final(out: Path) -> None:

@@ -1,4 +1,5 @@
-"""Events as images for a network: a time surface (how long ago was the last event?) and a voxel grid (when, in five bins)."""
+"""Events as images for a network: a time surface (how long ago was the last event?) and a
+voxel grid (when, in five bins)."""
 
 from pathlib import Path
 

@@ -41,8 +41,10 @@ def main(out: Path) -> None:
     axes[3].quiver(x[step], y[step], flow[..., 0], flow[..., 1], color="white", angles="xy", scale_units="xy", scale=0.8)
     figure.savefig(out / "labels.png", dpi=80)
     plt.close(figure)
-    print(f"depth {frame.depth.min():.2f} m to {frame.depth[np.isfinite(frame.depth)].max():.2f} m, ids {np.unique(frame.ids).tolist()}")
-    print(f"largest flow {speed.max():.1f} px, {100 * frame.forward.occluded.mean():.1f} % of the pixels occluded at its end")
+    print(f"depth {frame.depth.min():.2f} m to {frame.depth[np.isfinite(frame.depth)].max():.2f} m, ids "
+          f"{np.unique(frame.ids).tolist()}")
+    print(f"largest flow {speed.max():.1f} px, {100 * frame.forward.occluded.mean():.1f} % of the pixels occluded at "
+          "its end")
 
 
 def test_final(out: Path) -> None:

@@ -1,4 +1,5 @@
-"""Training data without files: windows of events and the flow over each, as a sequence happens. One window is held at a time."""
+"""Training data without files: windows of events and the flow over each, as a sequence
+happens. One window is held at a time."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,7 +23,8 @@ BINS = 5
 
 
 def samples(scene: Scene) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Of every label: signed counts of the events until the next one (BINS, H, W), the flow until then (2, H, W), px, and its mask (H, W)."""
+    """Of every label: signed counts of the events until the next one (BINS, H, W), the flow until
+    then (2, H, W), px, and its mask (H, W)."""
     truth, window = None, []
     for item in simulate_sequence(scene, labels=["flow"]):
         if isinstance(item, EventChunk):
@@ -48,7 +50,8 @@ def main(out: Path) -> None:
     scene = Scene(Camera(64, 48, pose=flight), duration=0.3, label_rate=10) + Primitive("cuboid", material=Material(procedural="fbm"))
     for k, (grid, flow, valid) in enumerate(samples(scene)):
         np.savez(out / f"{k}.npz", grid=grid, flow=flow, valid=valid)
-        print(f"window {k}: {np.abs(grid).sum():.0f} events after those that cancel, flow of {np.abs(flow[:, valid]).mean():.2f} px on average")
+        print(f"window {k}: {np.abs(grid).sum():.0f} events after those that cancel, flow of "
+              f"{np.abs(flow[:, valid]).mean():.2f} px on average")
 
 
 def test_final(out: Path) -> None:

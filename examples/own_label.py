@@ -1,4 +1,5 @@
-"""A label of your own: where in the world each pixel's surface is, from the shader into the data set; and a map drawn from it."""
+"""A label of your own: where in the world each pixel's surface is, from the shader into the
+data set; and a map drawn from it."""
 
 from pathlib import Path
 
@@ -52,7 +53,8 @@ def main(out: Path) -> None:
     axes[1].set(title="the same pixels from above", xlabel="x, m", ylabel="y, m", aspect="equal")
     figure.savefig(out / "position.png", dpi=80)
     plt.close(figure)
-    print(f"{made.made.count} sequence with {made.made.labels} labels; z from {seen[:, 2].min():.2f} m to {seen[:, 2].max():.2f} m")
+    print(f"{made.made.count} sequence with {made.made.labels} labels; z from {seen[:, 2].min():.2f} m to "
+          f"{seen[:, 2].max():.2f} m")
 
 
 def test_final(out: Path) -> None:

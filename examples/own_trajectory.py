@@ -1,4 +1,5 @@
-"""A trajectory of your own: the camera circles a column on key frames from a formula; the flow follows from the geometry."""
+"""A trajectory of your own: the camera circles a column on key frames from a formula; the
+flow follows from the geometry."""
 
 from pathlib import Path
 
@@ -25,11 +26,13 @@ def main(out: Path) -> None:
 
     middle = recording.flow[0][50:70, 76:84]
     np.save(out / "middle.npy", middle)
-    print(f"{len(times)} key frames, {len(recording.events)} events; the column's middle moves {np.median(middle[..., 0]):+.2f} px in 0.1 s")
+    print(f"{len(times)} key frames, {len(recording.events)} events; the column's middle moves "
+          f"{np.median(middle[..., 0]):+.2f} px in 0.1 s")
 
 
 def test_final(out: Path) -> None:
-    # The axis stays in the image's centre. A point in front of it, `radius` nearer, turns about it: u = f sin(a) r / (R - r cos a).
+    # The axis stays in the image's centre. A point in front of it, `radius` nearer, turns about it: u = f sin(a) r / (R
+    # - r cos a).
     angle, focal = 2 * np.pi * TURNS_PER_S * 0.1, 80 / np.tan(np.radians(25))
     expected = focal * 0.5 * np.sin(angle) / (RADIUS - 0.5 * np.cos(angle))
     assert abs(abs(np.median(np.load(out / "middle.npy")[..., 0])) - expected) < 0.02 * expected

@@ -108,9 +108,9 @@ def test_version_and_help(capsys):
 
 
 def test_help_imports_nothing_heavy():
-    code = ("import sys; from blinkgl import cli; cli.run(['--help']);"
-            "heavy = {'numpy', 'numba', 'moderngl', 'trimesh', 'scipy', 'cv2', 'h5py', 'torch', 'matplotlib', 'pydantic'} & set(sys.modules);"
-            "sys.exit(f'imported: {sorted(heavy)}' if heavy else 0)")
+    code = ("import sys; from blinkgl import cli; cli.run(['--help']);heavy = {'numpy', 'numba', 'moderngl', 'trimesh', "
+            "'scipy', 'cv2', 'h5py', 'torch', 'matplotlib', 'pydantic'} & set(sys.modules);sys.exit(f'imported: "
+            "{sorted(heavy)}' if heavy else 0)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
 
@@ -140,7 +140,8 @@ def test_no_memory_left_is_one_line_that_says_what_helps(program, error, capsys,
 def test_a_memory_limit_ends_a_command_in_one_line(tmp_path):
     """simulate of frames that do not fit into what 'ulimit -v' leaves."""
     np.lib.format.open_memmap(tmp_path / "frames.npy", "w+", np.uint8, (2, 30_000, 30_000))[:1, :1, :1] = 1
-    command = f"ulimit -v 3000000; exec {sys.executable} -m blinkgl.cli simulate {tmp_path}/frames.npy --fps 100 -o {tmp_path}/e.npz"
+    command = (f"ulimit -v 3000000; exec {sys.executable} -m blinkgl.cli simulate {tmp_path}/frames.npy --fps 100 -o "
+               f"{tmp_path}/e.npz")
     done = subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
     assert done.returncode == 2 and done.stderr.startswith("error: out of memory; ") and done.stderr.count("\n") == 1, done.stderr
     assert not (tmp_path / "e.npz").exists()

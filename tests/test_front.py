@@ -1,4 +1,5 @@
-"""The front door: names, documentation, one path each; scenes in Python are scenes of YAML; wrong calls say which argument."""
+"""The front door: names, documentation, one path each; scenes in Python are scenes of YAML;
+wrong calls say which argument."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def box_scene(**more) -> blinkgl.Scene:
 
 
 def test_import_brings_nothing_with_it():
-    code = "import sys, blinkgl; blinkgl.__version__; dir(blinkgl); print([m for m in sys.modules if m.startswith('blinkgl.') or m in ('numpy', 'numba', 'moderngl', 'pydantic')])"
+    code = ("import sys, blinkgl; blinkgl.__version__; dir(blinkgl); print([m for m in sys.modules if "
+            "m.startswith('blinkgl.') or m in ('numpy', 'numba', 'moderngl', 'pydantic')])")
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
 
 

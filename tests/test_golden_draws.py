@@ -1,4 +1,5 @@
-"""The same configuration and seed draw the same textures, bodies, worlds and noise in every version: against ``tests/golden/draws.json``."""
+"""The same configuration and seed draw the same textures, bodies, worlds and noise in every version: against
+``tests/golden/draws.json``."""
 
 from __future__ import annotations
 

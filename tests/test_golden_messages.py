@@ -1,8 +1,8 @@
 """What users are told when something is wrong, as golden files that a person reads as a text.
 
 ``tests/golden/messages.txt`` has every sentence of the sources (``python -m blinkgl.tools.messages`` makes it again);
-``tests/golden/commands.txt`` what the commands really print for some fifty mistakes (``BLINKGL_UPDATE_GOLDEN=1`` makes it again).
-A change of wording is a change of these files, to be reviewed there.
+``tests/golden/commands.txt`` what the commands really print for some fifty mistakes (``BLINKGL_UPDATE_GOLDEN=1`` makes
+it again). A change of wording is a change of these files, to be reviewed there.
 """
 
 from __future__ import annotations
@@ -40,14 +40,21 @@ FILES = {
     "weights.yaml": "events: {contrast_threshold: {weighted: [1, 2]}}\n",
     "seed.yaml": "seed: -1\n",
     "inline.yaml": "scene: {kind: explicit, objects: [{primitive: cuboid}]}\n",
-    "name.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, objects: [{mesh: b}]}\n",
-    "texture.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, materials: {m: {texture: missing.png}}, objects: [{mesh: a, material: m}]}\n",
-    "primitive.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: dodecahedron}}, objects: [{mesh: a}]}\n",
-    "parameter.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: sphere, parameters: {sides: 3}}}, objects: [{mesh: a}]}\n",
-    "mesh.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {file: broken.obj}}, objects: [{mesh: a}]}\n",
+    "name.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
+                 "objects: [{mesh: b}]}\n",
+    "texture.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
+                    "materials: {m: {texture: missing.png}}, objects: [{mesh: a, material: m}]}\n",
+    "primitive.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: dodecahedron}}, "
+                      "objects: [{mesh: a}]}\n",
+    "parameter.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: sphere, "
+                      "parameters: {sides: 3}}}, objects: [{mesh: a}]}\n",
+    "mesh.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {file: broken.obj}}, "
+                 "objects: [{mesh: a}]}\n",
     "glb.yaml": "scene: {kind: file, path: broken.glb}\n",
-    "keyframes.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, objects: [{mesh: a, keyframes: [{time: 1}, {time: 0}]}]}\n",
-    "turn.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, objects: [{mesh: a, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 40000]}]}]}\n",
+    "keyframes.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
+                      "objects: [{mesh: a, keyframes: [{time: 1}, {time: 0}]}]}\n",
+    "turn.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
+                 "objects: [{mesh: a, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 40000]}]}]}\n",
     "corner.yaml": "timeline: {min_step_us: {uniform: [100, 900]}, max_step_us: {uniform: [500, 2000]}}\n",
     "long.yaml": "time: {duration: 5000}\n",
     "bomb.yaml": "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" if k else "a0: &a0 [1]\n" for k in range(10)),

@@ -41,7 +41,8 @@ print(json.dumps({
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """A copy of what a build reads: building in the repository would leave files there, and two test processes collide."""
+    """A copy of what a build reads: building in the repository would leave files there, and
+    two test processes collide."""
     copy = tmp_path_factory.mktemp("source")
     for name in ("setup.cfg", "pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, copy)
@@ -58,7 +59,8 @@ def run(*command: str | Path, cwd: Path) -> str:
 
 
 def fresh_environment(folder: Path) -> Path:
-    """A virtual environment without pip that can import this one's dependencies but not its blinkgl; returns its bin/."""
+    """A virtual environment without pip that can import this one's dependencies but not its
+    blinkgl; returns its bin/."""
     run(sys.executable, "-m", "venv", "--without-pip", folder, cwd=folder.parent)
     site = next(folder.glob("lib/python*/site-packages"))
     seen = [path for path in sys.path if path.endswith("site-packages") and Path(path).is_dir()]
@@ -134,7 +136,8 @@ def test_editable(source, tmp_path):
     check_installation(bin_, source, tmp_path)
     changed = source / "shaders" / "include" / "only_here.glsl"
     changed.write_text("// new\n")  # an editable install sees new files at once
-    run(bin_ / "python", "-c", "from importlib import resources\nassert resources.files('blinkgl.shaders').joinpath('include/only_here.glsl').is_file()",
+    run(bin_ / "python", "-c", "from importlib import resources\nassert "
+                               "resources.files('blinkgl.shaders').joinpath('include/only_here.glsl').is_file()",
         cwd=tmp_path)
 
 
@@ -197,7 +200,8 @@ def test_changes_are_of_known_kinds():
 
 
 def test_the_container_installs_what_setup_sh_asks_for():
-    """The Dockerfile, without Docker: it copies what a build reads, and installs the packages that tools/setup.sh would."""
+    """The Dockerfile, without Docker: it copies what a build reads, and installs the
+    packages that tools/setup.sh would."""
     from blinkgl.tools.recipe import stage
 
     image, cpu = stage((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"), "cpu")

@@ -39,15 +39,15 @@ def test_every_room_is_on_the_map():
 
 
 def _room(module: str) -> str:
-    """The files at the top of scene/ and config/ are looked at one by one: scene/types.py comes before the rooms inside and scene/build.py after
-    them, config/labels.py before the table of labels and config/sequence.py after it."""
+    """The files at the top of scene/ and config/ are looked at one by one: scene/types.py comes before the rooms inside
+    and scene/build.py after them, config/labels.py before the table of labels and config/sequence.py after it."""
     parts = module.split(".")
     return ".".join(parts[:3] if parts[1] in ("scene", "config") else parts[:2])
 
 
 def test_data_flows_one_way():
-    """What is imported when a module is imported never leads back to the room it came from. (``blinkgl.tools`` reads what it likes;
-    the front door fetches its names when they are first used.)"""
+    """What is imported when a module is imported never leads back to the room it came from. (``blinkgl.tools`` reads
+    what it likes; the front door fetches its names when they are first used.)"""
     arrows: dict[str, set[str]] = {}
     for path in sorted((ROOT / "blinkgl").rglob("*.py")):
         module = path.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".").removesuffix(".__init__")

@@ -56,7 +56,8 @@ from blinkgl.trade.settings import Setting
 
 
 class Toy(Emulator):
-    """An ideal threshold with a fixed dead time: at most one event per pixel and frame, where ln(I + 0.01) has moved far enough."""
+    """An ideal threshold with a fixed dead time: at most one event per pixel and frame, where
+    ln(I + 0.01) has moved far enough."""
 
     class Config(EmulatorConfig):
         """A toy: an ideal threshold with a fixed dead time."""
@@ -225,7 +226,8 @@ def test_the_table_is_whole():
 
 
 def test_nothing_else_asks_which_kind_an_emulator_is():
-    """No name of a kind is compared with or stands in a list or table; the models of the kinds are named where they are declared alone."""
+    """No name of a kind is compared with or stands in a list or table; the models of the kinds
+    are named where they are declared alone."""
     root = Path(blinkgl.__file__).parent
     models = {emulator.Config.__name__ for emulator in EMULATORS.values()}
     found = {}
@@ -246,7 +248,8 @@ def test_nothing_else_asks_which_kind_an_emulator_is():
 
 
 def toy_with(part, line=None):
-    """The class above made anew from its source, one part ("Config.x": of its configuration) taken out or replaced by a line."""
+    """The class above made anew from its source, one part ("Config.x": of its
+    configuration) taken out or replaced by a line."""
     tree = ast.parse(inspect.getsource(Toy))
     body, name = tree.body[0].body, part
     if part.startswith("Config."):
@@ -505,13 +508,15 @@ def test_the_page_shows_this_toy_label():
 
 def test_reading_a_yaml_needs_neither_opengl_nor_a_compiler(tmp_path):
     (tmp_path / "a.yaml").write_text(yaml.safe_dump({"labels": {"depth": True, "flow": ["backward"]}}))
-    code = ("import sys; from blinkgl.config.sequence import load_run; print(load_run(sys.argv[1]).sequence(0).labels.depth);"
-            "assert not {'moderngl', 'numba', 'cv2', 'h5py', 'blinkgl.gl', 'blinkgl.render'} & set(sys.modules), sorted(sys.modules)")
+    code = ("import sys; from blinkgl.config.sequence import load_run; "
+            "print(load_run(sys.argv[1]).sequence(0).labels.depth);assert not {'moderngl', 'numba', 'cv2', 'h5py', "
+            "'blinkgl.gl', 'blinkgl.render'} & set(sys.modules), sorted(sys.modules)")
     assert subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.yaml")], capture_output=True, text=True, check=True).stdout == "True\n"
 
 
 def test_nothing_else_lists_labels():
-    """No name of a label is a key of a table or stands among others in a list, outside its own row: who needs some takes them from the table."""
+    """No name of a label is a key of a table or stands among others in a list, outside its own row:
+    who needs some takes them from the table."""
     root = Path(blinkgl.__file__).parent
     names = {*LABELS, "normals", "occlusion"} - {"images", "depth", "velocity"}  # words of other things, too
     found = {}

@@ -1,4 +1,5 @@
-"""What a type checker sees: every public signature says its types, a right program is clean and a wrong call is an error."""
+"""What a type checker sees: every public signature says its types, a right program is clean
+and a wrong call is an error."""
 
 from __future__ import annotations
 
@@ -65,7 +66,8 @@ blinkgl.no_such_name  # wrong
 
 
 def public_functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
-    """(function, whether its first parameter is the object or class) of the public functions of a module and of its public classes."""
+    """(function, whether its first parameter is the object or class) of the public functions of
+    a module and of its public classes."""
     waiting: list[tuple[list[ast.stmt], bool]] = [(tree.body, False)]
     while waiting:
         body, inside = waiting.pop()
@@ -93,7 +95,8 @@ def test_public_signatures_say_their_types(room):
 
 
 def test_a_users_program_is_checked(tmp_path):
-    """Errors at the lines that are wrong and nowhere else: a class that a checker takes for Any would be an error nowhere."""
+    """Errors at the lines that are wrong and nowhere else: a class that a checker takes for
+    Any would be an error nowhere."""
     pytest.importorskip("pyrefly", reason="the extra [dev] is not installed")
     (tmp_path / "program.py").write_text(PROGRAM, encoding="utf-8")
     program = next(file.locate() for file in metadata.files("pyrefly") or () if file.name == "pyrefly")

@@ -2,8 +2,8 @@
 
     python -m blinkgl.tools.bench_accuracy [CONFIG] [--sequences N] [--set a.b=c …] [--json FILE]
 
-For N sequences of a configuration (default: flying_objects.yaml, 3), one label in the middle of each: instance ids, depth,
-forward and backward flow, velocity and occlusion masks off the one-pixel silhouette band of either image;
+For N sequences of a configuration (default: flying_objects.yaml, 3), one label in the middle of each: instance ids,
+depth, forward and backward flow, velocity and occlusion masks off the one-pixel silhouette band of either image;
 and how many pixels differ in it.
 """
 

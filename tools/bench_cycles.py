@@ -1,11 +1,15 @@
-"""What rasterising costs beside a path tracer: Blender's Cycles (extra [cycles], see ``peer_cycles.py``) on the default random scene.
+"""What rasterising costs beside a path tracer: Blender's Cycles (extra [cycles], see
+``peer_cycles.py``) on the default random scene.
 
-    python -m blinkgl.tools.bench_cycles [CONFIG] [--frames 32] [--samples 128] [--set a.b=c …] [--json FILE] [--pictures FOLDER]
+    python -m blinkgl.tools.bench_cycles [CONFIG] [--frames 32] [--samples 128] [--set a.b=c …]
+    [--json FILE] [--pictures FOLDER]
 
-1. A short clip at low resolution (--width; the camera of the configuration, shrunk), frame times with at most --max-px of motion between two, the
-   same for every renderer; ESIM with the same thresholds on each, linear in time. Errors of the events, one cause at a time:
+1. A short clip at low resolution (--width; the camera of the configuration, shrunk), frame times with at most --max-px
+   of motion between two, the same for every renderer; ESIM with the same thresholds on each, linear in time. Errors of
+   the events, one cause at a time:
 
-   filtering   our frames against path-traced ones under our own light model (no shadows, no bounces): mip maps, anti-aliasing
+   filtering   our frames against path-traced ones under our own light model (no shadows, no
+               bounces): mip maps, anti-aliasing
    shadows     without them against with them, both path-traced
    bounces     direct light against four diffuse bounces, both path-traced
    all         our frames against everything
@@ -183,8 +187,8 @@ def main() -> None:
 
 
 def _show_clip(console: Console, r: dict) -> None:
-    table = Table(title=f"events, {r['width']}x{r['height']}, {r['frames']} frames of {r['milliseconds']:.0f} ms, {r['samples']} paths; partners within "
-                  f"{r['limit_us'] / 1000:.1f} ms", title_justify="left")
+    table = Table(title=f"events, {r['width']}x{r['height']}, {r['frames']} frames of {r['milliseconds']:.0f} ms, {r['samples']} "
+                        f"paths; partners within {r['limit_us'] / 1000:.1f} ms", title_justify="left")
     for name in ("cause", "judged", "by", "events", "missed", "extra", "time median, p95 / µs", "px", "voxel L2", "log RMSE"):
         table.add_column(name, justify="left" if name in ("cause", "judged", "by") else "right")
     for e in r["errors"]:
@@ -196,7 +200,8 @@ def _show_clip(console: Console, r: dict) -> None:
 
 def _show_speed(console: Console, r: dict) -> None:
     rate = r["frames_per_simulated_second"]
-    table = Table(title=f"{r['width']}x{r['height']}, {r['triangles']:,} triangles, {rate:.0f} frames per simulated second (displacement {r['max_px']:g} px)",
+    table = Table(title=f"{r['width']}x{r['height']}, {r['triangles']:,} triangles, {rate:.0f} frames per simulated second "
+                        f"(displacement {r['max_px']:g} px)",
                   title_justify="left")
     for name in ("renderer", "s per frame", "processor s", "first frame", "s per simulated s", "times BlinkGL"):
         table.add_column(name, justify="left" if name == "renderer" else "right")

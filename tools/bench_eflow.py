@@ -1,13 +1,16 @@
 """How fast the event networks' own code is: voxel grids, samples, and inference against the RAFT-style twin.
 
-    python -m blinkgl.tools.bench_eflow [--model eflowformer] [--size 640x480] [--rounds 5] [--data FOLDER] [--json FILE]
+    python -m blinkgl.tools.bench_eflow [--model eflowformer] [--size 640x480] [--rounds
+    5] [--data FOLDER] [--json FILE]
 
-- Voxel grids of 15 bins at 640x480, one core: million events per second, uniform and clustered events, raw and rectified coordinates.
-- Inference: rounds of the fast path and of the twin (``model.plain``: RAFT's lookup by 81 grid samples, its unfold upsampling, the mask in
-  every iteration, nothing hoisted) alternate in two processes that are never busy at once; ratio of the medians, and of the medians of
-  processor seconds. The flows are compared. The allocator's setting (eflow/allocator.py) lasts for a process, so it is tried in
-  both ways for the twin.
-- With --data, milliseconds to make one training sample from files, and to make its grids from events in memory: what a cache could save.
+- Voxel grids of 15 bins at 640x480, one core: million events per second, uniform and clustered
+  events, raw and rectified coordinates.
+- Inference: rounds of the fast path and of the twin (``model.plain``: RAFT's lookup by 81 grid samples, its unfold
+  upsampling, the mask in every iteration, nothing hoisted) alternate in two processes that are never busy at once;
+  ratio of the medians, and of the medians of processor seconds. The flows are compared. The allocator's setting
+  (eflow/allocator.py) lasts for a process, so it is tried in both ways for the twin.
+- With --data, milliseconds to make one training sample from files, and to make its grids from
+  events in memory: what a cache could save.
 """
 
 from __future__ import annotations
@@ -136,10 +139,11 @@ def main() -> None:
         print("one sample: {sample_ms:.2f} ms from files, of which its grids {grids_ms:.2f} ms".format(**result["samples"]))
     result["inference"] = r = inference(a.model, height, width, a.rounds, a.threads)
     for variant in VARIANTS:
-        line = f"{a.model} {a.size}, {variant}: {r['seconds'][variant]:.2f} s, processor {r['processor_seconds'][variant]:.2f} s"
+        line = (f"{a.model} {a.size}, {variant}: {r['seconds'][variant]:.2f} s, processor "
+                f"{r['processor_seconds'][variant]:.2f} s")
         if variant in r["ratio"]:
-            line += (f"; {r['ratio'][variant]:.2f} times the fast path's time ({r['ratio_processor'][variant]:.2f} times its processor time), flows of "
-                     f"{r['mean_flow_px']:.1f} px agree to {r['px'][variant]:.1e} px")
+            line += (f"; {r['ratio'][variant]:.2f} times the fast path's time ({r['ratio_processor'][variant]:.2f} times "
+                     f"its processor time), flows of {r['mean_flow_px']:.1f} px agree to {r['px'][variant]:.1e} px")
         print(line)
     if a.json:
         Path(a.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

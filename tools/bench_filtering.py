@@ -2,10 +2,10 @@
 
     python -m blinkgl.tools.bench_filtering [CONFIG] [--sequences 0 1] [--frames 120] [--json FILE]
 
-The same scenes at the same times with every setting; events (ESIM) and luminance are judged by frames drawn SS x SS times finer with
-a camera of its own and averaged by NumPy. All settings take turns frame by frame, so that a busy machine slows all of them alike;
-processor seconds are printed beside wall time. Wrong: events without a partner within the pixel, the polarity and ``--limit`` ms,
-missed and extra together, over the reference's count.
+The same scenes at the same times with every setting; events (ESIM) and luminance are judged by frames drawn SS x SS
+times finer with a camera of its own and averaged by NumPy. All settings take turns frame by frame, so that a busy
+machine slows all of them alike; processor seconds are printed beside wall time. Wrong: events without a partner within
+the pixel, the polarity and ``--limit`` ms, missed and extra together, over the reference's count.
 """
 
 from __future__ import annotations
@@ -86,7 +86,8 @@ class Judged:
 
 
 def judge(gl, scene: Scene, settings: dict, times: list[int], factor: int, limit_us: int, emulator) -> dict[str, dict]:
-    """setting -> events, missed, extra (shares of the reference's), log_rmse, and ms and processor ms per frame (medians)."""
+    """setting -> events, missed, extra (shares of the reference's), log_rmse, and ms and
+    processor ms per frame (medians)."""
     reference = Judged(gl, scene, PLAIN, emulator, factor)
     judged = {name: Judged(gl, scene, config, emulator) for name, config in settings.items()}
     squares = dict.fromkeys(settings, 0.0)

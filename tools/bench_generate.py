@@ -167,8 +167,9 @@ def main() -> None:
         _show_event_pass(console, result["event_pass"])
         result["still_camera"] = [still_camera(gl, kind, movers, repeat) for kind in ("tri/16", "full") for movers in (1, 3)]
         for r in result["still_camera"]:
-            console.print(f"still camera, {r['scene']}, {r['movers']} of 10 objects moving: {r['full redraw']:.0f} frames/s drawn whole, "
-                          f"{r['what moves']:.0f} where something moves: {r['ratio']:.1f}x (luminance and ESIM, same events)", highlight=False, soft_wrap=True)
+            console.print(f"still camera, {r['scene']}, {r['movers']} of 10 objects moving: {r['full redraw']:.0f} frames/s "
+                          f"drawn whole, {r['what moves']:.0f} where something moves: {r['ratio']:.1f}x (luminance and ESIM, "
+                          "same events)", highlight=False, soft_wrap=True)
         if options.peer:
             result["peer"] = peer(gl, options.quick)
             console.print("pyrender:", result["peer"])

@@ -2,10 +2,11 @@
 
     python -m blinkgl.tools.bench_load [--load 8] [--rounds 5] [--against FOLDER] [--json FILE]
 
-``--load`` processes spin while it measures (0: none; on a quiet machine that is the other half of the picture). For each emulator a clip of
-640x480 at 1000 fps is passed through once per thread count and round, thread counts taking turns; wall and processor milliseconds a frame,
-median over the rounds after one that does not count. ``--against``: a checkout of another version, measured in the same turns, each
-in a process of its own. ``digest`` is of all events: equal whatever the threads.
+``--load`` processes spin while it measures (0: none; on a quiet machine that is the other half of the picture). For
+each emulator a clip of 640x480 at 1000 fps is passed through once per thread count and round, thread counts taking
+turns; wall and processor milliseconds a frame, median over the rounds after one that does not count. ``--against``: a
+checkout of another version, measured in the same turns, each in a process of its own. ``digest`` is
+of all events: equal whatever the threads.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ THREADS = (1, 2)
 @contextlib.contextmanager
 def spinning(count: int) -> Iterator[None]:
     """``count`` processes that keep a core busy each, for as long as the block lasts."""
-    program = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    sum(range(100_000))"  # none outlives this process
+    program = ("import os\nparent = os.getppid()\nwhile os.getppid() == "
+               "parent:\n    sum(range(100_000))")  # none outlives this process
     children = [subprocess.Popen([sys.executable, "-c", program]) for _ in range(count)]
     try:
         yield
@@ -100,7 +102,8 @@ def main() -> None:
     if options.answer:
         answer()
         return
-    program = "import sys; sys.path.insert(0, sys.argv.pop(1)); name = sys.argv.pop(1); exec(compile(open(name).read(), name, 'exec'))"
+    program = ("import sys; sys.path.insert(0, sys.argv.pop(1)); name = sys.argv.pop(1); exec(compile(open(name).read(), "
+               "name, 'exec'))")
     folders = {"this": Path(__file__).resolve().parents[1], **({"against": Path(options.against).resolve()} if options.against else {})}
     versions = {version: subprocess.Popen([sys.executable, "-c", program, str(folder), __file__, "--answer"], stdin=subprocess.PIPE,
                                           stdout=subprocess.PIPE, text=True, env={**os.environ, "NUMBA_NUM_THREADS": str(max(THREADS))})
@@ -115,7 +118,8 @@ def main() -> None:
     report = {"machine": bench.machine_line(), "load": options.load, "load_average": os.getloadavg()[0], "rounds": options.rounds, "rows": rows}
     console = Console(width=120)
     console.print(report["machine"], highlight=False, soft_wrap=True)
-    table = Table(title=f"{options.load} spinning processes beside it (load average {report['load_average']:.1f}); ms a frame, median of {options.rounds}")
+    table = Table(title=f"{options.load} spinning processes beside it (load average {report['load_average']:.1f}); ms a frame, "
+                        f"median of {options.rounds}")
     for column in ("emulator", "version", "threads", "wall", "fastest", "processor", "wall x1 thread", "digest"):
         table.add_column(column)
     alone = {(r["emulator"], r["version"]): r["wall_ms"] for r in rows if r["threads"] == 1}

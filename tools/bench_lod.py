@@ -2,10 +2,10 @@
 
     python -m blinkgl.tools.bench_lod [--edge 2 4 8] [--error 0.25] [--antialiasing none ssaa2] [--json FILE]
 
-The scene is ``kind: random`` with a pool of finely meshed files made here (bumpy stones, knots, uv spheres: smooth, textured, with
-seams). Variants: without back-face and frustum culling, as it is by default, and with levels of detail; all of them take turns frame
-by frame, so that a busy machine slows them alike, and processor seconds are printed beside wall time. Events (ESIM) are judged against
-the full meshes drawn 8 x 8 times finer, as in bench_filtering.
+The scene is ``kind: random`` with a pool of finely meshed files made here (bumpy stones, knots, uv spheres: smooth,
+textured, with seams). Variants: without back-face and frustum culling, as it is by default, and with levels of detail;
+all of them take turns frame by frame, so that a busy machine slows them alike, and processor seconds are printed beside
+wall time. Events (ESIM) are judged against the full meshes drawn 8 x 8 times finer, as in bench_filtering.
 """
 
 from __future__ import annotations
@@ -109,7 +109,8 @@ class Everything(Renderer):
 
 
 def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> dict[str, dict]:
-    """variant -> triangles, ms and processor ms per frame: luminance, and luminance with ESIM; medians over interleaved rounds."""
+    """variant -> triangles, ms and processor ms per frame: luminance, and luminance with
+    ESIM; medians over interleaved rounds."""
     shape = (scene.camera.height, scene.camera.width)
     out = {}
     made = {}

@@ -1,11 +1,13 @@
-"""How many event frames the same accuracy of event times takes: time sampling x reconstruction on mixed slow and fast motion.
+"""How many event frames the same accuracy of event times takes: time sampling x
+reconstruction on mixed slow and fast motion.
 
     python -m blinkgl.tools.bench_sampling [--antialiasing none|ssaa2] [--scenes 3] [--quick] [--json FILE]
 
-Random scenes whose clock runs slow, then fast, then slow again, and a still camera in front of a fast and some slow objects. Each way of
-sampling is run at several densities; its events are matched one to one, within pixel, polarity and 5 ms, with those of frames 1/32 px apart
-(a larger limit would pair missed events with unrelated ones). From each way's errors over its number of frames follows how many frames it needs for the median *and* the 95th
-percentile that another way reaches. It counts frames and errors, so it may run on a busy machine.
+Random scenes whose clock runs slow, then fast, then slow again, and a still camera in front of a fast and some slow
+objects. Each way of sampling is run at several densities; its events are matched one to one, within pixel, polarity and
+5 ms, with those of frames 1/32 px apart (a larger limit would pair missed events with unrelated ones). From each way's
+errors over its number of frames follows how many frames it needs for the median *and* the 95th percentile that another
+way reaches. It counts frames and errors, so it may run on a busy machine.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ BASES = ("uniform, linear", "displacement, linear")
 
 
 class WarpedPath:
-    """A path whose clock runs at ``SLOW``, ``FAST`` and ``SLOW`` times its own rate, smoothly in between; it starts where the path starts."""
+    """A path whose clock runs at ``SLOW``, ``FAST`` and ``SLOW`` times its own rate, smoothly in
+    between; it starts where the path starts."""
 
     is_static = False
 
@@ -122,13 +125,15 @@ def measure(scene: Scene, gl, antialiasing: str, thin: int, say) -> dict[str, li
             for timeline in settings[::thin]:
                 events, run = simulate(timeline, renderer)
                 results[name].append(Run(run.frames, event_errors(dense, events, speeds, t0, t1, limit_us=LIMIT_US), run.timeline.info()))
-            say(f"  {name}: " + ", ".join(f"{r.frames} ({r.errors.time_median_us:.0f}/{r.errors.time_p95_us:.0f} µs, {r.errors.shift_median_px:.3f}/"
-                                          f"{r.errors.shift_p95_px:.3f} px, {100 * r.errors.missed:.0f} % missed)" for r in results[name]))
+            say(f"  {name}: " + ", ".join(f"{r.frames} ({r.errors.time_median_us:.0f}/{r.errors.time_p95_us:.0f} µs, "
+                                          f"{r.errors.shift_median_px:.3f}/{r.errors.shift_p95_px:.3f} px, {100 * r.errors.missed:.0f} % "
+                                          "missed)" for r in results[name]))
     return results
 
 
 def frames_needed(runs: list[Run], unit: str, median: float, p95: float) -> float:
-    """Frames at which both errors are reached, on straight lines of log error over log frames (beyond the runs: their last piece)."""
+    """Frames at which both errors are reached, on straight lines of log error over log frames
+    (beyond the runs: their last piece)."""
     runs = sorted(runs, key=lambda r: r.frames)
     needed = []
     for quantile, wanted in (("median", median), ("p95", p95)):
@@ -142,7 +147,8 @@ def frames_needed(runs: list[Run], unit: str, median: float, p95: float) -> floa
 
 
 def compare(results: list[dict[str, list[Run]]], unit: tuple[str, str], base: str) -> dict[str, dict[str, float]]:
-    """Frames of ``base`` per frame of each way at the base's own errors, over the base's middle settings and the scenes."""
+    """Frames of ``base`` per frame of each way at the base's own errors, over the base's
+    middle settings and the scenes."""
     table: dict[str, dict[str, float]] = {}
     for name in WAYS:
         ratios = []
@@ -174,7 +180,8 @@ def main() -> None:
             results[name] = measure(random_scene(*arguments), gl, options.antialiasing, 2 if options.quick else 1, say)
     tables = {}
     for unit in (("time", "us"), ("shift", "px")):
-        table = Table(title=f"frames of the base per frame of each way, same median and 95th percentile in {unit[1]} (mixed motion; geometric mean, least … most)", title_justify="left")
+        table = Table(title=f"frames of the base per frame of each way, same median and 95th percentile in {unit[1]} (mixed "
+                            "motion; geometric mean, least … most)", title_justify="left")
         table.add_column("sampling, reconstruction")
         for base in BASES:
             table.add_column(f"base: {base}", justify="right")

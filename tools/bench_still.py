@@ -2,9 +2,10 @@
 
     python -m blinkgl.tools.bench_still [--coverage 0.05] [--rounds 200] [--json FILE]
 
-bench_generate's probe scene (10 balls, ground and sky; "tri/16": 7,000 triangles, "full": 110,000), 640x480, camera and nine balls at
-rest, the tenth at a distance at which its rectangle covers about ``--coverage`` of the image, moving by half a pixel per frame. Both ways take turns of ten
-frames, each with its own renderer and ESIM emulator; times are medians, "mean" is over all frames. The events are compared one by one.
+bench_generate's probe scene (10 balls, ground and sky; "tri/16": 7,000 triangles, "full": 110,000), 640x480, camera and
+nine balls at rest, the tenth at a distance at which its rectangle covers about ``--coverage`` of the image, moving by
+half a pixel per frame. Both ways take turns of ten frames, each with its own renderer and ESIM emulator; times are
+medians, "mean" is over all frames. The events are compared one by one.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ WIDTH, HEIGHT = 640, 480
 STEP_NS = 2_000_000
 PX_PER_FRAME = 0.5
 TURN = 10
-"""Frames that one way draws before it is the other's turn: a way runs with its own data in the caches, as it would alone."""
+"""Frames that one way draws before it is the other's turn: a way runs with its own data in
+the caches, as it would alone."""
 
 
 def one_mover(kind: str, coverage: float) -> Scene:

@@ -2,9 +2,10 @@
 
     python -m blinkgl.tools.bench_workers [--workers 2] [--rounds 3] [--sequences 12] [--memory] [--json FILE]
 
-Rounds of 1 and N workers alternate; the time is that of making sequences, worker start-up left out. Processor seconds stand
-beside it: on a machine that others use, too, wall times mean little, but processor seconds per sequence over N cores say
-what an idle one would do. --memory also makes one sequence of 1 s and one of 60 s and shows the largest resident size of each.
+Rounds of 1 and N workers alternate; the time is that of making sequences, worker start-up left out. Processor seconds
+stand beside it: on a machine that others use, too, wall times mean little, but processor seconds per sequence over N
+cores say what an idle one would do. --memory also makes one sequence of 1 s and one of 60 s and
+shows the largest resident size of each.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ def main() -> None:
         table.add_row(str(w), f"{m['elapsed_s']:.1f}", f"{m['cpu_s']:.1f}", f"{m['cpu_s'] / m['elapsed_s']:.2f}", f"{m['load_before']:.1f}", f"{m['peak_rss_mb']:.0f}")
     console.print(table)
     ratio = median[1]["elapsed_s"] / median[arguments.workers]["elapsed_s"]
-    console.print(f"{arguments.workers} workers against 1: {ratio:.2f}x, medians of {arguments.rounds} rounds of {arguments.sequences} sequences", highlight=False)
+    console.print(f"{arguments.workers} workers against 1: {ratio:.2f}x, medians of {arguments.rounds} rounds of "
+                  f"{arguments.sequences} sequences", highlight=False)
     memory = {}
     if arguments.memory:
         for seconds in (1, 60):

@@ -1,11 +1,13 @@
 """Two networks on equal terms, from nothing to a table: generate, train both for the same steps, evaluate, time.
 
     python -m blinkgl.tools.compare_networks --out out/h100                       # half an hour on one large GPU
-    python -m blinkgl.tools.compare_networks --out out/h100 --minutes 9           # the same in pieces: repeat until it exits 0
+    python -m blinkgl.tools.compare_networks --out out/h100 --minutes 9           # the
+    same in pieces: repeat until it exits 0
 
-What is done is kept and not done again: the data set goes on with ``--resume``, training from its newest checkpoint, and whatever has a
-result is left alone. With --minutes it stops in time with exit status 75 and the same command goes on. Every step is a command
-that could be typed; it is printed before it runs. The result is OUT/table.md and OUT/comparison.json.
+What is done is kept and not done again: the data set goes on with ``--resume``, training from its newest checkpoint,
+and whatever has a result is left alone. With --minutes it stops in time with exit status 75 and the same command goes
+on. Every step is a command that could be typed; it is printed before it runs. The result is
+OUT/table.md and OUT/comparison.json.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ class Steps:
         sys.exit(AGAIN)
 
     def run(self, module: str, *arguments: str, timed: bool = False) -> None:
-        """``timed``: the command stops by itself. Others are stopped by SIGTERM when the time is up (all of them leave no half results)."""
+        """``timed``: the command stops by itself. Others are stopped by SIGTERM when the time is
+        up (all of them leave no half results)."""
         left = self.left()
         print("$", module.partition(".")[0], *arguments, flush=True)
         process = subprocess.Popen([sys.executable, "-m", module, *arguments])

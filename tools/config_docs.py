@@ -57,8 +57,9 @@ def page() -> str:
 
 def _primitives() -> str:
     """What `scene.meshes.<name>.parameters` may hold, from the builders' own signatures."""
-    lines = ["\n## Primitives\n\n", ("`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, parameters: {radius: 0.2, height: 2}}`. "
-              "All stand upright (z is their axis) and are centred on the origin; sizes are in the world's units (m), before the object's `scale`.\n\n"),
+    lines = ["\n## Primitives\n\n", ("`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, "
+                                     "parameters: {radius: 0.2, height: 2}}`. All stand upright (z is their axis) and are centred on the "
+                                     "origin; sizes are in the world's units (m), before the object's `scale`.\n\n"),
              "| kind | parameters and defaults | what it is |\n|---|---|---|\n"]
     for kind, build in BUILDERS.items():
         values = ", ".join(f"`{name}: {list(value) if isinstance(value, tuple) else value}`" for name,

@@ -1,13 +1,15 @@
-"""The Blender side of ``peer_cycles.py``: reads a scene from two plain files, path-traces its frames, writes them as .npy.
+"""The Blender side of ``peer_cycles.py``: reads a scene from two plain files, path-traces
+its frames, writes them as .npy.
 
     python cycles_worker.py FOLDER        FOLDER/job.json, FOLDER/job.npz in; FOLDER/000000.npy … out
 
-A program of its own that needs nothing but numpy and ``bpy``, and imports nothing of BlinkGL: Blender is GPL, so it stays in another
-process, and possibly in another interpreter, and only files pass between the two. ``peer_cycles.export`` describes them.
+A program of its own that needs nothing but numpy and ``bpy``, and imports nothing of BlinkGL: Blender is GPL, so it
+stays in another process, and possibly in another interpreter, and only files pass between the two.
+``peer_cycles.export`` describes them.
 
-Standard output carries one JSON object per line: ``{"blender", "setup_s", "setup_cpu_s"}`` when the scene stands, ``{"frame", "wall_s",
-"cpu_s"}`` after each frame (rendering alone, without writing the file), or ``{"error"}`` with a line for the user. What
-Blender itself prints goes to standard error.
+Standard output carries one JSON object per line: ``{"blender", "setup_s", "setup_cpu_s"}`` when the scene stands,
+``{"frame", "wall_s", "cpu_s"}`` after each frame (rendering alone, without writing the file), or ``{"error"}`` with a
+line for the user. What Blender itself prints goes to standard error.
 """
 
 from __future__ import annotations
@@ -136,8 +138,8 @@ def make_mesh(bpy, k: int, arrays: dict):
 
 
 def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky: float):
-    """Unlit: emission that only the camera sees. Lit: a diffuse BSDF, and albedo * even_sky * (0.5 + 0.5 n_z) as emission. Culled:
-    nothing where the camera sees a back face."""
+    """Unlit: emission that only the camera sees. Lit: a diffuse BSDF, and albedo * even_sky * (0.5 + 0.5 n_z) as
+    emission. Culled: nothing where the camera sees a back face."""
     material = bpy.data.materials.new(f"material {k}")
     material.use_nodes = True
     material.use_transparent_shadow = False  # what is culled is culled for the camera alone
@@ -206,8 +208,9 @@ def make_image(bpy, k: int, arrays: dict):
 
 
 def make_light(bpy, scene, job: dict) -> None:
-    """Sun without extent, and a dome that is white above the horizon and black below: without anything in between it gives
-    an upward-facing share of 0.5 + 0.5 n_z, exactly BlinkGL's sky. The camera sees the background instead of the dome."""
+    """Sun without extent, and a dome that is white above the horizon and black below: without anything in between it
+    gives an upward-facing share of 0.5 + 0.5 n_z, exactly BlinkGL's sky. The camera sees
+    the background instead of the dome."""
     light = job["light"]
     if light["sun"] > 0:
         lamp = bpy.data.lights.new("sun", "SUN")
@@ -264,7 +267,8 @@ def make_camera(bpy, scene, job: dict):
 
 
 def adjust(scene, settings: dict) -> None:
-    """Plain radiance in 32-bit floats: no view transform, no denoiser, no clamping, no adaptive sampling; a box of one pixel."""
+    """Plain radiance in 32-bit floats: no view transform, no denoiser, no clamping, no
+    adaptive sampling; a box of one pixel."""
     render = scene.render
     render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
     render.image_settings.color_mode, render.image_settings.exr_codec = "RGBA", "NONE"

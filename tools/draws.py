@@ -3,10 +3,11 @@
     python -m blinkgl.tools.draws            # writes tests/golden/draws.json
     python -m blinkgl.tools.draws --check    # exit status 1 when that file is not what the code draws
 
-Published data sets are made again from their recipes, so textures, bodies, motions, worlds and the emulators' noise must not change by accident;
-when one is changed on purpose this file is written anew and its difference is reviewed. An array is told by its shape and four numbers (mean, standard
-deviation, two projections) to six digits, so that the last bits of another processor's libm do not matter; events, which are integers made by
-portable arithmetic, are told exactly.
+Published data sets are made again from their recipes, so textures, bodies, motions, worlds and the emulators' noise
+must not change by accident; when one is changed on purpose this file is written anew and its difference is reviewed. An
+array is told by its shape and four numbers (mean, standard deviation, two projections) to six digits, so that the last
+bits of another processor's libm do not matter; events, which are integers made by portable
+arithmetic, are told exactly.
 """
 
 from __future__ import annotations
@@ -103,7 +104,8 @@ def bodies() -> dict[str, Any]:
 
 
 def shapes() -> dict[str, Any]:
-    """Primitives of other parameters than the usual ones; meshes whose normals and texture coordinates are made here."""
+    """Primitives of other parameters than the usual ones; meshes whose normals and texture
+    coordinates are made here."""
     other = {"cuboid": dict(extents=(1.0, 2.0, 0.5), subdivisions=3), "cylinder": dict(radius=0.3, height=2.0, segments=7, rings=4), "sphere": dict(radius=2.0, segments=9, rings=5),
              "icosphere": dict(radius=1.5, subdivisions=2), "cone": dict(radius=0.7, height=0.4, segments=6, rings=3), "torus": dict(radius=2.0, tube=0.3, segments=8, tube_segments=5),
              "capsule": dict(radius=0.4, height=1.5, segments=7, rings=6), "prism": dict(sides=5, radius=1.2, height=0.6), "pyramid": dict(sides=3, radius=0.8, height=1.7),
@@ -132,7 +134,8 @@ def coarse() -> dict[str, Any]:
 
 
 def clip(frames: int = 6, height: int = 37, width: int = 45) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(frames, times ns, rates) of a random walk of 8-bit codes, looked up in a table that is exact on every machine."""
+    """(frames, times ns, rates) of a random walk of 8-bit codes, looked up in a table that
+    is exact on every machine."""
     dice = np.random.default_rng(4)
     codes = np.clip(np.cumsum(dice.integers(-40, 41, (frames, height, width)) * (dice.random((frames, height, width)) < 0.5), axis=0) + 120, 1, 255)
     return (codes.astype(np.float32) / np.float32(256)) ** 2, 7_123 + np.cumsum(dice.integers(10**6, 4 * 10**7, frames)), dice.integers(-64, 65, codes.shape).astype(np.float32)

@@ -1,18 +1,21 @@
-"""Random configurations, made from the models themselves: what is accepted can be drawn, generated and verified; all else is one line.
+"""Random configurations, made from the models themselves: what is accepted can be drawn,
+generated and verified; all else is one line.
 
     python -m blinkgl.tools.fuzz_configs [--seed 0] [--count 10000] [--runs 300] [--out out/fuzz_configs] [--json FILE]
-    python -m blinkgl.tools.fuzz_configs --seed 0 --only read:317        # one configuration again: its YAML, and its traceback
+    python -m blinkgl.tools.fuzz_configs --seed 0 --only read:317        # one configuration
+    again: its YAML, and its traceback
 
-``read``: a configuration with any keys at any legal value, ends of ranges first, distributions anywhere, presets, groups and --set
-overrides; half of them with one or two defects (a value out of range or of another type, a misspelt or foreign key, a malformed
-distribution). It is read as ``blinkgl generate`` reads it, and if that accepts it, a dozen of its sequences are drawn.
-``run``: the same without defects, with sizes and durations forced so small that a sequence takes a fraction of a second; what is
-accepted is generated and verified.
+``read``: a configuration with any keys at any legal value, ends of ranges first, distributions anywhere, presets,
+groups and --set overrides; half of them with one or two defects (a value out of range or of another type, a misspelt or
+foreign key, a malformed distribution). It is read as ``blinkgl generate`` reads it, and if that accepts it, a dozen of
+its sequences are drawn. ``run``: the same without defects, with sizes and durations forced so small that a sequence
+takes a fraction of a second; what is accepted is generated and verified.
 
-Everything but these is a defect, and exit status 1: an error that is no BlinkGLError, or has several lines; a refusal of something that
-was accepted before (but for bodies that touch at the start, or find no free space: that is known when the scene is built); a sequence that does not verify; a process that dies, needs more than --memory or more than --cpu processor seconds.
-Each failure is printed with the command that repeats it, and its YAML is kept in OUT. The same seed and version make the same
-configurations.
+Everything but these is a defect, and exit status 1: an error that is no BlinkGLError, or has several lines; a refusal
+of something that was accepted before (but for bodies that touch at the start, or find no free space: that is known when
+the scene is built); a sequence that does not verify; a process that dies, needs more than --memory or more than --cpu
+processor seconds. Each failure is printed with the command that repeats it, and its YAML is kept in OUT. The same seed
+and version make the same configurations.
 """
 
 from __future__ import annotations
@@ -495,7 +498,8 @@ def _cpu_seconds(pid: int) -> float:
 
 
 def fuzz(seed: int, count: int, runs: int, out: Path | None = None, *, memory_mb: int = 2000, cpu_s: float = 20.0, console: Console | None = None) -> dict[str, Any]:
-    """Tries ``count`` configurations to read and ``runs`` to generate; returns the report. The failures' YAML goes to ``out``."""
+    """Tries ``count`` configurations to read and ``runs`` to generate; returns the report.
+    The failures' YAML goes to ``out``."""
     console = console or plain_console(quiet=True)
     worker = Worker(seed, memory_mb, cpu_s)
     outcomes: list[Outcome] = []

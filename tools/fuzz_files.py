@@ -1,15 +1,18 @@
-"""Every file format that BlinkGL reads, damaged: mutants are read in processes that may die, under a clock and a memory limit.
+"""Every file format that BlinkGL reads, damaged: mutants are read in processes that may
+die, under a clock and a memory limit.
 
-    python -m blinkgl.tools.fuzz_files [--mutants 1000] [--formats "events*" "mesh*"] [--seed 0] [--out out/fuzz] [--json FILE]
-    python -m blinkgl.tools.fuzz_files --formats "mesh ply" --only 317        # one mutant again, with its traceback
+    python -m blinkgl.tools.fuzz_files [--mutants 1000] [--formats "events*" "mesh*"] [--seed 0] [--out out/fuzz]
+    [--json FILE] python -m blinkgl.tools.fuzz_files --formats "mesh ply" --only 317
+    # one mutant again, with its traceback
 
-What may come of a mutant: it is read (and what was read is looked at, see :mod:`blinkgl.tools.fuzz_formats`), or refused with the one
-line of the command line. Everything else is a defect: a traceback, a crash, more than --cpu seconds, more than --memory, a message of several
-lines, or a wrong answer that a check could have known. Defects are grouped by where they happen; the first mutants of each group are kept
-in OUT with the command that repeats them. The same seed and version make the same mutants. Exit status 1 when there are defects.
+What may come of a mutant: it is read (and what was read is looked at, see :mod:`blinkgl.tools.fuzz_formats`), or
+refused with the one line of the command line. Everything else is a defect: a traceback, a crash, more than --cpu
+seconds, more than --memory, a message of several lines, or a wrong answer that a check could have known. Defects are
+grouped by where they happen; the first mutants of each group are kept in OUT with the command that repeats them. The
+same seed and version make the same mutants. Exit status 1 when there are defects.
 
-The reading process is forked from one that has read the whole file before, and reads mutants one after the other until one of them is the
-end of it, so that a mutant costs milliseconds; no OpenGL is in it.
+The reading process is forked from one that has read the whole file before, and reads mutants one after the other until
+one of them is the end of it, so that a mutant costs milliseconds; no OpenGL is in it.
 """
 
 from __future__ import annotations
@@ -54,8 +57,8 @@ _BATCH = 50
 
 @dataclass(frozen=True)
 class Limits:
-    """cpu_s : processor seconds a mutant may take. wall_s : against waiting without working. memory_mb : beyond what the whole file takes;
-    at eight times that allocations fail, to protect the machine."""
+    """cpu_s : processor seconds a mutant may take. wall_s : against waiting without working. memory_mb : beyond what
+    the whole file takes; at eight times that allocations fail, to protect the machine."""
 
     cpu_s: int = 10
     wall_s: float = 60.0
@@ -89,8 +92,8 @@ class Report:
 
 
 def fuzz(fmt: Format, mutants: int, *, seed: int = 0, limits: Limits = Limits(), out: Path | None = None, only: int | None = None) -> Report:
-    """Reads ``mutants`` mutants of a format. ``out``: folder for those that show a defect. Raises RuntimeError when the whole file is not
-    read well, which is a fault of the table."""
+    """Reads ``mutants`` mutants of a format. ``out``: folder for those that show a defect. Raises RuntimeError when the
+    whole file is not read well, which is a fault of the table."""
     report = Report(fmt.name)
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="blinkgl-fuzz-") as scratch:
@@ -111,7 +114,8 @@ def fuzz(fmt: Format, mutants: int, *, seed: int = 0, limits: Limits = Limits(),
                 elif outcome.kind in DEFECTS:
                     _note(report, task, index, outcome, out)
                 if only is not None:
-                    print(f"{fmt.name} #{index}: {task.mutant(index)[2]} of {task.mutant(index)[0]}: {outcome.kind}: {outcome.detail}\n{outcome.trace}")
+                    print(f"{fmt.name} #{index}: {task.mutant(index)[2]} of {task.mutant(index)[0]}: {outcome.kind}: "
+                          f"{outcome.detail}\n{outcome.trace}")
     report.seconds = time.perf_counter() - start
     return report
 
@@ -134,7 +138,8 @@ class _Task:
         self.usual_mb = whole.peak_mb
 
     def mutant(self, index: int) -> tuple[str, bytes, str]:
-        """(file, damaged bytes, mutator's name) number ``index``; the first target gets half of the mutants and more."""
+        """(file, damaged bytes, mutator's name) number ``index``; the first target gets
+        half of the mutants and more."""
         rng = np.random.default_rng([self.seed, zlib.crc32(self.format.name.encode()), index])
         target = self.targets[0] if rng.random() < 0.5 else self.targets[int(rng.integers(len(self.targets)))]
         data, name = self.originals[target], ""
@@ -292,7 +297,8 @@ def show(reports: list[Report]) -> None:
     console.print(table)
     for r in reports:
         for what, found in sorted(r.defects.items(), key=lambda item: -item[1]["count"]):
-            console.print(f"{r.format}: {found['count']} x {what}\n    {found['message'].strip().splitlines()[-1][:200]}\n    {found['repeat']}", highlight=False, markup=False, soft_wrap=True)
+            console.print(f"{r.format}: {found['count']} x {what}\n    {found['message'].strip().splitlines()[-1][:200]}\n    "
+                          f"{found['repeat']}", highlight=False, markup=False, soft_wrap=True)
 
 
 def chosen(patterns: list[str]) -> list[Format]:

@@ -1,8 +1,9 @@
-"""The table of what :mod:`blinkgl.tools.fuzz_files` damages: how a small whole file is made, how BlinkGL reads it, what damage fits it.
+"""The table of what :mod:`blinkgl.tools.fuzz_files` damages: how a small whole file is made,
+how BlinkGL reads it, what damage fits it.
 
-``judge(folder)`` reads by the way the command line reads and looks at what came of it. It returns None, or in words what a check could
-have known and did not: events outside the sensor, a flow that is NaN and valid, values that are not those of the file. The judges
-use no reader of BlinkGL for what they compare with.
+``judge(folder)`` reads by the way the command line reads and looks at what came of it. It returns None, or in words
+what a check could have known and did not: events outside the sensor, a flow that is NaN and valid, values that are not
+those of the file. The judges use no reader of BlinkGL for what they compare with.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Format:
         return self.needs is None or importlib.util.find_spec(self.needs) is not None
 
 
-# ---- events --------------------------------------------------------------------------------------------------------------
+# ---- events ----------------------------------------------------------------------------------------------------------
 
 
 def _events(n: int = 400):
@@ -131,7 +132,7 @@ def _judge_events(name: str) -> Callable[[Path], str | None]:
     return judge
 
 
-# ---- flow, labels, frames --------------------------------------------------------------------------------------------------
+# ---- flow, labels, frames --------------------------------------------------------------------------------------------
 
 
 def _flow():
@@ -298,7 +299,7 @@ def _judge_labels(folder: Path) -> str | None:
     return "objects" if any(a.dtype.hasobject for a in found) else None
 
 
-# ---- scenes ----------------------------------------------------------------------------------------------------------------
+# ---- scenes ----------------------------------------------------------------------------------------------------------
 
 
 def _make_mesh(ending: str) -> Callable[[Path], list[str]]:
@@ -453,7 +454,7 @@ def _judge_texture(name: str) -> Callable[[Path], str | None]:
     return judge
 
 
-# ---- data sets and configurations ------------------------------------------------------------------------------------------
+# ---- data sets and configurations ------------------------------------------------------------------------------------
 
 _RECIPE = {
     "seed": 11, "camera": {"width": WIDTH, "height": HEIGHT, "fov": 60}, "time": {"duration": 0.1, "label_rate": 20},
@@ -697,7 +698,7 @@ def _judge_train_yaml(folder: Path) -> str | None:
     return None
 
 
-# ---- the table -------------------------------------------------------------------------------------------------------------
+# ---- the table -------------------------------------------------------------------------------------------------------
 
 _PNG = (*m.BLIND, m.png_chunks, m.png_chunks, m.png_chunks, m.png_chunks)
 _NPZ = (*m.BLIND, m.fields(m.zip_layout), m.fields(m.zip_layout), *[m.arrays] * 8)

@@ -1,7 +1,8 @@
-"""Ways to damage a file, each a pure function of (rng, bytes): blindly, in its numbers, and in what its format keeps where.
+"""Ways to damage a file, each a pure function of (rng, bytes): blindly, in its numbers,
+and in what its format keeps where.
 
-Every mutator returns the damaged bytes. Those that know a format undo what would hide the damage (a PNG's checksums, a GLB's lengths), so
-that the reader's later stages are reached. Used by :mod:`blinkgl.tools.fuzz_files`.
+Every mutator returns the damaged bytes. Those that know a format undo what would hide the damage (a PNG's checksums, a
+GLB's lengths), so that the reader's later stages are reached. Used by :mod:`blinkgl.tools.fuzz_files`.
 """
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ def fixed(*places: tuple[int, str]) -> Mutator:
     return fields(lambda _: list(places))
 
 
-# ---- trees ---------------------------------------------------------------------------------------------------------------
+# ---- trees -----------------------------------------------------------------------------------------------------------
 
 
 def _leaf(rng) -> Any:
@@ -232,7 +233,7 @@ def safetensors_values(rng, data):
     return _field(rng, data, at, "<f")
 
 
-# ---- images --------------------------------------------------------------------------------------------------------------
+# ---- images ----------------------------------------------------------------------------------------------------------
 
 
 def png_chunks(rng, data):
@@ -263,7 +264,7 @@ def png_chunks(rng, data):
     return data[:8] + b"".join(struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks)
 
 
-# ---- NumPy ---------------------------------------------------------------------------------------------------------------
+# ---- NumPy -----------------------------------------------------------------------------------------------------------
 
 
 def npy_header(rng, data):
@@ -359,7 +360,7 @@ def zip_layout(data):
     return places
 
 
-# ---- HDF5 ----------------------------------------------------------------------------------------------------------------
+# ---- HDF5 ------------------------------------------------------------------------------------------------------------
 
 
 def hdf5_layout(data):
@@ -369,7 +370,8 @@ def hdf5_layout(data):
 
 
 def hdf5_objects(rng, data):
-    """One data set replaced: type, shape, group, a link elsewhere, external storage, virtual, claims without data; or an attribute."""
+    """One data set replaced: type, shape, group, a link elsewhere, external storage, virtual,
+    claims without data; or an attribute."""
     import h5py
 
     stream = io.BytesIO(data)
@@ -414,7 +416,7 @@ def _closed(file, stream: io.BytesIO) -> bytes:
     return stream.getvalue()
 
 
-# ---- binary layouts that move --------------------------------------------------------------------------------------------
+# ---- binary layouts that move ----------------------------------------------------------------------------------------
 
 
 def box_layout(data):

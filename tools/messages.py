@@ -3,8 +3,9 @@
     python -m blinkgl.tools.messages            # writes tests/golden/messages.txt
     python -m blinkgl.tools.messages --check    # exit status 1 when that file is not what the sources say
 
-Collected from the sources, not by provoking them, so none is missing: every BlinkGLError that is made, and what the configuration's
-validators say. ``{…}`` stands where a value goes. Errors made by a helper that is given its sentence are listed where the helper is called.
+Collected from the sources, not by provoking them, so none is missing: every BlinkGLError that is made, and what the
+configuration's validators say. ``{…}`` stands where a value goes. Errors made by a helper that is given its sentence
+are listed where the helper is called.
 """
 
 from __future__ import annotations

@@ -1,22 +1,25 @@
 """A small mutation run: are there tests that notice when a line is wrong?
 
-    python -m blinkgl.tools.mutate --map                      # once per commit: which test runs which line (the suite under coverage)
-    python -m blinkgl.tools.mutate --count 200 --seed 1       # draw mutants, run the tests that reach each, print the survivors
-    python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py    # the mutants of a module, without running any
-    python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41 # those of a line
+    python -m blinkgl.tools.mutate --map                      # once per commit: which test
+                                                              runs which line (the suite under coverage)
+    python -m blinkgl.tools.mutate --count 200 --seed 1       # draw mutants, run the tests that reach each, print the
+    survivors python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py    # the mutants of a module, without
+    running any python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41 # those of a line
 
-A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is made in a copy of
-the tree, so nothing here is touched. The tests that reached its line run, its module's own first, until one fails (killed), the time is up
-(killed: "time"), or all passed (survived). Lines that no test reaches are survivors without a run. What coverage cannot see is
-compiled: a numba kernel is given all tests of its module's callers, a shader those of ``tests/render`` and
-``tests/extremes``.
+A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is
+made in a copy of the tree, so nothing here is touched. The tests that reached its line run, its module's own first,
+until one fails (killed), the time is up (killed: "time"), or all passed (survived). Lines that no test reaches are
+survivors without a run. What coverage cannot see is compiled: a numba kernel is given all tests of its module's
+callers, a shader those of ``tests/render`` and ``tests/extremes``.
 
-What takes time is starting, not testing. So the tests of a mutant run in a child of a process (``--serve``, one per copy) that has imported
-what the tree stands on (numpy, numba, pytest, ...) and nothing of the tree itself. A kernel's machine code is taken from the cache unless
-the edit can be in it: an edited kernel, a constant that kernels may hold, and the kernels of every module that imports it are compiled again.
+What takes time is starting, not testing. So the tests of a mutant run in a child of a process (``--serve``, one per
+copy) that has imported what the tree stands on (numpy, numba, pytest, ...) and nothing of the tree itself. A kernel's
+machine code is taken from the cache unless the edit can be in it: an edited kernel, a constant that kernels may hold,
+and the kernels of every module that imports it are compiled again.
 
-Exit status 1 when less than ``--at-least`` (0.9) of the mutants died. Mutants that change nothing a test could see (an estimate that only
-saves time, say) are listed with the reason in ``tools/mutants_equivalent.txt``, printed, and not counted.
+Exit status 1 when less than ``--at-least`` (0.9) of the mutants died. Mutants that change nothing a test could see (an
+estimate that only saves time, say) are listed with the reason in
+``tools/mutants_equivalent.txt``, printed, and not counted.
 """
 
 from __future__ import annotations
@@ -295,7 +298,8 @@ def drawn(count: int, seed: int) -> list[Mutant]:
 
 
 def make_map(jobs: str, tests: list[str]) -> None:
-    """Runs the suite under coverage and keeps who ran what, and how long it took. With ``tests``, adds those to what is known."""
+    """Runs the suite under coverage and keeps who ran what, and how long it took. With
+    ``tests``, adds those to what is known."""
     MAP.mkdir(parents=True, exist_ok=True)
     sources = {p: (ROOT / p).read_text() for room in ROOMS for p in modules(room)}
     known = sorted(MAP.glob("durations*.xml"))
@@ -316,7 +320,8 @@ def make_map(jobs: str, tests: list[str]) -> None:
 
 
 def _called_at_import(folder: Path) -> set[str]:
-    """Names of functions that are called when a module of ``blinkgl`` is imported: what they return may be a constant of a kernel."""
+    """Names of functions that are called when a module of ``blinkgl`` is imported: what they
+    return may be a constant of a kernel."""
     names = set()
 
     def visit(node) -> None:
@@ -363,8 +368,9 @@ class Kernels:
         return known
 
     def stale(self, mutant: Mutant) -> set[str]:
-        """Modules whose kernels may contain what the mutant changed. An edit inside a function that is not compiled and not called on
-        import reaches no kernel: those are compiled from other functions and from the constants of modules."""
+        """Modules whose kernels may contain what the mutant changed. An edit inside a function that is not compiled and
+        not called on import reaches no kernel: those are compiled from other functions and
+        from the constants of modules."""
         if not mutant.path.endswith(".py"):
             return set()
         tree = ast.parse((self.folder / mutant.path).read_text())
@@ -385,7 +391,8 @@ class Kernels:
 
 
 def _remembered(mutant: Mutant) -> bool:
-    """Whether the line is in a function whose results are kept: then only the first test that asked in a process ran it."""
+    """Whether the line is in a function whose results are kept: then only the first test
+    that asked in a process ran it."""
     tree = ast.parse((ROOT / mutant.path).read_text())
     return any(isinstance(node, ast.FunctionDef) and node.lineno <= mutant.line <= node.end_lineno and any("cache" in ast.unparse(d) for d in node.decorator_list)
                for node in ast.walk(tree) if not COMPILED.search(" ".join(ast.unparse(d) for d in getattr(node, "decorator_list", ()))))
@@ -428,7 +435,8 @@ class Reach:
         return self._anywhere[path]
 
     def tests(self, mutant: Mutant) -> list[str]:
-        """In the order in which they run: the module's own file, its room, the others; quick files and tests first. Empty: none reaches the line."""
+        """In the order in which they run: the module's own file, its room, the others; quick files and tests first.
+        Empty: none reaches the line."""
         if mutant.path in self.sources and self.sources[mutant.path] != (ROOT / mutant.path).read_text():
             raise SystemExit(f"{mutant.path} has changed since --map: run it again")
         if mutant.path.endswith(".glsl"):
@@ -466,8 +474,8 @@ class Reach:
         return 1 if file.parts[1] == ("render" if path.suffix == ".glsl" else path.parts[1]) else 2
 
     def _around(self, mutant: Mutant) -> list[str]:
-        """Coverage names the first line of a statement only. What runs when a module is imported (a default, a constant) concerns all
-        that use the module, shortest first."""
+        """Coverage names the first line of a statement only. What runs when a module is imported (a default, a
+        constant) concerns all that use the module, shortest first."""
         lines = self.lines(mutant.path)
         for line in range(mutant.line, 0, -1):
             if line in lines:
@@ -502,7 +510,8 @@ class Server:
 
 
 def serve() -> int:
-    """Reads orders from standard input, one JSON object a line; runs each in a child; answers "passed", "failed" or "time"."""
+    """Reads orders from standard input, one JSON object a line; runs each in a child;
+    answers "passed", "failed" or "time"."""
     here = str(ROOT / "tools")
     sys.path[:] = [p for p in sys.path if p != here]
     for name in PRELOADED:
@@ -569,8 +578,9 @@ def _run_tests(order: dict) -> int:
 
 
 class _Witness:
-    """A plugin of pytest that writes down which test failed, or which file could not be collected, and ends the process when a test takes
-    many times the processor time that it took once (``seconds``; ``spare_s`` more for kernels that have to be compiled)."""
+    """A plugin of pytest that writes down which test failed, or which file could not be collected, and ends the process
+    when a test takes many times the processor time that it took once (``seconds``; ``spare_s`` more
+    for kernels that have to be compiled)."""
 
     def __init__(self, path: Path, seconds: dict[str, float], spare_s: float):
         self.path, self.seconds, self.spare_s = path, seconds, spare_s
@@ -586,7 +596,8 @@ class _Witness:
 
 
 class Copy:
-    """A copy of the tree that a mutant lives in; ``blinkgl.shaders`` and its like are links to the copy's own folders."""
+    """A copy of the tree that a mutant lives in; ``blinkgl.shaders`` and its like are links
+    to the copy's own folders."""
 
     def __init__(self, folder: Path):
         self.folder = folder
@@ -603,8 +614,8 @@ class Copy:
         self.server = Server(folder)
 
     def run(self, tests: dict[str, float], spare_s: float, stale: set[str] = frozenset(), original: dict[str, str] | None = None) -> tuple[str, str]:
-        """("passed" | "failed" | "time", the test that failed, "" where the process died). ``tests``: with the seconds that each took.
-        ``original``: digests of the sources of files that were edited outside of kernels."""
+        """("passed" | "failed" | "time", the test that failed, "" where the process died). ``tests``: with the seconds
+        that each took. ``original``: digests of the sources of files that were edited outside of kernels."""
         failed = self.folder / "output.failed"
         failed.unlink(missing_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
@@ -663,7 +674,8 @@ def equivalent() -> dict[str, str]:
 def key_of(mutant: Mutant, source: str) -> str:
     """A mutant's name by the text of its line instead of the line's number, which moves."""
     line = source.splitlines()[mutant.line - 1]
-    return f"{mutant.path} | {line.strip()} | {mutant.column - (len(line) - len(line.lstrip()))}: {mutant.before} -> {mutant.after or '(nothing)'}"
+    return (f"{mutant.path} | {line.strip()} | {mutant.column - (len(line) - len(line.lstrip()))}: {mutant.before} -> "
+            f"{mutant.after or '(nothing)'}")
 
 
 def excuses(mutants: list[Mutant]) -> dict[str, str]:
@@ -737,7 +749,8 @@ def main(arguments: list[str] | None = None) -> int:
     survivors = [r for r in results if r["outcome"] in ("survived", "no test")]
     results = [r for r in results if r["outcome"] != "broken"]
     share = 1 - len(survivors) / max(len(results), 1)
-    print(f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as equivalent")
+    print(f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as "
+          "equivalent")
     print(*(f"survived: {r['name']}  ({r['outcome']}, {r['tests']} tests)" for r in sorted(survivors, key=lambda r: r["name"])), sep="\n")
     print(*(f"equivalent: {m.name}  ({reasons[m.name]})" for m in excused), sep="\n")
     return 0 if share >= options.at_least else 1

@@ -1,28 +1,33 @@
-"""A path tracer, Blender's Cycles, on the same scenes: what rasterising itself costs (shadows, inter-reflection, filtering).
+"""A path tracer, Blender's Cycles, on the same scenes: what rasterising itself costs
+(shadows, inter-reflection, filtering).
 
     cost = Cost()
-    for luminance in frames(scene, times_ns, CyclesSettings(samples=64), cost):     # (H, W) float32, one per time, as it is done
+    for luminance in frames(scene, times_ns, CyclesSettings(samples=64), cost):     # (H, W)
+    float32, one per time, as it is done
         ...
     cost.wall_s, cost.cpu_s                                                         # per frame
 
-Blender's Python module ``bpy`` (extra [cycles]) is GPL and wants NumPy 1: it is never imported here. The scene is written to a folder as
-plain files (:func:`export`), and ``cycles_worker.py`` renders it in a process of its own, with this interpreter or with the one
-that the environment variable BLINKGL_BPY_PYTHON names.
+Blender's Python module ``bpy`` (extra [cycles]) is GPL and wants NumPy 1: it is never imported here. The scene is
+written to a folder as plain files (:func:`export`), and ``cycles_worker.py`` renders it in a process of its own, with
+this interpreter or with the one that the environment variable BLINKGL_BPY_PYTHON names.
 
 The same picture, as far as two renderers can make it:
 
-* Geometry, shading normals, texture coordinates, poses and camera are converted, not approximated; Blender keeps them in float32, so the
-  scene is moved to the first camera's place. Textures are handed over as linear float32, so no transfer curve is involved,
-  filtered bilinearly without mip maps; the pixel is the mean over its square (box filter of 1 px).
-* The sun is a lamp without extent, the sky a dome that is white above the horizon and black below: unobstructed, exactly
-  ``sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)``. Obstructed it is not what BlinkGL draws: that is the measurement. ``shadows=False,
-  bounces=0`` is BlinkGL's own light model (the sky is evaluated, so nothing is noisy); ``bounces=0`` adds shadows of sun and dome; ``bounces > 0`` adds inter-reflection.
-* Sky boxes are pictures: the camera sees them, light passes through them. Other unlit surfaces cast shadows but do not shine on
-  anything, as in BlinkGL. Back faces of closed one-sided meshes are invisible to the camera alone.
-* What stays different: shading normals that point away from the side that is lit are treated more strictly by a path tracer (dark
-  terminators on coarse smooth meshes), the picture ends at a far plane (1e8 units), and a path-traced frame is noisy: the same seed in every
-  frame keeps the noise of still surfaces still.
-* EEVEE is here for its speed and for unlit pictures: its filter is narrow but not a box, and of its lit pictures nothing is claimed.
+* Geometry, shading normals, texture coordinates, poses and camera are converted, not approximated; Blender keeps them
+  in float32, so the scene is moved to the first camera's place. Textures are handed over as linear float32, so no
+  transfer curve is involved, filtered bilinearly without mip maps; the pixel is the mean
+  over its square (box filter of 1 px).
+* The sun is a lamp without extent, the sky a dome that is white above the horizon and black below: unobstructed,
+  exactly ``sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)``. Obstructed it is not what BlinkGL draws: that is the
+  measurement. ``shadows=False, bounces=0`` is BlinkGL's own light model (the sky is evaluated, so nothing is noisy);
+  ``bounces=0`` adds shadows of sun and dome; ``bounces > 0`` adds inter-reflection.
+* Sky boxes are pictures: the camera sees them, light passes through them. Other unlit surfaces cast shadows but do not
+  shine on anything, as in BlinkGL. Back faces of closed one-sided meshes are invisible to the camera alone.
+* What stays different: shading normals that point away from the side that is lit are treated more strictly by a path
+  tracer (dark terminators on coarse smooth meshes), the picture ends at a far plane (1e8 units), and a path-traced
+  frame is noisy: the same seed in every frame keeps the noise of still surfaces still.
+* EEVEE is here for its speed and for unlit pictures: its filter is narrow but not a box, and of
+  its lit pictures nothing is claimed.
 """
 
 from __future__ import annotations
@@ -46,15 +51,16 @@ from blinkgl.scene.types import Material, Scene
 
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 WORKER = Path(__file__).with_name("cycles_worker.py")
-REMEDY = (f"run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter in {ENVIRONMENT} "
-          "(or install it here)")
+REMEDY = ("run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter "
+          f"in {ENVIRONMENT} (or install it here)")
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
 CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
 class CyclesSettings:
-    """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome; False needs bounces=0.   bounces : of diffuse light.
+    """samples : paths per pixel.   seed : of all frames.   shadows : of sun and dome; False
+    needs bounces=0.   bounces : of diffuse light.
     engine : "cycles" or "eevee" (bounces and seed do nothing there).   threads : 0 for all."""
 
     samples: int = 64
@@ -77,8 +83,9 @@ class CyclesSettings:
 
 @dataclass
 class Cost:
-    """Filled while frames arrive: seconds per frame of rendering alone (wall, and processor time of all threads); setup_s, setup_cpu_s:
-    making the scene in Blender (not counted in the frames; the first frame also builds the acceleration structure)."""
+    """Filled while frames arrive: seconds per frame of rendering alone (wall, and processor time of all threads);
+    setup_s, setup_cpu_s: making the scene in Blender (not counted in the frames; the first frame
+    also builds the acceleration structure)."""
 
     blender: str = ""
     setup_s: float = 0.0
@@ -93,7 +100,8 @@ def interpreter() -> str:
 
 
 def available() -> str:
-    """'' when a bpy is there (not whether it loads: that takes seconds and is found out by using it), else a line that says what to do."""
+    """'' when a bpy is there (not whether it loads: that takes seconds and is found out by using
+    it), else a line that says what to do."""
     chosen = interpreter()
     if chosen == sys.executable:
         found = importlib.util.find_spec("bpy") is not None
@@ -126,8 +134,8 @@ def source(scene: Scene, settings: CyclesSettings = CyclesSettings(), cost: Cost
 def colours(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
     """Linear radiance at each time, (H, W, 3) float32, in the order of times_ns, each as soon as it is rendered.
 
-    One Blender process serves the iterator and ends with it, also when it is abandoned. Raises BlinkGLError (one line) when there is no
-    bpy, when it does not fit its interpreter, or when Blender stops.
+    One Blender process serves the iterator and ends with it, also when it is abandoned. Raises BlinkGLError (one line)
+    when there is no bpy, when it does not fit its interpreter, or when Blender stops.
     """
     require()
     cost = Cost() if cost is None else cost
@@ -175,13 +183,14 @@ def _answers(blender, folder: Path, log, count: int, cost: Cost) -> Iterator[np.
 
 
 def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, folder: Path) -> None:
-    """Writes job.json and job.npz, all that the worker reads. World axes are the scene's (z up in both), its origin the first camera's place.
+    """Writes job.json and job.npz, all that the worker reads. World axes are the scene's (z up in
+    both), its origin the first camera's place.
 
     job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky}; settings; frames;
-    materials [{texture index or null, base_color, unlit, culled}]; bodies [{name, picture_only, parts [[mesh, material], …]}].
-    job.npz, k counting what job.json refers to: vertices{k} (V, 3), normals{k} (V, 3), uvs{k} (V, 2) float32 with uv_scale in them and v
-    growing upwards, faces{k} (F, 3) int32; texture{k} (h, w, 3) float32 linear, row 0 at the top; poses (bodies, N, 4, 4)
-    and camera_poses (N, 4, 4) float64, the camera's in Blender's camera axes.
+    materials [{texture index or null, base_color, unlit, culled}]; bodies [{name, picture_only, parts [[mesh,
+    material], …]}]. job.npz, k counting what job.json refers to: vertices{k} (V, 3), normals{k} (V, 3), uvs{k} (V, 2)
+    float32 with uv_scale in them and v growing upwards, faces{k} (F, 3) int32; texture{k} (h, w, 3) float32 linear, row
+    0 at the top; poses (bodies, N, 4, 4) and camera_poses (N, 4, 4) float64, the camera's in Blender's camera axes.
     """
     times_ns = np.array(list(times_ns), np.int64)
     camera, arrays = scene.camera, {}
@@ -227,9 +236,10 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
 def blender_camera(camera: PinHole) -> dict[str, float | str]:
     """Blender's parameters of the same pin-hole.
 
-    With horizontal fit the sensor's width is W px; a pixel is as wide as the sensor / W, and pixel_aspect_y / pixel_aspect_x times as
-    high, so fx = lens W / sensor and fy = fx aspect_x / aspect_y. Shifts are in widths of the sensor, +x right, +y up, and move the frame
-    under the optical axis, which with our pixel convention stands at the picture's middle for cx = (W - 1) / 2.
+    With horizontal fit the sensor's width is W px; a pixel is as wide as the sensor / W, and pixel_aspect_y /
+    pixel_aspect_x times as high, so fx = lens W / sensor and fy = fx aspect_x / aspect_y. Shifts are in widths of the
+    sensor, +x right, +y up, and move the frame under the optical axis, which with our pixel convention stands at the
+    picture's middle for cx = (W - 1) / 2.
     """
     sensor, tall = 36.0, camera.fx / camera.fy
     return {
@@ -257,7 +267,8 @@ def _paint(material: Material, culled: bool, textures: _Numbered, arrays: dict) 
 
 
 def _blender_uvs(uvs: np.ndarray, uv_scale: tuple[float, float]) -> np.ndarray:
-    """(V, 2) float32. Whole repeats are taken off before the cast, so that a mesh with thousands of them has zero in its middle."""
+    """(V, 2) float32. Whole repeats are taken off before the cast, so that a mesh with
+    thousands of them has zero in its middle."""
     scaled = uvs.astype(np.float64) * uv_scale
     if len(scaled):
         scaled -= np.rint((scaled.min(axis=0) + scaled.max(axis=0)) / 2)

@@ -10,12 +10,13 @@ to an .npz of plain arrays and drawn by this file run as a program (``peer_pyren
 What pyrender does, as found by reading and trying version 0.1.45, and what is done about it here:
 
 * FLAT colour is ``texture * base_color``, clamped, in whatever encoding the texture has: no sRGB decoding and none
-  after. Textures become 8-bit. So textures are handed over as **linear** bytes, and its colours are linear * 255; a texture
-  that is 8-bit sRGB here is rounded once more on the way.
+  after. Textures become 8-bit. So textures are handed over as **linear** bytes, and its colours are linear * 255; a
+  texture that is 8-bit sRGB here is rounded once more on the way.
 * Every picture is drawn 4x multi-sampled, and the depth that comes back is that of one of the samples, not of the pixel
-  centre: wrong by up to 3/8 px on a slant. The SEG flag turns multi-sampling off, so depth and ids come from a SEG pass.
-* SEG culls back faces whatever the material says: two-sided surfaces are handed over with every face doubled. When it is
-  timed, which needs no SEG pass, they are double-sided by its own means instead.
+  centre: wrong by up to 3/8 px on a slant. The SEG flag turns multi-sampling off, so
+  depth and ids come from a SEG pass.
+* SEG culls back faces whatever the material says: two-sided surfaces are handed over with every face doubled. When it
+  is timed, which needs no SEG pass, they are double-sided by its own means instead.
 * Depth is a 24-bit standard depth buffer, linearised in float32. With an infinite far plane its step is
   2^-24 Z / near relative to Z: choose ``near`` close to the nearest thing (``near`` argument) to read depth.
 * Texture row 0 is turned to the bottom on upload, hence v -> 1 - v. Its principal point is measured from the image's
@@ -71,7 +72,8 @@ def measure(scene: Scene, times_ns, repeat: int = 3) -> dict:
 
 
 def export(scene: Scene, times_ns, near: float | None = None, double: bool = True, **more) -> dict[str, np.ndarray]:
-    """The scene as plain arrays: geometry once, poses for each time. double : two faces for one of a two-sided surface."""
+    """The scene as plain arrays: geometry once, poses for each time. double : two faces for
+    one of a two-sided surface."""
     camera, arrays = scene.camera, {}
     parts = [(thing, part) for thing in scene.objects for part in thing.parts]
     for k, (_, part) in enumerate(parts):

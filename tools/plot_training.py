@@ -2,8 +2,9 @@
 
     python -m blinkgl.tools.plot_training out/smoke --out curve.png [--scores out/smoke_scores]
 
-End-point error of the training batches (thin: as logged; thick: mean of the last ten lines), of the validation set with the averaged
-weights, and of zero flow there. --scores: a folder of ``eflow evaluate``; adds the constant-median baselines of that set.
+End-point error of the training batches (thin: as logged; thick: mean of the last ten lines), of the validation set with
+the averaged weights, and of zero flow there. --scores: a folder of ``eflow evaluate``; adds the
+constant-median baselines of that set.
 """
 
 from __future__ import annotations

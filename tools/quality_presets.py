@@ -1,9 +1,12 @@
-"""Writes configs/quality/*.yaml from a measurement, with the figures they were chosen by, and keeps the measurement beside them.
+"""Writes configs/quality/*.yaml from a measurement, with the figures they were chosen by, and
+keeps the measurement beside them.
 
     blinkgl trade configs/flying_objects.yaml --out out/trade
-    python -m blinkgl.tools.quality_presets out/trade/trade.json 'fast=NAME' 'balanced=NAME' 'accurate=NAME' 'reference=NAME' [--command TEXT]
+    python -m blinkgl.tools.quality_presets out/trade/trade.json 'fast=NAME' 'balanced=NAME' 'accurate=NAME'
+    'reference=NAME' [--command TEXT]
 
-NAME is a setting of that measurement that is on its front; anything else is refused. tests/trade/test_presets.py checks the result.
+NAME is a setting of that measurement that is on its front; anything else is refused.
+tests/trade/test_presets.py checks the result.
 """
 
 from __future__ import annotations
@@ -28,10 +31,14 @@ def preset_text(quality: str, row: dict, result: dict) -> str:
     """One preset file."""
     size = result["sizes"][result["size"]]
     tree = apply_overrides({"timeline": {}, "render": {}}, row["overrides"])
-    figures = [f"{row['name']}: {row['cpu_s']:.1f} processor seconds ({row['wall_s']:.1f} s by the clock) per simulated second, {row['frames_per_s']:.0f} frames/s;",
-               f"voxel grids differ from the reference's by {100 * row['voxel']:.1f} %; {100 * row['missed']:.1f} % of the events missed, {100 * row['extra']:.1f} % extra,",
-               f"count {100 * row['count']:+.1f} %; event times {row['time_median_us']:.0f} µs (median), {row['time_p95_us']:.0f} µs (95 %), i.e. {row['shift_median_px']:.3f} px",
-               f"and {row['shift_p95_px']:.3f} px. {size['width']}x{size['height']}, {result['date']}; whole measurement: measured.json, docs/trade.md."]
+    figures = [(f"{row['name']}: {row['cpu_s']:.1f} processor seconds ({row['wall_s']:.1f} s by the clock) per simulated "
+               f"second, {row['frames_per_s']:.0f} frames/s;"),
+               (f"voxel grids differ from the reference's by {100 * row['voxel']:.1f} %; {100 * row['missed']:.1f} % of "
+                f"the events missed, {100 * row['extra']:.1f} % extra,"),
+               (f"count {100 * row['count']:+.1f} %; event times {row['time_median_us']:.0f} µs (median), "
+               f"{row['time_p95_us']:.0f} µs (95 %), i.e. {row['shift_median_px']:.3f} px"),
+               (f"and {row['shift_p95_px']:.3f} px. {size['width']}x{size['height']}, {result['date']}; whole measurement: "
+               "measured.json, docs/trade.md.")]
     return f"# quality: {quality}\n" + "".join(f"# {line}\n" for line in figures) + to_yaml(tree)
 
 

@@ -1,11 +1,13 @@
 """Injects faults into real runs for as long as one likes, and checks that nothing shows in the end.
 
-    python -m blinkgl.tools.soak [--recipe configs/blinkflow_mini.yaml] [--tiny] [--rounds 3] [--faults kill-worker,disk-full,…] [--json FILE]
+    python -m blinkgl.tools.soak [--recipe configs/blinkflow_mini.yaml] [--tiny] [--rounds 3] [--faults
+    kill-worker,disk-full,…] [--json FILE]
 
 One uninterrupted run in one process is the reference. Then, per round and fault: a run with two workers, the fault at a
 random moment, ``--resume`` as often as it takes, ``verify --deep``, and a comparison of every byte outside ``.run``.
-Faults strike a run in its middle: when at least a third of its sequences is whole, and others are being written. How many were
-whole is said; a run that was over before is done again. ``--tiny``: sequences of a tenth of a second, for many rounds.
+Faults strike a run in its middle: when at least a third of its sequences is whole, and others are being written. How
+many were whole is said; a run that was over before is done again. ``--tiny``: sequences of a
+tenth of a second, for many rounds.
 
 | fault | what happens |
 |---|---|
@@ -75,8 +77,9 @@ class Soak:
         return sum((out / task.name / "manifest.json").is_file() for task in self.tasks)
 
     def wait_until_busy(self, driver: subprocess.Popen, out: Path, least: int | None = None) -> bool:
-        """At least ``least`` (default: a random number from a third of all on) sequences are whole and another is at work, for up to
-        as long as one takes; False when the run was over before. What was whole then is appended to ``struck``."""
+        """At least ``least`` (default: a random number from a third of all on) sequences are whole and another is at
+        work, for up to as long as one takes; False when the run was over before. What was
+        whole then is appended to ``struck``."""
         count = len(self.tasks)
         target = least if least is not None else self.dice.randint(-(-count // 3), max(-(-count // 3), count - 5))
         while driver.poll() is None:
@@ -312,7 +315,8 @@ def main() -> None:
         soak.reference_bytes = sum(p.stat().st_size for p in reference.rglob("*") if p.is_file())
         costs = [json.loads(line)["total_s"] for line in (reference / RUN_FOLDER / "costs.jsonl").read_text().splitlines()]
         soak.limit_s, soak.pace_s = max(10.0, 8 * max(costs)), sum(costs) / len(costs)
-        console.print(f"reference: {len(soak.tasks)} sequences, {soak.reference_bytes / 1e6:.1f} MB, {elapsed:.0f} s; time limit {soak.limit_s:.0f} s", highlight=False)
+        console.print(f"reference: {len(soak.tasks)} sequences, {soak.reference_bytes / 1e6:.1f} MB, {elapsed:.0f} s; time "
+                      f"limit {soak.limit_s:.0f} s", highlight=False)
         for round_number in range(arguments.rounds):
             for fault in faults:
                 with output_folder(soak, fault) as out:

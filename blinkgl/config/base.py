@@ -1,7 +1,7 @@
 """Base of every config model: what keys it has, what it checks, and errors in one line that a stranger understands.
 
-A model checks one value by its field, and several values *together* by a :func:`rule`, which is given the values of the keys
-that it names and nothing else:
+A model checks one value by its field, and several values *together* by a :func:`rule`, which is given the values of the
+keys that it names and nothing else:
 
     class AdaptiveTimeline(Config):
         min_step_us: float = Field(200.0, ge=0.001)
@@ -12,8 +12,9 @@ that it names and nothing else:
             if least > most:
                 raise Refused(f"min_step_us must not exceed max_step_us = {most}")
 
-So what is looked at together is known without running anything, and :mod:`blinkgl.config.corners` tries all combinations of
-the ends of those distributions alone. pydantic's own validators of whole models, which see everything, are refused.
+So what is looked at together is known without running anything, and :mod:`blinkgl.config.corners` tries all
+combinations of the ends of those distributions alone. pydantic's own validators of whole
+models, which see everything, are refused.
 """
 
 from __future__ import annotations
@@ -56,9 +57,9 @@ class Refused(ValueError):
 
 @dataclass(frozen=True)
 class Rule:
-    """``check`` of the values of ``keys``, paths below the rule's model. ``*`` in a key: all entries of a list or table, as a
-    tuple; a leading ``?``: whether there is a value (not null); a leading ``#``: the names in a table, or the numbers of a list's
-    entries, as a tuple. A key below something that is null is None."""
+    """``check`` of the values of ``keys``, paths below the rule's model. ``*`` in a key: all entries of a list or
+    table, as a tuple; a leading ``?``: whether there is a value (not null); a leading ``#``: the names in a table, or
+    the numbers of a list's entries, as a tuple. A key below something that is null is None."""
 
     keys: tuple[str, ...]
     check: Callable[..., None]
@@ -116,8 +117,8 @@ class Config(BaseModel):
 
 
 def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:
-    """Annotation of a field that is one of ``models``, told apart by the value of the key ``tag``; where that key is not given
-    it is ``default``, so that a table may say only what it changes."""
+    """Annotation of a field that is one of ``models``, told apart by the value of the key ``tag``; where that key is
+    not given it is ``default``, so that a table may say only what it changes."""
     union: Any = typing.Union[models]  # type: ignore[not-a-type]  # noqa: UP007 - of as many as there are
     if default is None:
         return Annotated[union, Discriminator(tag)]
@@ -132,8 +133,8 @@ M = TypeVar("M", bound=Config)
 
 
 class Members(Generic[M]):
-    """Models told apart by the value of their key ``tag`` (``default`` where that is not given), in the order in which they were
-    added. More may be added at any time: see :class:`Family`."""
+    """Models told apart by the value of their key ``tag`` (``default`` where that is not given), in the order in which
+    they were added. More may be added at any time: see :class:`Family`."""
 
     def __init__(self, tag: str, default: str):
         self.tag, self.default = tag, default
@@ -168,9 +169,10 @@ def stands_for_many(annotation: Any) -> bool:
 
 
 class Family(Config):
-    """A model that stands for all that are in its ``members``: a field annotated by it takes any of those. Which there are is looked
-    up when a value is validated and when the models are walked (:func:`members`), not when the field's model is made; so one that is
-    added later counts as much as the first. Members are subclasses of it, by which they are known to share what it declares."""
+    """A model that stands for all that are in its ``members``: a field annotated by it takes any of those. Which there
+    are is looked up when a value is validated and when the models are walked (:func:`members`), not when the field's
+    model is made; so one that is added later counts as much as the first. Members are subclasses of it, by which they
+    are known to share what it declares."""
 
     members: ClassVar[Members[Any]]
 
@@ -186,8 +188,9 @@ class Family(Config):
 
 
 class Growing(Config):
-    """A model whose keys may be added to and taken away at any time. What keys it has is looked up when a value is validated, so that
-    models with a field of it (``labels: Labels = Field(default_factory=Labels)``) need not be made again."""
+    """A model whose keys may be added to and taken away at any time. What keys it has is looked up when a value is
+    validated, so that models with a field of it
+    (``labels: Labels = Field(default_factory=Labels)``) need not be made again."""
 
     _made: ClassVar[bool] = False
 
@@ -198,8 +201,8 @@ class Growing(Config):
 
     @classmethod
     def add_key(cls, name: str, annotation: Any, info: FieldInfo, before: str | None = None) -> None:
-        """before : key that it is to stand in front of; default: it is the last. Raises TypeError for a name that is taken, or that a model
-        cannot have as a key."""
+        """before : key that it is to stand in front of; default: it is the last. Raises TypeError for a name that is
+        taken, or that a model cannot have as a key."""
         if name in cls.model_fields or not name.isidentifier() or name.startswith("_") or hasattr(BaseModel, name):
             raise TypeError(f"'{name}' " + ("is a key already" if name in cls.model_fields else "cannot be a key"))
         fields = {**cls.model_fields, name: FieldInfo.from_annotated_attribute(annotation, info)}
@@ -263,7 +266,8 @@ def is_model(annotation: Any) -> bool:
 
 
 def below(annotation: Any, step: str | int) -> list[Any]:
-    """Annotations of what stands at key or index ``step`` ("*": any) of a value of ``annotation``; [] where nothing can."""
+    """Annotations of what stands at key or index ``step`` ("*": any) of a value of
+    ``annotation``; [] where nothing can."""
     if is_model(annotation):
         info = annotation.model_fields.get(step)
         return [] if info is None else members(info.annotation)
@@ -351,8 +355,8 @@ PROBLEMS = {
     "greater_than": "too small", "greater_than_equal": "too small", "less_than": "too large", "less_than_equal": "too large",
     "multiple_of": "not a multiple",
 }
-"""What pydantic's types of error are in plain words; `missing`, `extra_forbidden`, `value_error` and the tags of unions are
-put into words where they are translated."""
+"""What pydantic's types of error are in plain words; `missing`, `extra_forbidden`, `value_error` and the tags of unions
+are put into words where they are translated."""
 
 
 def _translate(model: type[BaseModel], error: ValidationError, where: str, start: Path = ()) -> ConfigError:
@@ -403,8 +407,8 @@ def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseMode
 
 
 def _locate(model: type[BaseModel], loc: tuple, kind: str) -> tuple[list[str], list[type[BaseModel]], list[Any], FieldInfo | None]:
-    """Config path of a pydantic location without the labels that pydantic inserts for members of unions; the models that may
-    own its last key; the annotations that are accepted there; and the field that they are of."""
+    """Config path of a pydantic location without the labels that pydantic inserts for members of unions; the models
+    that may own its last key; the annotations that are accepted there; and the field that they are of."""
     path: list[str] = []
     here: list[Any] = members(model)
     owners: list[type[BaseModel]] = []

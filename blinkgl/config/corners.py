@@ -1,16 +1,18 @@
-"""Which plain configurations stand for all that a template can draw, so that a template is accepted or refused when it is read.
+"""Which plain configurations stand for all that a template can draw, so that a template is
+accepted or refused when it is read.
 
 A sequence draws every distribution of its template. That no draw is refused for its range follows from checking, for
 everything that looks at values, all combinations of the *ends* of the distributions that it looks at together:
 
-- a field looks at its own value (for a list, at all its entries); besides both ends a value between them is tried, since
-  2.5 is no number of objects though 2 and 3 are;
+- a field looks at its own value (for a list, at all its entries); besides both ends a value between them is tried,
+  since 2.5 is no number of objects though 2 and 3 are;
 - a rule looks at the keys it names (:func:`blinkgl.config.base.rule`; it is given nothing else);
-- what a key means hangs on the ``kind`` of its table, on a ``preset`` beside it, and on what fills it in when it is not said
-  (:class:`Fill`: ``quality``, ``sensor``); and on every choice that it stands in.
+- what a key means hangs on the ``kind`` of its table, on a ``preset`` beside it, and on what fills it in when it is not
+  said (:class:`Fill`: ``quality``, ``sensor``); and on every choice that it stands in.
 
-Everything else stays at its first option. So forty distributions of forty independent keys cost a hundred configurations,
-not 2^40. That the ends are enough holds for conditions that are monotone or convex in each value alone, as all of ours are.
+Everything else stays at its first option. So forty distributions of forty independent keys cost a hundred
+configurations, not 2^40. That the ends are enough holds for conditions that are monotone or
+convex in each value alone, as all of ours are.
 """
 
 from __future__ import annotations
@@ -31,8 +33,8 @@ MOST = 4096
 class Fill:
     """Values laid under what a configuration says: ``values(*reads)`` returns a tree of them.
 
-    reads, writes : dotted keys from the top. ``values`` is given what the tree says at ``reads`` (None: nothing) and nothing
-    else, and may return keys at or below ``writes`` only."""
+    reads, writes : dotted keys from the top. ``values`` is given what the tree says at ``reads`` (None: nothing) and
+    nothing else, and may return keys at or below ``writes`` only."""
 
     reads: tuple[str, ...]
     writes: tuple[str, ...]
@@ -69,8 +71,8 @@ def _lay(under: Any, over: Any) -> Any:
 
 
 def sites(tree: Any) -> list[Path]:
-    """Paths of all distributions, those inside the choices of others included, outermost first. Raises ConfigError for a
-    malformed one."""
+    """Paths of all distributions, those inside the choices of others included, outermost first. Raises ConfigError for
+    a malformed one."""
     found: dict[Path, None] = {}
 
     def walk(node: Any, path: Path) -> None:
@@ -89,7 +91,8 @@ def sites(tree: Any) -> list[Path]:
 def corners(model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Iterator[Any]:
     """Plain trees that stand for all that ``tree`` can draw, as this module says; the first has every first option.
 
-    Raises ConfigError: a malformed distribution, or more than ``MOST`` combinations that have to be looked at together."""
+    Raises ConfigError: a malformed distribution, or more than ``MOST`` combinations that have
+    to be looked at together."""
     every = sites(tree)
     if not every:
         yield tree
@@ -105,14 +108,15 @@ def corners(model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Ite
 
 
 def corners_of(keys: tuple[str, ...], model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Iterator[Any]:
-    """Plain trees with every combination of the ends of the distributions at or below ``keys``, and of what those hang on."""
+    """Plain trees with every combination of the ends of the distributions at or below
+    ``keys``, and of what those hang on."""
     every = sites(tree)
     yield from combinations(tree, _together([(tuple(key.split(".")), True) for key in keys], model, every, fills))
 
 
 def combinations(tree: Any, group: frozenset[Path], between: Path | None = None) -> Iterator[Any]:
-    """``tree`` with every combination of options of the distributions at the paths in ``group``, the first option of all
-    others. ``between``: the one of which a value inside the range is an option, too."""
+    """``tree`` with every combination of options of the distributions at the paths in ``group``, the first option of
+    all others. ``between``: the one of which a value inside the range is an option, too."""
     number = _count(tree, (), group)
     if number > MOST:
         raise ConfigError("too many distributions are looked at together", where=", ".join(sorted(".".join(p) for p in group))[:200],
@@ -173,7 +177,8 @@ def _related(site: Path, key: Path, deep: bool) -> bool:
 
 
 def _together(keys: list[tuple[Path, bool]], model: type[Config], every: list[Path], fills: tuple[Fill, ...]) -> frozenset[Path]:
-    """The distributions that decide the values of ``keys`` (path, whether with all below it), directly or by what those hang on."""
+    """The distributions that decide the values of ``keys`` (path, whether with all below
+    it), directly or by what those hang on."""
     wanted = dict.fromkeys(keys)
     queue = list(wanted)
     while queue:
@@ -219,7 +224,8 @@ def _has_models(annotation: Any) -> bool:
 
 
 def placed_rules(model: type[Config]) -> tuple[tuple[Path, Rule], ...]:
-    """Every rule of ``model`` and of the models below it, with the path of the model that it belongs to ("*": any entry)."""
+    """Every rule of ``model`` and of the models below it, with the path of the model that it
+    belongs to ("*": any entry)."""
     found: list[tuple[Path, Rule]] = []
 
     def walk(annotation: Any, path: Path) -> None:

@@ -11,8 +11,8 @@ the drawn value is what the sequence's own ``config.yaml`` records:
     events: {shares: [{share: 0.8, value: {emulator: v2e}}, {share: 0.2, value: {emulator: voltmeter}}]}
 
 ``shares`` deals its values out instead of rolling dice: among any n sequences that follow one another, each value comes
-up as often as its share says, give or take a few (the additive recurrence of the golden ratio, from a seeded start). Its
-shares have to sum to 1.
+up as often as its share says, give or take a few (the additive recurrence of the golden ratio, from a seeded start).
+Its shares have to sum to 1.
 
 Each path draws from its own stream (seed, sequence, path), so adding one distribution changes no other draw.
 """
@@ -45,8 +45,8 @@ def draw(tree: Any, seed: int, sequence: int) -> Any:
 
 
 def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) -> list[Any]:
-    """What stands for all that the distribution ``node`` can draw: both ends of a range, every choice. ``between``: also a value
-    inside the range. Raises ConfigError (with the path) for a malformed one."""
+    """What stands for all that the distribution ``node`` can draw: both ends of a range, every choice. ``between``:
+    also a value inside the range. Raises ConfigError (with the path) for a malformed one."""
     kind, spec = next(iter(node.items()))
     _check(path, kind, spec)
     if kind == "shares":

@@ -1,7 +1,8 @@
 """Event emulators: parameters, units, defaults and where each comes from.
 
-``emulator`` picks the model; ``preset`` fills in published parameter sets, and any key given beside it wins over the preset.
-What configuration has to know of an emulator stands in its model here; what runs, and the table of both, in :mod:`blinkgl.events.table`.
+``emulator`` picks the model; ``preset`` fills in published parameter sets, and any key given beside it wins over the
+preset. What configuration has to know of an emulator stands in its model here; what runs, and the
+table of both, in :mod:`blinkgl.events.table`.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
 class EmulatorConfig(Family):
-    """The configuration of any emulator; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its name,
-    ``emulator: Literal["..."] = "..."``, takes no argument without a default, and says what stands here."""
+    """The configuration of any emulator; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its
+    name, ``emulator: Literal["..."] = "..."``, takes no argument without a default, and says what stands here."""
 
     members: ClassVar[Members[EmulatorConfig]] = Members("emulator", default="esim")
 

@@ -1,4 +1,5 @@
-"""``frames:`` section: sequences converted from recorded or rendered frames, such as TartanAir's, instead of from a scene."""
+"""``frames:`` section: sequences converted from recorded or rendered frames, such as
+TartanAir's, instead of from a scene."""
 
 from __future__ import annotations
 
@@ -37,5 +38,5 @@ class FramesConfig(Config):
 def check_span(frames: int, fps: float) -> None:
     """Refuses ``frames`` frames at ``fps`` that are longer than one event file can hold."""
     if (frames - 1) / fps > MAX_SPAN_S:
-        raise Refused(f"{frames} frames at this rate last {(frames - 1) / fps:.6g} s, more than the {MAX_SPAN_S:.1f} s that an event "
-                      "file can hold", where="fps", value=fps, accepted=f"at least {(frames - 1) / MAX_SPAN_S:.4g}, or fewer frames")
+        raise Refused(f"{frames} frames at this rate last {(frames - 1) / fps:.6g} s, more than the {MAX_SPAN_S:.1f} s that an "
+                      "event file can hold", where="fps", value=fps, accepted=f"at least {(frames - 1) / MAX_SPAN_S:.4g}, or fewer frames")

@@ -1,4 +1,5 @@
-"""``labels:``, whose keys come from the table of labels (:mod:`blinkgl.labels`): a label that is registered has its key here from then on."""
+"""``labels:``, whose keys come from the table of labels (:mod:`blinkgl.labels`): a label that is
+registered has its key here from then on."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ from blinkgl.config.base import Config
 
 
 class LodConfig(Config):
-    """Level of detail: meshes are decimated until their triangles are not far below a pixel. The level is chosen once per object and
-    sequence, from the nearest the object comes; frames and labels use the same meshes."""
+    """Level of detail: meshes are decimated until their triangles are not far below a pixel. The level is chosen once
+    per object and sequence, from the nearest the object comes; frames and labels use the same meshes."""
 
     enabled: bool = Field(False, description="false: every mesh as it is")
     edge_px: float = Field(8.0, ge=0.1, le=1000, description="edges are at most this long in the image (in the mean over a mesh, where it is nearest), px")

@@ -25,8 +25,8 @@ def _shipped(name: str) -> dict[str, Any]:
 
 
 def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any) -> dict[str, Any]:
-    """The preset's values for a configuration with this timeline.kind, events.emulator and frames (None: not said); none where
-    ``quality`` names no known one.
+    """The preset's values for a configuration with this timeline.kind, events.emulator and frames (None: not said);
+    none where ``quality`` names no known one.
 
     A timeline of another kind than the preset's takes the preset's reconstruction alone: the other values
     mean nothing to it. Emulators that cannot follow the preset's reconstruction take everything but that."""

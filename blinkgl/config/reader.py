@@ -1,9 +1,11 @@
-"""The one place that knows YAML: text in, plain data out (tables with text keys, lists, text, numbers, true/false, null), and back.
+"""The one place that knows YAML: text in, plain data out (tables with text keys, lists, text,
+numbers, true/false, null), and back.
 
-Whoever wrote the file may be a stranger, so what a file may cost is bounded before it is built: its size, its depth, the
-length of its numbers, and the number of values *after* aliases and merge keys are expanded (a few hundred bytes of aliases
-to aliases make billions). Plain tags only; a key given twice in one table is an error; a table may override what its merge
-key (``<<: *base``) brings. Dates are text, since nothing here is a date. ``1e-4`` is text in YAML 1.1: the models convert it.
+Whoever wrote the file may be a stranger, so what a file may cost is bounded before it is built: its size, its depth,
+the length of its numbers, and the number of values *after* aliases and merge keys are expanded (a few hundred bytes of
+aliases to aliases make billions). Plain tags only; a key given twice in one table is an error; a table may override
+what its merge key (``<<: *base``) brings. Dates are text, since nothing here is a date. ``1e-4``
+is text in YAML 1.1: the models convert it.
 """
 
 from __future__ import annotations
@@ -76,7 +78,8 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
             raise ComposerError(None, None, f"more than {MAX_VALUES} values, aliases expanded", event.start_mark)
 
     def plain_map(self, node: MappingNode) -> dict[str, Any]:
-        """Table of a mapping. The keys are constructed before merge keys are flattened: only the table's own may clash."""
+        """Table of a mapping. The keys are constructed before merge keys are flattened:
+        only the table's own may clash."""
         if not isinstance(node, MappingNode):
             raise ConstructorError(None, None, "not a table", node.start_mark)
         self._refuse_twice(node)
@@ -103,8 +106,8 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
         return key
 
     def plain_scalar(self, node: ScalarNode) -> Any:
-        """Text, number, true/false or null, by its tag. No one writes a number of a hundred digits, and Python will not print
-        one of five thousand."""
+        """Text, number, true/false or null, by its tag. No one writes a number of a hundred digits, and Python will not
+        print one of five thousand."""
         kind = node.tag.rpartition(":")[2]
         if kind in ("int", "float") and len(node.value) > MAX_DIGITS:
             raise ConstructorError(None, None, f"a number of {len(node.value)} digits", node.start_mark)
@@ -127,7 +130,8 @@ _Loader.yaml_constructors[None] = SafeConstructor.construct_undefined
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """Plain data from YAML text (None for an empty one); ConfigError with line and column when it is not YAML, or too much of it.
+    """Plain data from YAML text (None for an empty one); ConfigError with line and column
+    when it is not YAML, or too much of it.
 
     where : file or option, for the message."""
     if len(text) > MAX_BYTES:

@@ -38,7 +38,8 @@ def _as_list(value: Any) -> Any:
 
 
 def _one_of(words: tuple, kinds: tuple[str, ...] = ()):
-    """Refuses what is neither one of ``words`` nor a list of ``kinds``: pydantic would name the union's first member only."""
+    """Refuses what is neither one of ``words`` nor a list of ``kinds``: pydantic would name
+    the union's first member only."""
     def check(value: Any) -> Any:
         listed = isinstance(value, (list, tuple)) and kinds
         if not (any(value is w or (isinstance(w, str) and value == w) for w in words) or (listed and all(v in kinds for v in value))):
@@ -73,7 +74,8 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 PositiveRange = Annotated[tuple[Positive, Positive], BeforeValidator(_as_pair), AfterValidator(_ordered)]
 Paths = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
 Vector3 = tuple[float, float, float]
-# At 1e9 units float64 still tells 1e-7 units apart; beyond, a unit was mistaken, and float32 matrices would overflow in the end.
+# At 1e9 units float64 still tells 1e-7 units apart; beyond, a unit was mistaken, and float32 matrices would overflow in
+# the end.
 Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
 Position = tuple[Coordinate, Coordinate, Coordinate]
 Repeats = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -276,8 +278,8 @@ class KeyedMotionConfig(PoseConfig):
                 continue
             steps = [abs(v - u) for u, v in zip(eulers[k] or (0, 0, 0), eulers[k + 1] or (0, 0, 0))]
             if max(steps) >= 180:
-                raise Refused(f"euler changes by {max(steps):g} degrees about {'xyz'[steps.index(max(steps))]} from key frame {k} to {k + 1}; "
-                              "it must be less than 180 (add key frames in between)")
+                raise Refused(f"euler changes by {max(steps):g} degrees about {'xyz'[steps.index(max(steps))]} from key frame "
+                              f"{k} to {k + 1}; it must be less than 180 (add key frames in between)")
 
 
 class MeshConfig(Config):
@@ -349,7 +351,8 @@ def _known(used, known, key: str, table: str, at=None) -> None:
 
 
 def object_names(names: Iterable[str | None], meshes: Iterable[str]) -> list[str]:
-    """Names of an explicit scene's objects: as given (None: not), else the mesh's, with the object's number where that is taken."""
+    """Names of an explicit scene's objects: as given (None: not), else the mesh's, with the
+    object's number where that is taken."""
     made: list[str] = []
     for number, (name, mesh) in enumerate(zip(names, meshes)):
         name = name or (mesh if mesh not in made else f"{mesh}#{number}")

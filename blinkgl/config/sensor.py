@@ -99,7 +99,8 @@ def _shipped(known: str) -> SensorConfig:
 
 
 def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
-    """What the sensor called ``sensor`` says about a configuration with ``emulator`` (None: the default one); nothing for an unknown one."""
+    """What the sensor called ``sensor`` says about a configuration with ``emulator`` (None: the
+    default one); nothing for an unknown one."""
     if known_sensor(sensor) is None:
         return {}
     camera = load_sensor(sensor)

@@ -1,8 +1,8 @@
 """The whole configuration of a generation run, and of one sequence of it.
 
 ``load_run(path, overrides)`` reads a YAML file; ``RunTemplate.sequence(i)`` draws the i-th sequence's parameters
-and returns a frozen, validated :class:`SequenceConfig` of plain values. What can be drawn is checked when the file is read
-(:mod:`blinkgl.config.corners`).
+and returns a frozen, validated :class:`SequenceConfig` of plain values. What can be drawn is checked when the file is
+read (:mod:`blinkgl.config.corners`).
 """
 
 from __future__ import annotations
@@ -65,14 +65,16 @@ class CameraConfig(Config):
         return replace(centred, **{key: value for key in ("cx", "cy") if (value := getattr(self, key)) is not None})
 
     def scaled(self, factor: float) -> dict[str, Any]:
-        """The keys of a camera that sees the same with ``factor`` times the pixels in x and y, as near as whole pixels come to it."""
+        """The keys of a camera that sees the same with ``factor`` times the pixels in x and y,
+        as near as whole pixels come to it."""
         said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
         said |= {"focal": self.focal * factor} if self.focal is not None else {"fov": self.fov} if self.fov is not None else {}
         return {"width": max(1, round(self.width * factor)), "height": max(1, round(self.height * factor)), "near": self.near, **said}
 
 
 def camera_radius(camera: CameraModel, clearance: float) -> float:
-    """How far a random world's camera keeps from everything: its clearance, or a little more than the near plane's corners."""
+    """How far a random world's camera keeps from everything: its clearance, or a little more
+    than the near plane's corners."""
     return max(clearance, 1.01 * camera.near_corner)
 
 
@@ -92,8 +94,8 @@ class TimeConfig(Config):
         if duration * rate > MAX_LABELS:
             raise Refused(f"{duration * rate:.0f} labels", where="label_rate", value=rate, accepted=f"duration * label_rate of at most {MAX_LABELS}")
         if span_s(duration, rate) > MAX_SPAN_S:
-            raise Refused(f"with one label interval before and one after, {span_s(duration, rate):.6g} s are more than the {MAX_SPAN_S:.1f} s "
-                          "(71.6 minutes) that an event file can hold", where="duration", value=duration,
+            raise Refused(f"with one label interval before and one after, {span_s(duration, rate):.6g} s are more than the "
+                          f"{MAX_SPAN_S:.1f} s (71.6 minutes) that an event file can hold", where="duration", value=duration,
                           accepted="a shorter one, or more sequences")
 
     @property
@@ -123,7 +125,8 @@ class TimeConfig(Config):
 
 
 def span_s(duration: float, label_rate: float) -> float:
-    """From the start of the pre-roll to the end of the last label's interval, s; at most half a label more than it is."""
+    """From the start of the pre-roll to the end of the last label's interval, s; at most
+    half a label more than it is."""
     return duration + 1 / label_rate
 
 
@@ -134,9 +137,9 @@ ImageAntialiasing = Literal["none", "msaa4", "ssaa2", "ssaa4"]
 class RenderConfig(Config):
     """How a frame is drawn."""
 
-    antialiasing: Antialiasing = Field("none", description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel), taps4 textures (4 "
-                                       "lookups a pixel); ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. Costs: "
-                                       "docs/results.md")
+    antialiasing: Antialiasing = Field("none", description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel), taps4 textures (4 lookups a "
+                                                           "pixel); ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. "
+                                                           "Costs: docs/results.md")
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
     anisotropy: float = Field(1.0, ge=1, le=16, description="texture anisotropy, 1 is off (halves the rate on software GL)")
     mip_bias: float = Field(0.0, ge=-8, le=8, description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more")
@@ -220,8 +223,8 @@ class SequenceConfig(Config):
         least = camera_radius(camera.model, clearance)
         if least > height:
             raise Refused("the region is too low for a camera that keeps this far from everything", where="scene.region.height", value=height,
-                          accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near plane's corners: camera.near "
-                          "and camera.fov)")
+                          accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
+                                   "plane's corners: camera.near and camera.fov)")
 
 
 FILLS = (
@@ -254,8 +257,8 @@ class RunTemplate:
         return validate_field(SequenceConfig, "seed", self.tree.get("seed", 0))
 
     def check(self) -> SequenceConfig:
-        """Validates what stands for all that can be drawn, in every group; returns the first. Raises ConfigError before any
-        work starts."""
+        """Validates what stands for all that can be drawn, in every group; returns the first. Raises ConfigError before
+        any work starts."""
         if "groups" in self.tree:
             from blinkgl.config.recipe import all_groups
 
@@ -279,7 +282,8 @@ class RunTemplate:
 
 
 def _validated(tree: dict[str, Any]) -> SequenceConfig:
-    """SequenceConfig of plain data, with the values of a named quality and sensor filled in where the tree says nothing."""
+    """SequenceConfig of plain data, with the values of a named quality and sensor filled in
+    where the tree says nothing."""
     for fill in FILLS:
         tree = fill(tree)
     return validate(SequenceConfig, tree)

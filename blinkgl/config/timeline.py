@@ -12,9 +12,10 @@ from blinkgl.config.events import followers
 
 class _Timeline(Config):
     reconstruction: Literal["linear", "pchip", "hermite"] = Field(
-        "linear", description="log intensity between two frames. linear: straight lines. pchip: monotone cubics over the neighbouring frames, free "
-        "of rendering. hermite: monotone cubics with dL/dt from the shader, which makes frames dearer and fewer enough. "
-        f"The cubics are for `events.emulator: {' or '.join(followers('pchip'))}`")
+        "linear", description="log intensity between two frames. linear: straight lines. pchip: monotone cubics over the "
+                              "neighbouring frames, free of rendering. hermite: monotone cubics with dL/dt from the "
+                              "shader, which makes frames dearer and fewer enough. The cubics are for `events.emulator: "
+                              f"{' or '.join(followers('pchip'))}`")
 
 
 class UniformTimeline(_Timeline):
@@ -36,7 +37,8 @@ class _AdaptiveTimeline(_Timeline):
 
 
 class DisplacementTimeline(_AdaptiveTimeline):
-    """Event frames so far apart that pixels move no more than ``max_px`` from one to the next, by the speeds at both ends of the step."""
+    """Event frames so far apart that pixels move no more than ``max_px`` from one to the next, by
+    the speeds at both ends of the step."""
 
     kind: Literal["displacement"] = "displacement"
     max_px: float = Field(0.5, gt=0, le=1e4, description="displacement between two frames, px, that the percentile keeps to")
@@ -45,8 +47,8 @@ class DisplacementTimeline(_AdaptiveTimeline):
 
 
 class BrightnessTimeline(_AdaptiveTimeline):
-    """Event frames so far apart that the signal changes by no more than a fraction of the contrast threshold, by |dL/dt| from the
-    shader at both ends of the step."""
+    """Event frames so far apart that the signal changes by no more than a fraction of the contrast threshold, by
+    |dL/dt| from the shader at both ends of the step."""
 
     kind: Literal["brightness"] = "brightness"
     max_fraction_of_threshold: float = Field(1.0, gt=0, le=100, description="change between two frames, in smallest nominal contrast thresholds")
@@ -54,8 +56,8 @@ class BrightnessTimeline(_AdaptiveTimeline):
 
 
 class BudgetTimeline(_AdaptiveTimeline):
-    """Event frames so far apart that event times are as wrong as is allowed: the error of the reconstruction in use is measured while
-    frames are drawn, and the achieved estimate goes into the manifest."""
+    """Event frames so far apart that event times are as wrong as is allowed: the error of the reconstruction in use is
+    measured while frames are drawn, and the achieved estimate goes into the manifest."""
 
     kind: Literal["budget"] = "budget"
     max_time_error_us: float | None = Field(None, gt=0, le=1e9, description="error of event times, µs; give this or max_time_error_px")

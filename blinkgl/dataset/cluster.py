@@ -1,7 +1,8 @@
 """The same tasks on Ray (extra ``[cluster]``): an existing cluster, or a local one that lives as long as the run.
 
-All nodes need this BlinkGL, the recipe's asset folders and the output folder under the same paths (a shared file system): a sequence
-is written by the node that made it. Before any work each node is asked for its versions and the content hashes of its assets.
+All nodes need this BlinkGL, the recipe's asset folders and the output folder under the same paths (a shared file
+system): a sequence is written by the node that made it. Before any work each node is asked for its
+versions and the content hashes of its assets.
 """
 
 from __future__ import annotations
@@ -26,13 +27,16 @@ _CONNECT_S = 5.0
 
 
 class RayCluster:
-    """Executor of :mod:`blinkgl.dataset.run` on Ray. A worker that is lost costs an attempt, a node that is lost does not.
+    """Executor of :mod:`blinkgl.dataset.run` on Ray. A worker that is lost costs an
+    attempt, a node that is lost does not.
 
     workers : tasks at a time; default: as many as the cluster has CPUs, new nodes included.
-    address : of a running cluster ("host:6379", "auto", "ray://host:10001"); default: the one this process is connected to, else
-        that of the environment's RAY_ADDRESS, else one of its own on this machine, closed with the run. That one has no dashboard and
-        listens on 127.0.0.1 alone: whoever reaches a Ray port may run code (Ray 2.60 asks for a token, earlier versions for nothing).
-    gpus : GPUs per task, e.g. 0.25 for four tasks on each. Ray deals them out; the task draws on that card's EGL device.
+    address : of a running cluster ("host:6379", "auto", "ray://host:10001"); default: the one this process is connected
+        to, else that of the environment's RAY_ADDRESS, else one of its own on this machine, closed with the run. That
+        one has no dashboard and listens on 127.0.0.1 alone: whoever reaches a Ray port may run code (Ray 2.60 asks for
+        a token, earlier versions for nothing).
+    gpus : GPUs per task, e.g. 0.25 for four tasks on each. Ray deals them out; the task
+    draws on that card's EGL device.
     """
 
     def __init__(self, workers: int | None = None, *, address: str | None = None, gpus: float = 0.0):
@@ -237,7 +241,8 @@ def _open(job: dict[str, Any]) -> tuple[Maker, Message]:
 
 
 def _egl_device(gpu_ids: list) -> int | None:
-    """The EGL device of the card Ray gave to this task: cards are numbered alike, but EGL lists software devices, too."""
+    """The EGL device of the card Ray gave to this task: cards are numbered alike, but EGL
+    lists software devices, too."""
     from blinkgl.gl.context import egl_devices
 
     if not gpu_ids or not str(gpu_ids[0]).isdigit():
@@ -258,7 +263,8 @@ def _work(job: dict[str, Any], task: int, attempt: int, expected: tuple[dict[str
         if _maker is None or _maker.job.to_dict() != job:
             _, hello = _open(job)
             if different := environment_differences(hello["environment"], expected[0]):
-                return {"kind": "refused", "error": f"a worker on {socket.gethostname()} differs from the run's first in version or hardware: {different}"}
+                return {"kind": "refused", "error": f"a worker on {socket.gethostname()} differs from the run's first in version or hardware: "
+                                                    f"{different}"}
             if hello["assets"] != expected[1]:
                 return {"kind": "refused", "error": f"node {socket.gethostname()} sees other meshes or textures"}
     except BlinkGLError as error:
@@ -291,8 +297,8 @@ def _reachable(address: str) -> None:
 def _loopback_only() -> Iterator[None]:
     """Makes Ray take 127.0.0.1 for this machine's address, and so bind all its servers to it.
 
-    Ray does so by itself on macOS and Windows, where it knows no clusters of machines; the constant behind that is read when a
-    cluster starts. (``_node_ip_address="127.0.0.1"`` is turned into the outward address by Ray.)"""
+    Ray does so by itself on macOS and Windows, where it knows no clusters of machines; the constant behind that is read
+    when a cluster starts. (``_node_ip_address="127.0.0.1"`` is turned into the outward address by Ray.)"""
     from ray._private import ray_constants
 
     before = getattr(ray_constants, "ENABLE_RAY_CLUSTER", True)
@@ -304,6 +310,7 @@ def _loopback_only() -> Iterator[None]:
 
 
 def _short_folder() -> str:
-    """Where temporary files go, unless its name leaves no room for those of Ray's sockets: Unix allows 107 characters."""
+    """Where temporary files go, unless its name leaves no room for those of Ray's sockets:
+    Unix allows 107 characters."""
     folder = tempfile.gettempdir()
     return folder if len(folder) <= 20 else "/tmp"

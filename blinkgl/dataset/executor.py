@@ -1,4 +1,5 @@
-"""Who makes the sequences: this process, or a pool of processes on this machine. (Many machines: :mod:`blinkgl.dataset.cluster`.)
+"""Who makes the sequences: this process, or a pool of processes on this machine. (Many machines:
+:mod:`blinkgl.dataset.cluster`.)
 
 All keep one contract, so that the loop in :mod:`blinkgl.dataset.run` does not know which it has:
 
@@ -90,8 +91,8 @@ class Local:
     devices : EGL devices, dealt out to the workers in turn. Default: all graphics cards there are, if there are several
         and the configuration asks for no other than the first; else the configuration's.
 
-    A worker that dies is replaced. Workers have sessions of their own, so that Ctrl-C reaches only the driver, and leave when
-    the driver's end of their standard input closes, however it died.
+    A worker that dies is replaced. Workers have sessions of their own, so that Ctrl-C reaches only the driver, and
+    leave when the driver's end of their standard input closes, however it died.
     """
 
     def __init__(self, workers: int, devices: list[int] | None = None):
@@ -230,8 +231,8 @@ class _Process:
             return None
         self._mentioned = True
         return {"kind": "silent", "task": self.task, "pid": self.popen.pid,
-                "error": f"worker {self.slot} (pid {self.popen.pid}) {_condition(self.popen.pid)}: no word from it for {quiet:.0f} s; "
-                         "waiting for it, until --time-limit or its end"}
+                "error": f"worker {self.slot} (pid {self.popen.pid}) {_condition(self.popen.pid)}: no word from it for "
+                         f"{quiet:.0f} s; waiting for it, until --time-limit or its end"}
 
     def stop(self) -> None:
         if self.popen.poll() is None:
@@ -259,7 +260,8 @@ def _condition(pid: int) -> str:
 
 
 def several_cards(job: Job) -> list[int] | None:
-    """The machine's graphics cards as EGL devices, when there are several and the configuration leaves the choice open."""
+    """The machine's graphics cards as EGL devices, when there are several and the
+    configuration leaves the choice open."""
     wanted = [group.template.check().gl for group in job.plan().used]
     if any(gl.backend == "osmesa" or gl.device != 0 for gl in wanted) or os.environ.get("GLCONTEXT_DEVICE_INDEX"):
         return None

@@ -1,7 +1,7 @@
 """``blinkgl explain CONFIG``: what a run will model, what it leaves out and why, and what it is likely to cost.
 
-The scene of one sequence is built and a handful of its frames are drawn and timed (or, of recorded frames, converted); nothing
-is written.
+The scene of one sequence is built and a handful of its frames are drawn and timed (or, of recorded frames, converted);
+nothing is written.
 """
 
 from __future__ import annotations
@@ -75,7 +75,8 @@ def explain(template: RunTemplate, sequence: int | None = None) -> Explanation:
 
 
 def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanation:
-    """A sequence that is converted from recorded frames: nothing is rendered; the first few frames are converted and timed."""
+    """A sequence that is converted from recorded frames: nothing is rendered; the first few
+    frames are converted and timed."""
     frames = config.frames
     probe = simulate_sequence(config, index, base=base, labels=False)
     files, flows, masks = probe.files, probe.flows, probe.masks

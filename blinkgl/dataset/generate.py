@@ -1,4 +1,5 @@
-"""Generates sequences: one consumer of :func:`~blinkgl.sequence.simulate.simulate_sequence`, and the plainest loop around it."""
+"""Generates sequences: one consumer of :func:`~blinkgl.sequence.simulate.simulate_sequence`,
+and the plainest loop around it."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ from blinkgl.sequence.clock import StageClock
 def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
                  progress: Progress | None = None) -> Iterator[SequenceReport]:
     """Generates ``num`` (default: the configuration's ``output.sequences``) sequences below ``out``, in order, in this
-    process, yielding a report after each. The first error ends it; :mod:`blinkgl.dataset.run` is the loop that does not give up.
+    process, yielding a report after each. The first error ends it;
+    :mod:`blinkgl.dataset.run` is the loop that does not give up.
 
     Raises BlinkGLError: any configuration or asset error, no OpenGL, or an output folder that exists; the folders
     are looked at before any work starts."""

@@ -1,4 +1,5 @@
-"""What a run has to make: the list of sequences, and what identifies the run so that another day's workers can go on with it."""
+"""What a run has to make: the list of sequences, and what identifies the run so that another
+day's workers can go on with it."""
 
 from __future__ import annotations
 
@@ -47,7 +48,8 @@ _NUMBERED = re.compile(r"(.+)_([0-9]{6,})")
 
 
 class Tasks(Sequence[Task]):
-    """The sequences of a run by number, made when they are asked for: a run of millions takes no more memory than one of ten.
+    """The sequences of a run by number, made when they are asked for: a run of millions
+    takes no more memory than one of ten.
 
     parts : (group, output, first, count) of each group that has sequences, in order.
     """
@@ -96,7 +98,8 @@ class Tasks(Sequence[Task]):
         return self._starts[part] + index - first if inside else None
 
     def present(self, out: Path) -> Iterator[tuple[int, Task]]:
-        """The tasks at whose names something lies below ``out``, in no order. Looks at what is there, not for all that could be."""
+        """The tasks at whose names something lies below ``out``, in no order. Looks at what
+        is there, not for all that could be."""
         for split in self.splits:
             try:
                 entries = os.scandir(out / split)
@@ -155,7 +158,8 @@ class Plan:
     def check_assets(self) -> dict[str, str]:
         """Content hash of every file that the run's scenes may use, by name; frame folders by name and size.
 
-        Raises ConfigError and AssetError: missing folders, empty pools, pools too small for the split, too few frame folders."""
+        Raises ConfigError and AssetError: missing folders, empty pools, pools too small for
+        the split, too few frame folders."""
         hashes: dict[str, str] = {}
         for group in self.used:
             try:
@@ -222,8 +226,8 @@ def digest(hashes: dict[str, str]) -> str:
 def check_output(out: str | Path) -> None:
     """OutputError when ``out`` cannot become a folder of sequences.
 
-    ``out`` itself may be a symbolic link; what BlinkGL makes below it may not be one already: sequences would go, and what is not
-    whole would be moved, where nobody looks for a data set."""
+    ``out`` itself may be a symbolic link; what BlinkGL makes below it may not be one already: sequences would go, and
+    what is not whole would be moved, where nobody looks for a data set."""
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise OutputError("is a file", where=str(out), accepted="a folder")

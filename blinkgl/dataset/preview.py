@@ -12,8 +12,9 @@ from blinkgl.sequence import Picture, Simulation
 
 
 class PreviewRecorder:
-    """Context manager; does nothing where the sequence gives no pictures. The flow panel shows the instantaneous velocity times the
-    label interval, which is what the flow labels look like for small motions; recorded frames have none."""
+    """Context manager; does nothing where the sequence gives no pictures. The flow panel shows the instantaneous
+    velocity times the label interval, which is what the flow labels look like for small
+    motions; recorded frames have none."""
 
     def __init__(self, config: PreviewConfig, sequence: Simulation, writer: SequenceWriter):
         self._clock, rate = sequence.clock, sequence.pictures_hz

@@ -28,7 +28,8 @@ from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.io.index import write_index
 
 ATTEMPTS = 3
-"""A sequence is set aside after so many failures that could have passed, or one that could not (:func:`blinkgl.errors.may_pass`)."""
+"""A sequence is set aside after so many failures that could have passed, or one that could not
+(:func:`blinkgl.errors.may_pass`)."""
 _POLL_S = 0.5
 
 
@@ -64,10 +65,10 @@ def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | Non
     mixed : go on although the recipe, the assets or the software are not those the run began with.
     time_limit_s : wall time of one attempt at one sequence; 0: none.
 
-    Raises BlinkGLError when no sequence at all could be made; nothing but logs is left then, and another recipe may start in ``out``.
-    Raises, before any work: ConfigError and AssetError (recipe, assets), GLError, OutputError (folder of another recipe, another
-    run at work in it, cannot be written). Raises during work: OutputError when the disk is full, KeyboardInterrupt for Ctrl-C and
-    SIGTERM; whole sequences stay, and ``resume`` goes on.
+    Raises BlinkGLError when no sequence at all could be made; nothing but logs is left then, and another recipe may
+    start in ``out``. Raises, before any work: ConfigError and AssetError (recipe, assets), GLError, OutputError (folder
+    of another recipe, another run at work in it, cannot be written). Raises during work: OutputError when the disk is
+    full, KeyboardInterrupt for Ctrl-C and SIGTERM; whole sequences stay, and ``resume`` goes on.
     """
     executor = executor or Inline()
     out = Path(out)

@@ -111,8 +111,8 @@ class RunFolder:
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
-        """One run at a time per folder; the lock goes when the process does. Makes the folder, and takes it away when it is
-        empty in the end: a run that was refused leaves nothing."""
+        """One run at a time per folder; the lock goes when the process does. Makes the folder, and takes it away when
+        it is empty in the end: a run that was refused leaves nothing."""
         made = self._make()
         self._handle = self._lock()
         try:
@@ -157,7 +157,8 @@ class RunFolder:
             self._make()
 
     def check_in_place(self) -> None:
-        """OutputError when the folder that was locked is no longer the one at ``out``: deleted, moved or replaced under the run."""
+        """OutputError when the folder that was locked is no longer the one at ``out``:
+        deleted, moved or replaced under the run."""
         if not _same(self.out, self._handle):
             raise OutputError("was deleted, moved or replaced while the run was at work in it", where=str(self.out),
                               accepted="a folder that stays where it is")
@@ -211,8 +212,9 @@ class RunFolder:
             return True
 
     def sweep(self, plan: Plan) -> None:
-        """Removes what dead writers of this run left. Those of another machine or an earlier boot cannot be asked whether they
-        live: theirs go when this run has seen nothing in them change for an hour of its own, by a clock that nobody can set."""
+        """Removes what dead writers of this run left. Those of another machine or an earlier boot cannot be asked
+        whether they live: theirs go when this run has seen nothing in them change for an hour of
+        its own, by a clock that nobody can set."""
         now = time.monotonic()
         for folder in [*(self.out / split for split in plan.tasks.splits), self.out, self.path]:
             with contextlib.suppress(OSError):
@@ -245,7 +247,8 @@ class RunFolder:
         self.begun = True
 
     def forget(self, plan: Plan, keep_logs: bool) -> None:
-        """Takes back :meth:`begin` for a run of which nothing came. What was put away stays: it is not ours to delete."""
+        """Takes back :meth:`begin` for a run of which nothing came. What was put away stays:
+        it is not ours to delete."""
         for name in ("run.json", "recipe.yaml", "assets.json", "failed.json", "costs.jsonl"):
             (self.path / name).unlink(missing_ok=True)
         (self.out / "index.jsonl").unlink(missing_ok=True)
@@ -283,7 +286,8 @@ class RunFolder:
         return list(found.values())
 
     def read(self, name: str) -> dict[str, Any] | None:
-        """A JSON file of the folder, of the shape it has here; None when there is none. OutputError when it is damaged."""
+        """A JSON file of the folder, of the shape it has here; None when there is none.
+        OutputError when it is damaged."""
         path = self.path / name
         try:
             return parse(read_text(path), _RECORDS[name])

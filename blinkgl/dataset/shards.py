@@ -5,8 +5,8 @@ One sample per flow label, its files side by side under one key:
     flying_000017_000003.json        sequence, times in µs, size, polarity convention
     flying_000017_000003.old.npz     events of the interval before the label: x, y uint16, t int64 µs, p uint8
     flying_000017_000003.new.npz     events of the label's interval [from, to)
-    flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has them: every label whose
-                                     row names a ``shard``
+    flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has
+                                     them: every label whose row names a ``shard``
 
 The same data set, seed and shard size give the same bytes.
 """

@@ -22,7 +22,8 @@ class Listening:
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can reach it. IPv4 addresses in IPv6 clothes (::ffff:127.0.0.1) count as what they are."""
+        """Whether only this machine can reach it. IPv4 addresses in IPv6 clothes
+        (::ffff:127.0.0.1) count as what they are."""
         address = ipaddress.ip_address(self.address)
         return (getattr(address, "ipv4_mapped", None) or address).is_loopback
 
@@ -31,7 +32,8 @@ class Listening:
 
 
 def listening(pid: int) -> list[Listening]:
-    """The listening TCP sockets, IPv4 and IPv6, of ``pid`` and all its descendants. Processes of other users are not seen into."""
+    """The listening TCP sockets, IPv4 and IPv6, of ``pid`` and all its descendants. Processes
+    of other users are not seen into."""
     sockets = {}
     for table in ("tcp", "tcp6"):
         with contextlib.suppress(OSError):  # a kernel without IPv6
@@ -76,6 +78,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def _address(text: str) -> str:
-    """"0100007F" -> "127.0.0.1": the kernel prints words of four bytes in its own byte order, which is little-endian here."""
+    """"0100007F" -> "127.0.0.1": the kernel prints words of four bytes in its own byte
+    order, which is little-endian here."""
     data = b"".join(bytes.fromhex(text[k:k + 8])[::-1] for k in range(0, len(text), 8))
     return str(ipaddress.ip_address(data))

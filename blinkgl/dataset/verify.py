@@ -1,8 +1,8 @@
-"""Is a data set whole and right? Files against manifests, names and manifests against configurations, contents against the formats,
-and a sample against itself made anew.
+"""Is a data set whole and right? Files against manifests, names and manifests against configurations, contents against
+the formats, and a sample against itself made anew.
 
-A sequence's problems are lines of text; none means none found. What could not be looked at is counted and said: nothing is
-passed over in silence. Whatever stands in a record, looking at it ends, and ends with a line.
+A sequence's problems are lines of text; none means none found. What could not be looked at is counted and said: nothing
+is passed over in silence. Whatever stands in a record, looking at it ends, and ends with a line.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ _SAME_ANYWHERE = ("split", "seed", "sequence", "emulator", "labels", "duration_u
 class Verification:
     """``problems``: sequence (or "." for the data set) -> lines. ``notes``: what was not looked at, and why.
 
-    ``deep``: sequences that were made again, the same bit by bit or not. ``in_part``: those of them that differ from what this
-    machine makes and were made on another; there only what no machine has a say in was compared."""
+    ``deep``: sequences that were made again, the same bit by bit or not. ``in_part``: those of them that differ from
+    what this machine makes and were made on another; there only what no machine has a say in was compared."""
 
     sequences: int = 0
     problems: dict[str, list[str]] = field(default_factory=dict)
@@ -147,7 +147,8 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
 
 
 def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
-    """Do the folder's name, the manifest and the sequence's own configuration speak of the same sequence, and is there what it asks for?"""
+    """Do the folder's name, the manifest and the sequence's own configuration speak of the same
+    sequence, and is there what it asks for?"""
     index, output = manifest["sequence"], config.output
     path = sequence_name(output, index)
     said = [("split", output.split), ("seed", config.seed), ("sequence", output.first_index), ("emulator", config.events.emulator)]
@@ -179,7 +180,8 @@ def _files_of(config: SequenceConfig) -> Iterator[str]:
 
 
 def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
-    """Sorted, inside the sensor and the sequence's time, counted as the manifest says, and ``ms_to_idx`` right at every millisecond."""
+    """Sorted, inside the sensor and the sequence's time, counted as the manifest says, and
+    ``ms_to_idx`` right at every millisecond."""
     problems = []
     with open_hdf5(path) as file:
         columns = {k: dataset(file, f"events/{k}", path, shape=(None,)) for k in "xytp"}
@@ -219,8 +221,8 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
 
 
 def _check_labels(folder: Path, manifest: dict[str, Any]) -> list[str]:
-    """Of every label there is: as many files as time stamps as labels; times inside the sequence and in order; and in the first and the last
-    file an array of the manifest's size that holds what its row says it can."""
+    """Of every label there is: as many files as time stamps as labels; times inside the sequence and in order; and in
+    the first and the last file an array of the manifest's size that holds what its row says it can."""
     problems = []
     for label in LABELS.values():
         files = sorted(name for name in manifest["files"] if label.forms[0].holds(name))
@@ -259,7 +261,7 @@ def _check_value(path: Path, manifest: dict[str, Any], label: Label) -> list[str
     return [] if problem is None else [problem]
 
 
-# ---- between sequences ------------------------------------------------------------------------------------------------
+# ---- between sequences -----------------------------------------------------------------------------------------------
 
 
 def _between(root: Path, folders: list[Path]) -> list[str]:
@@ -303,8 +305,9 @@ def _index(root: Path, folders: list[Path]) -> list[str]:
 
 
 def _twins(known: dict[str, _Known], result: Verification) -> dict[str, list[str]]:
-    """Sequences with the events or the poses of another one, although they are different draws. Where nothing is drawn at all (a scene
-    of one's own or recorded frames, thresholds that are all alike) twins are what was asked for, and a note."""
+    """Sequences with the events or the poses of another one, although they are different draws. Where nothing is drawn
+    at all (a scene of one's own or recorded frames, thresholds that are all alike) twins
+    are what was asked for, and a note."""
     seen: dict[tuple[str, str], str] = {}
     problems: dict[str, list[str]] = {}
     for name, one in known.items():
@@ -330,7 +333,8 @@ def _noisy(config: SequenceConfig) -> bool:
 
 
 def _against_run(root: Path, folders: list[Path], known: dict[str, _Known], result: Verification) -> list[str]:
-    """Sequences that the recipe asks for and are not there, or are and it draws others; what the run says of its OpenGL."""
+    """Sequences that the recipe asks for and are not there, or are and it draws others; what
+    the run says of its OpenGL."""
     plan, record = plan_of(root), RunFolder(root).read("run.json") or {}
     if plan is None:
         result.notes.append("no record of the run here: sequences were not compared with a recipe")
@@ -375,7 +379,8 @@ def _called(template: RunTemplate) -> str:
 
 
 def _comparable(config: SequenceConfig) -> dict[str, Any]:
-    """Plain data without what a sequence's own configuration says otherwise than the recipe: its number, and which of the folders."""
+    """Plain data without what a sequence's own configuration says otherwise than the recipe:
+    its number, and which of the folders."""
     tree = json.loads(config.model_dump_json())
     for key in ("sequences", "first_index"):
         tree["output"].pop(key)
@@ -407,7 +412,7 @@ def plan_of(root: Path) -> Plan | None:
     return None
 
 
-# ---- made again --------------------------------------------------------------------------------------------------------
+# ---- made again ------------------------------------------------------------------------------------------------------
 
 
 def _deep(root: Path, chosen: dict[str, _Known], result: Verification, base: str | Path | None, progress) -> None:
@@ -471,8 +476,8 @@ def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
 
 
 def _agrees(file: str, one: Path, other: Path) -> bool:
-    """Whether two machines' files of one name say the same, as far as machines can agree. True for what a renderer, a codec or a
-    library may change in every byte."""
+    """Whether two machines' files of one name say the same, as far as machines can agree. True for what a renderer, a
+    codec or a library may change in every byte."""
     a, b = one / file, other / file
     if file == "config.yaml":
         configs = [load_run(path) for path in (a, b)]

@@ -1,13 +1,15 @@
-"""What every worker does, whoever started it: one process, one OpenGL context, one set of numba threads, one sequence after another.
+"""What every worker does, whoever started it: one process, one OpenGL context, one set of
+numba threads, one sequence after another.
 
-A :class:`Job` says what the run is; a :class:`Maker` turns task numbers into sequence directories and plain-data messages
-(dicts that JSON can carry):
+A :class:`Job` says what the run is; a :class:`Maker` turns task numbers into sequence directories and plain-data
+messages (dicts that JSON can carry):
 
     {"kind": "hello", "pid", "environment", "assets"}          ready
     {"kind": "progress", "task", "frames", "events", "fraction", "seconds": by stage so far,
      "omissions": what is not drawn}
     {"kind": "done", "task", "report": {…}, "bytes", "cpu_s", "peak_rss_kib"}
-    {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use trying again, "stop": nor anything else}
+    {"kind": "failed", "task", "error": one line, "expected": a BlinkGLError, "final": no use
+    trying again, "stop": nor anything else}
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ from blinkgl.gl import GLContext, create_context
 
 Message = dict[str, Any]
 RUN_FOLDER = ".run"
-"""Below the data set: recipe, logs, costs. Readers of the data set skip hidden folders, and nothing in it is compared."""
+"""Below the data set: recipe, logs, costs. Readers of the data set skip hidden folders, and
+nothing in it is compared."""
 _NEWS_EVERY_S = 0.25
 
 
@@ -58,9 +61,9 @@ class Job:
 
 
 def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Variables of each of ``workers`` processes on ``cores`` cores: cores are divided, not oversubscribed. What the user has set
-    stays. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) as soon as there are two workers: two processes
-    then draw 1.2-1.35 times as fast as one with two threads."""
+    """Variables of each of ``workers`` processes on ``cores`` cores: cores are divided, not oversubscribed. What the
+    user has set stays. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) as soon as there are two workers:
+    two processes then draw 1.2-1.35 times as fast as one with two threads."""
     share = max(1, cores // max(1, workers))
     wanted = {"NUMBA_NUM_THREADS": str(share), "OMP_NUM_THREADS": str(share), "OPENBLAS_NUM_THREADS": str(share)}
     if workers > 1:
@@ -88,7 +91,8 @@ class Maker:
         return {"kind": "hello", "pid": os.getpid(), "environment": environment(self.gl), "assets": digest(assets)}
 
     def make(self, number: int, attempt: int, tell: Callable[[Message], None]) -> Message:
-        """The ``number``-th task of the plan. Returns "done" or "failed"; only KeyboardInterrupt and SystemExit get out."""
+        """The ``number``-th task of the plan. Returns "done" or "failed"; only
+        KeyboardInterrupt and SystemExit get out."""
         task = self.plan.tasks[number]
         log = SequenceLog(self.job.out, task.name)
         log.write(f"attempt {attempt}, pid {os.getpid()} on {platform.node()}")
@@ -114,7 +118,8 @@ class Maker:
             return {"kind": "failed", "task": number, "error": line, "expected": isinstance(error, BlinkGLError),
                     "final": not may_pass(error), "stop": _disk_is_full(error)}
         size = sum(p.stat().st_size for p in report.path.rglob("*") if p.is_file())
-        log.write(f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} labels, {size} bytes; "
+        log.write(f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} "
+                  f"labels, {size} bytes; "
                   + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items()))
         return {"kind": "done", "task": number, "bytes": size, "cpu_s": time.process_time() - cpu, "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
                 "report": {**asdict(report), "path": str(report.path)}}
@@ -151,8 +156,9 @@ def environment_differences(one: dict[str, str], other: dict[str, str]) -> str:
 
 @lru_cache(maxsize=1)
 def _source_hash() -> str:
-    """12 hex digits of the code and shaders that are running: a version number says little about a checkout. BLINKGL_BUILD says
-    it instead where somebody else answers for that (the tag of a container image; tests while the code is being worked on)."""
+    """12 hex digits of the code and shaders that are running: a version number says little about a checkout.
+    BLINKGL_BUILD says it instead where somebody else answers for that (the tag of a container image;
+    tests while the code is being worked on)."""
     if build := os.environ.get("BLINKGL_BUILD"):
         return build
     found = hashlib.sha256()

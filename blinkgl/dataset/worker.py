@@ -1,7 +1,7 @@
 """A worker process of the local executor: ``python -m blinkgl.dataset.worker FD``.
 
-The job, then task numbers, come as lines of JSON on standard input; messages (:mod:`blinkgl.dataset.work`) leave on FD the
-same way. When standard input ends, the driver is dead: whatever is being made is thrown away.
+The job, then task numbers, come as lines of JSON on standard input; messages (:mod:`blinkgl.dataset.work`) leave on FD
+the same way. When standard input ends, the driver is dead: whatever is being made is thrown away.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def _listen(tasks: queue.Queue) -> None:
     for line in sys.stdin:
         tasks.put(json.loads(line))
     tasks.put(None)
-    # Idle workers leave by the None. One that is at work gets the signal; one that hangs must not outlive the driver either.
+    # Idle workers leave by the None. One that is at work gets the signal; one that hangs must not outlive the driver
+    # either.
     os.kill(os.getpid(), signal.SIGTERM)
     threading.Event().wait(_GRACE_S)
     os._exit(1)

@@ -64,7 +64,8 @@ def log_q25(v: float) -> float:
     to its old level, a reference never drifts, and ties are decided by numbers rather than by rounding. In
     float32 the same four bytes would resolve 5e-7 at ln v = -6.
     """
-    # sqrt(1/2) taken off the bits, the exponent field changes at sqrt(1/2) 2^n instead of at 2^n: the reduced interval lies round 1.
+    # sqrt(1/2) taken off the bits, the exponent field changes at sqrt(1/2) 2^n instead of at 2^n: the reduced interval
+    # lies round 1.
     bits = _F(v).view(np.int32)
     exponent = _I(_I(bits - _SQRT_HALF_BITS) >> _EXP23)  # v = m 2^exponent with m in [sqrt(1/2), sqrt(2))
     f = _F(_I(bits - _I(exponent << _EXP23)).view(np.float32) - _F1)
@@ -96,7 +97,8 @@ _EXP_MIN_32, _BIAS_32 = _F(-87.0), _I(127)
 def exp_f32(v: float) -> float:
     """exp(v) for float32 v <= 80, relative error < 2e-7; below -87 it stays at exp(-87) = 1.6e-38."""
     v = np.maximum(v, _EXP_MIN_32)
-    # e^v = 2^n e^r with |r| <= ln(2)/2. n ln 2 in two parts (Cody and Waite): the first has so few bits that n times it is exact.
+    # e^v = 2^n e^r with |r| <= ln(2)/2. n ln 2 in two parts (Cody and Waite): the first has so few bits that n times it
+    # is exact.
     n = _F(_F(v * _LOG2E_32 + _ROUND_32) - _ROUND_32)
     r = _F(_F(v - n * _LN2_HI_32) - n * _LN2_LO_32)
     p = r * _E32_6 + _E32_5

@@ -1,7 +1,8 @@
 """An event camera, emulator and read-out together, and the one loop that frames go through it in.
 
-Whoever turns frames into events does it here: a generated sequence, converted frames, a video, a reference, a benchmark. So what
-stands between an emulator and the outside (the read-out, a path between frames that is one frame late) is never left out by one of them.
+Whoever turns frames into events does it here: a generated sequence, converted frames, a video, a reference, a
+benchmark. So what stands between an emulator and the outside (the read-out, a path between frames that is one frame
+late) is never left out by one of them.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ from blinkgl.events.types import Events
 
 
 class EventFrame(NamedTuple):
-    """What an emulator is given of one moment; valid until the next one is asked for, so that a source may reuse its arrays.
+    """What an emulator is given of one moment; valid until the next one is asked for, so
+    that a source may reuse its arrays.
 
     luminance : (H, W) float32, linear, or uint8 codes.   rate : (H, W) float32, d(luminance)/dt per second, or None.
-    rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere. As of ``Emulator.step``."""
+    rows : (y0, y1): outside these rows the frame is the one before; None: it may differ anywhere.
+    As of ``Emulator.step``."""
 
     t_ns: int
     luminance: np.ndarray
@@ -35,8 +38,10 @@ class EventFrame(NamedTuple):
 class EventCamera:
     """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
 
-    readout : None: no limit.   seed : of the emulator's draws.   reconstruction : the path between frames, see :class:`Emulator`.
-    emulator : the :class:`Emulator` itself.   Raises EventDataError: size, or a path that the emulator cannot follow."""
+    readout : None: no limit.   seed : of the emulator's draws.   reconstruction : the path
+                                between frames, see :class:`Emulator`.
+    emulator : the :class:`Emulator` itself.   Raises EventDataError: size, or a path that
+                                               the emulator cannot follow."""
 
     def __init__(self, config: EmulatorConfig, readout: ReadoutConfig | None, height: int, width: int, seed: int,
                  reconstruction: str = "linear"):
@@ -69,8 +74,8 @@ class EventCamera:
         return 0 if self._readout is None else self._readout.late
 
     def step(self, frame: EventFrame) -> Events:
-        """The events that are out by :attr:`done_ns` and were not before. Raises EventDataError as ``Emulator.step``; ``t_ns`` is then
-        the frame's."""
+        """The events that are out by :attr:`done_ns` and were not before. Raises EventDataError as ``Emulator.step``;
+        ``t_ns`` is then the frame's."""
         try:
             events = self.emulator.step(frame.luminance, frame.t_ns, frame.rows, frame.rate)
         except EventDataError as error:

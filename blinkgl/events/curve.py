@@ -1,6 +1,7 @@
 """Log intensity between two frames as a monotone cubic, and the times at which it passes levels.
 
-In units of the interval (time s and level y both from 0 to 1; alpha, beta the slopes at its ends in units of the secant)
+In units of the interval (time s and level y both from 0 to 1; alpha, beta the slopes at
+its ends in units of the secant)
 
     y(s) = alpha s + (3 - 2 alpha - beta) s^2 + (alpha + beta - 2) s^3
 
@@ -61,7 +62,8 @@ def slope_at_end(near: float, far: float, near_ns: float, far_ns: float) -> floa
 
 @register_jitable
 def end_slopes(older: float, before: float, now: float, newer: float, dt_ns: float, older_ns: float, newer_ns: float) -> tuple[float, float]:
-    """(alpha, beta) of an interval from the log intensities of four frames; older_ns or newer_ns 0: there is no such frame."""
+    """(alpha, beta) of an interval from the log intensities of four frames; older_ns or
+    newer_ns 0: there is no such frame."""
     change = np.float64(now - before)
     secant = change / dt_ns
     alpha = beta = 1.0

@@ -32,8 +32,8 @@ NO_FRAME, NO_CODES, NO_LOG = np.empty(0, np.float32), np.empty(0, np.uint8), np.
 
 
 def _flat(array: np.ndarray) -> np.ndarray:
-    """(H*W,) in C order. Kernels write into no frame, but numba compiles another one for arrays that must not be written, such as a
-    renderer's views: those whose memory may be are handed on as such."""
+    """(H*W,) in C order. Kernels write into no frame, but numba compiles another one for arrays that must not be
+    written, such as a renderer's views: those whose memory may be are handed on as such."""
     flat = np.ascontiguousarray(array).reshape(-1)
     if not flat.flags.writeable:
         with contextlib.suppress(ValueError):  # memory that really is read-only
@@ -79,7 +79,8 @@ class Emulator(ABC):
     @classmethod
     @abstractmethod
     def noiseless(cls, config: EmulatorConfig) -> EmulatorConfig:
-        """What is left of it when noise and bandwidth are taken away: of this or another emulator, whose events `trade` judges by."""
+        """What is left of it when noise and bandwidth are taken away: of this or another
+        emulator, whose events `trade` judges by."""
 
     def __init__(self, height: int, width: int, seed: int, reconstruction: str = "linear"):
         if reconstruction not in self.Config.reconstructions:
@@ -132,11 +133,12 @@ class Emulator(ABC):
     def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None, rate: np.ndarray | None = None) -> Events:
         """Events since the last frame; see the class.
 
-        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ) and, with ``rate``,
-        that the rates there are 0, whatever they were in the frame before. Emulators whose still pixels do nothing skip those rows and do
-        not look at them, neither for events nor for values that cannot be used; the events are the same.
-        rate : (H, W) float32, d(luminance)/dt per second at the frame's time (of ``decode[code]`` for uint8). Only ``hermite`` looks
-        at it; a value that is not finite counts as 0."""
+        rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ)
+        and, with ``rate``, that the rates there are 0, whatever they were in the frame before. Emulators whose still
+        pixels do nothing skip those rows and do not look at them, neither for events nor for values that cannot be
+        used; the events are the same.
+        rate : (H, W) float32, d(luminance)/dt per second at the frame's time (of ``decode[code]`` for uint8). Only
+        ``hermite`` looks at it; a value that is not finite counts as 0."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
         rate = self._checked_rate(rate) if self.needs_rate else None
@@ -172,8 +174,8 @@ class Emulator(ABC):
         return _flat(rate)
 
     def flush(self) -> Events:
-        """Events that are still held back; call it after the last frame. Empty for everything but ``pchip``, which then takes its slope
-        at the last frame from the frames before it. Further frames may follow."""
+        """Events that are still held back; call it after the last frame. Empty for everything but ``pchip``, which then
+        takes its slope at the last frame from the frames before it. Further frames may follow."""
         return Events.empty()
 
     def _checked_time(self, t_ns: int) -> int:
@@ -210,12 +212,14 @@ class Emulator(ABC):
 
     # -- running the kernels --------------------------------------------------------------------------------
     def _run(self, kernel, arguments: tuple, base_us: int, span_us: int) -> Events:
-        """Run a band kernel over all blocks, on up to :func:`~blinkgl.events.threads.thread_count` threads, and sort what it emits.
+        """Run a band kernel over all blocks, on up to
+        :func:`~blinkgl.events.threads.thread_count` threads, and sort what it emits.
 
-        ``kernel(taken, start, edges, progress, share, packed, *arguments)`` takes bands of whole blocks, [edges[b], edges[b + 1]),
-        by :func:`~blinkgl.events.threads.take_part` until there are none. In band b it goes on from block ``progress[b, 0]`` with
-        ``progress[b, 1]`` events in ``packed[b]`` and stops early when that might not hold the next block; it then goes on from
-        there in a larger buffer. ``share`` is the number of events a block may emit.
+        ``kernel(taken, start, edges, progress, share, packed, *arguments)`` takes bands of whole blocks, [edges[b],
+        edges[b + 1]), by :func:`~blinkgl.events.threads.take_part` until there are none. In band b it goes on from
+        block ``progress[b, 0]`` with ``progress[b, 1]`` events in ``packed[b]`` and stops early when that might not
+        hold the next block; it then goes on from there in a larger buffer. ``share`` is the
+        number of events a block may emit.
         """
         first, stop = self._changed if self._still_pixels_sleep else (0, self.height * self.width)
         first_block, stop_block = first // BLOCK, -(-stop // BLOCK)

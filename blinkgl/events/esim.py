@@ -4,7 +4,8 @@ Rebecq, Gehrig, Scaramuzza, "ESIM: an Open Event Camera Simulator", CoRL 2018, s
 the last level passed L_ref, a pixel fires ON at every L_ref + j C+ and OFF at every L_ref - j C- that L reaches in
 the interval (t_prev, t], at the time where the straight line from L_prev to L meets the level, floored to the
 microsecond. A level passed in the refractory period is lost (L_ref moves all the same). Instead of the straight line
-it may be a monotone cubic (:mod:`~blinkgl.events.curve`): the same levels at better times. Only the pixels that fire solve it.
+it may be a monotone cubic (:mod:`~blinkgl.events.curve`): the same levels at better times.
+Only the pixels that fire solve it.
 
 C+ and C- belong to the pixel and are drawn once; with jitter each *event* draws the next ones, once. (Thresholds
 redrawn at every frame lose events, the more the higher the frame rate.) Everything is integer arithmetic: logs in
@@ -12,8 +13,8 @@ redrawn at every frame lose events, the more the higher the frame rate.) Everyth
 returns exactly passes exactly the same levels.
 
 How it is fast: the logarithm and the comparison with both levels are branch-free loops over blocks that stay in
-the first-level cache; the pixels that fire are then picked out of the block's flags, eight at a time, without branches on the data.
-:mod:`blinkgl.events.reference` is the slow twin.
+the first-level cache; the pixels that fire are then picked out of the block's flags, eight at a time, without branches
+on the data. :mod:`blinkgl.events.reference` is the slow twin.
 """
 
 from __future__ import annotations
@@ -120,8 +121,9 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
         while i >= row_end:
             y += 1
             row_end += v.width
-        # Rebecq et al. 2018, section 3: the path goes from p.log[i] to ``level``, ``whole`` units. What of it lies beyond the level that is
-        # being passed is ``gap``, so that level is met at the fraction (whole - gap) / whole of a straight line.
+        # Rebecq et al. 2018, section 3: the path goes from p.log[i] to ``level``, ``whole`` units. What of it lies
+        # beyond the level that is being passed is ``gap``, so that level is met at the fraction (whole - gap) / whole
+        # of a straight line.
         level, above, below = np.int64(now[i - first]), np.int64(p.upper[i]), np.int64(p.lower[i])
         whole = abs(level - p.log[i])
         polarity = np.int64(level >= above)
@@ -163,7 +165,8 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
                 else:
                     cut += 1
             if p.fired.size:
-                # The next thresholds, drawn once per level and numbered by the levels passed: how the path was cut into frames has no part in it.
+                # The next thresholds, drawn once per level and numbered by the levels passed: how the path was cut into
+                # frames has no part in it.
                 p.fired[i] += 1
                 a, b = normal2(v.seed, np.uint64(i), _JITTER, np.uint64(p.fired[i]))
                 up = max(v.floor_on, step_on + np.int64(np.floor(v.jitter * a + 0.5)))
@@ -195,7 +198,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         farthest = _flag_block(now[:n], p.upper[s:e], p.lower[s:e], flags)
         if farthest >= 0:
             count = compact_flags(flags, scratch, s, active)
-            # As many events a pixel as levels fit between the first one and the farthest, rounded up; never more than the block's share.
+            # As many events a pixel as levels fit between the first one and the farthest, rounded up; never more than
+            # the block's share.
             cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
@@ -290,7 +294,8 @@ def draw_thresholds(height: int, width: int, on: float, off: float, sigma: float
 
 class Esim(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. State: 12 bytes per pixel; spread thresholds
-    (constant) and the refractory period add 8 each, jitter and the slopes of ``hermite`` 4, the neighbours of ``pchip`` 12."""
+    (constant) and the refractory period add 8 each, jitter and the slopes of ``hermite``
+    4, the neighbours of ``pchip`` 12."""
 
     Config = EsimConfig
     _still_pixels_sleep = True
@@ -327,8 +332,8 @@ class Esim(Emulator):
         self._last_ns = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
         self._upper, self._lower = (np.zeros(pixels, np.int32) for _ in range(2))
         if self.lags:
-            # The last four frames, frame k in row k mod 4: their logs, times, and the pixels [first, stop) in which each
-            # differs from the one before it.
+            # The last four frames, frame k in row k mod 4: their logs, times, and the pixels [first, stop) in which
+            # each differs from the one before it.
             self._ring, self._ring_ns, self._ring_rows = np.zeros((4, pixels), np.int32), np.zeros(4, np.int64), np.zeros((4, 2), np.int64)
             self._passed = np.zeros(1, np.int64)  # number of the frame up to which events have been returned
         else:

@@ -24,8 +24,8 @@ _EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
 JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
 
 
-# A radix sort from the lowest digit of the time up (Knuth, TAOCP 3, 5.2.5). Every pass keeps the order of equal digits, so what has been
-# sorted by lower digits stays sorted, and the first pass keeps the raster order.
+# A radix sort from the lowest digit of the time up (Knuth, TAOCP 3, 5.2.5). Every pass keeps the order of equal digits,
+# so what has been sorted by lower digits stays sorted, and the first pass keeps the raster order.
 
 
 @numba.njit(**JIT)
@@ -125,7 +125,8 @@ class PackedBuffer:
             return Events.empty()
         threads = max(1, min(threads, total // _EVENTS_PER_THREAD))
         parts = 1 if threads == 1 else min(_PARTS_PER_THREAD * threads, len(counts))
-        # Short intervals take one pass; longer ones passes of 11 bits, whose 2048 counters and write positions stay in the first-level cache.
+        # Short intervals take one pass; longer ones passes of 11 bits, whose 2048 counters and write positions stay in
+        # the first-level cache.
         bits = max(1, int(span_us).bit_length())
         digit_bits = bits if bits <= _SINGLE_PASS_BITS else _DIGIT_BITS
         if self._sorted.shape[1] < total:

@@ -6,8 +6,8 @@ the one before. Below the limit events are late by less than a microsecond; abov
 ``queue_events / events_per_second`` and the output rate is the bus's. Events of one microsecond are served in raster
 order, as a row arbiter would, so in overload the upper rows of that microsecond come first.
 
-An event exists for the outside when it has left the bus. A recording that ends at time T therefore ends with the last event that
-left by T; those still on the bus then are no part of it, and are counted (``late``).
+An event exists for the outside when it has left the bus. A recording that ends at time T therefore ends with the last
+event that left by T; those still on the bus then are no part of it, and are counted (``late``).
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ _PS_PER_US = 1_000_000
 
 @numba.njit(**JIT)
 def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
-    """``waiting``: ring of the times (ps) at which the last accepted events left. ``state``: accepted, bus free (ps), row."""
+    """``waiting``: ring of the times (ps) at which the last accepted events left.
+    ``state``: accepted, bus free (ps), row."""
     kept, size = 0, waiting.size
     accepted, free_ps, row = state[0], state[1], state[2]
     for i in range(t_us.size):
@@ -49,7 +50,8 @@ def _serve(t_us, y, event_ps, row_ps, waiting, state, keep, out_us):
 class Readout:
     """Events of an emulator, in order, chunk by chunk -> the events the sensor sends.
 
-    ``dropped`` counts the events that found the queue full; ``late`` those that had not left the bus by the end of the last step.
+    ``dropped`` counts the events that found the queue full; ``late`` those that had not left
+    the bus by the end of the last step.
     """
 
     def __init__(self, config: ReadoutConfig):
@@ -67,8 +69,8 @@ class Readout:
         return len(self._on_bus)
 
     def step(self, events: Events, until_us: int | None = None) -> Events:
-        """The events that leave the bus until ``until_us`` (that microsecond included), stamped when they do and in order from step
-        to step; later ones wait for the next step. None: all of them, however late.
+        """The events that leave the bus until ``until_us`` (that microsecond included), stamped when they do and in
+        order from step to step; later ones wait for the next step. None: all of them, however late.
 
         ``until_us`` : the time up to which the emulator has given its events, int µs.
         Raises EventDataError for times beyond 100 days, which picoseconds in int64 cannot hold."""

@@ -20,7 +20,8 @@ def smallest_threshold(config: Thresholds) -> float:
 
 
 class Response(NamedTuple):
-    """The signal gain * ln(I + offset), below the luminance ``joint`` a straight line, which fires every ``threshold`` (the smallest nominal one)."""
+    """The signal gain * ln(I + offset), below the luminance ``joint`` a straight line, which fires every ``threshold``
+    (the smallest nominal one)."""
 
     threshold: float
     gain: float

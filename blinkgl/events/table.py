@@ -32,8 +32,8 @@ _SOME_SENSOR = SensorConfig(name="some", width=4, height=3, pixel_pitch_um=10, c
 def register(emulator: type[Emulator]) -> type[Emulator]:
     """Puts a class into the table after a look at every part of it; returns it, so that it may stand above the class.
 
-    Raises TypeError naming the emulator and the part that is missing or of the wrong kind, or that another has its name; nothing is then
-    registered."""
+    Raises TypeError naming the emulator and the part that is missing or of the wrong kind, or that another has its
+    name; nothing is then registered."""
     kind = _checked(emulator)
     if EMULATORS.get(kind, emulator) is not emulator:
         raise TypeError(f"emulator '{kind}': there is one already, {EMULATORS[kind].__name__}")

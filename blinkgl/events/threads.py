@@ -1,11 +1,12 @@
 """Kernels on several threads that sleep when they have nothing to do.
 
-numba's own parallel loops run on OpenMP, whose threads spin for milliseconds after every loop, and at its end wait spinning for
-the last one. On a machine with nothing else to do that is as fast as can be; where something else runs, the thread that is waited for
-stands in the queue behind the ones that wait (two threads then took four to five times as long as one, and twelve times the
-processor time). Here a thread that has no work holds no core, and nobody waits for a thread that has not begun: work is cut in more
-parts than there are threads, every thread takes the next part that nobody has (:func:`take_part`), and the caller, who takes parts
-like everybody else, has done them all by itself where no helper got a core in time.
+numba's own parallel loops run on OpenMP, whose threads spin for milliseconds after every loop, and at its end wait
+spinning for the last one. On a machine with nothing else to do that is as fast as can be; where something else runs,
+the thread that is waited for stands in the queue behind the ones that wait (two threads then took four to five times as
+long as one, and twelve times the processor time). Here a thread that has no work holds no core, and nobody waits for a
+thread that has not begun: work is cut in more parts than there are threads, every thread takes the next part that
+nobody has (:func:`take_part`), and the caller, who takes parts like everybody else, has done them all
+by itself where no helper got a core in time.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from numba.extending import intrinsic, register_jitable
 
 @intrinsic
 def _exchange(typingctx, array, index, value):
-    """Puts ``value`` into int64 ``array[index]`` and returns what was there, in one step that no other thread can get between."""
+    """Puts ``value`` into int64 ``array[index]`` and returns what was there, in one step
+    that no other thread can get between."""
     if not (isinstance(array, types.Array) and array.dtype == types.int64 and array.ndim == 1):
         raise TypingError("expected a 1-D int64 array")
 
@@ -37,7 +39,8 @@ def _exchange(typingctx, array, index, value):
 
 @register_jitable
 def take_part(taken: np.ndarray, start: int) -> int:
-    """In a kernel: the number of a part that no thread has taken before, the next from ``start`` on, around the end; -1 when none is left.
+    """In a kernel: the number of a part that no thread has taken before, the next from ``start``
+    on, around the end; -1 when none is left.
 
     A thread that starts at the same place every time finds what it left in its core's cache."""
     for k in range(taken.size):
@@ -77,7 +80,8 @@ class _Job:
                 self._all_out.release()
 
     def lead(self) -> None:
-        """The part of the caller: when its own run is over no part is left to take, so only those at work are waited for."""
+        """The part of the caller: when its own run is over no part is left to take, so
+        only those at work are waited for."""
         try:
             self._kernel(self._taken, 0, *self._arguments)
         finally:
@@ -101,9 +105,11 @@ def _help_for_ever(jobs: SimpleQueue[_Job]) -> None:
 
 
 def run(kernel: Callable, parts: int, arguments: tuple, threads: int) -> None:
-    """``kernel(taken, start, *arguments)`` on up to ``threads`` threads at once, the calling one among them; over when all parts are done.
+    """``kernel(taken, start, *arguments)`` on up to ``threads`` threads at once, the calling one
+    among them; over when all parts are done.
 
-    kernel : a compiled function that releases the GIL and works on the parts that ``take_part(taken, start)`` gives it, until that is -1.
+    kernel : a compiled function that releases the GIL and works on the parts that
+    ``take_part(taken, start)`` gives it, until that is -1.
     Raises what the kernel raised in any thread."""
     if threads <= 1:
         kernel(np.zeros(parts, np.int64), 0, *arguments)
@@ -129,5 +135,6 @@ os.register_at_fork(after_in_child=_forget)
 
 
 def thread_count() -> int:
-    """How many threads a kernel may use: ``numba.set_num_threads`` in this thread, else NUMBA_NUM_THREADS, else the cores."""
+    """How many threads a kernel may use: ``numba.set_num_threads`` in this thread, else
+    NUMBA_NUM_THREADS, else the cores."""
     return numba.get_num_threads()

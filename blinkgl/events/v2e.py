@@ -167,8 +167,9 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
     table = p.shot_table[block]
     whole = np.float64(table[table.size - 1])
     t_ns, index = p.clock_ns[block], p.clock_index[block]
-    # A Poisson process of candidates for the block as a whole, as fast as if all its pixels were dark, thinned below to what their
-    # intensities allow (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock a block instead of one a pixel.
+    # A Poisson process of candidates for the block as a whole, as fast as if all its pixels were dark, thinned below to
+    # what their intensities allow (Lewis and Shedler, Naval Research Logistics 26, 1979). One clock a block instead of
+    # one a pixel.
     while t_ns <= end_ns:
         gap, pick = shot_draw(v.seed, np.uint64(block), np.uint64(index), v.shot_unit_per_ns * whole)
         # How many entries are <= weight. Weights are much alike, so the proportional guess is a cache line away.
@@ -225,7 +226,8 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
         leak = np.float64(p.leak[i]) if p.leak.size else 0.0
         x0 = np.float64(p.x[i])
         dx = np.float64(x_now[o]) - x0
-        # Over the interval, s from 0 to 1: z(s) = lin-log (a straight line) + lag (e^-ks, see curve_of) + leak and noise (straight lines).
+        # Over the interval, s from 0 to 1: z(s) = lin-log (a straight line) + lag (e^-ks, see curve_of) + leak and
+        # noise (straight lines).
         lag, k = 0.0, -1.0
         if p.lag.size:
             lag = np.float64(p.lag[i])
@@ -430,8 +432,8 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_
 class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
-    State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first or
-    shot noise asks for it, 8 with the dead time. Constants: 16 bytes per pixel, 8 more with shot noise."""
+    State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first
+    or shot noise asks for it, 8 with the dead time. Constants: 16 bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
     _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",

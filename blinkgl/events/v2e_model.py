@@ -58,8 +58,8 @@ def _gentle_growth(k):
 @register_jitable
 def relax(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
     """Lag y - x at the interval's end; kappa = 2 pi f_c dt / 275. float32."""
-    # The low-pass y' = (x - y) / tau with x on a straight line: lag(1) = lag(0) e^-k - (x1 - x0) (1 - e^-k) / k. Its corner frequency is
-    # f_c (I + 20) / 275 (v2e, ``low_pass_filter``), at the interval's mean intensity.
+    # The low-pass y' = (x - y) / tau with x on a straight line: lag(1) = lag(0) e^-k - (x1 - x0) (1 - e^-k) / k. Its
+    # corner frequency is f_c (I + 20) / 275 (v2e, ``low_pass_filter``), at the interval's mean intensity.
     a, g = decay(kappa * (_HALF * (intensity_before + intensity_now) + _JOINT))
     return lag * a - (now - before) * g
 

@@ -166,7 +166,8 @@ def _sense_block(before, now, v, interval, v_end, flags):
         end = move(v[i], drift)
         v_end[i] = end
         flags[i] = np.uint8(near_threshold(v[i], end, noise))
-        # Mean number of events between thresholds at +-1: |mu| dt of the drift alone, sigma^2 dt of the diffusion alone.
+        # Mean number of events between thresholds at +-1: |mu| dt of the drift alone, sigma^2 dt of the diffusion
+        # alone.
         mean_events = _F(abs(drift) + noise * noise)
         most = max(most, mean_events.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
     return np.int32(most).view(np.float32)

@@ -23,8 +23,9 @@ _LATEST_S = 1e7
 class Renderer:
     """Draws one sequence's scene at any time. Holds OpenGL: ``with Renderer(scene) as renderer: renderer.image(0.2)``.
 
-    source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.   quality : as of :func:`record`.
-    Times are seconds on the scene's clock, from ``start_s`` to ``end_s``; outside them everything stands still.
+    source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.   quality : as of
+    :func:`record`. Times are seconds on the scene's clock, from ``start_s`` to ``end_s``;
+    outside them everything stands still.
     Raises ConfigError, AssetError, GLError."""
 
     def __init__(self, source: Source, *, index: int = 0, quality: str | None = None):
@@ -59,7 +60,8 @@ class Renderer:
     def frame(self, t: float, labels: Sequence[str] = ("images",), *, to: float | None = None, back_to: float | None = None) -> LabelFrame:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
-        labels : as of :func:`record`.   to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
+        labels : as of :func:`record`.   to, back_to : s, where flow and flow_backward lead;
+                                         default: one label interval on and back."""
         request = asked_for(LabelsConfig.model_validate(labels_tree(labels)))
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
         return self._renderer.labels(t_ns, request, t_ns + interval if to is None else _ns(to, "to"),
@@ -73,7 +75,8 @@ def _ns(seconds: float, where: str) -> int:
 def render_frame(source: Source, t: float, labels: Sequence[str] = ("images",), *, index: int = 0, to: float | None = None) -> LabelFrame:
     """One :class:`LabelFrame` at t s; for many, a :class:`Renderer` saves making OpenGL's context each time.
 
-    labels : as of :func:`record`; images are ``.colour``, (H, W, 3) float32 linear, flow is ``.forward``, px, others have their own names.
+    labels : as of :func:`record`; images are ``.colour``, (H, W, 3) float32 linear, flow is
+    ``.forward``, px, others have their own names.
     to : s, where the flow leads; default: one label interval on.   Raises as :class:`Renderer`."""
     with Renderer(source, index=index) as renderer:
         return renderer.frame(t, labels, to=to)

@@ -23,24 +23,28 @@ _SIDE = 65535
 
 
 def open_events(path: str | os.PathLike) -> EventFile:
-    """An event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``; ``height``, ``width`` in px, None
-    where the file does not say (``file.sized()`` finds out), times in µs. Endings: .h5 .hdf5 .raw .aedat4 .txt .csv .npz .npy.
+    """An event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
+    ``height``, ``width`` in px, None where the file does not say (``file.sized()`` finds out), times in µs. Endings:
+    .h5 .hdf5 .raw .aedat4 .txt .csv .npz .npy.
 
     Raises AssetError: missing, unknown ending, or not what the ending says."""
     return formats.open_events(check.path(path, "path"))
 
 
 def read_events(path: str | os.PathLike) -> Events:
-    """All :class:`Events` of a file, t in µs, in memory. Raises AssetError and EventDataError (times that run backwards …)."""
+    """All :class:`Events` of a file, t in µs, in memory. Raises AssetError and
+    EventDataError (times that run backwards …)."""
     with open_events(path) as file:
         return file.read()
 
 
 def write_events(path: str | os.PathLike, events: Events | Iterable[Events], height: int, width: int, *, format: str | None = None,
                  t_offset_us: int = 0, time_unit: str = "s", overwrite: bool = True) -> int:
-    """Writes events, or chunks in order, of a sensor of height x width px; the file appears whole or not at all. Returns how many.
+    """Writes events, or chunks in order, of a sensor of height x width px; the file appears
+    whole or not at all. Returns how many.
 
-    path : its ending names the format, or ``format``: dsec, evt3, evt2, aedat4, text, csv, npz, npy.   t_offset_us : DSEC's, µs.
+    path : its ending names the format, or ``format``: dsec, evt3, evt2, aedat4, text, csv,
+    npz, npy.   t_offset_us : DSEC's, µs.
     time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
     path, height, width = check.path(path, "path"), check.whole(height, "height", 1, _SIDE), check.whole(width, "width", 1, _SIDE)
     offset = check.whole(t_offset_us, "t_offset_us", 0, 2**62)
@@ -76,16 +80,19 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str
 
 
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool, of a .png (DSEC), .flo or .npy file.
+    """flow (H, W, 2) float32 px, +x right, +y down (0 where invalid), and valid (H, W) bool,
+    of a .png (DSEC), .flo or .npy file.
 
     Raises AssetError: missing, damaged, or no flow."""
     return flow_files.read_flow(check.path(path, "path"))
 
 
 def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | None = None) -> int:
-    """Writes flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16 bit), .flo or .npy, by the ending.
+    """Writes flow (H, W, 2) px and valid (H, W) bool (default: all) as .png (DSEC's 16
+    bit), .flo or .npy, by the ending.
 
-    Returns how many valid pixels the format could not hold; they are stored as invalid. Raises OutputError, ConfigError."""
+    Returns how many valid pixels the format could not hold; they are stored as invalid. Raises
+    OutputError, ConfigError."""
     field = check.array(flow, "flow", (None, None, 2), "an array (H, W, 2), px")
     mask = np.ones(field.shape[:2], bool) if valid is None else check.array(valid, "valid", field.shape[:2], f"an array {field.shape[:2]} of bool")
     if not field.size:
@@ -97,7 +104,8 @@ def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames:
             interval_ms: float = 20.0, zero_time: bool = False) -> Comparison:
     """How alike two event files are, over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
 
-    b : event file; None: ``a`` is described.   frames : video or folder of images both are compared with.   fps : of the frames, Hz.
+    b : event file; None: ``a`` is described.   frames : video or folder of images both are
+                                                compared with.   fps : of the frames, Hz.
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
@@ -111,11 +119,14 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: EmulatorSe
              report: SimulationReport | None = None) -> Iterator[Events]:
     """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
 
-    frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array, t_ns). uint8, uint16, or
-    float (1.0 is white).   emulator : as of :func:`record`.   sensor : the read-out limit of that camera, and with an emulator's name its values.
+    frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
+    t_ns). uint8, uint16, or float (1.0 is white).   emulator : as of :func:`record`.   sensor : the read-out limit of
+                                                     that camera, and with an emulator's name its values.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
-    interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense flow, at most ``max_px`` px a step.
-    report : a SimulationReport to be filled.   Raises ConfigError at once; EventDataError as frames come, naming the frame."""
+    interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense
+    flow, at most ``max_px`` px a step.
+    report : a SimulationReport to be filled.   Raises ConfigError at once; EventDataError
+                                                as frames come, naming the frame."""
     from blinkgl.recordings import simulation
 
     if not isinstance(frames, Iterable):
@@ -127,9 +138,11 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
                   gamma: str | float | None = None, interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
                   sensor: str | None = None, timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None,
                   overwrite: bool = True) -> SimulationReport:
-    """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as ``blinkgl simulate``; files appear whole or not at all.
+    """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
+    ``blinkgl simulate``; files appear whole or not at all.
 
-    timestamps : file of times, one a frame.   preview : a video of frames and events to write.   The rest: as of :func:`simulate`.
+    timestamps : file of times, one a frame.   preview : a video of frames and events to write.
+                                               The rest: as of :func:`simulate`.
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 

@@ -27,8 +27,9 @@ EmulatorSettings = str | Mapping[str, Any] | Config
 class Timeline:
     """When frames are drawn for the emulator: ``Timeline("displacement", max_px=0.5)``.
 
-    kind : "uniform" (fps, Hz), "displacement" (max_px, px), "brightness" (max_fraction_of_threshold) or "budget" (max_time_error_us or
-    max_time_error_px). values : keys of that kind, and ``reconstruction``; see ``timeline:`` in docs/configuration.md.
+    kind : "uniform" (fps, Hz), "displacement" (max_px, px), "brightness" (max_fraction_of_threshold) or "budget"
+    (max_time_error_us or max_time_error_px). values : keys of that kind, and ``reconstruction``;
+    see ``timeline:`` in docs/configuration.md.
     Raises ConfigError."""
 
     def __init__(self, kind: str = "displacement", **values: Any):
@@ -60,10 +61,13 @@ def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, 
              labels: Sequence[str] | None = None) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
-    source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at most).   workers : processes; 1: this one.
-    resume : go on where ``out`` holds sequences of this run.   emulator, sensor, timeline, quality, labels : as of :func:`record`.
+    source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
+    most).   workers : processes; 1: this one.
+    resume : go on where ``out`` holds sequences of this run.   emulator, sensor, timeline,
+    quality, labels : as of :func:`record`.
     Returns what was made (``made.events``, ``made.labels`` …) and what was set aside.
-    Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files first), AssetError, GLError, OutputError."""
+    Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files
+    first), AssetError, GLError, OutputError."""
     from blinkgl.dataset.executor import Inline, Local
     from blinkgl.dataset.run import run_dataset
 

@@ -1,10 +1,12 @@
-"""Scenes in Python: the pieces of ``scene: {kind: explicit}``, checked by the same models, drawn from the same data classes.
+"""Scenes in Python: the pieces of ``scene: {kind: explicit}``, checked by the same models,
+drawn from the same data classes.
 
-    scene = Scene(Camera(320, 240, pose=Keyframes({0: look_at((-3, 0, 1), (0, 0, 0)), 1: look_at((-3, 1, 1), (0, 0, 0))})))
-    scene += Primitive("cuboid", material=Material(procedural="bricks"))
+    scene = Scene(Camera(320, 240, pose=Keyframes({0: look_at((-3, 0, 1), (0, 0, 0)), 1: look_at((-3, 1, 1), (0, 0,
+    0))}))) scene += Primitive("cuboid", material=Material(procedural="bricks"))
 
-World: right-handed, z up. Lengths in metres, angles in degrees, times in seconds on the scene's clock. All pieces are values: nothing
-changes them, ``scene + body`` is another scene. Whatever cannot be used raises ConfigError when the piece is made, and names the argument.
+World: right-handed, z up. Lengths in metres, angles in degrees, times in seconds on the scene's clock. All pieces are
+values: nothing changes them, ``scene + body`` is another scene. Whatever cannot be used raises ConfigError when the
+piece is made, and names the argument.
 """
 
 from __future__ import annotations
@@ -44,7 +46,8 @@ class _Piece:
     tree: dict[str, Any]
 
     def _checked(self, model: type[Config], tree: dict[str, Any], **renamed: str) -> dict[str, Any]:
-        """``tree`` as it is, when the model takes it. renamed : what keys of the model are called as arguments; "": by their own keys."""
+        """``tree`` as it is, when the model takes it. renamed : what keys of the model are
+        called as arguments; "": by their own keys."""
         try:
             validate(model, tree)
         except ConfigError as error:
@@ -62,7 +65,8 @@ class Pose(_Piece):
     """Where a body or a camera is, and at most one way to say how it is turned.
 
     position : (3,) m.   euler : (3,) degrees about the world's x, then y, then z.   quaternion : (4,) w, x, y, z.
-    look_at : (3,) m, the point that a camera's z axis, or a body's x axis, is turned to. At rest a camera looks along +x with z up.
+    look_at : (3,) m, the point that a camera's z axis, or a body's x axis, is turned to. At
+    rest a camera looks along +x with z up.
     Raises ConfigError."""
 
     def __init__(self, position: Vector = (0.0, 0.0, 0.0), *, euler: Vector | None = None, quaternion: Vector | None = None,
@@ -71,12 +75,14 @@ class Pose(_Piece):
 
 
 def look_at(position: Vector, target: Vector) -> Pose:
-    """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's horizon is level. Raises ConfigError."""
+    """A :class:`Pose` at ``position`` (3,) m, turned to the point ``target`` (3,) m; a camera's
+    horizon is level. Raises ConfigError."""
     return Pose(position, look_at=target)
 
 
 class Keyframes(_Piece):
-    """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before the first time and after the last.
+    """A motion through poses: ``Keyframes({0.0: Pose(…), 1.5: Pose(…)})``, held before
+    the first time and after the last.
 
     poses : time in s -> :class:`Pose`, two or more; from one to the next less than half a turn.
     interpolation : "spline" (twice continuously differentiable) or "linear" (straight lines and slerp).
@@ -105,7 +111,8 @@ class Camera(_Piece):
     """A pin-hole camera and its motion.
 
     width, height : px.   fov : horizontal field of view, degrees (default 60), or focal : focal length, px.
-    cx, cy : principal point, px; (0, 0) is the centre of the top-left pixel; default: the image's centre.   near : m, nothing nearer is drawn.
+    cx, cy : principal point, px; (0, 0) is the centre of the top-left pixel; default: the image's
+    centre.   near : m, nothing nearer is drawn.
     pose : :class:`Pose`, :class:`Keyframes` or a position (3,); OpenCV axes (x right, y down, z forward).
     Raises ConfigError."""
 
@@ -118,7 +125,8 @@ class Camera(_Piece):
 class Light(_Piece):
     """One white sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z).
 
-    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60, 40).   unlit : radiance = albedo everywhere.
+    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60,
+    40).   unlit : radiance = albedo everywhere.
     Raises ConfigError."""
 
     def __init__(self, sun: float = 0.9, sky: float = 0.6, *, elevation: float | None = None, azimuth: float | None = None, unlit: bool = False):
@@ -129,9 +137,11 @@ class Light(_Piece):
 class Material(_Piece):
     """A Lambert surface: ``color`` times at most one texture.
 
-    image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or float, linear light; row 0 is the top.
+    image : an image file (sRGB; .hdr is linear), or an array: (h, w, 3) uint8 sRGB, or
+    float, linear light; row 0 is the top.
     color : (3,) linear factor.   procedural, seed : kind and number of a made-up texture, such as "bricks".
-    photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.   max_size : px, longer sides of a file are reduced.
+    photograph : one that scikit-image brings, such as "astronaut".   uv_scale : (2,) repeats.
+    max_size : px, longer sides of a file are reduced.
     unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
     Raises ConfigError; a missing file is found when the scene is built."""
 
@@ -178,8 +188,10 @@ class _Body(_Piece):
 class Primitive(_Body):
     """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid.
 
-    parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)`` (docs/configuration.md, "primitives").
-    material : :class:`Material`, default white.   pose : :class:`Pose`, :class:`Keyframes` or a position (3,).   scale : one factor, or (3,).
+    parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``
+    (docs/configuration.md, "primitives").
+    material : :class:`Material`, default white.   pose : :class:`Pose`, :class:`Keyframes` or a
+                                                   position (3,).   scale : one factor, or (3,).
     name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
     Raises ConfigError."""
 
@@ -204,7 +216,8 @@ class Mesh(_Body):
     file : obj, ply, stl, glb or gltf.   up : the file's axis that points up, "auto", "y" or "z".
     vertices : (V, 3) m, body axes.   faces : (F, 3) indices, counter-clockwise seen from outside.
     uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
-    material : :class:`Material`; default: the file's own, or white.   pose, scale, name, category : as of :class:`Primitive`.
+    material : :class:`Material`; default: the file's own, or white.   pose, scale, name,
+    category : as of :class:`Primitive`.
     Raises ConfigError; a missing or damaged file raises when the scene is built."""
 
     def __init__(self, file: str | os.PathLike | None = None, *, vertices: ArrayLike | None = None, faces: ArrayLike | None = None,
@@ -243,8 +256,8 @@ class Scene(_Piece):
 
     camera : :class:`Camera`.   objects : :class:`Primitive` and :class:`Mesh`; ids count from 1 in this order.
     light : :class:`Light`.   background : linear radiance where nothing is hit.
-    duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label interval after ``start``, so that
-    a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
+    duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label
+    interval after ``start``, so that a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
     collisions : stop what collides where it does.   seed : of the sensor's noise.
     Raises ConfigError."""
 
@@ -290,7 +303,8 @@ class Scene(_Piece):
         return f"<Scene of {len(self.objects)} objects>"
 
     def template(self) -> RunTemplate:
-        """The scene as the run that a YAML file would be, relative paths from the working folder. Raises ConfigError: no objects."""
+        """The scene as the run that a YAML file would be, relative paths from the working
+        folder. Raises ConfigError: no objects."""
         if not self.objects:
             raise ConfigError("a scene without objects", where="Scene.objects", accepted="at least one: scene + Primitive(…)")
         return RunTemplate({**self._run, "camera": self.camera.tree, "scene": self.tree}, Path.cwd())

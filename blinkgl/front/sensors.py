@@ -46,8 +46,9 @@ DvsVoltmeter.__doc__ = "DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion w
 
 
 def load_sensor(name: str) -> SensorConfig:
-    """The values of a shipped camera: davis240c, davis346, dvxplorer, gen31_vga, imx636 (case and punctuation do not matter).
+    """The values of a shipped camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
+    (case and punctuation do not matter).
 
-    ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …; ``values("v2e")`` is what they say of
-    an emulator's keys. Raises ConfigError."""
+    ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …;
+    ``values("v2e")`` is what they say of an emulator's keys. Raises ConfigError."""
     return _load_sensor(name)

@@ -28,13 +28,17 @@ def simulate_sequence(source: Source, *, index: int = 0, emulator: EmulatorSetti
                 case EventChunk(): item.events                        # of about one frame, t in µs
                 case GroundTruth(): item.frame.forward.flow           # (H, W, 2) float32 px
 
-    All events before a label's time come before its :class:`GroundTruth`, and no others. OpenGL is held until the loop ends, however it does.
+    All events before a label's time come before its :class:`GroundTruth`, and no others. OpenGL is
+    held until the loop ends, however it does.
 
-    source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``) included.   index : number of the sequence.
+    source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
+    included.   index : number of the sequence.
     emulator, sensor, timeline, quality, labels : as of :func:`record`; what ``labels`` does not name is not drawn.
-    events : False leaves them out.   pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
-    The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``, ``labels``. Iterate over it once,
-    or use it in ``with`` where it may never be. Raises ConfigError, AssetError, GLError and, as it goes, EventDataError."""
+    events : False leaves them out.   pictures_hz : gives a :class:`Picture` so many times per
+                                      second of simulated time, at event frames.
+    The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
+    ``labels``. Iterate over it once, or use it in ``with`` where it may never be. Raises ConfigError, AssetError,
+    GLError and, as it goes, EventDataError."""
     config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
@@ -59,7 +63,8 @@ class Recording:
     events : all of them, t in µs on the scene's clock.   t_us : (K,) int64, times of the labels.
     labels : K times :class:`LabelFrame`; what was not asked for is None in it.
     images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones as they are), or None.
-    config : every value as drawn.   frames : how many the emulator saw.   lost : events that its limit and the read-out swallowed."""
+    config : every value as drawn.   frames : how many the emulator saw.   lost : events that
+                                     its limit and the read-out swallowed."""
 
     events: Events
     t_us: np.ndarray
@@ -72,7 +77,8 @@ class Recording:
 
     @property
     def flow(self) -> np.ndarray:
-        """(K, H, W, 2) float32 px, +x right, +y down, from each label's time to the next; 0 where :attr:`valid` is False."""
+        """(K, H, W, 2) float32 px, +x right, +y down, from each label's time to the next; 0
+        where :attr:`valid` is False."""
         return np.stack([flow.flow for flow in self._forward()])
 
     @property
@@ -98,9 +104,11 @@ def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None 
 
     source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.
     emulator : "esim", "v2e", "voltmeter", or a table with its values, ``{"emulator": "v2e", "cutoff_hz": 200}``.
-    sensor : camera whose size, emulator values and read-out are taken, such as "davis346".   timeline : :class:`Timeline`.
+    sensor : camera whose size, emulator values and read-out are taken, such as "davis346".
+    timeline : :class:`Timeline`.
     quality : "fast", "balanced", "accurate" or "reference".
-    labels : names of labels, such as images, flow, flow_backward, occlusion, depth (docs/configuration.md has all); default: the source's.
+    labels : names of labels, such as images, flow, flow_backward, occlusion, depth
+    (docs/configuration.md has all); default: the source's.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
     images, frames, chunks, times = [], [], [], []

@@ -26,11 +26,12 @@ from blinkgl.gl.shader import ShaderLoader
 _thread = threading.local()
 """``current``: weak reference to the context last made current in the thread."""
 _opened_by: int | None = None
-"""The process that opened OpenGL first. One that is forked off it afterwards has the drivers' locks, and not their threads: it would
-wait for them for ever with its first triangle, also in a context of its own."""
+"""The process that opened OpenGL first. One that is forked off it afterwards has the drivers' locks, and not their
+threads: it would wait for them for ever with its first triangle, also in a context of its own."""
 REQUIRED_VERSION = 430
 APT_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6"
-REMEDY = f"run 'sudo apt-get install -y --no-install-recommends {APT_PACKAGES}', or install the GPU's driver with its EGL part"
+REMEDY = (f"run 'sudo apt-get install -y --no-install-recommends {APT_PACKAGES}', or install the GPU's driver with its EGL "
+          "part")
 DEVICE_VARIABLE = "GLCONTEXT_DEVICE_INDEX"
 
 _LOWER_LEFT, _ZERO_TO_ONE, _CLIP_DEPTH_MODE = 0x8CA1, 0x935F, 0x935D
@@ -56,7 +57,8 @@ class GLContext:
     notes      : what was tried before and failed, one line each (empty when the first choice worked).
     shaders    : the :class:`~blinkgl.gl.shader.ShaderLoader` behind :meth:`program`.
 
-    Not thread-safe, and not to be carried over ``fork()``: GLError in a process that was forked after the first context was made.
+    Not thread-safe, and not to be carried over ``fork()``: GLError in a process that was
+    forked after the first context was made.
     """
 
     def __init__(self, raw: Any, backend: str, device: int, notes: tuple[str, ...] = ()):
@@ -108,12 +110,13 @@ class GLContext:
     def make_current(self) -> None:
         """Make this context the current one again, after another context was used in the same thread.
 
-        Raises GLError where it is current in another thread: going on would draw into, and free, what belongs to the context
-        that is current here, and in a forked process."""
+        Raises GLError where it is current in another thread: going on would draw into, and free, what belongs to the
+        context that is current here, and in a forked process."""
         _refuse_after_fork()
         egl = None
         if self.backend == "egl":
-            # EGL does not see what OSMesa does behind its back: it takes a context it bound for still bound, and does nothing.
+            # EGL does not see what OSMesa does behind its back: it takes a context it bound for still bound, and does
+            # nothing.
             egl = _unbind_egl()
         self._raw.__enter__()  # glcontext does not look at what eglMakeCurrent answers
         if egl is not None and not egl.eglGetCurrentContext():
@@ -121,15 +124,16 @@ class GLContext:
         _thread.current = weakref.ref(self)
 
     def resume(self) -> None:
-        """:meth:`make_current` where another context has been made so in this thread since. For whoever goes on after somebody else's turn."""
+        """:meth:`make_current` where another context has been made so in this thread since. For
+        whoever goes on after somebody else's turn."""
         if getattr(_thread, "current", lambda: None)() is not self:
             self.make_current()
 
     @contextlib.contextmanager
     def borrowed(self) -> Iterator[None]:
-        """Current inside the block; afterwards the one that was current in this thread before is so again. Releasing needs it:
-        OpenGL's names are per context, so what is freed while another context is current is that other one's, and the
-        garbage collector may finish an abandoned generator, and with it a renderer, at any moment."""
+        """Current inside the block; afterwards the one that was current in this thread before is so again. Releasing
+        needs it: OpenGL's names are per context, so what is freed while another context is current is that other one's,
+        and the garbage collector may finish an abandoned generator, and with it a renderer, at any moment."""
         before = getattr(_thread, "current", lambda: None)()
         try:
             self.make_current()
@@ -167,7 +171,8 @@ def create_context(backend: str = "auto", device: int = 0) -> GLContext:
     """Make a headless context and make it current.
 
     backend : "egl"; "osmesa"; or "auto": EGL's ``device``, then (only for device 0) EGL's other devices, then OSMesa.
-    device  : index in the order of ``eglQueryDevicesEXT``; CUDA_VISIBLE_DEVICES has no say in it. The environment variable
+    device  : index in the order of ``eglQueryDevicesEXT``; CUDA_VISIBLE_DEVICES has no say
+    in it. The environment variable
               GLCONTEXT_DEVICE_INDEX overrides it (glcontext's own rule, kept because job schedulers set it).
 
     Raises GLError naming every attempt and the remedy, and in a process that was forked after another context was made.
@@ -264,7 +269,8 @@ def _one_line(error: Exception) -> str:
 
 
 def egl_devices() -> list[str]:
-    """One description per EGL device, in ``gl.device`` order; empty without EGL or its device extension. Makes no context."""
+    """One description per EGL device, in ``gl.device`` order; empty without EGL or its
+    device extension. Makes no context."""
     name = _loadable(_EGL_LIBRARIES)
     if name is None:
         return []

@@ -47,7 +47,8 @@ FORMATS = {
 
 
 def checked_array(out: np.ndarray | None, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """``out``, or a new array where there is none. ValueError when it is not C-contiguous or of another shape or dtype."""
+    """``out``, or a new array where there is none. ValueError when it is not C-contiguous
+    or of another shape or dtype."""
     if out is None:
         return np.empty(shape, dtype)
     if out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous:
@@ -59,12 +60,15 @@ class Target:
     """A framebuffer of ``width`` x ``height`` px with colour textures and depth.
 
     colour : one key of :data:`FORMATS` per attachment, ``layout(location = i)`` in the fragment shader.
-    samples: 0, or coverage samples per pixel: then colour and depth are multi-sampled renderbuffers, which can be drawn to
+    samples: 0, or coverage samples per pixel: then colour and depth are multi-sampled
+    renderbuffers, which can be drawn to
              and resolved (:meth:`resolve_into`), not read or sampled.
-    depth  : True: 32F renderbuffer; "texture": 32F texture that a later pass can sample (``.depth.use(unit)``, ``sampler2D``);
+    depth  : True: 32F renderbuffer; "texture": 32F texture that a later pass can sample
+    (``.depth.use(unit)``, ``sampler2D``);
              False: none. Clear it to 0 and test with ``ctx.depth_func = ">"`` (reversed-Z).
 
-    fbo    : moderngl.Framebuffer.   colour: its textures, filtered NEAREST (renderbuffers when multi-sampled).   depth: renderbuffer, texture or None.
+    fbo    : moderngl.Framebuffer.   colour: its textures, filtered NEAREST (renderbuffers when multi-sampled).   depth:
+           renderbuffer, texture or None.
 
     Raises GLError for unknown formats, sizes or samples beyond the driver's limit.
     """
@@ -103,7 +107,8 @@ class Target:
 
     def _depth(self, kind: bool | str) -> moderngl.Texture | moderngl.Renderbuffer | None:
         """moderngl only makes 24-bit depth. Its object is kept and given 32F storage *before* it is attached, so that
-        moderngl knows the framebuffer has depth: attached behind its back, depth_mask stays off and depth is never written."""
+        moderngl knows the framebuffer has depth: attached behind its back, depth_mask stays
+        off and depth is never written."""
         gl, size = self.gl, (self.width, self.height)
         if kind is False:
             return None
@@ -131,9 +136,11 @@ class Target:
         self.fbo.use()
 
     def clear(self, *colour: float | int | Sequence[float], depth: float = 0.0) -> None:
-        """Make it current and clear every attachment: value i (scalar or per component) for attachment i, 0 where none is given.
+        """Make it current and clear every attachment: value i (scalar or per component) for
+        attachment i, 0 where none is given.
 
-        Unlike ``fbo.clear`` this is defined for integer formats and may differ between attachments. Honours the scissor.
+        Unlike ``fbo.clear`` this is defined for integer formats and may differ between
+        attachments. Honours the scissor.
         """
         self.fbo.use()
         for i, pixel in enumerate(self.formats):
@@ -157,7 +164,8 @@ class Target:
     def read(self, i: int = 0, out: np.ndarray | None = None, region: tuple[int, int, int, int] | None = None) -> np.ndarray:
         """Attachment ``i``: (H, W) for one component, else (H, W, C); dtype of its format; row 0 is the top row.
 
-        out    : written in place and returned when given (C-contiguous, that shape and dtype). No allocation: the fast way.
+        out    : written in place and returned when given (C-contiguous, that shape and
+               dtype). No allocation: the fast way.
         region : (x, y, w, h) px; H, W are then h, w.
         """
         pixel = self.formats[i]
@@ -168,7 +176,8 @@ class Target:
         return out
 
     def read_depth(self, out: np.ndarray | None = None) -> np.ndarray:
-        """(H, W) float32 window-space depth: near/z_camera for BlinkGL's reversed-Z infinite projection, 0 where cleared."""
+        """(H, W) float32 window-space depth: near/z_camera for BlinkGL's reversed-Z infinite
+        projection, 0 where cleared."""
         if self.depth is None:
             raise GLError("this target has no depth")
         out = checked_array(out, (self.height, self.width), np.dtype(np.float32))

@@ -1,9 +1,10 @@
 """GLSL programs from files: one file per program, ``#include``, ``#define`` variants, errors that name the user's line.
 
-A file in ``shaders/`` holds all stages of one program, told apart by ``#ifdef VERTEX_SHADER`` / ``#ifdef FRAGMENT_SHADER``;
-it is compiled once per stage. ``#include "camera.glsl"`` takes ``shaders/include/camera.glsl`` and has an include guard
-built in, so that two includes may share a third. What the compiler sees is one text with a table saying which file and line
-each of its lines came from: drivers disagree about ``#line`` with a file number, but all of them count lines.
+A file in ``shaders/`` holds all stages of one program, told apart by ``#ifdef VERTEX_SHADER`` /
+``#ifdef FRAGMENT_SHADER``; it is compiled once per stage. ``#include "camera.glsl"`` takes
+``shaders/include/camera.glsl`` and has an include guard built in, so that two includes may share a third. What the
+compiler sees is one text with a table saying which file and line each of its lines came from: drivers disagree about
+``#line`` with a file number, but all of them count lines.
 """
 
 from __future__ import annotations
@@ -27,14 +28,15 @@ STAGES = ("vertex", "fragment")
 DEFAULT_VERSION = "#version 430 core"
 
 MADE: list[Callable[[], Mapping[str, str]]] = []
-"""Includes that are no files: each gives texts by the name that they are included by. Whoever makes some adds itself here; a file of the
-shader folder wins."""
+"""Includes that are no files: each gives texts by the name that they are included by. Whoever makes some adds itself
+here; a file of the shader folder wins."""
 
 _VERSION = re.compile(r"\s*#\s*version\b")
 _INCLUDE = re.compile(r'\s*#\s*include\b\s*(?P<argument>.*?)\s*(//.*)?$')
 _QUOTED = re.compile(r'"([^"]+)"$')
 _NAME = re.compile(r"(?!gl_|GL_)[A-Za-z](?!\w*__)\w*$")
-# Where drivers put the line number: Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD/Intel/Apple "ERROR: 0:12: …".
+# Where drivers put the line number: Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD/Intel/Apple "ERROR:
+# 0:12: …".
 _MESSAGES = (
     re.compile(r"\d+:(?P<line>\d+)\(\d+\): (?:preprocessor )?(?P<kind>error|warning): (?P<text>.*)"),
     re.compile(r"\d+\((?P<line>\d+)\) : (?P<kind>error|warning) (?P<text>.*)"),
@@ -46,8 +48,10 @@ _STAGE_HEADER = re.compile(r"(vertex|fragment)_shader$")
 @dataclass(frozen=True)
 class ShaderSource:
     """text : GLSL as the compiler sees it, one stage.
-    origin : (file, line) of each of its lines, 1-based, the file relative to the shader folder; ("", 0) for generated lines.
-    files : text of every file in it, by the same names.   made : names of those that are no files (:data:`MADE`), as they are included."""
+    origin : (file, line) of each of its lines, 1-based, the file relative to the shader
+    folder; ("", 0) for generated lines.
+    files : text of every file in it, by the same names.   made : names of those that are no files
+    (:data:`MADE`), as they are included."""
 
     name: str
     stage: str
@@ -62,7 +66,8 @@ class ShaderSource:
 
 
 class ShaderError(GLError):
-    """A shader that does not load, compile or link. ``str``: one line; ``detail``: every message with the source around it."""
+    """A shader that does not load, compile or link. ``str``: one line; ``detail``: every
+    message with the source around it."""
 
     def __init__(self, problem: str, *, where: str | None = None, detail: str = "", log: str = "", **more: Any):
         super().__init__(problem, where=where, **more)
@@ -77,7 +82,8 @@ def shader_folder() -> Traversable:
 def expand(name: str, stage: str, defines: Mapping[str, Any] | None = None, folder: Traversable | None = None) -> ShaderSource:
     """Source of one stage with includes and defines written out.
 
-    name    : file in ``folder`` (default: the shipped shaders), or an absolute path; includes are always the folder's.   stage: "vertex" or "fragment".
+    name    : file in ``folder`` (default: the shipped shaders), or an absolute path; includes are always the folder's.
+            stage: "vertex" or "fragment".
     defines : NAME -> number, True (1), text as it stands, or False/None (left undefined).
 
     Raises ShaderError for a missing file, an include cycle, or a define that is no GLSL identifier.
@@ -202,8 +208,8 @@ class ShaderLoader:
         self._made: dict[tuple[str, tuple[tuple[str, str], ...]], dict[str, str]] = {}  # includes of a program that are no files
 
     def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
-        """The program of file ``name`` with ``defines``; compiled when first asked for, and again when an include that is no file has
-        changed. Raises ShaderError."""
+        """The program of file ``name`` with ``defines``; compiled when first asked for, and again when an include that
+        is no file has changed. Raises ShaderError."""
         key = (name, normalised(defines))
         if key not in self._programs or not self._made.get(key, {}).items() <= made_includes().items():
             self._programs[key] = self._compile(name, defines)

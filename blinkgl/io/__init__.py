@@ -1,4 +1,5 @@
-"""Files in and out: one module per format, the reader beside the writer. Nothing here knows about scenes, GL or emulators.
+"""Files in and out: one module per format, the reader beside the writer. Nothing here knows
+about scenes, GL or emulators.
 
 In:    events, pictures and labels as arrays, or files of strangers.
 Out:   files that appear whole or not at all, or arrays, or one line that names the file.

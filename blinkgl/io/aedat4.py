@@ -67,8 +67,8 @@ class Aedat4Reader:
 
 
 class _Decoder:
-    """dv-processing in a process of its own, :mod:`blinkgl.io.aedat4_decode`: damaged bytes crash it or keep it busy for ever.
-    Iterating yields its arrays. Raises AssetError."""
+    """dv-processing in a process of its own, :mod:`blinkgl.io.aedat4_decode`: damaged bytes crash it or keep it busy
+    for ever. Iterating yields its arrays. Raises AssetError."""
 
     def __init__(self, path: Path):
         self.path = path

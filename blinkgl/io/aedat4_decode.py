@@ -1,8 +1,9 @@
 """The process that runs dv-processing for :class:`blinkgl.io.aedat4.Aedat4Reader`: ``python aedat4_decode.py FILE``.
 
-The library does not verify what it unpacks, so that damaged bytes can crash it or keep it busy for ever; here it may. Written to stdout: a
-line of JSON, {"size": [height, width]} or {"problem": …}; then batches, each eight bytes of count and as many rows of :data:`ROW`; last a count of -1 and
-a line of JSON, {} or {"problem": …}. Imports nothing of BlinkGL, so as to start quickly.
+The library does not verify what it unpacks, so that damaged bytes can crash it or keep it busy for ever; here it may.
+Written to stdout: a line of JSON, {"size": [height, width]} or {"problem": …}; then batches, each eight bytes of count
+and as many rows of :data:`ROW`; last a count of -1 and a line of JSON, {} or {"problem": …}. Imports nothing of
+BlinkGL, so as to start quickly.
 """
 
 import json

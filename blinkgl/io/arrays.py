@@ -1,4 +1,5 @@
-"""Events as NumPy files: .npz with x, y, t, p, or .npy with a structured array. Whole recordings in memory, unlike the others."""
+"""Events as NumPy files: .npz with x, y, t, p, or .npy with a structured array. Whole
+recordings in memory, unlike the others."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _NAMES = {"t": ("t", "ts", "timestamp", "timestamps"), "x": ("x",), "y": ("y",),
 
 
 class ArrayReader:
-    """``.npz`` with four columns or ``.npy`` structured. Integer times are µs, float times seconds; p is 0/1, -1/1 or bool.
+    """``.npz`` with four columns or ``.npy`` structured. Integer times are µs, float
+    times seconds; p is 0/1, -1/1 or bool.
 
     A plain (N, 4) array is refused: files in the wild disagree about the order of its columns."""
 

@@ -11,8 +11,8 @@ INVALID = np.array([40, 40, 40], np.uint8)
 _RADIUS = 255
 _BANDS = ((15, (255, 0, 0), (255, 255, 0)), (6, (255, 255, 0), (0, 255, 0)), (4, (0, 255, 0), (0, 255, 255)),
           (11, (0, 255, 255), (0, 0, 255)), (13, (0, 0, 255), (255, 0, 255)), (6, (255, 0, 255), (255, 0, 0)))
-"""Hue bands of the Middlebury wheel: number of steps, from, to (Baker et al., "A Database and Evaluation Methodology for Optical
-Flow", IJCV 2011, colour coding after Ware); unequal, because equal steps of hue do not look equal."""
+"""Hue bands of the Middlebury wheel: number of steps, from, to (Baker et al., "A Database and Evaluation Methodology
+for Optical Flow", IJCV 2011, colour coding after Ware); unequal, because equal steps of hue do not look equal."""
 
 
 @functools.cache
@@ -80,7 +80,8 @@ def count_events(x: np.ndarray, y: np.ndarray, p: np.ndarray, counts: np.ndarray
 
 
 def event_colour(counts: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 of (2, H, W) counts: ON blue, OFF red on white, both violet; one event already shows, more are darker."""
+    """(H, W, 3) uint8 of (2, H, W) counts: ON blue, OFF red on white, both violet; one event
+    already shows, more are darker."""
     rgb = np.empty((*counts.shape[1:], 3), np.uint8)
     _shade(counts, _SHADE, rgb)
     return rgb

@@ -1,7 +1,8 @@
 """Events as a file claims them: nothing wraps round, nothing lies outside the sensor, nothing runs backwards.
 
-Every reader hands the columns it finds to :func:`events_of`; :class:`blinkgl.io.formats.EventFile`, the slicing readers and every
-writer ask :func:`check_events` for the rest. Positions in messages are indices of events, counted from the file's first.
+Every reader hands the columns it finds to :func:`events_of`; :class:`blinkgl.io.formats.EventFile`, the slicing readers
+and every writer ask :func:`check_events` for the rest. Positions in messages are indices of
+events, counted from the file's first.
 """
 
 from __future__ import annotations
@@ -20,9 +21,11 @@ def events_of(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, where:
               signed: bool = False) -> Events:
     """Columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
 
-    t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. first : index of the first of these events in the file.
-    Raises EventDataError, naming event and value, for what Events cannot hold: coordinates outside uint16 or between pixels, NaN,
-    times beyond int64, another polarity. AssetError: a column that is no 1-D array of numbers, or columns of different lengths."""
+    t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. first : index of the
+    first of these events in the file.
+    Raises EventDataError, naming event and value, for what Events cannot hold: coordinates outside uint16 or between
+    pixels, NaN, times beyond int64, another polarity. AssetError: a column that is no 1-D array of
+    numbers, or columns of different lengths."""
     columns = {"x": np.asarray(x), "y": np.asarray(y), "t": np.asarray(t), "p": np.asarray(p)}
     if any(c.ndim != 1 for c in columns.values()) or len({len(c) for c in columns.values()}) != 1:
         raise AssetError("event columns differ in length", where=where, value={k: c.shape for k, c in columns.items()})
@@ -34,7 +37,8 @@ def events_of(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, where:
 
 
 def microseconds(seconds: np.ndarray, where: str, first: int = 0) -> np.ndarray:
-    """int64 µs, rounded, of float seconds. Raises EventDataError, naming the event, for NaN, infinity and what int64 cannot hold."""
+    """int64 µs, rounded, of float seconds. Raises EventDataError, naming the event, for NaN,
+    infinity and what int64 cannot hold."""
     t = np.rint(np.asarray(seconds, np.float64) * 1e6)
     if len(t) and not (np.abs(t) < _MAX_TIME).all():  # NaN compares False
         i = int(np.argmin(np.abs(t) < _MAX_TIME))
@@ -44,9 +48,9 @@ def microseconds(seconds: np.ndarray, where: str, first: int = 0) -> np.ndarray:
 
 def check_events(events: Events, where: str, first: int = 0, *, height: int | None = None, width: int | None = None,
                  after: int | None = None) -> int | None:
-    """Refuses, naming event and value, what lies outside a sensor of that size (None: not known), a polarity other than 0 and 1, and
-    times that run backwards, also against ``after``, the last time before these events. Returns the last time (``after`` when there are
-    no events). Raises EventDataError."""
+    """Refuses, naming event and value, what lies outside a sensor of that size (None: not known), a polarity other than
+    0 and 1, and times that run backwards, also against ``after``, the last time before these events. Returns the last
+    time (``after`` when there are no events). Raises EventDataError."""
     t = events.t
     if not len(t):
         return after

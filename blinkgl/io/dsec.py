@@ -243,7 +243,8 @@ class DsecEventReader:
         """Events of [t0_us, t1_us), image clock, by DSEC's rule: ``ms_to_idx`` gives the conservative range
         floor(t0)…ceil(t1) in ms, the exact bounds are searched inside it.
 
-        Raises EventDataError as :func:`~blinkgl.io.columns.check_events`; AssetError: damaged, or a table that leaves events out."""
+        Raises EventDataError as :func:`~blinkgl.io.columns.check_events`; AssetError: damaged,
+        or a table that leaves events out."""
         r0, r1 = int(t0_us) - self.t_offset_us, int(t1_us) - self.t_offset_us
         start, stop = self._index(r0 // 1000, 0), self._index(-(-r1 // 1000), self.count)
         if not 0 <= start <= stop <= self.count:
@@ -293,8 +294,8 @@ class DsecEventReader:
 
 
 def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:
-    """``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A simulated pin-hole camera's is the identity;
-    loaders such as E-RAFT's insist on the file."""
+    """``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A simulated pin-hole camera's is the
+    identity; loaders such as E-RAFT's insist on the file."""
     with output_errors(path), h5py.File(path, "w") as file:
         file.create_dataset("rectify_map", data=np.asarray(rectify_map, np.float32), track_times=False,
                             compression=hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE))

@@ -1,8 +1,8 @@
 """Prophesee's EVT2 (32-bit words) and EVT3 (16-bit words), decoded and encoded by numba kernels.
 
 EVT2: type in bits 31..28 (0 OFF, 1 ON, 8 TIME_HIGH = t >> 6); t low 27..22, x 21..11, y 10..0.
-EVT3: type in bits 15..12: 0 ADDR_Y, 2 ADDR_X (polarity bit 11), 3 VECT_BASE_X, 4 VECT_12, 5 VECT_8, 6 TIME_LOW (t & 0xfff),
-8 TIME_HIGH (t >> 12 & 0xfff): 24 bits of µs, wrapping every 16.8 s. (Prophesee, "EVT 2.0 / 3.0 format" pages.)
+EVT3: type in bits 15..12: 0 ADDR_Y, 2 ADDR_X (polarity bit 11), 3 VECT_BASE_X, 4 VECT_12, 5 VECT_8, 6 TIME_LOW (t &
+0xfff), 8 TIME_HIGH (t >> 12 & 0xfff): 24 bits of µs, wrapping every 16.8 s. (Prophesee, "EVT 2.0 / 3.0 format" pages.)
 
 Like other encoders of a ready event list we write EVT3's single events only, no vectors; the reader knows both.
 """
@@ -32,7 +32,8 @@ _MAX_TIME = 1 << 34
 class EvtWriter:
     """Streams events into an EVT2 or EVT3 file with a header that names format and geometry.
 
-    Raises EventDataError for times outside [0, 2^34) µs or out of order, and coordinates outside the sensor or the formats' 11 bits.
+    Raises EventDataError for times outside [0, 2^34) µs or out of order, and coordinates
+    outside the sensor or the formats' 11 bits.
     """
 
     def __init__(self, path: str | os.PathLike, height: int, width: int, version: str = "evt3"):
@@ -81,9 +82,10 @@ class EvtWriter:
 class EvtReader:
     """Header and events of an EVT2/EVT3 file. ``height`` and ``width`` are None when the header does not say.
 
-    As the format asks for, events before the first TIME_HIGH have no time and are left out, and triggers and vendors' words are passed over.
-    Raises AssetError: no ``% evt`` header, another version, an impossible size, stray bytes at the end (truncated), a word that
-    the format does not have (with its byte), events but no TIME_HIGH at all."""
+    As the format asks for, events before the first TIME_HIGH have no time and are left out, and
+    triggers and vendors' words are passed over.
+    Raises AssetError: no ``% evt`` header, another version, an impossible size, stray bytes at the end (truncated), a
+    word that the format does not have (with its byte), events but no TIME_HIGH at all."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -103,7 +105,8 @@ class EvtReader:
     def chunks(self, words: int = 1 << 17) -> Iterator[Events]:
         """All events, as decoded from ``words`` words at a time."""
         dtype = _WORD[self.version]
-        # EVT2: time high, wraps.  EVT3: time high, y, low, vector base x, polarity, wraps.  -1: no time yet.  Last: events without a time.
+        # EVT2: time high, wraps.  EVT3: time high, y, low, vector base x, polarity, wraps.  -1: no time yet.  Last:
+        # events without a time.
         state = np.array([-1, 0, 0] if self.version == "evt2" else [-1, 0, 0, 0, 0, 0, 0], np.int64)
         position = self._start
         decode, most = (_decode_evt2, 1) if self.version == "evt2" else (_decode_evt3, 12)
@@ -116,7 +119,8 @@ class EvtReader:
                 t = np.empty(most * len(raw), np.int64)
                 n, bad = decode(raw, state, x, y, t, p)
                 if bad >= 0:
-                    raise AssetError(f"damaged at byte {position + bad * dtype.itemsize}: no {self.version.upper()} word can stand here",
+                    raise AssetError(f"damaged at byte {position + bad * dtype.itemsize}: no {self.version.upper()} word can "
+                                     "stand here",
                                      where=str(self.path), value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}")
                 position += whole
                 if n:
@@ -222,7 +226,8 @@ def _encode_evt3(x, y, t, p, state, first, words):
 
 @numba.njit(cache=True, nogil=True)
 def _decode_evt3(words, state, x, y, t, p):
-    """Returns (events, index of the first word of an unknown type, or whose vector leaves the 11 bits of x; -1: none)."""
+    """Returns (events, index of the first word of an unknown type, or whose vector leaves
+    the 11 bits of x; -1: none)."""
     n, bad = 0, -1
     high, row, low, base, polarity, wraps, untimed = state
     for i in range(len(words)):

@@ -41,8 +41,8 @@ def encode_flow_npy(flow: np.ndarray, valid: np.ndarray) -> bytes:
 
 
 def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray) -> int:
-    """Writes flow (H, W, 2) px and valid (H, W) bool; the file appears whole or not at all. Returns how many valid pixels the format could
-    not hold (.png: beyond -256 ... 255.99 px), which are stored as invalid.
+    """Writes flow (H, W, 2) px and valid (H, W) bool; the file appears whole or not at all. Returns how many valid
+    pixels the format could not hold (.png: beyond -256 ... 255.99 px), which are stored as invalid.
 
     Raises OutputError: unknown ending, or it cannot be written."""
     ending, lost = Path(path).suffix, 0

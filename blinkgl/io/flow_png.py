@@ -1,7 +1,7 @@
 """Flow as 16-bit PNG: DSEC's (quantum 1/128 px, ±256 px) and KITTI's (1/64 px, ±512 px).
 
-On disk the channels are R = x, G = y, B = valid. OpenCV is the codec because imageio's default and Pillow silently return 8 bits
-for 16-bit RGB; it speaks BGR, so the order is turned here and nowhere else.
+On disk the channels are R = x, G = y, B = valid. OpenCV is the codec because imageio's default and Pillow silently
+return 8 bits for 16-bit RGB; it speaks BGR, so the order is turned here and nowhere else.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def encode_flow_png(flow: np.ndarray, valid: np.ndarray, *, scale: float = DSEC_
     """PNG bytes of a flow field.
 
     flow : (H, W, 2) float px, +x right, +y down. valid : (H, W) bool.
-    Returns (png, lost): ``lost`` counts valid pixels that the format cannot hold (beyond -256 … 255.99 px for DSEC, or not
-    finite). They are stored as invalid instead of being clipped to a wrong flow. Invalid pixels hold zero flow.
+    Returns (png, lost): ``lost`` counts valid pixels that the format cannot hold (beyond -256 … 255.99 px for DSEC, or
+    not finite). They are stored as invalid instead of being clipped to a wrong flow. Invalid pixels hold zero flow.
     """
     valid = np.asarray(valid, bool)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -76,8 +76,8 @@ def encode_png(image: np.ndarray, strategy: int = cv2.IMWRITE_PNG_STRATEGY_RLE) 
 
 
 def read_png(path: str | os.PathLike) -> np.ndarray:
-    """Pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes; AssetError when missing,
-    truncated, undecodable, or of more than 2^28 px (what it would unpack to is known before that happens)."""
+    """Pixels as stored, channels in OpenCV's BGR order, of a PNG or another image that OpenCV decodes; AssetError when
+    missing, truncated, undecodable, or of more than 2^28 px (what it would unpack to is known before that happens)."""
     try:
         data = Path(path).read_bytes()
     except OSError as error:

@@ -33,8 +33,8 @@ SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 128
 
 
 class EventWriter(Protocol):
-    """What every format's writer offers; ``abort`` never raises. ``t_end_us`` may be set before the end: the recording's, where it
-    is later than the last event's (used by DSEC's table)."""
+    """What every format's writer offers; ``abort`` never raises. ``t_end_us`` may be set before the end: the
+    recording's, where it is later than the last event's (used by DSEC's table)."""
 
     t_end_us: int | None
 
@@ -59,8 +59,9 @@ class EventFile:
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning, in pieces, memory flat (npz, npy: held whole).
 
-        Raises, naming event and value, EventDataError: times that run backwards, an event outside height and width where those are known,
-        or that :class:`~blinkgl.events.types.Events` cannot hold; AssetError when the file is damaged."""
+        Raises, naming event and value, EventDataError: times that run backwards, an event outside height and width
+        where those are known, or that :class:`~blinkgl.events.types.Events` cannot hold;
+        AssetError when the file is damaged."""
         last, count = None, 0
         for events in self._reader.chunks():
             last = check_events(events, str(self.path), count, height=self.height, width=self.width, after=last)
@@ -160,8 +161,8 @@ def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int, ti
 @contextlib.contextmanager
 def event_writer(path: str | os.PathLike, height: int, width: int, *, format: str | None = None, t_offset_us: int = 0,
                  time_unit: str = "s", overwrite: bool = True) -> Iterator[EventWriter]:
-    """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the block ends
-    without an exception, and not at all otherwise.
+    """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the
+    block ends without an exception, and not at all otherwise.
 
     t_offset_us : DSEC only, the time of the recording's start. time_unit : text and CSV only, "s" or "us".
     Raises OutputError, EventDataError.
@@ -192,7 +193,8 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str
     """Copies events from one format to another, streaming.
 
     size : (height, width) for sources that do not say (default: guessed, see :meth:`EventFile.sized`).
-    time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for formats that count from the start (EVT2, EVT3).
+    time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for formats that
+    count from the start (EVT2, EVT3).
     Returns the source with its size, and the number of events written.
     """
     output_format(target, format)

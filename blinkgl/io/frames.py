@@ -1,4 +1,5 @@
-"""Frame sequences as input: a video, a folder of images, or an array file; one frame in memory at a time (.npz: all)."""
+"""Frame sequences as input: a video, a folder of images, or an array file; one frame in
+memory at a time (.npz: all)."""
 
 from __future__ import annotations
 
@@ -22,12 +23,12 @@ _STAMP_FILES = ("timestamps.txt", "images.txt", "timestamps.csv")
 class FrameSource:
     """Frames with their times.
 
-    height, width : px. count : number of frames, None when unknown before the end. times_known : False where only ``fps`` given
-    by the user can time the frames. Iterating yields (frame, t_ns, name): frame (H, W) or (H, W, 3) RGB of uint8, uint16 or
-    float32; t_ns int, strictly increasing; name for messages.
+    height, width : px. count : number of frames, None when unknown before the end. times_known : False where only
+    ``fps`` given by the user can time the frames. Iterating yields (frame, t_ns, name): frame (H, W) or (H, W, 3) RGB
+    of uint8, uint16 or float32; t_ns int, strictly increasing; name for messages.
 
-    Raises (while iterating): AssetError for an undecodable frame, EventDataError for a changed size or times that do not
-    increase, a single frame.
+    Raises (while iterating): AssetError for an undecodable frame, EventDataError for a changed size or times that do
+    not increase, a single frame.
     """
 
     path: Path
@@ -58,8 +59,8 @@ class FrameSource:
 def open_frames(path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None) -> FrameSource:
     """A video (by ending), a folder of images, or .npy/.npz with frames (N, H, W) or (N, H, W, 3).
 
-    fps : frame rate; overrides the video's own and any time stamps. timestamps : file with one time per frame, or "time name"
-    lines as the Event Camera Dataset's images.txt (integers are µs, numbers with a point seconds). A folder's own
+    fps : frame rate; overrides the video's own and any time stamps. timestamps : file with one time per frame, or "time
+    name" lines as the Event Camera Dataset's images.txt (integers are µs, numbers with a point seconds). A folder's own
     timestamps.txt, or an images.txt in it or its parent, is found by itself.
 
     Raises AssetError or EventDataError, one line naming file, frame and value.
@@ -187,8 +188,8 @@ def _stamps(name: str, values: np.ndarray) -> list[int]:
 
 
 def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
-    """(t_ns, name or None) per line of "time" or "time name"; integers are µs, numbers with a point or exponent seconds; ``#``
-    comments and one header line are skipped. Raises EventDataError naming the line."""
+    """(t_ns, name or None) per line of "time" or "time name"; integers are µs, numbers with a point or exponent
+    seconds; ``#`` comments and one header line are skipped. Raises EventDataError naming the line."""
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:

@@ -1,7 +1,9 @@
-"""HDF5 files that are not trusted: opened without being led out of the file, data sets checked before they are believed.
+"""HDF5 files that are not trusted: opened without being led out of the file, data sets
+checked before they are believed.
 
-An HDF5 file may say that its data lie in other files (external storage, virtual data sets, external links): read as root, such a
-file copies whatever it names into a column. :func:`open_hdf5` is the one way to open a file for reading and refuses them by name.
+An HDF5 file may say that its data lie in other files (external storage, virtual data sets, external links): read as
+root, such a file copies whatever it names into a column. :func:`open_hdf5` is the one way to open a
+file for reading and refuses them by name.
 """
 
 from __future__ import annotations
@@ -52,8 +54,8 @@ def open_hdf5(path: Path) -> h5py.File:
 
 
 def _leads_out(root: h5py.h5f.FileID, name: bytes, kind: int) -> str | None:
-    """What stands under ``name``, when it is stored elsewhere. Soft links stay inside the file: what they lead to has a link of its
-    own here, which is looked at."""
+    """What stands under ``name``, when it is stored elsewhere. Soft links stay inside the file: what they lead to has a
+    link of its own here, which is looked at."""
     if kind == h5py.h5l.TYPE_SOFT:
         return None
     if kind != h5py.h5l.TYPE_HARD:
@@ -87,10 +89,11 @@ def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
 
 
 def dataset(file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu") -> h5py.Dataset:
-    """The data set ``name``, with its shape (None: any length) and NumPy kinds ("iu" integers, "f" floats, "b" bools) as asked for,
-    and as many values stored as it claims.
+    """The data set ``name``, with its shape (None: any length) and NumPy kinds ("iu" integers, "f" floats, "b" bools)
+    as asked for, and as many values stored as it claims.
 
-    Raises AssetError: none of that name (or a group), another shape or type, values that were never written, huge chunks."""
+    Raises AssetError: none of that name (or a group), another shape or type, values that
+    were never written, huge chunks."""
     found = file.get(name)
     if not isinstance(found, h5py.Dataset):
         raise AssetError(f"no dataset '{name}'", where=str(path))
@@ -116,7 +119,8 @@ def dataset(file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, 
 
 
 def blosc_dataset(file: h5py.File, name: str, shape: tuple[int, ...], dtype: DTypeLike, chunks: tuple[int, ...]) -> h5py.Dataset:
-    """A new data set that grows along its first axis: Blosc-zstd level 1 with bit shuffle (filter 32001), as in DSEC's files."""
+    """A new data set that grows along its first axis: Blosc-zstd level 1 with bit shuffle
+    (filter 32001), as in DSEC's files."""
     codec = hdf5plugin.Blosc(cname="zstd", clevel=_LEVEL, shuffle=_BIT_SHUFFLE)
     return file.create_dataset(name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, compression=codec)
 
@@ -124,8 +128,9 @@ def blosc_dataset(file: h5py.File, name: str, shape: tuple[int, ...], dtype: DTy
 def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
     """``data[start:] = rows`` for a data set of :func:`blosc_dataset`, which grows to hold them.
 
-    Chunks are compressed here, each by one thread, instead of inside HDF5. There Blosc would take the user's ``BLOSC_NTHREADS``, and with
-    more than one thread stores its blocks in the order they finish: bytes would differ from run to run."""
+    Chunks are compressed here, each by one thread, instead of inside HDF5. There Blosc would take the user's
+    ``BLOSC_NTHREADS``, and with more than one thread stores its blocks in the order they finish:
+    bytes would differ from run to run."""
     step = data.chunks[0]
     begin = start // step * step
     rows = np.ascontiguousarray(rows, data.dtype)

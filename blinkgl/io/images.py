@@ -1,4 +1,5 @@
-"""Images, masks, ids, depth and normals of a sequence; NumPy files, whose headers are checked before they are believed."""
+"""Images, masks, ids, depth and normals of a sequence; NumPy files, whose headers are checked
+before they are believed."""
 
 from __future__ import annotations
 
@@ -68,7 +69,8 @@ def encode_npy(array: np.ndarray) -> bytes:
 
 
 def read_npy(path: str | os.PathLike) -> np.ndarray:
-    """An array; AssetError when missing, no .npy, truncated, of objects, or of a shape that the file is too short or too long for."""
+    """An array; AssetError when missing, no .npy, truncated, of objects, or of a shape that the
+    file is too short or too long for."""
     with numpy_errors(path):
         check_npy(path)
         return np.load(path, allow_pickle=False)
@@ -81,9 +83,11 @@ def check_npy(path: str | os.PathLike) -> None:
 
 
 def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """(shape, Fortran order?, dtype) at the beginning of ``file``, ``size`` bytes long; it is left where the data begin.
+    """(shape, Fortran order?, dtype) at the beginning of ``file``, ``size`` bytes long; it
+    is left where the data begin.
 
-    Raises AssetError: objects (they would be unpickled), or a shape that is not what the bytes hold; and what NumPy raises."""
+    Raises AssetError: objects (they would be unpickled), or a shape that is not what the
+    bytes hold; and what NumPy raises."""
     version = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(file)
@@ -99,8 +103,8 @@ def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], 
 class NpzReader:
     """The arrays of an .npz by name; one is read when it is asked for. Never unpickles. Use as a context manager.
 
-    Raises (inside :func:`numpy_errors`) AssetError: an entry that is no plain array of numbers, or that would not fit into half of this
-    machine's memory: a small archive can unpack to any size."""
+    Raises (inside :func:`numpy_errors`) AssetError: an entry that is no plain array of numbers, or that would not fit
+    into half of this machine's memory: a small archive can unpack to any size."""
 
     def __init__(self, path: str | os.PathLike):
         self.path, self._archive = path, zipfile.ZipFile(path)
@@ -136,8 +140,8 @@ def memory_limit() -> int:
 
 @contextlib.contextmanager
 def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
-    """Any failure to load ``path`` with NumPy as an AssetError: on damaged bytes it raises what its header parser, zipfile
-    and zlib happen to (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
+    """Any failure to load ``path`` with NumPy as an AssetError: on damaged bytes it raises what its header parser,
+    zipfile and zlib happen to (TokenError, BadZipFile, zlib.error, NotImplementedError, MemoryError …)."""
     try:
         yield
     except AssetError:

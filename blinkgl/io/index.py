@@ -1,6 +1,7 @@
 """``index.jsonl``: one line per sequence of a data set, for loaders that do not want to search a file system.
 
-    {"path": "train/flying_000000", "split": "train", "name": "flying_000000", "sequence": 0, "seed": …, "emulator": "v2e",
+    {"path": "train/flying_000000", "split": "train", "name": "flying_000000", "sequence":
+    0, "seed": …, "emulator": "v2e",
      "events": …, "labels": …, "frames": …, "height": …, "width": …, "t_offset_us": …, "duration_us": …, "bytes": …}
 
 Made from the manifests alone and sorted by path: the same sequences give the same file.
@@ -32,7 +33,8 @@ _KEYS = ("split", "sequence", "seed", "emulator", "events", "labels", "frames", 
 
 
 def sequence_folders(root: str | Path) -> Iterator[Path]:
-    """Folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a sequence; hidden ones are not looked at."""
+    """Folders <root>/<split>/<sequence> with a manifest, or ``root`` itself when it is a
+    sequence; hidden ones are not looked at."""
     root = Path(root)
     if (root / MANIFEST).is_file():
         yield root
@@ -51,9 +53,11 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
 
 
 def write_index(root: str | Path) -> int:
-    """Writes ``index.jsonl`` of the sequences below ``root`` (damaged ones are left out); returns how many. Raises OutputError.
+    """Writes ``index.jsonl`` of the sequences below ``root`` (damaged ones are left out);
+    returns how many. Raises OutputError.
 
-    Lines are sorted in parts of some thousands, which wait in files without names and are merged: memory does not grow with the data set."""
+    Lines are sorted in parts of some thousands, which wait in files without names and are merged:
+    memory does not grow with the data set."""
     root = Path(root)
     count = 0
     with atomic_file(root / INDEX) as path, output_errors(path), contextlib.ExitStack() as stack:
@@ -116,7 +120,8 @@ _MODEL = TypeAdapter(_Line)
 
 
 def read_index(root: str | Path) -> list[dict[str, Any]]:
-    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves the data set or is listed twice."""
+    """The lines of ``index.jsonl``. Raises AssetError: missing, damaged, a path that leaves
+    the data set or is listed twice."""
     path = Path(root) / INDEX
     try:
         entries = [parse(line, _MODEL) for line in read_text(path).splitlines() if line]

@@ -41,7 +41,8 @@ def map_scalar(values: np.ndarray, name: str, low: float, high: float, log: bool
 
 
 def id_colours(ids: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8: distinct hues by the golden ratio, dark grey for 0; the same number always has the same colour."""
+    """(H, W, 3) uint8: distinct hues by the golden ratio, dark grey for 0; the same number
+    always has the same colour."""
     numbers = ids.astype(np.int64)
     hue = (numbers * 0.61803398875) % 1.0
     value = 0.62 + 0.38 * ((numbers * 0.7548776662) % 1.0)
@@ -65,9 +66,11 @@ def component(array: np.ndarray, which: str) -> np.ndarray:
 
 def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str | None = None, low: float | None = None,
             high: float | None = None, hit: np.ndarray | None = None) -> tuple[np.ndarray, dict]:
-    """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high", "log"}, {"kind": "wheel", "high"} or {"kind": kind}.
+    """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high", "log"}, {"kind":
+    "wheel", "high"} or {"kind": kind}.
 
-    kind : as of a :class:`~blinkgl.labels.Label`, or "uv".   which : component of a vector; "auto" takes the kind's own way.
+    kind : as of a :class:`~blinkgl.labels.Label`, or "uv".   which : component of a
+    vector; "auto" takes the kind's own way.
     hit : (H, W) bool, where scalars mean something (they set the range, the rest is dark grey)."""
     if array.dtype == bool or kind == "mask":
         return np.where(array[..., None], np.uint8(245), np.uint8(25)).repeat(3, axis=-1), {"kind": "mask"}

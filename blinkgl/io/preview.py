@@ -1,4 +1,5 @@
-"""preview.mp4: frames, events and flow colours side by side, with the time; made while the sequence is being generated."""
+"""preview.mp4: frames, events and flow colours side by side, with the time; made while the
+sequence is being generated."""
 
 from __future__ import annotations
 
@@ -22,8 +23,8 @@ _LEGEND = 27
 
 
 class PreviewWriter:
-    """Streams a side-by-side video. Frames are taken at ``rate_hz`` of simulated time and played at ``fps``, i.e. slowed by
-    ``rate_hz / fps``; memory does not grow with the sequence.
+    """Streams a side-by-side video. Frames are taken at ``rate_hz`` of simulated time and played at ``fps``, i.e.
+    slowed by ``rate_hz / fps``; memory does not grow with the sequence.
 
         preview.add_events(events)              every chunk
         preview.set_flow(flow, valid)           whenever a label exists; shown until the next
@@ -85,8 +86,8 @@ class PreviewWriter:
         return self._ticks.due(t_us)
 
     def frame(self, t_us: int, image: np.ndarray) -> None:
-        """Composes and encodes one picture (several times when more than one period has passed). image: (H, W[, 3]) float
-        linear light in [0, 1], or uint8 sRGB."""
+        """Composes and encodes one picture (several times when more than one period has passed). image: (H, W[, 3])
+        float linear light in [0, 1], or uint8 sRGB."""
         if not self.due(t_us):
             return
         small = self._fit(image)  # first: cheaper, and averages linear light where it is given

@@ -1,7 +1,7 @@
 """Records on disk that somebody else may have written or damaged: read with limits, and from regular files alone.
 
-A manifest, an index, a run's record: whatever stands in them, reading ends, and ends with data of the shape that its model asks
-for or with one line that says what is wrong.
+A manifest, an index, a run's record: whatever stands in them, reading ends, and ends with data of the shape that its
+model asks for or with one line that says what is wrong.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _BLOCK = 1 << 20
 
 
 def open_regular(path: str | os.PathLike) -> int:
-    """A file descriptor for reading. OSError; AssetError for what is no regular file: a pipe would wait for a writer for ever, a
-    device has no end. A link at the end of the path is followed only to such a file."""
+    """A file descriptor for reading. OSError; AssetError for what is no regular file: a pipe would wait for a writer
+    for ever, a device has no end. A link at the end of the path is followed only to such a file."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -48,8 +48,8 @@ def read_text(path: str | os.PathLike, limit: int = MAX_RECORD_BYTES) -> str:
 
 
 def parse(text: str, model: TypeAdapter | None = None) -> Any:
-    """Plain data from JSON text, as written, once ``model`` has accepted it. ValueError says in one line what is wrong: no JSON, nested too deeply,
-    a key twice, or not of the model's shape."""
+    """Plain data from JSON text, as written, once ``model`` has accepted it. ValueError says in one line what is wrong:
+    no JSON, nested too deeply, a key twice, or not of the model's shape."""
     try:
         data = json.loads(text, object_pairs_hook=_unique)
         if model is not None:
@@ -98,8 +98,9 @@ InsidePath = Annotated[str, AfterValidator(_inside)]
 
 
 def entries_below(folder: str | os.PathLike) -> Iterator[tuple[str, str, int]]:
-    """(POSIX path relative to ``folder``, kind, bytes) of everything below it; kind is "file", "empty folder", "symbolic link" or
-    "special file". Links are not followed. Folders that hold something are not listed themselves. OSError."""
+    """(POSIX path relative to ``folder``, kind, bytes) of everything below it; kind is "file", "empty folder",
+    "symbolic link" or "special file". Links are not followed. Folders that hold something
+    are not listed themselves. OSError."""
     pending = [""]
     while pending:
         prefix = pending.pop()

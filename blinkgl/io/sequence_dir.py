@@ -2,8 +2,8 @@
 
     <sequence>/
       events.h5                      DSEC layout (blinkgl.io.dsec)
-      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line   (these and all below that
-                                     are labels: as their rows say, blinkgl.labels)
+      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line   (these
+                                     and all below that are labels: as their rows say, blinkgl.labels)
       flow/forward/%06d.png          DSEC 16-bit flow;                  flow/forward_timestamps.txt   from_us,to_us
       flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
       flow/forward_flo/%06d.flo, flow/forward.h5                        (on request)
@@ -48,8 +48,8 @@ _IN_FLIGHT = 8
 
 
 class SequenceWriter:
-    """Context manager around one sequence directory. On success everything appears under ``final`` at once; on any exception
-    (Ctrl-C and a full disk included) nothing does and the temporary is removed.
+    """Context manager around one sequence directory. On success everything appears under ``final`` at once; on any
+    exception (Ctrl-C and a full disk included) nothing does and the temporary is removed.
 
     Encoding and hashing run in one background thread, event compression in another; their errors surface in the next
     call or on exit. Arrays are copied, so callers may reuse read-back buffers.
@@ -65,8 +65,8 @@ class SequenceWriter:
 
     Attributes
     ----------
-    info : dict written into the manifest beside the checksums (seed, versions, GL renderer, counts). Keep wall-clock times
-        out of it: the same seed shall give the same manifest.
+    info : dict written into the manifest beside the checksums (seed, versions, GL renderer, counts). Keep wall-clock
+        times out of it: the same seed shall give the same manifest.
     t_end_us : set it to the sequence's end, so that ``ms_to_idx`` covers an eventless tail.
 
     Raises
@@ -129,8 +129,9 @@ class SequenceWriter:
         self._events.append(events)
 
     def label(self, name: str, index: int, value: Any, t_us: int, to_us: int | None = None) -> None:
-        """The ``index``-th value of a label (:mod:`blinkgl.labels`) of ``t_us``; ``to_us``: where it leads, of those that lead to another time.
-        Pixels that a form cannot hold are counted in ``lost`` and the manifest. Raises TypeError: a value of another shape or kind of number."""
+        """The ``index``-th value of a label (:mod:`blinkgl.labels`) of ``t_us``; ``to_us``: where it leads, of those
+        that lead to another time. Pixels that a form cannot hold are counted in ``lost`` and the manifest. Raises
+        TypeError: a value of another shape or kind of number."""
         label = label_of(name)
         if (wrong := label.wrong(value, self.height, self.width)) is not None:
             raise TypeError(f"label '{name}': {wrong}")
@@ -258,7 +259,8 @@ class SequenceWriter:
             fsync(self.final.parent)
 
     def _check_untouched(self) -> None:
-        """OutputError when a file that was written is gone or cut: somebody tidied up under us. Half of it must not pass for the whole."""
+        """OutputError when a file that was written is gone or cut: somebody tidied up under us.
+        Half of it must not pass for the whole."""
         sizes = {name: path.stat().st_size if (path := self._tmp / name).is_file() else None for name in self._promised | self._files.keys()}
         for name, size in sorted(sizes.items()):
             if size is None or size != self._files.get(name, {"bytes": size})["bytes"]:
@@ -296,7 +298,8 @@ class _File(BaseModel):
 
 
 class Manifest(BaseModel):
-    """What a manifest must look like, wherever it comes from. Further keys are welcome; a key that its maker left out is None."""
+    """What a manifest must look like, wherever it comes from. Further keys are welcome; a
+    key that its maker left out is None."""
 
     model_config = ConfigDict(strict=True, extra="allow")
     format: Literal["blinkgl-sequence"]
@@ -324,8 +327,9 @@ _MODEL = TypeAdapter(Manifest)
 def verify_sequence(folder: str | os.PathLike, *, checksums: bool = True) -> list[str]:
     """Problems of a sequence directory against its manifest, one line each; empty when whole.
 
-    Finds missing, foreign, truncated and altered files, and what is no file: links, pipes, devices, empty folders. An unreadable
-    manifest is one problem. ``checksums=False`` reads no contents, and so misses what was altered without changing its length."""
+    Finds missing, foreign, truncated and altered files, and what is no file: links, pipes, devices, empty folders. An
+    unreadable manifest is one problem. ``checksums=False`` reads no contents, and so misses what
+    was altered without changing its length."""
     folder = Path(folder)
     try:
         files = read_manifest(folder)["files"]

@@ -1,9 +1,10 @@
-"""Events as text, the Event Camera Dataset's ``t[s] x y p`` and its relatives, parsed and printed by numba at disk speed.
+"""Events as text, the Event Camera Dataset's ``t[s] x y p`` and its relatives, parsed and
+printed by numba at disk speed.
 
-Read: separators space, tab, comma; comment lines (``#``, ``%``) anywhere; before the first event a line ``width height`` (as E2VID's files
-have) and a line that names the columns, also as faery writes it (``t,x@640,y@480,on``); p as 0/1 or -1/1; t in seconds when it is written
-with a point or an exponent, in µs when it is an integer, the same way in the whole file. Written: seconds with six decimals, or integer
-µs (exact both).
+Read: separators space, tab, comma; comment lines (``#``, ``%``) anywhere; before the first event a line
+``width height`` (as E2VID's files have) and a line that names the columns, also as faery writes it
+(``t,x@640,y@480,on``); p as 0/1 or -1/1; t in seconds when it is written with a point or an exponent, in µs when it is
+an integer, the same way in the whole file. Written: seconds with six decimals, or integer µs (exact both).
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ _COLUMN_NAMES = ({"t", "ts", "time", "times", "timestamp", "timestamps"}, {"x"},
 
 
 class TextReader:
-    """``height`` and ``width`` are None when the file does not say. Raises AssetError with the line's number for anything that is no event."""
+    """``height`` and ``width`` are None when the file does not say. Raises AssetError with the line's
+    number for anything that is no event."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -58,7 +60,8 @@ class TextReader:
         check_size(self.height, self.width, str(path))
 
     def _name_columns(self, text: str) -> None:
-        """Takes sizes and the unit of time from a line that names the columns; AssetError when it names others, or in another order."""
+        """Takes sizes and the unit of time from a line that names the columns; AssetError when
+        it names others, or in another order."""
         names = re.split(r"[,\t]|\s+(?![\[(])", text.lower().replace('"', ""))
         found = [_COLUMN.fullmatch(name.strip()) for name in names if name.strip()]
         if len(found) != 4 or not all(m and m["name"] in known for m, known in zip(found, _COLUMN_NAMES)):
@@ -102,8 +105,9 @@ class TextReader:
 
 
 class TextWriter:
-    """``t x y p``. ``separator`` "," makes a CSV: it begins with a line that names the columns. unit : "s" writes seconds with six decimals,
-    "us" integer µs; the CSV is then what faery writes and reads, with the sensor's size in its first line."""
+    """``t x y p``. ``separator`` "," makes a CSV: it begins with a line that names the columns. unit : "s" writes
+    seconds with six decimals, "us" integer µs; the CSV is then what faery writes and reads, with
+    the sensor's size in its first line."""
 
     def __init__(self, path: str | os.PathLike, height: int, width: int, separator: str = " ", *, unit: str = "s"):
         if unit not in ("s", "us"):
@@ -139,7 +143,8 @@ class TextWriter:
 
 @numba.njit(cache=True, nogil=True)
 def _number(buffer, i):
-    """(mantissa, decimal exponent, integer?, next index); next index -1: not a number, or more digits than int64 holds."""
+    """(mantissa, decimal exponent, integer?, next index); next index -1: not a number, or
+    more digits than int64 holds."""
     mantissa, exponent, digits, integer = np.int64(0), 0, 0, True
     negative = buffer[i] == 45
     if buffer[i] == 45 or buffer[i] == 43:
@@ -177,7 +182,8 @@ def _number(buffer, i):
 
 @numba.njit(cache=True, nogil=True)
 def _scaled(mantissa, exponent):
-    """mantissa · 10^exponent rounded to the nearest integer, exactly (half away from zero); ok False when it overflows."""
+    """mantissa · 10^exponent rounded to the nearest integer, exactly (half away from zero);
+    ok False when it overflows."""
     value = abs(mantissa)
     while exponent > 0 and value != 0:
         if value > 10**17:

@@ -128,7 +128,8 @@ class VideoReader:
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
-    """(H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; ffmpeg does. AssetError: undecodable."""
+    """(H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR;
+    ffmpeg does. AssetError: undecodable."""
     if not os.path.isfile(path):
         raise AssetError("no such file", where=str(path))
     command = [_ffmpeg(AssetError, path), "-loglevel", "error", "-nostdin", "-i", os.fspath(path), "-frames:v", "1", "-c:v", "pfm", "-f", "image2pipe", "-"]

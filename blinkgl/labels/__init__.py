@@ -1,8 +1,10 @@
-"""Ground truth, one row per label: what :mod:`blinkgl.config` reads of it, what is drawn, what lies on disk, how it is judged.
+"""Ground truth, one row per label: what :mod:`blinkgl.config` reads of it, what is drawn,
+what lies on disk, how it is judged.
 
 In:    rows (:func:`register`).
 Out:   :data:`LABELS`, which configuration, renderer, writer, verification, reports and the shader debugger read.
-Start: label.py, which says what a row holds, and depth.py, the plainest of them. Neither OpenGL nor a compiler is imported here: a YAML is read by it.
+Start: label.py, which says what a row holds, and depth.py, the plainest of them. Neither OpenGL nor a compiler is
+imported here: a YAML is read by it.
 """
 
 from blinkgl.labels.depth import Depth

@@ -14,8 +14,9 @@ import numpy as np
 class Form:
     """``FOLDER/000000.ENDING``, one file a label, or ``FOLDER.ENDING``, one file for all of them.
 
-    encode : a value as the bytes of a file, or as (bytes, number of its pixels that the form cannot hold).   read : the value in a file;
-    raises AssetError.   rows : of one file for all, name -> (H, W[, C]) array that is appended to the dataset of that name."""
+    encode : a value as the bytes of a file, or as (bytes, number of its pixels that the form cannot hold).   read : the
+    value in a file; raises AssetError.   rows : of one file for all, name -> (H, W[, C]) array that
+                                          is appended to the dataset of that name."""
 
     folder: str
     ending: str
@@ -59,7 +60,8 @@ def image_png(folder: str) -> Form:
 
 
 def _images(name: str) -> Callable[[Any], Any]:
-    """A function of :mod:`blinkgl.io.images`, which is imported when it is first used: configuration reads this module."""
+    """A function of :mod:`blinkgl.io.images`, which is imported when it is first used:
+    configuration reads this module."""
     def call(value: Any) -> Any:
         from blinkgl.io import images
 

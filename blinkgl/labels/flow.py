@@ -22,11 +22,13 @@ _KEYS = {
     "float_flow": Key(tuple[Literal["npy", "flo", "h5"], ...], Field((), description="float32 flow besides the PNG"), "depth"),
 }
 _PX, _SHARE = 2 / 128, 0.95
-"""Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the pixels. Silhouettes may fall on either side."""
+"""Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the
+pixels. Silhouettes may fall on either side."""
 
 
 class FlowTo(Label):
-    """:class:`Flow` to the next label's time or to the one before; valid pixels beyond DSEC's ±256 px become invalid in the PNG, not in the float forms."""
+    """:class:`Flow` to the next label's time or to the one before; valid pixels beyond DSEC's ±256 px become invalid in
+    the PNG, not in the float forms."""
 
     unit, kind = "px", "motion"
     buffer, varyings = "RGBA32F", ("local",)

@@ -1,7 +1,8 @@
 """What a label is: everything that is known of one kind of ground truth, in one class.
 
-A row of the table is an instance. What it has to say is listed in :class:`Label`, in the order of its way: configuration, shader, the CPU,
-files, the reference. docs/extending.md has the whole of one; :func:`blinkgl.labels.register` names what is missing.
+A row of the table is an instance. What it has to say is listed in :class:`Label`, in the order of its way:
+configuration, shader, the CPU, files, the reference. docs/extending.md has the whole of one;
+:func:`blinkgl.labels.register` names what is missing.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
 
 @dataclass(frozen=True)
 class Key:
-    """A key of ``labels:``: its type, and default and description as pydantic has them.   before : key that it stands in front of."""
+    """A key of ``labels:``: its type, and default and description as pydantic has them.
+    before : key that it stands in front of."""
 
     annotation: Any
     info: Any
@@ -57,11 +59,13 @@ class Key:
 class View:
     """One array of a label that is shown and judged by itself; of most labels the only one.
 
-    name, title, unit, kind : as of :class:`Label`.   of : the array (H, W[, C]) in a value.   reference : what it should be, of a scene and a
-    :class:`~blinkgl.render.reference.ReferenceFrame`.   judged_in, tolerance : unit of its error, and the most that is let pass.
-    error : (drawn, true, label interval in s) -> (H, W) >= 0.   statistic : "max" of the pixels' errors, or their "mean".
-    same_triangle : judged only where both sides see the same triangle.   band_there : not judged where the point lands beside a silhouette at
-    the time that the label leads to.   note : said beside the figure."""
+    name, title, unit, kind : as of :class:`Label`.   of : the array (H, W[, C]) in a value.   reference : what it
+    should be, of a scene and a :class:`~blinkgl.render.reference.ReferenceFrame`.   judged_in, tolerance : unit of its
+    error, and the most that is let pass.
+    error : (drawn, true, label interval in s) -> (H, W) >= 0.   statistic : "max" of the
+    pixels' errors, or their "mean".
+    same_triangle : judged only where both sides see the same triangle.   band_there : not judged where the point lands
+    beside a silhouette at the time that the label leads to.   note : said beside the figure."""
 
     name: str
     title: str
@@ -81,7 +85,8 @@ class View:
 class Drawn(Protocol):
     """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
 
-    scene : as it is drawn.   raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
+    scene : as it is drawn.   raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.
+                              value(name) : what that label made of its.
     there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
 
     scene: Scene
@@ -94,27 +99,34 @@ class Drawn(Protocol):
 
 
 class Label:
-    """One kind of ground truth. ``name``, ``about``, ``reference`` and ``tolerance`` have to be said; a label of the shader says ``buffer``, and ``glsl``.
+    """One kind of ground truth. ``name``, ``about``, ``reference`` and ``tolerance`` have to be said; a label of the
+    shader says ``buffer``, and ``glsl``.
 
     What it is called
-        name : key of ``labels:`` (unless it says other ``keys``), folder, attribute of a :class:`~blinkgl.labels.LabelFrame`.
+        name : key of ``labels:`` (unless it says other ``keys``), folder, attribute of a
+        :class:`~blinkgl.labels.LabelFrame`.
         about : what it is and how it is written, for the page of keys.   default : written when nothing is said.
-        title, unit : for tables.   kind : how a picture shows it, one of KINDS.   off : what ``explain`` says of it when it is not asked for.
+        title, unit : for tables.   kind : how a picture shows it, one of KINDS.   off : what
+                                    ``explain`` says of it when it is not asked for.
 
     What is drawn
         buffer : a key of BUFFERS; None: no output of the label shader.
-        glsl : source of ``TYPE label_NAME()``, TYPE being the buffer's, with uniforms of its own and, by name, ``local`` (object-local
-        position) and ``facing()`` (the surface's normal, object axes, on the camera's side), where ``varyings`` names "local" or "normal",
-        and ``#include``; None: it stands in ``shaders/include/labels/NAME.glsl``.
+        glsl : source of ``TYPE label_NAME()``, TYPE being the buffer's, with uniforms of its own and, by name,
+        ``local`` (object-local position) and ``facing()`` (the surface's normal, object axes, on the camera's side),
+        where ``varyings`` names "local" or "normal", and ``#include``; None: it stands in
+        ``shaders/include/labels/NAME.glsl``.
         needs : labels whose buffers are drawn with it.   there : labels whose buffers it reads at the other time.
-        towards : "forward" or "backward": it leads from one label's time to the next or the one before; None: it is of one time.
-        anti_aliased : drawn by the colour pass instead, by the configuration's filter.   at_last : there at the end of the last interval, too.
+        towards : "forward" or "backward": it leads from one label's time to the next or the
+        one before; None: it is of one time.
+        anti_aliased : drawn by the colour pass instead, by the configuration's filter.   at_last :
+        there at the end of the last interval, too.
 
     What it is
         channels : 0 for (H, W), n for (H, W, n); None: either (H, W) or (H, W, 3).   dtype : None: any.
 
     Files
-        forms : how it lies on disk; the first is always written.   stamps : file of times, a line per label; None: none.
+        forms : how it lies on disk; the first is always written.   stamps : file of
+        times, a line per label; None: none.
         shard : ending of its file in a shard; None: not there.
 
     The reference
@@ -174,8 +186,9 @@ class Label:
     # ---- the shader and the CPU ----------------------------------------------------------------------------------
 
     def uniforms(self, shot: Shot) -> Mapping[str, np.ndarray]:
-        """Values of the uniforms in ``glsl``, once a frame: name -> array whose first axis counts the scene's objects, (n,), (n, k) for a vector,
-        (n, rows, columns) for a matrix. ``shot.moment`` has the poses and matrices, ``shot.ends[towards]`` those of the other time."""
+        """Values of the uniforms in ``glsl``, once a frame: name -> array whose first axis counts the scene's objects,
+        (n,), (n, k) for a vector, (n, rows, columns) for a matrix. ``shot.moment`` has the poses and matrices,
+        ``shot.ends[towards]`` those of the other time."""
         return {}
 
     def finish(self, drawn: Drawn) -> Any:
@@ -221,7 +234,8 @@ class Label:
     # ---- the reference -------------------------------------------------------------------------------------------
 
     def reference(self, scene: Scene, frame: ReferenceFrame) -> np.ndarray:
-        """(H, W[, C]) float64: what it should be, of the float64 reference's hits; 0 or inf where nothing is hit, as ``finish`` has it."""
+        """(H, W[, C]) float64: what it should be, of the float64 reference's hits; 0 or inf where
+        nothing is hit, as ``finish`` has it."""
         raise NotImplementedError
 
     @property

@@ -18,7 +18,8 @@ _KEYS = {"occlusion": Key(bool, Field(True, description="masks of pixels that ar
 
 
 class OcclusionAt(Label):
-    """(H, W) bool: a valid pixel's point is not visible where its flow ends, behind another surface or outside the image."""
+    """(H, W) bool: a valid pixel's point is not visible where its flow ends, behind another
+    surface or outside the image."""
 
     title, kind, off = "occlusion masks", "mask", "labels.occlusion: false, or no flow"
     dtype = bool

@@ -1,4 +1,5 @@
-"""What the label shader (``shaders/label.glsl``) includes that is no file: the table of labels in GLSL, and the snippets that stand in rows."""
+"""What the label shader (``shaders/label.glsl``) includes that is no file: the table of labels in GLSL, and the
+snippets that stand in rows."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ def define_of(name: str) -> str:
 
 
 def includes() -> dict[str, str]:
-    """Texts by the name that they are included by: labels_need.glsl, labels.glsl, and labels/NAME.glsl of those labels whose source is their own."""
+    """Texts by the name that they are included by: labels_need.glsl, labels.glsl, and
+    labels/NAME.glsl of those labels whose source is their own."""
     drawn = [label for label in LABELS.values() if label.buffer]
     own = {f"labels/{label.name}.glsl": label.glsl.lstrip("\n") for label in drawn if label.glsl is not None}
     return {"labels_need.glsl": _needs(drawn), "labels.glsl": _written(drawn), **own}

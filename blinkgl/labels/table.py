@@ -24,7 +24,8 @@ _KEYS: dict[str, Key] = {}
 def register(label: Label) -> Label:
     """Puts a row into the table after a look at every part of it, and its keys into ``labels:``; returns it.
 
-    Raises TypeError naming the label and the part that is missing or of the wrong kind, or that another has its name; nothing is then registered."""
+    Raises TypeError naming the label and the part that is missing or of the wrong kind, or that another has its name;
+    nothing is then registered."""
     keys = _checked(label)
     added: list[str] = []
     try:

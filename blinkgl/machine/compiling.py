@@ -1,8 +1,8 @@
 """How long this process has spent compiling kernels, and a clock that stands still meanwhile.
 
-numba compiles a kernel the first time it is called with arguments of some types and keeps the result on disk (beside the source, in the
-user's cache folder where that is not writable, or in NUMBA_CACHE_DIR); on a machine that has done so the figure is 0. It is no part of what
-anything costs, so it must not be in anybody's seconds.
+numba compiles a kernel the first time it is called with arguments of some types and keeps the result on disk (beside
+the source, in the user's cache folder where that is not writable, or in NUMBA_CACHE_DIR); on a machine that has done so
+the figure is 0. It is no part of what anything costs, so it must not be in anybody's seconds.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from numba.core import event
 
 
 class _Watch(event.Listener):
-    """Wall seconds between the start of the outermost compilation and its end. numba compiles under one lock, so they nest and never overlap."""
+    """Wall seconds between the start of the outermost compilation and its end. numba compiles under
+    one lock, so they nest and never overlap."""
 
     def __init__(self) -> None:
         self.seconds, self._depth, self._began = 0.0, 0, 0.0
@@ -49,7 +50,8 @@ def compiling_line(seconds: float) -> str:
 
 
 def compile_ahead(emulators: tuple[str, ...] = ()) -> float:
-    """Compiles the kernels of these emulators (default: all), for frames of either type, so that no later process has to. Seconds that it took."""
+    """Compiles the kernels of these emulators (default: all), for frames of either type, so that no
+    later process has to. Seconds that it took."""
     import tempfile
     from pathlib import Path
 

@@ -108,8 +108,9 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
         yield Check(section, "version", "ok", gl.version)
         info = gl.ctx.info
         yield Check(section, "limits", "info",
-                    f"texture {info['GL_MAX_TEXTURE_SIZE']} px, viewport {'x'.join(str(v) for v in info['GL_MAX_VIEWPORT_DIMS'])}, "
-                    f"{info['GL_MAX_DRAW_BUFFERS']} draw buffers, {gl.ctx.max_samples} samples, anisotropy {gl.ctx.max_anisotropy:g}")
+                    f"texture {info['GL_MAX_TEXTURE_SIZE']} px, viewport "
+                    f"{'x'.join(str(v) for v in info['GL_MAX_VIEWPORT_DIMS'])}, {info['GL_MAX_DRAW_BUFFERS']} draw buffers, "
+                    f"{gl.ctx.max_samples} samples, anisotropy {gl.ctx.max_anisotropy:g}")
         driver = "install a newer driver (OpenGL 4.5) or use 'gl: {backend: osmesa}'"
         for name in ("R32F", "RG32F", "RGBA32F", "R32UI", "R16F", "RGBA8"):
             yield _try(section, f"{name} target", lambda name=name: _draw_exactly(gl, name), driver)
@@ -159,7 +160,8 @@ def _draw_exactly(gl, name: str) -> str:
 
 
 def _draw_depth(gl) -> str:
-    """near/z from 0.01 to 1e6 units to one float32 rounding; and of two surfaces 1e-6 apart at 1e5 the nearer one wins."""
+    """near/z from 0.01 to 1e6 units to one float32 rounding; and of two surfaces 1e-6 apart
+    at 1e5 the nearer one wins."""
     import moderngl
 
     near = 0.01

@@ -1,5 +1,5 @@
-"""Optional parts: what they are for, and the command that installs them. BlinkGL itself is on no package index, so a remedy names
-the packages, never ``blinkgl[extra]``."""
+"""Optional parts: what they are for, and the command that installs them. BlinkGL itself is on no package index, so a
+remedy names the packages, never ``blinkgl[extra]``."""
 
 from __future__ import annotations
 

@@ -26,7 +26,8 @@ IEI_EDGES_US = np.logspace(0, 7, 71)
 LOG_OFFSET = 10.0
 """Added to the 8-bit code before the logarithm: keeps the dark noise of real frames from dominating."""
 BLUR_PX = 1.0
-"""Sigma of the Gaussian on both maps before a correlation: single-event quantisation and sub-pixel shifts are not what it asks about."""
+"""Sigma of the Gaussian on both maps before a correlation: single-event quantisation and
+sub-pixel shifts are not what it asks about."""
 
 
 @dataclass
@@ -42,7 +43,8 @@ class Side:
     iei: np.ndarray = field(default=None, repr=False)
     """(70,) inter-event intervals per bin of IEI_EDGES_US"""
     frame_correlation: np.ndarray | None = field(default=None, repr=False)
-    """(K,) Pearson correlation over the pixels of the polarity sum with the change of ln(I + 10), both blurred by BLUR_PX"""
+    """(K,) Pearson correlation over the pixels of the polarity sum with the change of ln(I +
+    10), both blurred by BLUR_PX"""
     implied_threshold: np.ndarray | None = field(default=None, repr=False)
     """(K,) change of ln(I + 10) per event: slope through 0 of change on polarity sum"""
 
@@ -66,7 +68,8 @@ class Side:
 
 @dataclass
 class Comparison:
-    """Result of :func:`compare`. ``b`` is None when there was one recording. What is told pixel by pixel is None where the two differ in size."""
+    """Result of :func:`compare`. ``b`` is None when there was one recording. What is told pixel by
+    pixel is None where the two differ in size."""
 
     edges_us: np.ndarray
     a: Side
@@ -93,7 +96,8 @@ class Comparison:
 
     @property
     def iei_distance(self) -> float:
-        """Largest difference of the two cumulative distributions of the inter-event interval (Kolmogorov–Smirnov distance)."""
+        """Largest difference of the two cumulative distributions of the inter-event interval
+        (Kolmogorov–Smirnov distance)."""
         cdf = [np.cumsum(s.iei) / max(s.iei.sum(), 1) for s in (self.a, self.b)]
         return float(np.abs(cdf[0] - cdf[1]).max())
 
@@ -133,13 +137,16 @@ class Comparison:
 def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames: str | os.PathLike | None = None, fps: float | None = None,
             timestamps: str | os.PathLike | None = None, gamma: str | float = "linear", frame_delay_ms: float = 0.0,
             interval_ms: float = 20.0, zero_time: bool = False) -> Comparison:
-    """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the time they share; alone, ``a`` is described.
+    """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the
+    time they share; alone, ``a`` is described.
 
     Recordings of different sensor sizes are described side by side; what needs the same pixels in both is then None.
 
-    Intervals are those between frames where frames are given, else ``interval_ms``. ``b`` may itself be frames (a folder, video, .npy of
-    frames): anything that is no event file. gamma : of the frames; "linear" takes the codes as intensities, as fits a DAVIS's frames.
-    frame_delay_ms : added to the frames' times; a stamp of the exposure's start lags its centre. zero_time : count both recordings from their first event.
+    Intervals are those between frames where frames are given, else ``interval_ms``. ``b`` may itself be frames (a
+    folder, video, .npy of frames): anything that is no event file. gamma : of the frames; "linear" takes the codes as
+    intensities, as fits a DAVIS's frames.
+    frame_delay_ms : added to the frames' times; a stamp of the exposure's start lags its centre. zero_time : count both
+    recordings from their first event.
 
     Raises EventDataError: frames of another size than a recording, no common time. AssetError: unreadable.
     """
@@ -204,7 +211,8 @@ def _accumulate(files: list[EventFile], shifts: list[int], edges: np.ndarray, ch
 
 @numba.njit(cache=True, nogil=True)
 def _collect(x, y, t, p, origin, counts, sums, last, iei, bins):
-    """Adds events to the count and polarity maps and to the histogram of inter-event intervals (ten bins per decade of µs)."""
+    """Adds events to the count and polarity maps and to the histogram of inter-event
+    intervals (ten bins per decade of µs)."""
     for i in range(len(t)):
         r, c = y[i], x[i]
         counts[r, c] += 1
@@ -316,7 +324,8 @@ def _plain(value: Any) -> Any:
 
 
 def plot(result: Comparison, path: str | os.PathLike) -> None:
-    """One PNG: rates over time, counts per pixel, inter-event intervals, correlations per interval. OutputError when it cannot be written."""
+    """One PNG: rates over time, counts per pixel, inter-event intervals, correlations per
+    interval. OutputError when it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -4,7 +4,8 @@
         ...
 
 ``frames`` is any iterable, a generator included; nothing but the current frames is kept. :func:`file_to_events` is the
-same from file to file (``blinkgl simulate``). :func:`blinkgl.simulate` and :func:`blinkgl.simulate_file` are these behind the front door.
+same from file to file (``blinkgl simulate``). :func:`blinkgl.simulate` and
+:func:`blinkgl.simulate_file` are these behind the front door.
 """
 
 from __future__ import annotations
@@ -70,16 +71,20 @@ def frames_to_events(frames: Iterable, *, fps: float | None = None, emulator: st
     Parameters
     ----------
     frames : iterable of (H, W) or (H, W, 3) RGB arrays with ``fps``, of (array, t_ns) pairs or (array, t_ns, name)
-        triples (a :class:`~blinkgl.io.frames.FrameSource` is that). uint8, uint16 (full scale 1.0) or float (1.0 is white, more is fine).
+        triples (a :class:`~blinkgl.io.frames.FrameSource` is that). uint8, uint16 (full scale
+        1.0) or float (1.0 is white, more is fine).
     emulator : name of one ("esim", "v2e", "voltmeter"), or a config of one.
     gamma : "srgb", "linear", or an exponent N (luminance = code^N). Default: srgb for integers, linear for floats.
-    interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1`` frames in between
-        by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see :mod:`blinkgl.timeline.interpolate`).
-    seed : of the emulator. readout : the sensor's bus (``load_sensor(name).readout``); None: no limit. report : filled as it goes.
+    interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1``
+        frames in between by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see
+        :mod:`blinkgl.timeline.interpolate`).
+    seed : of the emulator. readout : the sensor's bus (``load_sensor(name).readout``); None:
+    no limit. report : filled as it goes.
 
     Raises
     ------
-    EventDataError : NaN, infinite or negative intensities, non-increasing times, a changed size, fewer than two frames; names the frame.
+    EventDataError : NaN, infinite or negative intensities, non-increasing times, a changed
+    size, fewer than two frames; names the frame.
     ConfigError : unknown emulator, gamma or interpolation.
     """
     report = report if report is not None else SimulationReport()
@@ -89,7 +94,8 @@ def frames_to_events(frames: Iterable, *, fps: float | None = None, emulator: st
 
 
 class Step(NamedTuple):
-    """One step of an emulator. events : before t_ns, not given before.   frame : (H, W) float32 linear luminance or uint8 codes, at t_ns."""
+    """One step of an emulator. events : before t_ns, not given before.   frame : (H, W) float32
+    linear luminance or uint8 codes, at t_ns."""
 
     t_ns: int
     events: Events
@@ -118,7 +124,8 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
 
 def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, *, gamma: str | float | None, interpolate: str, factor: int,
             max_px: float, report: SimulationReport | None = None) -> Iterator[Step]:
-    """Frames (array, t_ns, name), those in between included, through an event camera. Raises EventDataError as :func:`frames_to_events`."""
+    """Frames (array, t_ns, name), those in between included, through an event camera. Raises
+    EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
     first = next(frames)
     decode = Decoder(gamma)
@@ -166,8 +173,8 @@ def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, 
 def file_to_events(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None,
                    timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None, overwrite: bool = True,
                    progress: Callable[[SimulationReport, float | None], None] | None = None, **options: Any) -> SimulationReport:
-    """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format (.h5 .raw .aedat4
-    .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
+    """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format
+    (.h5 .raw .aedat4 .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
 
     preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
     """

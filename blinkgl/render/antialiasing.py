@@ -10,11 +10,13 @@ from blinkgl.errors import GLError
 class Samples(NamedTuple):
     """How one pixel is sampled.
 
-    grid  : the image is drawn grid x grid times finer and averaged (super-sampling: everything is evaluated grid² times).
+    grid  : the image is drawn grid x grid times finer and averaged (super-sampling:
+    everything is evaluated grid² times).
     multi : coverage samples per drawn pixel (multi-sampling: silhouettes are filtered, the shader runs once per pixel
             and triangle); 0: one, at the pixel's centre.
     taps  : 1, or 4: texture lookups of a drawn pixel, spread over the pixel, each one mip level finer. The texture is
-            super-sampled, the light and the silhouettes are not. Event frames only: colour is not worth a shader variant."""
+            super-sampled, the light and the silhouettes are not. Event frames only: colour
+            is not worth a shader variant."""
 
     grid: int = 1
     multi: int = 0

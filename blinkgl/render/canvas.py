@@ -1,7 +1,7 @@
 """What a pass draws on, and the handle of what it drew: a frame stays on the card until somebody reads it.
 
-A :class:`Canvas` owns one pass's target and, where frames are viewed, the memory that they are viewed in. It is drawn over by the pass's
-next frame; whoever reads a frame after that is told so.
+A :class:`Canvas` owns one pass's target and, where frames are viewed, the memory that they are viewed in. It is drawn
+over by the pass's next frame; whoever reads a frame after that is told so.
 """
 
 from __future__ import annotations
@@ -29,11 +29,13 @@ DEPTH_BUFFER = "depth buffer"
 
 
 class Frame:
-    """What a pass drew of a moment, on the card, until the same pass draws its next frame; GLError for whoever asks afterwards.
+    """What a pass drew of a moment, on the card, until the same pass draws its next frame;
+    GLError for whoever asks afterwards.
 
     moment : as the pass saw it.   t_ns : its time.   names : of its pictures; where none is said the first is meant.
     width, height : px.
-    changed : rectangles in which it may differ from the same pass's frame before it; None: anywhere. See :meth:`changed_since`."""
+    changed : rectangles in which it may differ from the same pass's frame before it; None:
+    anywhere. See :meth:`changed_since`."""
 
     def __init__(self, canvas: Canvas, number: int, moment: Moment, changed: list[Rectangle] | None):
         self._canvas, self._number, self.moment, self.changed = canvas, number, moment, changed
@@ -61,8 +63,8 @@ class Frame:
         return self._canvas.target
 
     def texture(self, output: str = "") -> moderngl.Texture:
-        """Of an output of the pass (default: its first), or :data:`DEPTH_BUFFER`, for another pass or a compute shader. As the program
-        wrote it: all components of its format."""
+        """Of an output of the pass (default: its first), or :data:`DEPTH_BUFFER`, for another pass or a compute shader.
+        As the program wrote it: all components of its format."""
         if output == DEPTH_BUFFER:
             if self._canvas.pass_.depth != "texture":
                 raise GLError("the pass keeps no depth buffer that can be read", where=type(self._canvas.pass_).__name__, value=output,
@@ -78,14 +80,14 @@ class Frame:
         return self._canvas.read(name, out)
 
     def view(self, name: str = "") -> np.ndarray:
-        """The same as a read-only array in memory that the renderer owns and writes the next frame into: no allocation, and only what
-        has changed is transferred. To be copied by whoever wants to keep it."""
+        """The same as a read-only array in memory that the renderer owns and writes the next frame into: no allocation,
+        and only what has changed is transferred. To be copied by whoever wants to keep it."""
         self._check()
         return self._canvas.view(name, self)
 
     def changed_since(self, before: Frame | None) -> list[Rectangle] | None:
-        """Rectangles outside of which this frame equals ``before``; None: it may differ anywhere, since nothing is known of two frames
-        that are not of the same pass, one right after the other."""
+        """Rectangles outside of which this frame equals ``before``; None: it may differ anywhere, since nothing is
+        known of two frames that are not of the same pass, one right after the other."""
         if before is None:
             return None
         # Another of its own kind: its members are no secret.
@@ -106,7 +108,8 @@ class Frame:
 
 
 class Canvas:
-    """Of one pass of one renderer. width, height : of the image.   number : of the last frame; -1 when it has been released."""
+    """Of one pass of one renderer. width, height : of the image.   number : of the last
+    frame; -1 when it has been released."""
 
     def __init__(self, pass_: Pass, painter: Painter, width: int, height: int):
         self.pass_, self.painter, self.number = pass_, painter, 0

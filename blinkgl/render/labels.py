@@ -1,4 +1,5 @@
-"""Ground truth of one time: what the label pass draws, finished by the rows of the labels, which may look at the buffers of other times."""
+"""Ground truth of one time: what the label pass draws, finished by the rows of the labels, which may
+look at the buffers of other times."""
 
 from __future__ import annotations
 

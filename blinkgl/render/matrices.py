@@ -2,8 +2,8 @@
 
 Clip space: x right, y DOWN, w = Z along the optical axis, reversed-Z with the far plane at infinity
 (depth = near / Z in [0, 1], 1 at the near plane). Because y points down in clip space already, row 0 of every
-image is the top row and ``gl_FragCoord.xy - 0.5`` is the user's pixel: no image is ever flipped. The matrix from camera axes to it is
-the camera model's (:meth:`blinkgl.camera.CameraModel.clip_from_cam`).
+image is the top row and ``gl_FragCoord.xy - 0.5`` is the user's pixel: no image is ever flipped. The matrix from camera
+axes to it is the camera model's (:meth:`blinkgl.camera.CameraModel.clip_from_cam`).
 """
 
 from __future__ import annotations
@@ -46,12 +46,13 @@ def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
 
 
 DEPTH_ROOM = 2.0
-"""A fragment may lie a fraction of a pixel outside of its triangle, and outside of the part's depths by the slope there."""
+"""A fragment may lie a fraction of a pixel outside of its triangle, and outside of the
+part's depths by the slope there."""
 
 
 def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) -> np.ndarray:
-    """(n, 2) uint32 of bounding spheres, ``inverse_depths`` of guard.glsl: the smallest 1/Z that a fragment can have, as the bits of a float32,
-    and the largest's less those. centre_z, radius : (n,) float64."""
+    """(n, 2) uint32 of bounding spheres, ``inverse_depths`` of guard.glsl: the smallest 1/Z that a fragment can have,
+    as the bits of a float32, and the largest's less those. centre_z, radius : (n,) float64."""
     farthest, nearest = np.maximum(centre_z + radius, near), np.maximum(centre_z - radius, near)
     bits = np.stack([1 / (DEPTH_ROOM * farthest), DEPTH_ROOM / nearest], axis=1).astype(np.float32).view(np.uint32)
     bits[:, 1] -= bits[:, 0]

@@ -1,4 +1,5 @@
-"""One instant of a scene as a camera sees it: poses, matrices, rates, what is in view. Computed once, shared by all passes.
+"""One instant of a scene as a camera sees it: poses, matrices, rates, what is in view.
+Computed once, shared by all passes.
 
     moments = Moments(scene, resources.items)
     moment = moments.at(t_ns)
@@ -26,7 +27,8 @@ KEPT = 4
 
 
 class View(NamedTuple):
-    """What drawing needs of a camera. projection : (4, 4) float64 clip_from_cam.   frustum : (5, 3) inward unit normals, camera axes."""
+    """What drawing needs of a camera. projection : (4, 4) float64 clip_from_cam.   frustum : (5, 3)
+    inward unit normals, camera axes."""
 
     camera: CameraModel
     projection: np.ndarray
@@ -38,7 +40,8 @@ class View(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """(n, 4, 4) float64 per object, 1/s: d(MVP)/dt and d(T_world_obj)/dt, from the analytic derivatives of the paths."""
+    """(n, 4, 4) float64 per object, 1/s: d(MVP)/dt and d(T_world_obj)/dt, from the analytic
+    derivatives of the paths."""
 
     mvp: np.ndarray
     T_world_obj: np.ndarray
@@ -60,7 +63,8 @@ class Moment:
         return other
 
     def from_place(self, view: View, T_world_cam: np.ndarray, dT_world_cam: np.ndarray | None = None) -> Moment:
-        """The same instant through a camera elsewhere, such as a lamp that casts shadows; dT_world_cam : (4, 4) 1/s, None: it stands still."""
+        """The same instant through a camera elsewhere, such as a lamp that casts shadows;
+        dT_world_cam : (4, 4) 1/s, None: it stands still."""
         other = Moment(self.t_ns, view, T_world_cam, self.T_world_obj, self._stage)
         other.__dict__["dT_world_cam"] = np.zeros((4, 4)) if dT_world_cam is None else dT_world_cam
         return other

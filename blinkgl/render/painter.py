@@ -33,7 +33,8 @@ class Programs(dict["Kind", Uniforms]):
 
 
 class Painter:
-    """Draws for the passes of one renderer. A subclass may look on: every method is called by the passes and none by another.
+    """Draws for the passes of one renderer. A subclass may look on: every method is called
+    by the passes and none by another.
 
     gl : GLContext.   resources : SceneResources.   stats : what is counted."""
 
@@ -44,7 +45,8 @@ class Painter:
         self._culling = False
 
     def begin(self, target: Target, background: tuple[float, ...] = ()) -> None:
-        """Draw into ``target`` from now on, which is cleared: the first attachment to ``background``, 0 where it ends, the others to 0."""
+        """Draw into ``target`` from now on, which is cleared: the first attachment to
+        ``background``, 0 where it ends, the others to 0."""
         self.prepare(target)
         target.clear(*([*background, 0.0, 0.0, 0.0, 0.0][: pixel.components] for pixel in target.formats[:1]), depth=0.0)
         self.stats.frames += 1

@@ -1,7 +1,7 @@
 """The float64 reference renderer: what every buffer of every pass should hold, by casting rays on the CPU.
 
-It shares nothing with the rasteriser but :mod:`blinkgl.scene.types` and the camera models: no GLSL, no clip space, no projection matrix.
-It sees through any camera model whose rays point forward (Z > 0).
+It shares nothing with the rasteriser but :mod:`blinkgl.scene.types` and the camera models: no GLSL, no clip space, no
+projection matrix. It sees through any camera model whose rays point forward (Z > 0).
 Tests and the shader debugger compare the GPU with it. One ray goes through each pixel centre (or any other image
 point); it hits the nearest triangle, and everything else follows from the object-local point of the hit.
 
@@ -12,13 +12,14 @@ With ``M(t) = inv(T_world_cam(t)) @ T_world_obj(t)``, the point p is at ``M p`` 
 
     flow_x = fx (dX - rx dZ) / Z1,    (dX, dY, dZ) = (M1 - M0) p,    Z1 = Z0 + dZ,
 
-without subtracting two projections (:meth:`blinkgl.camera.CameraModel.displacement`). ``M1 - M0`` is formed from the differences of the poses, so a pose that does not
-change contributes exactly nothing. What is left is about 1e-15 of the flow, plus the resolution of the poses themselves:
-a translation of size 1e6 units is stored to 1e-10 units, i.e. fx * 1e-10 / Z px.
+without subtracting two projections (:meth:`blinkgl.camera.CameraModel.displacement`). ``M1 - M0`` is formed from the
+differences of the poses, so a pose that does not change contributes exactly nothing. What is left is about 1e-15 of the
+flow, plus the resolution of the poses themselves: a translation of size 1e6 units is stored
+to 1e-10 units, i.e. fx * 1e-10 / Z px.
 
 Back faces: a closed mesh whose material is not double-sided is not hit from behind; any other is, with the shading
-normal turned round. Textures are sampled bilinearly at their full resolution, without mip maps: mip maps are the GPU's way
-to anti-alias, not a property of the scene.
+normal turned round. Textures are sampled bilinearly at their full resolution, without mip maps: mip maps are the GPU's
+way to anti-alias, not a property of the scene.
 """
 
 from __future__ import annotations
@@ -407,8 +408,8 @@ def silhouette_band(ids: np.ndarray, depth: np.ndarray, width: int = 1, jump: fl
     """(H, W) bool: pixels within ``width`` px (8-neighbourhood) of an id change or a jump in depth.
 
     ids : (H, W) integers.   depth : (H, W), inf or nan where nothing is hit.   A jump is a second difference of 1 / Z
-    along x or y above ``jump`` of its largest value there: 1 / Z is affine in the image of a plane, however steep the plane
-    is seen, so that slanted ground is not taken for an edge.
+    along x or y above ``jump`` of its largest value there: 1 / Z is affine in the image of a plane, however steep the
+    plane is seen, so that slanted ground is not taken for an edge.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.nan_to_num(1.0 / np.asarray(depth, np.float64), nan=0.0, posinf=0.0, neginf=0.0)

@@ -6,9 +6,10 @@
         edges = renderer.draw(MyPass(), t_ns)                  # a Frame: on the card until it is read
 
 A pass (``passes/``) says what is drawn; a :class:`~blinkgl.render.moment.Moment` where everything is; a
-:class:`~blinkgl.render.canvas.Canvas` holds what one pass has drawn, :class:`~blinkgl.render.still.StillCanvas` draws again only what
-moves. Poses are composed in float64 relative to the camera (``matrices.py``); vertices stay object-local. Programs and targets are made
-the first time something asks for them, and only in the variants the scene's materials need.
+:class:`~blinkgl.render.canvas.Canvas` holds what one pass has drawn, :class:`~blinkgl.render.still.StillCanvas` draws
+again only what moves. Poses are composed in float64 relative to the camera (``matrices.py``); vertices stay
+object-local. Programs and targets are made the first time something asks for them, and only in
+the variants the scene's materials need.
 """
 
 from __future__ import annotations
@@ -40,9 +41,10 @@ if TYPE_CHECKING:
 class Renderer:
     """Draws one scene. Holds GL resources: use it as a context manager or call :meth:`release`.
 
-    scene : as it is drawn, frames and ground truth alike: at the level of detail that the configuration asks for, without triangles
-    that are lines in float32.   width, height : of the image, px.   stats : RenderStats.
-    whole : frames are always drawn whole; otherwise a camera that stands still has only what moves drawn again, to the same pixels.
+    scene : as it is drawn, frames and ground truth alike: at the level of detail that the configuration asks for,
+    without triangles that are lines in float32.   width, height : of the image, px.   stats : RenderStats.
+    whole : frames are always drawn whole; otherwise a camera that stands still has only what
+    moves drawn again, to the same pixels.
     painter : class that issues the draw calls; a subclass may look on."""
 
     def __init__(self, gl: GLContext, scene: Scene, config: RenderConfig, *, whole: bool = False, painter: type[Painter] = Painter):
@@ -73,7 +75,8 @@ class Renderer:
             self._painter.resources.release()
 
     def forget(self) -> None:
-        """Nothing of what was drawn or compiled before is used again: to be called when the context's programs are to be replaced."""
+        """Nothing of what was drawn or compiled before is used again: to be called when the
+        context's programs are to be replaced."""
         for canvas in self._canvases.values():
             canvas.release()
         self._canvases = {}
@@ -81,8 +84,8 @@ class Renderer:
         self._painter.forget()
 
     def look_through(self, camera: CameraModel) -> None:
-        """From now on draws with another camera of the same size and path: another part of the picture at the same cost.
-        Nothing of what was drawn before is used again, and frames are drawn whole."""
+        """From now on draws with another camera of the same size and path: another part of the picture at the same
+        cost. Nothing of what was drawn before is used again, and frames are drawn whole."""
         self._moments.look_through(camera)
         self._labels.forget()
         self.whole = True  # what stands still in one picture is no backdrop of the other
@@ -128,24 +131,24 @@ class Renderer:
     # ---- frames --------------------------------------------------------------------------------------------------
 
     def luminance(self, t_ns: int, rate: bool = False) -> Frame:
-        """Linear luminance at t_ns, (H, W) float32; with ``rate`` beside it "rate", d(luminance)/dt per second of each pixel, as the
-        surface it shows moves (edges that pass are not in it)."""
+        """Linear luminance at t_ns, (H, W) float32; with ``rate`` beside it "rate", d(luminance)/dt per second of each
+        pixel, as the surface it shows moves (edges that pass are not in it)."""
         return self.draw(filtered(Luminance(rate, self._samples)), t_ns)
 
     def brightness(self, t_ns: int, every: int = 1) -> Frame:
-        """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures filtered as for the
-        whole image. h = max(1, H // every), w likewise: the small picture covers the whole image, so that its pixels are H / h and W / w
-        pixels apart, a little more than ``every`` where that is no divisor."""
+        """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures
+        filtered as for the whole image. h = max(1, H // every), w likewise: the small picture covers the whole image,
+        so that its pixels are H / h and W / w pixels apart, a little more than ``every`` where that is no divisor."""
         return self.draw(Brightness(every), t_ns)
 
     def velocity(self, t_ns: int, every: int = 1) -> Frame:
-        """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit, h and w as for
-        :meth:`brightness`: a few pixels are enough to find the largest motion."""
+        """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit, h and w
+        as for :meth:`brightness`: a few pixels are enough to find the largest motion."""
         return self.draw(Velocity(every), t_ns)
 
     def velocity_of_movers(self, t_ns: int, every: int = 1) -> Frame:
-        """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone, those behind
-        something included: still a bound."""
+        """:meth:`velocity` of what moves, for the time sampling: with a still camera of the moving objects alone, those
+        behind something included: still a bound."""
         return self.draw(Velocity(every, moving_only=not self.whole), t_ns)
 
     def colour(self, t_ns: int, antialiasing: str | None = None) -> Frame:

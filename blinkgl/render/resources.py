@@ -68,7 +68,8 @@ class DrawItem:
 MAX_RADIUS = 1e18
 """Times the largest focal length, 1e9 px, still far below float32's 3e38."""
 MAX_RADIANCE = 1e18
-"""Of a texel: times the largest colour and the largest light of a configuration, 1e9 each, it is still finite in float32."""
+"""Of a texel: times the largest colour and the largest light of a configuration, 1e9 each,
+it is still finite in float32."""
 _LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
 
 
@@ -183,8 +184,8 @@ class SceneResources:
 
 
 def _near_zero(uvs: np.ndarray) -> np.ndarray:
-    """(V, 2) float64 texture coordinates less whole repeats, so that a mesh with thousands of them has zero in its middle.
-    float32 at 50 000 repeats resolves 0.004 of a repeat: the texture of a wide ground would move in steps."""
+    """(V, 2) float64 texture coordinates less whole repeats, so that a mesh with thousands of them has zero in its
+    middle. float32 at 50 000 repeats resolves 0.004 of a repeat: the texture of a wide ground would move in steps."""
     low, high = uvs.min(axis=0), uvs.max(axis=0)
     return uvs - np.rint((low + high) / 2) if max(-low.min(), high.max()) > 64 else uvs
 

@@ -1,8 +1,8 @@
 """A camera that stands still: draw what does not move once, and after that only where something moves.
 
-The still part of the scene is kept as a picture with its depth. For each frame the rectangles that moving objects cover,
-now or in the frame before, are restored from it, the moving objects are drawn over them under a scissor, and only those
-rectangles are read back. Every pixel gets the value that a full redraw would give it.
+The still part of the scene is kept as a picture with its depth. For each frame the rectangles that moving objects
+cover, now or in the frame before, are restored from it, the moving objects are drawn over them under a scissor, and
+only those rectangles are read back. Every pixel gets the value that a full redraw would give it.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel)
 
 
 class StillCanvas(Canvas):
-    """Of a pass that draws the scene with a camera that stands still. The target always holds the whole last frame; what is kept beside
-    it, the still objects' picture and the places of those that move, is nobody else's."""
+    """Of a pass that draws the scene with a camera that stands still. The target always holds the whole last frame;
+    what is kept beside it, the still objects' picture and the places of those that move, is nobody else's."""
 
     _picture: Target | None = None
     _covered: tuple[Rectangle, ...] = ()  # by what moves, in the last frame

@@ -2,7 +2,8 @@
 
 In:    the folder of a data set.
 Out:   report.html.
-Start: page.py (``build_report``) and templates/data_set.html; collect.py gathers, charts.py counts. markup.py fills in any room's templates.
+Start: page.py (``build_report``) and templates/data_set.html; collect.py gathers, charts.py
+counts. markup.py fills in any room's templates.
 """
 
 from blinkgl.report.page import build_report, write_report

@@ -11,8 +11,9 @@ WIDTH, HEIGHT, BOTTOM, LEFT = 300, 120, 18, 6
 
 @dataclass(frozen=True)
 class Histogram:
-    """``bars``: (left edge, height) of those that are not empty, on the line y = ``floor``; ``median_x`` is None where the median is off the axis.
-    ``low``, ``high``, ``median``: values to be written below, the last one at ``label_x``."""
+    """``bars``: (left edge, height) of those that are not empty, on the line y = ``floor``; ``median_x`` is None where
+    the median is off the axis. ``low``, ``high``, ``median``: values to be written below, the
+    last one at ``label_x``."""
 
     bars: list[tuple[float, float]]
     bar_width: float

@@ -1,4 +1,5 @@
-"""What the page is made of: a sample of labels for pictures and distributions, every configuration for the parameters."""
+"""What the page is made of: a sample of labels for pictures and distributions, every
+configuration for the parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Pages from templates (jinja2). Whatever is put into one is escaped, unless a template itself made it; a name that is missing is an error."""
+"""Pages from templates (jinja2). Whatever is put into one is escaped, unless a template itself
+made it; a name that is missing is an error."""
 
 from __future__ import annotations
 

@@ -20,7 +20,8 @@ _MAX_LISTED = 50
 
 
 def write_report(root: str | Path, out: str | Path | None = None, *, examples: int = 6) -> Path:
-    """Writes the page (default ``<root>/report.html``) and ``index.jsonl``; returns the page's path. Raises BlinkGLError."""
+    """Writes the page (default ``<root>/report.html``) and ``index.jsonl``; returns the page's
+    path. Raises BlinkGLError."""
     found = collect(root, examples=examples)
     out = Path(out) if out is not None else Path(root) / "report.html"
     write_index(root)

@@ -174,7 +174,8 @@ class Scene:
         return replace(self, rig=self.rig.with_first(camera=camera))
 
     def seen_by(self, number: int) -> Scene:
-        """The scene as the rig's sensor of this number sees it: with that one alone. Raises ConfigError where there is none."""
+        """The scene as the rig's sensor of this number sees it: with that one alone. Raises
+        ConfigError where there is none."""
         return replace(self, rig=self.rig.seen_by(number))
 
     def with_path(self, path: PosePath) -> Scene:

@@ -9,8 +9,8 @@ from blinkgl.machine.compiling import compiled_s, working_clock
 
 
 class StageClock:
-    """Wall seconds per named stage, without the compilation of kernels, which happens once per machine and is told apart
-    (``compile_s``). ``with clock("events"): …`` adds to a stage; stages do not nest."""
+    """Wall seconds per named stage, without the compilation of kernels, which happens once per machine and is told
+    apart (``compile_s``). ``with clock("events"): …`` adds to a stage; stages do not nest."""
 
     def __init__(self) -> None:
         self.started = working_clock()

@@ -1,8 +1,9 @@
-"""A sequence of recorded frames: the E-Tartan way. Frames go through the emulator, the frames' own flow becomes the label.
+"""A sequence of recorded frames: the E-Tartan way. Frames go through the emulator, the
+frames' own flow becomes the label.
 
 A folder is expected to look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of frames in
-another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero: the point is hidden
-or outside the image in the next frame).
+another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero: the point is
+hidden or outside the image in the next frame).
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ _FLOW = (".npy", ".flo", ".png")
 
 
 def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
-    """The folders that ``frames.folders`` names, sorted. ConfigError: none named, none found, or no image folder inside."""
+    """The folders that ``frames.folders`` names, sorted. ConfigError: none named, none
+    found, or no image folder inside."""
     found: list[Path] = []
     for number, pattern in enumerate(config.folders):
         matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
@@ -54,7 +56,8 @@ def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
 
 
 def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
-    """The ``index``-th folder of frames; the only one for every index. Raises ConfigError as :func:`matching_folders`, or for too few."""
+    """The ``index``-th folder of frames; the only one for every index. Raises ConfigError as
+    :func:`matching_folders`, or for too few."""
     folders = matching_folders(config, base)
     if len(folders) > 1 and index >= len(folders):
         raise ConfigError(f"{len(folders)} folders are too few for sequence {index}", where="frames.folders")
@@ -62,8 +65,8 @@ def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
 
 
 def used_images(config: FramesConfig, folder: Path) -> list[Path]:
-    """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer than an event
-    file can hold."""
+    """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer
+    than an event file can hold."""
     files = _listed(folder / config.images, IMAGE)[config.first:]
     files = files[: config.count]
     if len(files) < 3 or (config.count and len(files) < config.count):
@@ -78,8 +81,9 @@ def used_images(config: FramesConfig, folder: Path) -> list[Path]:
 class RecordedSequence(Simulation):
     """A sequence of the ``index``-th folder of frames; see :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
-    Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval of events before
-    it, as in drawn sequences. Its ``config`` names the folder.   files : the images.   flows, masks : files of labels, or none.
+    Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval
+    of events before it, as in drawn sequences. Its ``config`` names the folder.   files : the
+    images.   flows, masks : files of labels, or none.
     Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them."""
 
     def __init__(self, config: SequenceConfig, index: int, *, base: Path, events: bool, labels: bool, pictures_hz: float | None):

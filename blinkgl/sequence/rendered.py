@@ -1,4 +1,5 @@
-"""A sequence of a scene: frames are drawn at the times the timeline asks for and go through the emulator; ground truth at label times."""
+"""A sequence of a scene: frames are drawn at the times the timeline asks for and go through the
+emulator; ground truth at label times."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ from blinkgl.timeline import Timeline, make_timeline
 
 
 def drawn(renderer: Renderer, times: Iterable[int], rates: bool = False) -> Iterator[EventFrame]:
-    """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one. rates : with d(luminance)/dt."""
+    """The frames of the event pass at ``times``, ns; a :class:`Timeline` is told every one.
+    rates : with d(luminance)/dt."""
     observe, frame = times.observe if isinstance(times, Timeline) else None, None
     for t_ns in times:
         before, frame = frame, renderer.luminance(t_ns, rate=rates)
@@ -41,7 +43,8 @@ class RenderedSequence(Simulation):
     """See :func:`~blinkgl.sequence.simulate.simulate_sequence`.
 
     scene : as it was built.   renderer : what draws it, at its level of detail.
-    sensor : what is recorded, and through which camera. A scene that was made already is recorded as the configuration says."""
+    sensor : what is recorded, and through which camera. A scene that was made already is
+    recorded as the configuration says."""
 
     def __init__(self, config: SequenceConfig, index: int, gl: GLContext | None, *, base: Path, events: bool, labels: bool,
                  pictures_hz: float | None, scene: Scene | None, renderer: Renderer | None, window_ns: tuple[int, int] | None):
@@ -107,8 +110,8 @@ class RenderedSequence(Simulation):
         return {**self.clock.seconds, "render": stats.render_s - render_s, "read-back": stats.readback_s - readback_s}
 
     def poses(self) -> dict[str, np.ndarray]:
-        """t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M, 4, 4) float64 in the
-        order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near."""
+        """t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M, 4, 4)
+        float64 in the order of object_ids (n,) and object_names (n,); K (3, 3); resolution (width, height); near."""
         scene, times = self.scene, [self.config.time.t0_ns, *self.config.time.label_times_ns]
         T_world_cam, T_world_obj = poses_at(scene, times)
         return {

@@ -6,9 +6,10 @@
                 case EventChunk(t_ns, events): ...
                 case GroundTruth(): ...
 
-Events come in chunks, one a frame, cut where a label's time lies between two frames; ground truth comes at its time, between them. So
-whoever trains on a window of events and the flow over it holds one window, and nobody holds a sequence. (Files would not mind all
-events first, as it used to be: they are the same, byte for byte. An online consumer would then have to keep every event.)
+Events come in chunks, one a frame, cut where a label's time lies between two frames; ground truth comes at its time,
+between them. So whoever trains on a window of events and the flow over it holds one window, and nobody holds a
+sequence. (Files would not mind all events first, as it used to be: they are the same, byte for byte. An online consumer
+would then have to keep every event.)
 """
 
 from __future__ import annotations
@@ -36,14 +37,18 @@ from blinkgl.timeline import Ticks, Timeline
 def simulate_sequence(config: SequenceConfig, index: int = 0, gl: GLContext | None = None, *, base: Path = Path("."), events: bool = True,
                       labels: bool = True, pictures_hz: float | None = None, scene: Scene | None = None, renderer: Renderer | None = None,
                       window_ns: tuple[int, int] | None = None) -> Simulation:
-    """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth` and :class:`Picture` in time order.
+    """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth` and
+    :class:`Picture` in time order.
 
     gl : context to draw with; None: one of its own, where something is drawn at all.
     base : folder that relative paths in the configuration start from.
-    events, labels : False leaves them out; what ``labels:`` does not ask for is left out anyway. Nothing is drawn that nobody asked for.
+    events, labels : False leaves them out; what ``labels:`` does not ask for is left out
+    anyway. Nothing is drawn that nobody asked for.
     pictures_hz : pictures per second of simulated time, at the frames of the event pass; None: none.
-    scene : made already, instead of the configuration's.   renderer : made already, and not released at the end; its scene is drawn.
-    window_ns : first and last time, ns, instead of all of the sequence. (These three: of what is drawn, not of recorded frames.)
+    scene : made already, instead of the configuration's.   renderer : made already, and not
+    released at the end; its scene is drawn.
+    window_ns : first and last time, ns, instead of all of the sequence. (These three: of
+    what is drawn, not of recorded frames.)
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
         raise ConfigError("pictures are of event frames, and there are none", where="pictures_hz", value=pictures_hz, accepted="None, or events=True")
@@ -63,13 +68,15 @@ _NO_LABEL = (0, None)
 
 
 class Simulation(ABC):
-    """One sequence in time: iterate over it once. It holds OpenGL until its end, however the loop ends, or that of its ``with`` block.
+    """One sequence in time: iterate over it once. It holds OpenGL until its end, however the
+    loop ends, or that of its ``with`` block.
 
     config : every value as drawn.   index : number of the sequence.   height, width : px.
     t0_ns, t1_ns : first and last time, ns.   pictures_hz : that it gives, or None.
     clock : wall seconds per stage.   camera : emulator and read-out, None when no events were asked for.
     events, labels : given so far.   triangles : of all that is drawn; 0 for recorded frames.
-    timeline : the :class:`Timeline` that says when event frames are drawn; None for recorded frames, and without events.
+    timeline : the :class:`Timeline` that says when event frames are drawn; None for
+    recorded frames, and without events.
     omissions : what files of the scene ask for and is not drawn, a line per file."""
 
     triangles = 0
@@ -140,7 +147,8 @@ class Simulation(ABC):
 
     @property
     def losses(self) -> tuple[int, int, int]:
-        """Events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's queue full, and that are on its bus still."""
+        """Events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's
+        queue full, and that are on its bus still."""
         return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
 
     @property

@@ -7,7 +7,8 @@ from blinkgl.errors import ConfigError
 
 
 def choose_executor(name: str, workers: int | None, *, address: str | None = None, gpus: float = 0.0, devices: str | None = None) -> Executor:
-    """``local`` without ``workers`` is this process itself. Raises ConfigError: unknown name, options of another executor, no Ray."""
+    """``local`` without ``workers`` is this process itself. Raises ConfigError: unknown name,
+    options of another executor, no Ray."""
     if name not in ("local", "ray"):
         raise ConfigError("unknown executor", where="--executor", value=name, accepted="local or ray")
     if name == "local":

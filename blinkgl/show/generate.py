@@ -28,8 +28,8 @@ SET_ASIDE = 3
 
 def run(config: str, out: str, *, num: int | None = None, seed: int | None = None, overrides: Sequence[str] = (), quiet: bool = False,
         executor: Executor | None = None, resume: bool = False, mixed: bool = False, time_limit_s: float = 0.0) -> int:
-    """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing, whose names and reasons
-    are said even when ``quiet``. Raises what it raises."""
+    """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing,
+    whose names and reasons are said even when ``quiet``. Raises what it raises."""
     template = load_run(config, overrides, seed=seed)
     console = plain_console(quiet=quiet)
     outcome = run_dataset(template, out, executor, num=num, resume=resume, mixed=mixed, time_limit_s=time_limit_s,
@@ -42,8 +42,8 @@ def run(config: str, out: str, *, num: int | None = None, seed: int | None = Non
 
 
 class Display:
-    """Sequences, events, frames/s, what is left, disk used and expected: a bar per sequence at work on a terminal, a line per
-    finished sequence elsewhere."""
+    """Sequences, events, frames/s, what is left, disk used and expected: a bar per sequence at work on a terminal, a
+    line per finished sequence elsewhere."""
 
     def __init__(self, console: Console, out: Path):
         self._console, self._out = console, out
@@ -87,7 +87,8 @@ class Display:
             self._say(f"{name}: {message['error']}")
         elif kind == "failed":
             self._given_up += bool(message.get("given_up"))
-            self._say(f"{name} failed, {'set aside' if message.get('given_up') else 'will be tried again'}: {message['error']}")
+            self._say(f"{name} failed, {'set aside' if message.get('given_up') else 'will be tried again'}: "
+                      f"{message['error']}")
         self._bars.update(self._total, completed=self._done + sum(f for f, _, _ in self._at_work.values()), detail=self.summary())
 
     def end(self, outcome: Outcome) -> None:
@@ -145,8 +146,8 @@ def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
     else:
         say(console, f"nothing to make: all {outcome.found} sequences are whole" if not outcome.set_aside else "no sequence was made")
     if outcome.set_aside:
-        say(console, f"{len(outcome.set_aside)} of {outcome.planned} sequences are set aside; run again with --resume to try them again "
-                     f"(logs: {out}/.run/logs)")
+        say(console, f"{len(outcome.set_aside)} of {outcome.planned} sequences are set aside; run again with --resume to try "
+                     f"them again (logs: {out}/.run/logs)")
         for name, reason in sorted(outcome.set_aside.items()):
             say(console, f"  {name}: {reason}")
 
@@ -157,8 +158,8 @@ def _line(report: SequenceReport) -> str:
 
 
 def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -> None:
-    """The final table: what was made, how fast, and where the time went. ``elapsed_s``: of the run, where several workers
-    each spent wall time at once."""
+    """The final table: what was made, how fast, and where the time went. ``elapsed_s``: of the run, where several
+    workers each spent wall time at once."""
     s, first = made.summary(), made.first
     assert first is not None, "there is nothing to show of no sequences"
     table = Table(title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",

@@ -14,8 +14,9 @@ from blinkgl.show.terminal import plain_column, plain_console, say
 
 
 def emulator_options(name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None) -> dict[str, Any]:
-    """``emulator`` and ``readout`` of :func:`blinkgl.simulate` from an emulator's name, an optional YAML mapping (it may name
-    the emulator itself), ``key=value`` overrides, and an optional sensor whose values hold where nothing else is said."""
+    """``emulator`` and ``readout`` of :func:`blinkgl.simulate` from an emulator's name, an optional YAML mapping (it
+    may name the emulator itself), ``key=value`` overrides, and an optional sensor whose
+    values hold where nothing else is said."""
     data: dict[str, Any] = {}
     if config is not None:
         data = read_table(config, "emulator parameters, key: value")
@@ -53,7 +54,8 @@ def run(source: str, target: str, *, emulator: str, sensor: str | None = None, c
         report = file_to_events(source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options)
     rate = report.events / report.duration_s if report.duration_s else 0.0
     say(console, f"{target}: {report.events:,} events in {report.duration_s:.6g} s ({rate / 1e6:.3g} M/s, "
-        f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator steps")
+                 f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator "
+                 "steps")
     if report.displacement is not None:
         say(console, str(report.displacement))
     elif report.steps > report.frames:

@@ -1,5 +1,6 @@
-"""What is printed for people. Rich reads words in square brackets as its markup and drops them: "(extra [cluster])" becomes "(extra )",
-a path "run[x]" loses its end. Every console and progress column of the project is made here, and takes text as it stands.
+"""What is printed for people. Rich reads words in square brackets as its markup and drops them: "(extra [cluster])"
+becomes "(extra )", a path "run[x]" loses its end. Every console and progress column of the project
+is made here, and takes text as it stands.
 
 And what is printed where not every character can be: :func:`never_fail_to_print`."""
 
@@ -14,8 +15,8 @@ from rich.progress import TextColumn
 
 
 def plain_console(**options: Any) -> Console:
-    """``rich.console.Console`` whose strings, in tables too, are no markup and no names of emoji (``a:bug:b`` is a folder). For style pass a
-    ``rich.text.Text`` or ``style=``."""
+    """``rich.console.Console`` whose strings, in tables too, are no markup and no names of emoji (``a:bug:b`` is a
+    folder). For style pass a ``rich.text.Text`` or ``style=``."""
     return Console(markup=False, emoji=False, **options)
 
 
@@ -40,8 +41,9 @@ def _plainly(error: UnicodeError) -> tuple[str, int]:
 
 
 def never_fail_to_print() -> None:
-    """From here on, a character that stdout or stderr cannot encode (LC_ALL=C, PYTHONIOENCODING=ascii) is printed as the nearest plain
-    one, or '?'. A command calls it before it prints anything; a number nobody can read is better than none."""
+    """From here on, a character that stdout or stderr cannot encode (LC_ALL=C, PYTHONIOENCODING=ascii) is printed as
+    the nearest plain one, or '?'. A command calls it before it prints anything; a number
+    nobody can read is better than none."""
     codecs.register_error("blinkgl-plainly", _plainly)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # not what tests and notebooks put there

@@ -58,7 +58,8 @@ def show(result: dict, console: Console) -> None:
         if last["frame_wall_s"] is not None:
             mine = [r for r in result["settings"] if (r["size"] or "full") == name]
             span = lambda key, mine=mine: " to ".join(f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max))
-            console.print(f"seconds per frame of {size['width']}x{size['height']}, wall (processor): Cycles {last['frame_wall_s']:.2f} ({last['frame_cpu_s']:.2f}), "
-                          f"the settings {span('wall_s')} ({span('cpu_s')})", highlight=False, soft_wrap=True)
+            console.print(f"seconds per frame of {size['width']}x{size['height']}, wall (processor): Cycles "
+                          f"{last['frame_wall_s']:.2f} ({last['frame_cpu_s']:.2f}), the settings {span('wall_s')} "
+                          f"({span('cpu_s')})", highlight=False, soft_wrap=True)
         line = convergence_line(result, name)
         console.print(("" if name == "full" else f"{name}: ") + line, highlight=False, soft_wrap=True, style="" if size["converged"] else "yellow")

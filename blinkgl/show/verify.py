@@ -29,7 +29,8 @@ def run(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -
 
 
 def last_line(result: Verification, deep: bool) -> str:
-    """"20 sequences, 3 made again and compared bit by bit: no problem found"; says also what was compared in part or not at all."""
+    """"20 sequences, 3 made again and compared bit by bit: no problem found"; says also what
+    was compared in part or not at all."""
     parts = [f"{result.sequences} sequences"]
     if deep:
         parts.append(f"{len(result.deep) - len(result.in_part)} made again and compared bit by bit")

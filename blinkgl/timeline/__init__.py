@@ -2,7 +2,8 @@
 
 In:    a configuration, small pictures of image velocity or luminance.
 Out:   frame times, int64 ns, increasing.
-Start: strategy.py (``make_timeline``); sampling.py has the arithmetic, budget.py measures the error, interpolate.py invents frames of a video.
+Start: strategy.py (``make_timeline``); sampling.py has the arithmetic, budget.py measures the error,
+interpolate.py invents frames of a video.
 """
 
 from blinkgl.timeline.sampling import Ticks, bounded_times, displacement_times, uniform_times

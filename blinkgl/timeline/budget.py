@@ -3,16 +3,17 @@
 The estimate is embedded, as in solvers of differential equations: of three frames in a row the middle one is left out,
 the curve through the others (of the reconstruction in use) is compared with it, and the distance *in time* between the
 curve and the frame's value is the error that steps of twice the length would have. Each pixel counts by how much its
-signal changed, that is by the number of its events. Now and then a step is drawn in two halves, which measures the error
-of that very step. With g the error as a fraction of the step and d the displacement per step, px, all these measurements
-are points (log d, log g); the line g = A d^m through them, older ones forgotten, gives the error of any other step, and
-the image speed at a time, known before the frame is drawn, gives d: when something speeds up, the step does not lag behind.
+signal changed, that is by the number of its events. Now and then a step is drawn in two halves, which measures the
+error of that very step. With g the error as a fraction of the step and d the displacement per step, px, all these
+measurements are points (log d, log g); the line g = A d^m through them, older ones forgotten, gives the error of any
+other step, and the image speed at a time, known before the frame is drawn, gives d: when
+something speeds up, the step does not lag behind.
 
-The halved steps are what tells the order m of one length of step, and the correction (by how many events were beyond the target)
-what makes a mean of logarithms a percentile over events: without it the *estimated* error is 1.6 to 1.9 times the target where motion
-comes in bursts that the image speed does not tell of. On five rendered scenes (three reconstructions, three targets) the achieved error
-grows by 9 % without either one and by 25 % without both, with 10 and 23 % fewer frames (geometric means): most in the scenes where it is
-above the target already.
+The halved steps are what tells the order m of one length of step, and the correction (by how many events were beyond
+the target) what makes a mean of logarithms a percentile over events: without it the *estimated* error is 1.6 to 1.9
+times the target where motion comes in bursts that the image speed does not tell of. On five rendered scenes (three
+reconstructions, three targets) the achieved error grows by 9 % without either one and by 25 % without both, with 10 and
+23 % fewer frames (geometric means): most in the scenes where it is above the target already.
 """
 
 from __future__ import annotations
@@ -32,9 +33,11 @@ _PRIOR = {"linear": (0.10, 1.0), "pchip": (0.08, 1.2), "hermite": (0.05, 1.5)}
 _HIGHEST = {"linear": 1.0, "pchip": 2.0, "hermite": 3.0}
 """m of smooth signals, the largest that is believed."""
 FORGET, STIFFNESS, SPREAD = 0.9, 1.0, 0.15
-"""Share of a measurement left after the next one; weight of the prior m, in squared units of log d; smallest variance of it."""
+"""Share of a measurement left after the next one; weight of the prior m, in squared units
+of log d; smallest variance of it."""
 FOLLOW, CORRECTION = 0.3, (-0.7, 3.0)
-"""Step of the correction per measurement with too many events beyond the target; its limits, log of the target's reduction."""
+"""Step of the correction per measurement with too many events beyond the target; its limits,
+log of the target's reduction."""
 _EDGES = np.logspace(-3, 8, 1101)
 
 
@@ -60,7 +63,8 @@ def _left_out(scheme, older, a, middle, b, newer, slope_a, slope_b, t, error, we
 
 
 def contraharmonic_mean(speed: np.ndarray) -> float:
-    """sum v^2 / sum v: the mean over events, of which a pixel makes as many as its speed is large. 0 of nothing; what is not finite is left out."""
+    """sum v^2 / sum v: the mean over events, of which a pixel makes as many as its speed is large. 0
+    of nothing; what is not finite is left out."""
     speed = speed[np.isfinite(speed)].astype(np.float64)
     total = speed.sum()
     return float((speed * speed).sum() / total) if total > 0 else 0.0
@@ -102,7 +106,8 @@ class TimeError:
         return x, y, float(np.clip(m, 0.0, _HIGHEST[self.reconstruction]))
 
     def observe(self, t_ns: int, signal: np.ndarray, slope: np.ndarray | None, speed: np.ndarray) -> None:
-        """signal, speed : (h, w) float32 of the sampled pixels, speed px/s.   slope : (h, w) d(signal)/dt per second, for hermite."""
+        """signal, speed : (h, w) float32 of the sampled pixels, speed px/s.   slope : (h, w)
+        d(signal)/dt per second, for hermite."""
         nothing = signal if slope is None else slope
         self._frames.append((t_ns, signal.ravel(), nothing.ravel(), speed.ravel()))
         f = list(self._frames)

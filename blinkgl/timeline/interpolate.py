@@ -22,8 +22,9 @@ _LEAST = 16  # px, of a side: below, OpenCV's dense flow raises, returns NaN or 
 
 
 def cubic(frames: Iterable[Timed], factor: int = 4) -> Iterator[Timed]:
-    """``factor - 1`` frames between any two by monotone piecewise-cubic interpolation of ln(1e-3 + I) over four neighbours (Fritsch
-    and Butland 1984: no over-shoot, hence no invented events; unequal spacing is respected; linear at both ends)."""
+    """``factor - 1`` frames between any two by monotone piecewise-cubic interpolation of ln(1e-3 + I) over four
+    neighbours (Fritsch and Butland 1984: no over-shoot, hence no invented events; unequal
+    spacing is respected; linear at both ends)."""
     a = b = None  # the last two nodes: (frame, log, t)
     slope_a = secant = None  # slope at a, secant from a to b; per ms: float32 products of slopes per ns would underflow
     for frame, t in frames:
@@ -78,7 +79,8 @@ def _combine(a, b, m0, m1, w0, w1, w2, w3, out):
 
 @dataclass
 class Displacement:
-    """How far things move from one given frame to the next, px, as the dense flow says; filled while :func:`motion` runs."""
+    """How far things move from one given frame to the next, px, as the dense flow says;
+    filled while :func:`motion` runs."""
 
     pairs: int = 0
     median: float = 0.0
@@ -100,11 +102,13 @@ class Displacement:
 
 
 def motion(frames: Iterable[Timed], max_px: float = 1.0, *, most: int = 64, displacement: Displacement | None = None) -> Iterator[Timed]:
-    """So many frames in between that no more than ``max_px`` (99.5 % of the pixels) are moved per step, at most ``most`` per pair.
+    """So many frames in between that no more than ``max_px`` (99.5 % of the pixels) are moved
+    per step, at most ``most`` per pair.
 
     Dense flow (OpenCV's DIS) both ways; both frames are warped to the intermediate time by linearly combined flows and
-    blended by distance in time; where the flows contradict each other (occlusion) only the frame that sees the pixel counts.
-    What no frame shows is guessed: the result is an interpolation and ``displacement`` says over how many pixels.
+    blended by distance in time; where the flows contradict each other (occlusion) only the frame that sees the pixel
+    counts. What no frame shows is guessed: the result is an interpolation and
+    ``displacement`` says over how many pixels.
     """
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     statistics = displacement if displacement is not None else Displacement()

@@ -66,7 +66,8 @@ def _step(steps: float, pace: float, low: int, high: int) -> int:
 
 
 class Ticks:
-    """Which of the times that come by are the first at or after each multiple of 1 / rate_hz since t0_us: when a picture of a video is due.
+    """Which of the times that come by are the first at or after each multiple of 1 / rate_hz since
+    t0_us: when a picture of a video is due.
 
     In float µs, each period added to the last."""
 

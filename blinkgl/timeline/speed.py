@@ -18,5 +18,6 @@ def _largest_squared(velocity):
 
 
 def largest_speed(velocity: np.ndarray) -> float:
-    """Of (H, W, 2) float32 px/s: px/s. Pixels without a finite velocity (a surface in the camera plane) are left out."""
+    """Of (H, W, 2) float32 px/s: px/s. Pixels without a finite velocity (a surface in the
+    camera plane) are left out."""
     return float(np.sqrt(_largest_squared(velocity)))

@@ -1,7 +1,7 @@
 """The strategies of ``timeline:``: frame times that adapt to what is drawn.
 
-    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer, emulator_of(config.events).response(config.events))
-    for t_ns in timeline:
+    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer,
+    emulator_of(config.events).response(config.events)) for t_ns in timeline:
         luminance = ...                              # the frame at t_ns
         timeline.observe(t_ns, luminance, rate)
     timeline.info()                                  # what was achieved, for the manifest
@@ -37,7 +37,8 @@ class SmallPictures(Protocol):
 
 
 class Timeline:
-    """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing; each is decided when asked for."""
+    """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing;
+    each is decided when asked for."""
 
     def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response):
         self.config, self.t0_ns, self.t1_ns, self.pictures, self.response = config, t0_ns, t1_ns, pictures, response
@@ -119,7 +120,8 @@ class Budget(Timeline):
             self.pace(t_ns)
         nearest = min(self._speeds, key=lambda t: abs(t - t_ns))
         speed = self._speeds[nearest]
-        # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of the stride or smaller than the stride.
+        # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of
+        # the stride or smaller than the stride.
         rows, columns = (((np.arange(few) + 0.5) * many / few).astype(np.intp) for few, many in zip(speed.shape, luminance.shape))
         pick = lambda a: a[np.ix_(rows, columns)]
         small = pick(luminance)
@@ -140,7 +142,8 @@ def make_timeline(config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: Smal
 
 
 def moving(values: np.ndarray) -> np.ndarray:
-    """Those that are neither zero nor beyond all bounds (a surface in the camera plane): a still background has no say in a percentile."""
+    """Those that are neither zero nor beyond all bounds (a surface in the camera plane): a still
+    background has no say in a percentile."""
     values = values.ravel()
     return values[(values > 0) & np.isfinite(values)]
 

@@ -1,4 +1,5 @@
-"""How wrong the flow labels of a setting are, by casting float64 rays at a sample of pixels into the scene as it was described."""
+"""How wrong the flow labels of a setting are, by casting float64 rays at a sample of pixels
+into the scene as it was described."""
 
 from __future__ import annotations
 
@@ -14,10 +15,11 @@ _AROUND = np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)], float)
 
 
 def flow_errors(scene: Scene, renderer: Renderer, t_ns: int, t_next_ns: int, seed: int = 0) -> dict[str, float]:
-    """Error of the forward flow in px, median and maximum, over ``PIXELS`` random pixels off silhouettes; NaN where there are none.
+    """Error of the forward flow in px, median and maximum, over ``PIXELS`` random pixels off
+    silhouettes; NaN where there are none.
 
-    scene : the scene with all its triangles, whatever the renderer draws instead of it. A pixel counts where it and its four
-    neighbours see one instance, the renderer agrees on which, and the flow is valid on both sides."""
+    scene : the scene with all its triangles, whatever the renderer draws instead of it. A pixel counts where it and its
+    four neighbours see one instance, the renderer agrees on which, and the flow is valid on both sides."""
     height, width = renderer.height, renderer.width
     rng = np.random.default_rng(seed)
     xy = np.stack([rng.integers(0, width, PIXELS), rng.integers(0, height, PIXELS)], axis=1)

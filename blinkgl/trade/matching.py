@@ -4,9 +4,10 @@ The matching of two event trains of a pixel and polarity minimises
 
     sum over matched pairs |t_a - t_b|  +  limit / 2 * (events without a partner),    |t_a - t_b| <= limit,
 
-which is the spike-train metric of Victor and Purpura (J. Neurophysiology 76, 1996) with cost 2 / limit per unit of time: moving an
-event is cheaper than losing one and inventing another as long as it moves by no more than ``limit``. An optimal matching keeps
-the order of time, so dynamic programming over the two sorted trains finds it; only partners within ``limit`` are looked at.
+which is the spike-train metric of Victor and Purpura (J. Neurophysiology 76, 1996) with cost 2 / limit per unit of
+time: moving an event is cheaper than losing one and inventing another as long as it moves by no more than ``limit``. An
+optimal matching keeps the order of time, so dynamic programming over the two sorted trains finds it; only partners
+within ``limit`` are looked at.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ _JIT = dict(cache=True, nogil=True)
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """partner : (len(reference),) int64, index of each reference event's partner in the judged stream; -1: it was missed.
-    dt_us : (len(reference),) int64, judged minus reference time, µs; 0 where missed.   extra : judged events without a partner."""
+    """partner : (len(reference),) int64, index of each reference event's partner in the
+    judged stream; -1: it was missed.
+    dt_us : (len(reference),) int64, judged minus reference time, µs; 0 where missed.   extra
+    : judged events without a partner."""
 
     partner: np.ndarray
     dt_us: np.ndarray
@@ -58,7 +61,8 @@ def match_events(reference: Events, judged: Events, height: int, width: int, lim
 
 
 def _trains(events: Events, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Events grouped by pixel and polarity: (starts (2 H W + 1,), order (N,)); train k is ``order[starts[k]:starts[k + 1]]``, by time."""
+    """Events grouped by pixel and polarity: (starts (2 H W + 1,), order (N,)); train k is
+    ``order[starts[k]:starts[k + 1]]``, by time."""
     starts = np.zeros(2 * height * width + 1, np.int64)
     order = np.empty(len(events), np.int64)
     _group(events.x, events.y, events.p, width, starts, order)
@@ -81,9 +85,10 @@ def _group(x, y, p, width, starts, order):
 
 @numba.njit(**_JIT)
 def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
-    """Dynamic programming per train. cost[i][j]: the least cost (in half µs, so that integers suffice) of the first i events of a
-    and the first j of b. Row i holds j from low[i], the number of b's events too early for event i - 1 of a, to high[i], the number of
-    those not too late for it: outside, events can only be lost, at ``limit`` half µs each."""
+    """Dynamic programming per train. cost[i][j]: the least cost (in half µs, so that integers suffice) of the first i
+    events of a and the first j of b. Row i holds j from low[i], the number of b's events too early for event i - 1 of
+    a, to high[i], the number of those not too late for it: outside, events can only be
+    lost, at ``limit`` half µs each."""
     low, high = np.empty(64, np.int64), np.empty(64, np.int64)
     row_start = np.empty(64, np.int64)
     cost, choice = np.empty(256, np.int64), np.empty(256, np.uint8)

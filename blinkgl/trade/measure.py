@@ -1,7 +1,8 @@
 """Times settings and judges their events: the measurement behind ``blinkgl trade``.
 
-The events of a clip are simulated as ``blinkgl generate`` simulates them (:func:`~blinkgl.sequence.simulate.simulate_sequence`; nothing is
-written), once per setting and round. Rounds are interleaved, so that a busy moment of the machine falls on all settings alike.
+The events of a clip are simulated as ``blinkgl generate`` simulates them
+(:func:`~blinkgl.sequence.simulate.simulate_sequence`; nothing is written), once per setting and round. Rounds are
+interleaved, so that a busy moment of the machine falls on all settings alike.
 """
 
 from __future__ import annotations
@@ -35,8 +36,10 @@ ENOUGH = 0.1
 
 @dataclass(frozen=True)
 class Options:
-    """clip_s : simulated seconds; 0: one label interval.   tiles : columns, rows, width, height of the judged rectangles.
-    levels : (samples per pixel side, px between frames) of the reference, rising until it has converged or ``reference_s`` is spent.
+    """clip_s : simulated seconds; 0: one label interval.   tiles : columns, rows, width,
+    height of the judged rectangles.
+    levels : (samples per pixel side, px between frames) of the reference, rising until it has
+    converged or ``reference_s`` is spent.
     reference : "raster", or "cycles" (extra [cycles]): the same scene path-traced, samples² paths a pixel.
     rounds, rounds_s : at most so many rounds, and no new one when so many seconds are gone."""
 
@@ -83,8 +86,8 @@ class Measured:
 
 @dataclass
 class Level:
-    """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest error of any
-    setting judged by this one. frame_wall_s, frame_cpu_s : of a path tracer, rendering alone, median."""
+    """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest
+    error of any setting judged by this one. frame_wall_s, frame_cpu_s : of a path tracer, rendering alone, median."""
 
     scale: int
     max_px: float
@@ -121,7 +124,8 @@ class Bench:
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")
-        # Labels and previews take no part in this; noise, and a bus that makes events late, would drown the errors that are asked for.
+        # Labels and previews take no part in this; noise, and a bus that makes events late, would drown the errors that
+        # are asked for.
         self.emulator = emulator_of(base.events).noiseless(base.events)
         tree = apply_overrides(template.tree, ["quality=null", *_sized(base, SIZES[size])])
         self._template = RunTemplate({**tree, "events": self.emulator.model_dump()}, template.base)

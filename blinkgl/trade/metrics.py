@@ -20,9 +20,11 @@ BINS = 15
 class EventErrors:
     """Errors of a stream against the reference. Times are absolute differences of matched events.
 
-    time_*_us : µs.   shift_*_px : the same times the image speed at the event's pixel and time: how far the edge is from where it
-    should have been. missed, extra : events without a partner, relative to the reference's count. count : events relative to the
-    reference's count, minus 1. voxel : ||V - V_ref|| / ||V_ref|| of signed 15-bin voxel grids. NaN where there is nothing to judge by."""
+    time_*_us : µs.   shift_*_px : the same times the image speed at the event's pixel and
+                      time: how far the edge is from where it
+    should have been. missed, extra : events without a partner, relative to the reference's count. count : events
+    relative to the reference's count, minus 1. voxel : ||V - V_ref|| / ||V_ref|| of signed 15-bin voxel grids. NaN
+    where there is nothing to judge by."""
 
     events: int
     reference_events: int
@@ -83,7 +85,8 @@ def event_errors(reference: Events, judged: Events, speeds: SpeedMaps, t0_us: in
 
 
 def voxel_grid(events: Events, t0_us: int, t1_us: int, height: int, width: int, bins: int = BINS) -> np.ndarray:
-    """(bins, H, W) float32: polarities (+1, -1), each shared between the two bins beside (bins - 1) (t - t0) / (t1 - t0)."""
+    """(bins, H, W) float32: polarities (+1, -1), each shared between the two bins beside
+    (bins - 1) (t - t0) / (t1 - t0)."""
     grid = np.zeros((bins, height, width), np.float32)
     _vote(events.x, events.y, events.t, events.p, np.int64(t0_us), np.int64(t1_us), grid)
     return grid

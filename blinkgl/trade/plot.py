@@ -90,8 +90,8 @@ def _legend(ax, rows: list[dict]) -> None:
 
 
 def _label(ax, rows: list[dict], cost: str, renderer) -> list:
-    """Names of the front's settings, below and left of their points, where by definition there is nothing; pushed down until they
-    do not overlap."""
+    """Names of the front's settings, below and left of their points, where by definition there is nothing; pushed down
+    until they do not overlap."""
     factor, floor = PANELS[0][2], np.inf
     height, names = None, []
     for r in sorted(rows, key=lambda r: r[cost]):

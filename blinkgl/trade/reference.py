@@ -1,8 +1,10 @@
-"""The reference that settings are judged by: the same scene drawn so finely in space and time that it does not matter any more.
+"""The reference that settings are judged by: the same scene drawn so finely in space and
+time that it does not matter any more.
 
 Only some rectangles of the image are drawn (and judged): a whole image at 32 x 32 samples a pixel is out of reach, and
-a few thousand pixels in many places say as much about errors as all of them. Each pixel is the mean of ``scale`` x ``scale`` samples on a
-regular grid; at that rate mip maps are hardly touched any more, so this converges to the box-filtered image of the full textures.
+a few thousand pixels in many places say as much about errors as all of them. Each pixel is the mean of ``scale`` x
+``scale`` samples on a regular grid; at that rate mip maps are hardly touched any more, so this converges to the
+box-filtered image of the full textures.
 """
 
 from __future__ import annotations
@@ -48,7 +50,8 @@ def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray
 
 
 class FineTiles:
-    """Rectangles of a scene's image at ``scale`` x ``scale`` samples a pixel. A context manager; calling it is a FrameSource."""
+    """Rectangles of a scene's image at ``scale`` x ``scale`` samples a pixel. A context
+    manager; calling it is a FrameSource."""
 
     cost = None
 

@@ -26,7 +26,8 @@ COLUMNS = ("name", "wall_s", "cpu_s", "frames_per_s", "triangles", "time_median_
 
 
 def chosen(settings: tuple[Setting, ...], only: list[str], skip: list[str] = ()) -> tuple[Setting, ...]:
-    """The settings whose name contains one of ``only`` (all, when there is none) and none of ``skip``. Raises ConfigError when none is left."""
+    """The settings whose name contains one of ``only`` (all, when there is none) and none of ``skip``. Raises
+    ConfigError when none is left."""
     has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)
     found = tuple(s for s in settings if (not only or has(s, only)) and not has(s, skip))
     if not found:
@@ -55,7 +56,8 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
             if not mine:
                 continue
             bench = Bench(gl, template, options, size, say)
-            say(f"{bench.width}x{bench.height}, {bench.duration_s:g} s of sequence {options.sequence}, {len(mine)} settings")
+            say(f"{bench.width}x{bench.height}, {bench.duration_s:g} s of sequence {options.sequence}, {len(mine)} "
+                "settings")
             results = bench.measure(mine)
             levels = bench.judge(results, bench.speeds())
             rows += [{**r.to_dict(), "width": bench.width, "height": bench.height} for r in results]
@@ -84,7 +86,8 @@ def convergence_line(result: dict, size: str = "full") -> str:
         return f"the reference, {what}, was NOT checked: there was time for one level only"
     moved = ", ".join(f"{NAMES[k]} {100 * v:.2g} %" for k, v in last["ratio"].items())
     verdict = "converged" if result["sizes"][size]["converged"] else f"did NOT converge to a tenth ({100 * result['enough']:.0f} %) within the limits"
-    return f"the reference {verdict}: {what}; from the level before it moved by, in parts of the smallest error judged: {moved}"
+    return (f"the reference {verdict}: {what}; from the level before it moved by, in parts of the smallest error judged: "
+            f"{moved}")
 
 
 NAMES = {"time_median_us": "median time", "time_p95_us": "95 % time", "wrong": "missed and extra", "voxel": "voxel grid"}

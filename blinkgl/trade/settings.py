@@ -2,10 +2,13 @@
 
 Not the full product: it would be thousands of settings, most of them silly. What is there and why:
 
-1. displacement x anti-aliasing, in full: the two axes that matter most, and they interact, because each hides the other's error.
-2. reconstruction x displacement at one anti-aliasing: a better curve between frames trades against more frames and nothing else ...
+1. displacement x anti-aliasing, in full: the two axes that matter most, and they interact,
+   because each hides the other's error.
+2. reconstruction x displacement at one anti-aliasing: a better curve between frames trades
+   against more frames and nothing else ...
 3. ... and both, pchip at the coarse steps, with sharper mip maps: where presets are looked for.
-4. every other way to choose the times (uniform, brightness, budget) at one anti-aliasing, so that each is a curve to compare.
+4. every other way to choose the times (uniform, brightness, budget) at one anti-aliasing,
+   so that each is a curve to compare.
 5. anisotropy, level of detail and texture size one at a time: they change what a frame is, not when it is drawn.
 6. half the image size: another data set, with a reference of its own; it says what a pixel costs.
 """
@@ -57,7 +60,8 @@ class Setting:
 
 
 def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
-    """The settings of a sweep, without repetitions. random_scene : the scene has pools, whose textures can be made smaller."""
+    """The settings of a sweep, without repetitions. random_scene : the scene has pools,
+    whose textures can be made smaller."""
     displacement = lambda *px: [f"displacement {p:g} px" for p in px]
     uniform = lambda *fps: [f"uniform {f}/s" for f in fps]
     curves = [r for r in RECONSTRUCTIONS if r != "linear"]

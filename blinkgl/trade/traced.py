@@ -1,5 +1,6 @@
-"""A path tracer in the reference's place (``blinkgl trade --reference cycles``): errors then contain what rasterising leaves out, shadows
-and inter-reflection, and what it filters differently. Needs the extra [cycles]; see ``tools/peer_cycles.py``."""
+"""A path tracer in the reference's place (``blinkgl trade --reference cycles``): errors then contain what rasterising
+leaves out, shadows and inter-reflection, and what it filters differently. Needs the extra [cycles];
+see ``tools/peer_cycles.py``."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ from blinkgl.trade.reference import FineTiles
 
 
 class TracedFrames:
-    """The scene by Blender's Cycles at ``scale`` * ``scale`` paths a pixel, with shadows and four diffuse bounces. Used like FineTiles, but
-    draws whole images, at seconds each: for small ones and short clips.
+    """The scene by Blender's Cycles at ``scale`` * ``scale`` paths a pixel, with shadows and four diffuse bounces. Used
+    like FineTiles, but draws whole images, at seconds each: for small ones and short clips.
 
     cost : seconds per frame, filled as frames are drawn. Raises BlinkGLError when Blender is not there or stops."""
 

@@ -1,7 +1,8 @@
-"""From sources to batches: augmentation, grids, cropping, mixing; every sample a pure function of (seed, epoch, position).
+"""From sources to batches: augmentation, grids, cropping, mixing; every sample a pure
+function of (seed, epoch, position).
 
-Nothing here keeps a state that a checkpoint would have to hold: training step s of any run takes the same samples with the same
-augmentation, whatever the number of workers and however often the run was interrupted.
+Nothing here keeps a state that a checkpoint would have to hold: training step s of any run takes the same samples with
+the same augmentation, whatever the number of workers and however often the run was interrupted.
 """
 
 from __future__ import annotations
@@ -36,8 +37,9 @@ class Key:
 class Mixture:
     """The order of an endless training run over several sources.
 
-    weights : share of each source in an epoch. An epoch has as many samples as the sources together; each source contributes in
-    proportion to its weight, going through its own samples in an order that is new for every pass over it.
+    weights : share of each source in an epoch. An epoch has as many samples as the sources together; each source
+    contributes in proportion to its weight, going through its own samples in an order
+    that is new for every pass over it.
     """
 
     def __init__(self, sizes: list[int], weights: list[float], seed: int):
@@ -77,10 +79,11 @@ class Mixture:
 
 
 class FlowDataset(Dataset):
-    """Samples as tensors. ``dataset[key]`` for training (a :class:`Key`), ``dataset[i]`` for evaluation (no augmentation, no crop).
+    """Samples as tensors. ``dataset[key]`` for training (a :class:`Key`), ``dataset[i]`` for
+    evaluation (no augmentation, no crop).
 
-    Gives a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400), mask (H, W) bool,
-    name, scene; without ground truth flow and valid are left out.
+    Gives a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400), mask
+    (H, W) bool, name, scene; without ground truth flow and valid are left out.
 
     empty : "error" refuses a sample without an event in either window; "skip" takes the next sample that has some.
     """
@@ -142,7 +145,8 @@ class FlowDataset(Dataset):
 
 
 def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> RawSample:
-    """The event-level augmentations, each with its own probability; all draws happen, so that switching one off moves no other."""
+    """The event-level augmentations, each with its own probability; all draws happen, so that
+    switching one off moves no other."""
     u = rng.random(7)
     noise_rng, hot_rng, drop_rng = rng.spawn(3)
     if u[0] < a.horizontal_flip:
@@ -163,8 +167,8 @@ def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> 
 
 
 def scaled(sample: dict, factor: float, least: tuple[int, int] | None = None) -> dict:
-    """Image scaled by ``factor`` (at least so that ``least`` = (H, W) fits), grids bilinear, flow bilinear times the true factor of
-    each axis, validity only where all four contributing pixels are valid."""
+    """Image scaled by ``factor`` (at least so that ``least`` = (H, W) fits), grids bilinear, flow bilinear times the
+    true factor of each axis, validity only where all four contributing pixels are valid."""
     height, width = sample["new"].shape[-2:]
     size = [max(round(height * factor), (least or (1, 1))[0]), max(round(width * factor), (least or (1, 1))[1])]
     resize = lambda a: torch.nn.functional.interpolate(a[None], size=size, mode="bilinear", align_corners=False)[0]
@@ -187,8 +191,8 @@ def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name:
 
 
 class StepSampler(Sampler):
-    """Batches of keys from training step ``start`` on, for one rank of ``world``: step s takes samples s·B … (s+1)·B - 1 of the
-    mixture, rank r every world-th of them."""
+    """Batches of keys from training step ``start`` on, for one rank of ``world``: step s takes samples s·B … (s+1)·B -
+    1 of the mixture, rank r every world-th of them."""
 
     def __init__(self, mixture: Mixture, batch: int, start: int, stop: int, rank: int = 0, world: int = 1):
         self.mixture, self.batch, self.start, self.stop, self.rank, self.world = mixture, batch, start, stop, rank, world
@@ -210,7 +214,8 @@ def collate(samples: list[dict]) -> dict:
 
 
 class _Carrying(Dataset):
-    """A data set whose errors travel as values: raised in a loader process, torch would hand them on as pages of traceback."""
+    """A data set whose errors travel as values: raised in a loader process, torch would hand
+    them on as pages of traceback."""
 
     def __init__(self, dataset: FlowDataset):
         self.dataset = dataset
@@ -233,7 +238,8 @@ def _collate_or_carry(samples: list) -> dict | BlinkGLError:
 
 
 def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool = False) -> Iterator[dict]:
-    """Batches in the sampler's order; the same ones for any number of workers. Raises what ``dataset`` and :func:`collate` raise."""
+    """Batches in the sampler's order; the same ones for any number of workers. Raises what
+    ``dataset`` and :func:`collate` raise."""
     loader = DataLoader(_Carrying(dataset), batch_sampler=sampler, num_workers=workers, collate_fn=_collate_or_carry, pin_memory=pin,
                         persistent_workers=workers > 0, prefetch_factor=4 if workers else None,
                         generator=torch.Generator(),  # else each start would draw from torch's global one

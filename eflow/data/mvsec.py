@@ -1,4 +1,5 @@
-"""MVSEC as samples: image pairs dt = 1 or 4 apart, ground truth propagated through the 20 Hz flow (Zhu et al., RSS 2018)."""
+"""MVSEC as samples: image pairs dt = 1 or 4 apart, ground truth propagated through the 20
+Hz flow (Zhu et al., RSS 2018)."""
 
 from __future__ import annotations
 
@@ -55,9 +56,9 @@ class NpzRows:
 class MvsecSource:
     """Samples of ``<seq>_data.hdf5`` + ``<seq>_gt_flow_dist.npz`` files at or below ``root``.
 
-    Sample i of a sequence: events between images i - dt … i (old) and i … i + dt (new); ground truth over the same time, by
-    following pixels through the successive 20 Hz flow fields. ``mask``: pixels with an event in the new window, inside the
-    256x256 centre crop, above the hood outdoors. Times: µs since the sequence's first image."""
+    Sample i of a sequence: events between images i - dt … i (old) and i … i + dt (new); ground truth over the same
+    time, by following pixels through the successive 20 Hz flow fields. ``mask``: pixels with an event in the new
+    window, inside the 256x256 centre crop, above the hood outdoors. Times: µs since the sequence's first image."""
 
     has_backward = False
 
@@ -169,9 +170,9 @@ def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
 def propagate(pieces: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, np.ndarray]:
     """Displacement of every pixel followed through successive flow fields, each over a fraction of its interval.
 
-    pieces : (flow (H, W, 2) px over the field's whole interval, fraction in (0, 1]); 0, 0 means invalid. The field is read at
-    the pixel nearest to where the point has got to. Returns flow (H, W, 2) float32 and valid (H, W): False where any piece
-    was invalid or NaN, or the point left the image before the last piece."""
+    pieces : (flow (H, W, 2) px over the field's whole interval, fraction in (0, 1]); 0, 0 means invalid. The field is
+    read at the pixel nearest to where the point has got to. Returns flow (H, W, 2) float32 and valid (H, W): False
+    where any piece was invalid or NaN, or the point left the image before the last piece."""
     height, width = pieces[0][0].shape[:2]
     start = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
     at, valid = start.copy(), np.ones((height, width), bool)

@@ -1,4 +1,5 @@
-"""Events to the tensor a network eats. A representation is a frozen value: ``representation(window, height, width)``."""
+"""Events to the tensor a network eats. A representation is a frozen value:
+``representation(window, height, width)``."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ class Representation(Protocol):
 
 @dataclass(frozen=True)
 class VoxelGrid:
-    """See :func:`eflow.ops.voxel.voxel_grid`. bounds "window": bins span [t0, t1]; "events": first to last event (E-RAFT's)."""
+    """See :func:`eflow.ops.voxel.voxel_grid`. bounds "window": bins span [t0, t1]; "events":
+    first to last event (E-RAFT's)."""
 
     bins: int = 15
     normalise: str = "nonzero"

@@ -1,6 +1,8 @@
-"""Data sets on disk as lists of samples: BlinkGL's sequence directories, DSEC, BlinkFlow. (MVSEC: :mod:`eflow.data.mvsec`.)
+"""Data sets on disk as lists of samples: BlinkGL's sequence directories, DSEC, BlinkFlow. (MVSEC:
+:mod:`eflow.data.mvsec`.)
 
-All three are an event file beside one flow file per label, so one reader serves them; what differs is where the files lie.
+All three are an event file beside one flow file per label, so one reader serves them;
+what differs is where the files lie.
 
 | layout | events | flow | times |
 |---|---|---|---|
@@ -45,7 +47,8 @@ class Source(Protocol):
 
 @dataclass(frozen=True)
 class Entry:
-    """One label: flow from ``from_us`` to ``to_us`` (image clock). ``index``: the file's number, kept for submissions."""
+    """One label: flow from ``from_us`` to ``to_us`` (image clock). ``index``: the file's
+    number, kept for submissions."""
 
     index: int
     from_us: int
@@ -66,8 +69,8 @@ class Sequence:
 
 
 class FolderSource:
-    """Samples of :class:`Sequence` objects, in order. Files are opened on first use in each process (HDF5 handles survive
-    neither a fork nor a pickle) and at most 16 stay open."""
+    """Samples of :class:`Sequence` objects, in order. Files are opened on first use in each process (HDF5 handles
+    survive neither a fork nor a pickle) and at most 16 stay open."""
 
     def __init__(self, sequences: list[Sequence]):
         self.sequences = sequences
@@ -164,8 +167,8 @@ def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def find_blinkgl(root: Path) -> list[Sequence]:
-    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds; those without forward flow
-    are passed over. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
+    """Sequence directories at or below ``root``: those of its ``index.jsonl``, else whatever a search finds; those
+    without forward flow are passed over. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
     found = []
     indexed = (root / INDEX).is_file()
     folders = [root / line["path"] for line in read_index(root)] if indexed else [m.parent for m in sorted(root.rglob("manifest.json"))]
@@ -190,8 +193,9 @@ def find_blinkgl(root: Path) -> list[Sequence]:
 
 
 def find_dsec(root: Path) -> list[Sequence]:
-    """DSEC sequences at or below ``root``; events and flow may lie in one tree, or in the archives' own ``train_events`` and
-    ``train_optical_flow``. A ``test_forward_flow_timestamps.csv`` or ``<sequence>.csv`` gives a test sequence its times."""
+    """DSEC sequences at or below ``root``; events and flow may lie in one tree, or in the archives' own
+    ``train_events`` and ``train_optical_flow``. A ``test_forward_flow_timestamps.csv`` or
+    ``<sequence>.csv`` gives a test sequence its times."""
     found = []
     for events in sorted(root.rglob("events.h5")):
         if events.parent.name not in ("left", "events_left") or "forward_flow" in {p.name for p in events.parent.parent.iterdir()}:
@@ -216,15 +220,16 @@ def find_dsec(root: Path) -> list[Sequence]:
 
 
 def find_blinkflow(root: Path) -> list[Sequence]:
-    """BlinkFlow's published layout: ``[<split>/]<scene>/<seq>/{events_left/events.h5, forward_flow, config.yaml}``. Label 0
-    has no events before it and is left out."""
+    """BlinkFlow's published layout: ``[<split>/]<scene>/<seq>/{events_left/events.h5, forward_flow, config.yaml}``.
+    Label 0 has no events before it and is left out."""
     found = []
     for folder in sorted(p.parent for p in root.rglob("forward_flow") if p.is_dir()):
         fps = _fps(folder / "config.yaml")
         files = sorted((folder / "forward_flow").glob("*.npy"))
         backward = {int(f.stem): f for f in (folder / "backward_flow").glob("*.npy")}
         at = lambda i, fps=fps: round(i * 1e6 / fps)
-        # backward_flow/k belongs to frames k+1 -> k in the published sets, so the one that starts at label i is file i - 1.
+        # backward_flow/k belongs to frames k+1 -> k in the published sets, so the one that starts at label i is file i
+        # - 1.
         entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in ((int(f.stem), f) for f in files) if i > 0)
         parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)
         name = "/".join(parts[-2:])
@@ -296,7 +301,8 @@ def detect_format(root: Path) -> str:
 def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1) -> Source:
     """The data set at ``path``; ``dt``: MVSEC's interval in images, 1 or 4.
 
-    Raises AssetError: nothing there, or a damaged index; files of single samples are only looked at when they are asked for."""
+    Raises AssetError: nothing there, or a damaged index; files of single samples are only
+    looked at when they are asked for."""
     root = Path(path)
     kind = detect_format(root) if format == "auto" else format
     if kind == "mvsec":

@@ -1,7 +1,7 @@
 """One window of events, and the transforms of a (old window, new window, flow) sample that are exact.
 
-Everything acts on the events themselves, before any grid exists, so that each transform is right for every representation;
-that it equals the transform of the voxel grid is what the tests show.
+Everything acts on the events themselves, before any grid exists, so that each transform is right for every
+representation; that it equals the transform of the voxel grid is what the tests show.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Window:
         return replace(self, p=1 - self.p)
 
     def reversed(self) -> Window:
-        """The film backwards: t -> t0 + t1 - t, order and polarity turned (what brightened now darkens). Times then lie in (t0, t1];
-        voxel(reversed) = -flip(bins) of voxel exactly."""
+        """The film backwards: t -> t0 + t1 - t, order and polarity turned (what brightened now darkens). Times then lie
+        in (t0, t1]; voxel(reversed) = -flip(bins) of voxel exactly."""
         return replace(self, x=self.x[::-1], y=self.y[::-1], t=(self.t0 + self.t1) - self.t[::-1], p=(1 - self.p)[::-1])
 
     def with_events(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> Window:

@@ -17,7 +17,8 @@ __all__ = ["NAMES", "FlowModel", "FlowPrediction", "build_model", "model_config"
 
 
 def build_model(config) -> FlowModel:
-    """The network a model configuration (:mod:`eflow.config`) describes, freshly initialised from torch's current seed."""
+    """The network a model configuration (:mod:`eflow.config`) describes, freshly
+    initialised from torch's current seed."""
     if config.name == "eraft":
         from eflow.models.eraft import Eraft as model
     elif config.name == "eflowformer":

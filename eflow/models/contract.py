@@ -19,12 +19,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FlowPrediction:
-    """flows : list of (N, 2, H, W) float32 px at input resolution, t -> t + Δ at reference t, +x right, +y down; coarse or early
+    """flows : list of (N, 2, H, W) float32 px at input resolution, t -> t + Δ at reference
+    t, +x right, +y down; coarse or early
         first, the last is the answer. Evaluation mode gives only the last.
     kind : "sequence" (refinements of one field) or "scales" (decoder scales); decides the weights of the loss.
     has_match : flows[0] is the matching layer's field, not the refinement's.
-    low : (N, 2, H/8, W/8) final low-resolution flow in units of low-resolution px, for a warm start; None where there is none.
-    backward_match : (N, 2, H/8, W/8) the same volume's match t -> t - Δ direction (new to old), low-resolution px; or None.
+    low : (N, 2, H/8, W/8) final low-resolution flow in units of low-resolution px, for a
+    warm start; None where there is none.
+    backward_match : (N, 2, H/8, W/8) the same volume's match t -> t - Δ direction (new to
+    old), low-resolution px; or None.
     """
 
     flows: list[Tensor]

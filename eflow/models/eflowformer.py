@@ -1,4 +1,5 @@
-"""E-FlowFormer (Li et al., "BlinkFlow", IROS 2023): E-RAFT with transformer-enhanced features and a supervised matching layer."""
+"""E-FlowFormer (Li et al., "BlinkFlow", IROS 2023): E-RAFT with transformer-enhanced
+features and a supervised matching layer."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _TOKENS = 1024
 
 
 class Mlp(nn.Sequential):
-    """Norm, expand fourfold, GELU, contract. Without gradients in blocks of tokens, whose hidden layer then stays in the cache."""
+    """Norm, expand fourfold, GELU, contract. Without gradients in blocks of tokens, whose
+    hidden layer then stays in the cache."""
 
     def __init__(self):
         super().__init__(nn.LayerNorm(FEATURES), nn.Linear(FEATURES, MLP_RATIO * FEATURES), nn.GELU(), nn.Linear(MLP_RATIO * FEATURES, FEATURES))
@@ -46,7 +48,8 @@ class EnhancementLayer(nn.Module):
         self.mlp_cross = Mlp()
 
     def forward(self, x: Tensor) -> Tensor:
-        """x: (2N, h, w, C), the old windows' features, then the new ones'; each half's cross-attention queries the other."""
+        """x: (2N, h, w, C), the old windows' features, then the new ones'; each half's
+        cross-attention queries the other."""
         x = x + self.local(self.norm_local(x))
         if self.mlp_local is not None:
             x = x + self.mlp_local(x)

@@ -1,4 +1,5 @@
-"""E-RAFT (Gehrig et al., "E-RAFT: Dense Optical Flow from Event Cameras", 3DV 2021) on RAFT (Teed & Deng, ECCV 2020)."""
+"""E-RAFT (Gehrig et al., "E-RAFT: Dense Optical Flow from Event Cameras", 3DV 2021) on RAFT
+(Teed & Deng, ECCV 2020)."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ class MotionEncoder(nn.Module):
 class SepConvGru(nn.Module):
     """GRU with 1x5, then 5x1 convolutions over [hidden, context, motion]; update and reset gates share one convolution.
 
-    The context does not change over the iterations, so its third of every convolution is computed once (:meth:`prepare`)."""
+    The context does not change over the iterations, so its third of every convolution is computed
+    once (:meth:`prepare`)."""
 
     def __init__(self):
         super().__init__()
@@ -105,8 +107,8 @@ class Update(nn.Module):
         self.mask_head = nn.Sequential(nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 9 * 64, 1))
 
     def forward(self, h: Tensor, context, taps: Tensor, flow: Tensor, with_mask: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-        """h (N, 128, h, w), context: :meth:`SepConvGru.prepare`'s result (or the context itself: the slow twin), taps (N, 324, h, w),
-        flow (N, 2, h, w) -> hidden, Δflow, mask logits (None unless wanted)."""
+        """h (N, 128, h, w), context: :meth:`SepConvGru.prepare`'s result (or the context itself: the slow twin), taps
+        (N, 324, h, w), flow (N, 2, h, w) -> hidden, Δflow, mask logits (None unless wanted)."""
         motion = self.motion(taps, flow)
         h = self.gru.forward_slow(h, context, motion) if isinstance(context, Tensor) else self.gru(h, context, motion)
         # 0.25 balances the gradients of the two heads, as RAFT does.

@@ -1,4 +1,5 @@
-"""EV-FlowNet (Zhu et al., "EV-FlowNet: Self-Supervised Optical Flow Estimation for Event-based Cameras", RSS 2018), supervised here."""
+"""EV-FlowNet (Zhu et al., "EV-FlowNet: Self-Supervised Optical Flow Estimation for Event-based
+Cameras", RSS 2018), supervised here."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ from eflow.models.unets import Residual, ScaledTanh, double, to_size
 
 
 class EvFlowNet(FlowModel):
-    """U-Net on one window: four stride-2 convolutions, two residual blocks, four nearest-x2 decoders with skips and a tanh flow
-    head each; every decoder also sees the flow of the one before."""
+    """U-Net on one window: four stride-2 convolutions, two residual blocks, four nearest-x2 decoders with skips and a
+    tanh flow head each; every decoder also sees the flow of the one before."""
 
     divisor, least = 16, 32
 

@@ -1,5 +1,5 @@
-"""Spike-FlowNet (Lee et al., "Spike-FlowNet: Event-based Optical Flow Estimation with Energy-Efficient Hybrid Neural Networks",
-ECCV 2020), supervised here."""
+"""Spike-FlowNet (Lee et al., "Spike-FlowNet: Event-based Optical Flow Estimation with Energy-Efficient Hybrid Neural
+Networks", ECCV 2020), supervised here."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ class _Fire(torch.autograd.Function):
 class SpikeFlowNet(FlowModel):
     """Spiking encoder, ordinary residual blocks and decoders.
 
-    The window is halved into two groups of ``steps`` count frames; spike step s sees frame s of both groups (four channels). Each
-    encoder layer is a bias-free stride-2 convolution into integrate-and-fire neurons with soft reset; its *accumulated input
-    current* over all steps is the skip connection and, at the last layer, the residual blocks' input."""
+    The window is halved into two groups of ``steps`` count frames; spike step s sees frame s of both groups (four
+    channels). Each encoder layer is a bias-free stride-2 convolution into integrate-and-fire neurons with soft reset;
+    its *accumulated input current* over all steps is the skip connection and, at the last
+    layer, the residual blocks' input."""
 
     divisor, least = 16, 32
 

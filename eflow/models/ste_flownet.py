@@ -1,4 +1,5 @@
-"""STE-FlowNet (Ding et al., "Spatio-Temporal Recurrent Networks for Event-Based Optical Flow Estimation", AAAI 2022), supervised."""
+"""STE-FlowNet (Ding et al., "Spatio-Temporal Recurrent Networks for Event-Based Optical Flow
+Estimation", AAAI 2022), supervised."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ class ConvGru(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Fuses state, correlation, flow (and the coarser decoder's features) into a residual flow and features for the next scale."""
+    """Fuses state, correlation, flow (and the coarser decoder's features) into a residual flow
+    and features for the next scale."""
 
     def __init__(self, inputs: int, channels: int, last: bool):
         super().__init__()
@@ -47,9 +49,10 @@ class Decoder(nn.Module):
 
 
 class SteFlowNet(FlowModel):
-    """The window's count slices go through the encoder one after the other, a ConvGRU at each of four scales carrying state. Each of
-    ``sweeps`` passes decodes from coarse to fine: at a scale, slice 0's state is correlated (9x9) with the states of the later
-    slices i, warped back by i / slices of the current flow, averaged over i, and a decoder adds a residual to the flow."""
+    """The window's count slices go through the encoder one after the other, a ConvGRU at each of four scales carrying
+    state. Each of ``sweeps`` passes decodes from coarse to fine: at a scale, slice 0's state is correlated (9x9) with
+    the states of the later slices i, warped back by i / slices of the current flow, averaged over i,
+    and a decoder adds a residual to the flow."""
 
     divisor, least = 16, 32
 

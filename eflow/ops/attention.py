@@ -1,7 +1,8 @@
-"""Spatially separable attention (Twins-SVT, Chu et al., NeurIPS 2021): local windows, and all tokens to sub-sampled keys.
+"""Spatially separable attention (Twins-SVT, Chu et al., NeurIPS 2021): local windows, and
+all tokens to sub-sampled keys.
 
-Maps are (N, h, w, C). Sizes that windows do not divide are padded, and padded tokens are masked as keys: a zero token that takes
-part in a softmax is a vote for nothing.
+Maps are (N, h, w, C). Sizes that windows do not divide are padded, and padded tokens are masked as keys: a zero token
+that takes part in a softmax is a vote for nothing.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ class ConditionalPosition(nn.Module):
 
 
 def sine_position(h: int, w: int, dim: int, like: Tensor) -> Tensor:
-    """(1, dim, h, w) 2-D sine code (Parmar et al.; DETR's layout): dim/4 wavelengths 2π … 2π·10^4 of tokens, sine and cosine of y, then
-    of x. Not normalised by the size, so that a crop and the full frame see the same periods."""
+    """(1, dim, h, w) 2-D sine code (Parmar et al.; DETR's layout): dim/4 wavelengths 2π … 2π·10^4 of tokens, sine and
+    cosine of y, then of x. Not normalised by the size, so that a crop and the full frame see the same periods."""
     k = torch.arange(dim // 4, device=like.device, dtype=torch.float32)
     rate = torch.exp(-math.log(1e4) * k / (dim // 4))
     y = torch.arange(h, device=like.device, dtype=torch.float32)[None] * rate[:, None]

@@ -1,12 +1,14 @@
 """All-pairs correlation, its lookup, and the matching layer.
 
-The volume of feature maps f1, f2 (N, D, h, w) is C[i, j] = <f1_i, f2_j> / sqrt(D); its pyramid average-pools the target axis; a
-lookup reads (2r+1)^2 bilinear taps round a target coordinate on each level (RAFT, Teed & Deng, ECCV 2020, sec. 3.2).
+The volume of feature maps f1, f2 (N, D, h, w) is C[i, j] = <f1_i, f2_j> / sqrt(D); its pyramid average-pools the target
+axis; a lookup reads (2r+1)^2 bilinear taps round a target coordinate on each level (RAFT,
+Teed & Deng, ECCV 2020, sec. 3.2).
 
 Three implementations give the same taps:
-- dense, one (2r+2)^2 integer gather per token and level: all taps share one sub-pixel fraction, so they are one 2-D lerp of the patch.
-  Differentiable, any device. On the CPU without gradients a numba kernel does the same.
-- on demand: the patch's correlations are computed from pooled features when they are looked up; memory linear in tokens.
+- dense, one (2r+2)^2 integer gather per token and level: all taps share one sub-pixel fraction, so they are one 2-D
+  lerp of the patch. Differentiable, any device. On the CPU without gradients a numba kernel does the same.
+- on demand: the patch's correlations are computed from pooled features when they are
+  looked up; memory linear in tokens.
 - ``lookup_slow``: RAFT's 81 grid samples, the twin.
 """
 
@@ -49,7 +51,8 @@ class DenseCorrelation:
         self.levels = [v.squeeze(1) for v in self.levels]
 
     def lookup(self, coords: Tensor) -> Tensor:
-        """coords (N, 2, h, w) fp32 target coordinates -> (N, 324, h, w) fp32; channel level*81 + 9*dy + dx, zero outside."""
+        """coords (N, 2, h, w) fp32 target coordinates -> (N, 324, h, w) fp32; channel
+        level*81 + 9*dy + dx, zero outside."""
         if self.slow:
             return lookup_slow(self.levels, coords)
         if coords.device.type == "cpu" and not torch.is_grad_enabled():
@@ -127,7 +130,8 @@ def expected_flow(volume: Tensor, h: int, w: int) -> Tensor:
 
 
 def expected_position(logits: Tensor, h: int, w: int) -> Tensor:
-    """(N, rows, h*w) logits -> (N, 2, rows) expected (x, y). By the marginals: sums, which TF32 and bf16 products do not touch."""
+    """(N, rows, h*w) logits -> (N, 2, rows) expected (x, y). By the marginals: sums, which
+    TF32 and bf16 products do not touch."""
     if not torch.is_grad_enabled() and logits.shape[1] > _ROWS:  # row blocks that stay in the cache
         return torch.cat([expected_position(logits[:, s:s + _ROWS], h, w) for s in range(0, logits.shape[1], _ROWS)], 2)
     p = logits.float().softmax(-1).unflatten(-1, (h, w))
@@ -137,8 +141,8 @@ def expected_position(logits: Tensor, h: int, w: int) -> Tensor:
 
 
 def patch_index(coords: Tensor, h: int, w: int) -> tuple[Tensor, Tensor, Tensor]:
-    """coords (M, 2) -> flat indices (M, 10, 10) of the patch floor(c) - r … floor(c) + r + 1 clamped into h x w, which of them are
-    inside (M, 10, 10) bool, and the fraction (M, 2)."""
+    """coords (M, 2) -> flat indices (M, 10, 10) of the patch floor(c) - r … floor(c) + r + 1 clamped into h x w, which
+    of them are inside (M, 10, 10) bool, and the fraction (M, 2)."""
     limit = torch.tensor([w, h], device=coords.device, dtype=coords.dtype)
     # Beyond this every tap is outside; also keeps the conversion to integer defined for diverging flow.
     coords = torch.minimum(coords.clamp(min=-(RADIUS + 2.0)), limit + RADIUS + 1)
@@ -157,8 +161,8 @@ def lerp_patch(patch: Tensor, fraction: Tensor) -> Tensor:
 
 
 def lookup_slow(levels: list[Tensor], coords: Tensor) -> Tensor:
-    """RAFT's lookup: 81 bilinear grid samples per token and level. (Its normalisation divides by the level's size - 1: levels
-    of one cell, inputs under 128 px, would be NaN; the models refuse those.)"""
+    """RAFT's lookup: 81 bilinear grid samples per token and level. (Its normalisation divides by the level's size - 1:
+    levels of one cell, inputs under 128 px, would be NaN; the models refuse those.)"""
     n, _, h, w = coords.shape
     d = torch.arange(-RADIUS, RADIUS + 1, device=coords.device, dtype=coords.dtype)
     dy, dx = torch.meshgrid(d, d, indexing="ij")
@@ -212,7 +216,8 @@ def _taps(volume, coords, scale, first, out):
 
 
 def local_correlation(f1: Tensor, f2: Tensor, radius: int = 4) -> Tensor:
-    """<f1(x), f2(x + d)> / D for |d| <= radius: (N, (2r+1)^2, h, w), rows of dy, zero outside; STE-FlowNet's 9x9 cost."""
+    """<f1(x), f2(x + d)> / D for |d| <= radius: (N, (2r+1)^2, h, w), rows of dy, zero
+    outside; STE-FlowNet's 9x9 cost."""
     h, w = f1.shape[-2:]
     padded = F.pad(f2, (radius,) * 4)
     side = 2 * radius + 1

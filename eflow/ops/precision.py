@@ -1,4 +1,5 @@
-"""Where bf16 is not good enough: softmax and expectation, coordinates, flow accumulation, upsampling (errors of px otherwise)."""
+"""Where bf16 is not good enough: softmax and expectation, coordinates, flow accumulation,
+upsampling (errors of px otherwise)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Low-resolution flow to full resolution: learned convex combinations (RAFT, Teed & Deng, ECCV 2020, sec. 3.3) and bilinear."""
+"""Low-resolution flow to full resolution: learned convex combinations (RAFT, Teed & Deng,
+ECCV 2020, sec. 3.3) and bilinear."""
 
 from __future__ import annotations
 
@@ -12,8 +13,8 @@ SCALE = 8
 
 
 def convex_upsample(flow: Tensor, mask: Tensor) -> Tensor:
-    """flow (N, 2, h, w) low-resolution px; mask (N, 9*64, h, w) logits, channel k*64 + 8*i + j: neighbour k (row-major 3x3) of
-    sub-pixel (i, j). Returns (N, 2, 8h, 8w) full-resolution px, fp32.
+    """flow (N, 2, h, w) low-resolution px; mask (N, 9*64, h, w) logits, channel k*64 + 8*i + j: neighbour k (row-major
+    3x3) of sub-pixel (i, j). Returns (N, 2, 8h, 8w) full-resolution px, fp32.
 
     Neighbours outside the image repeat the edge: padding with zeros turns a constant 24 px into 10.7 in the corners.
     """
@@ -36,6 +37,7 @@ def convex_upsample_slow(flow: Tensor, mask: Tensor) -> Tensor:
 
 
 def bilinear_upsample(flow: Tensor) -> Tensor:
-    """(N, 2, h, w) low-resolution px to (N, 2, 8h, 8w) full-resolution px; pixel centres aligned as the strided trunk's are."""
+    """(N, 2, h, w) low-resolution px to (N, 2, 8h, 8w) full-resolution px; pixel centres
+    aligned as the strided trunk's are."""
     with fp32(flow):
         return SCALE * F.interpolate(flow.float(), scale_factor=SCALE, mode="bilinear", align_corners=False)

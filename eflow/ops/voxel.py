@@ -11,7 +11,8 @@ import numpy as np
 
 def voxel_grid(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, bins: int, height: int, width: int, *,
                normalise: str = "nonzero") -> np.ndarray:
-    """Signed event voxel grid with a linear kernel in time (Zhu et al., CVPR 2019, eq. 1), bin coordinate (B-1)(t-t0)/(t1-t0).
+    """Signed event voxel grid with a linear kernel in time (Zhu et al., CVPR 2019, eq. 1), bin
+    coordinate (B-1)(t-t0)/(t1-t0).
 
     x, y : uint16 px, or float32 rectified px, which are splatted bilinearly (corners outside the sensor are dropped).
     t : int64 µs, t0 <= t <= t1; subtracted as integers. p : uint8 {0, 1}, counted as -1 and +1.
@@ -127,8 +128,8 @@ def _count(x, y, t, p, t0, span, counts):
 
 def counts_and_times(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, height: int,
                      width: int) -> np.ndarray:
-    """EV-FlowNet's image (Zhu et al., RSS 2018): (4, height, width) float32 = OFF count, ON count, latest OFF time, latest ON
-    time; times as fractions of the window, 0 where no event was. Raises ValueError as :func:`voxel_grid`."""
+    """EV-FlowNet's image (Zhu et al., RSS 2018): (4, height, width) float32 = OFF count, ON count, latest OFF time,
+    latest ON time; times as fractions of the window, 0 where no event was. Raises ValueError as :func:`voxel_grid`."""
     out = np.zeros((4, height, width), np.float32)
     outside = _latest(x, y, t, p, np.int64(t0), np.int64(max(t1 - t0, 1)), out)
     if outside:

@@ -20,8 +20,8 @@ def backward_warp(image: Tensor, flow: Tensor) -> Tensor:
 
 
 def forward_warp(flow: Tensor) -> Tensor:
-    """A flow field carried along itself to the next reference time (warm start): every vector splatted bilinearly to where it
-    points, averaged where several land, zero where none does. (N, 2, h, w) px."""
+    """A flow field carried along itself to the next reference time (warm start): every vector splatted bilinearly to
+    where it points, averaged where several land, zero where none does. (N, 2, h, w) px."""
     n, _, h, w = flow.shape
     at = (pixel_grid(h, w, flow) + flow).flatten(2)
     base = at.floor()

@@ -1,4 +1,5 @@
-"""Errors in plain words: nothing of pydantic's vocabulary reaches a user, for every type of error that the models can give."""
+"""Errors in plain words: nothing of pydantic's vocabulary reaches a user, for every type of
+error that the models can give."""
 
 import re
 import typing
@@ -87,13 +88,16 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
     ("labels: {flow: both}", "labels.flow: not a list (got 'both'); expected a list of 'forward' or 'backward', such as [forward]"),
     ("labels: {depth: maybe}", "labels.depth: not true or false (got 'maybe'); expected true or false"),
     ("scene: {region: 3}", "scene.region: not a table of keys (got 3); expected a table of keys"),
-    ("scene: {kind: explicit, objects: [{mesh: m}], meshes: {m: {primitive: cuboid}}, camera: {position: [1, 2]}}", "scene.camera.position: too few entries (got [1, 2])"),
-    ("scene: {kind: explicit, objects: [{mesh: m}], meshes: {m: {primitive: cuboid}}, camera: {position: [1, 2, 3, 4]}}", "scene.camera.position: too many entries (got [1, 2, 3, 4]); expected a list of three numbers"),
+    (("scene: {kind: explicit, objects: [{mesh: m}], meshes: {m: {primitive: cuboid}}, camera: {position: "
+      "[1, 2]}}"), "scene.camera.position: too few entries (got [1, 2])"),
+    (("scene: {kind: explicit, objects: [{mesh: m}], meshes: {m: {primitive: cuboid}}, camera: {position: "
+      "[1, 2, 3, 4]}}"), "scene.camera.position: too many entries (got [1, 2, 3, 4]); expected a list of three numbers"),
     ("scene: {kind: explicit}", "scene.objects: is required"),
-    ("timeline: {fps: 100}", ("timeline.fps: unknown key; expected one of: kind, max_px, max_px_peak, max_step_us, min_step_us, percentile, reconstruction, "
-                              "sample_every; it is a key of kind: uniform")),
+    ("timeline: {fps: 100}", ("timeline.fps: unknown key; expected one of: kind, max_px, max_px_peak, max_step_us, min_step_us, "
+                              "percentile, reconstruction, sample_every; it is a key of kind: uniform")),
     ("events: {k1: 3}", "events.k1: unknown key; expected one of: contrast_threshold"),
-    ("timeline: {kind: regular}", "timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement', 'brightness', 'budget'"),
+    ("timeline: {kind: regular}", ("timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement', "
+                                   "'brightness', 'budget'")),
     ("events: {emulator: [esim]}", "events.emulator: unknown choice (got ['esim']); expected one of 'esim', 'v2e', 'voltmeter'"),
     ("scene: {kind: file}", "scene.path: is required; expected text"),
     ("scene: {kind: file, path: x, camera: [1]}", "scene.camera: not accepted (got [1]); expected text, a whole number, or null"),

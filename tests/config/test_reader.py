@@ -55,7 +55,8 @@ def test_a_bomb_in_a_run_and_in_an_override(tmp_path):
 
 
 def test_aliases_and_merge_keys_as_people_use_them():
-    text = "base: &base {width: 3, height: 4}\nwide: {<<: *base, width: 9}\nboth: [*base, *base]\nmore: {<<: [{x: 1}, *base]}"
+    text = ("base: &base {width: 3, height: 4}\nwide: {<<: *base, width: 9}\nboth: [*base, *base]\nmore: {<<: [{x: 1}, "
+            "*base]}")
     assert parse_yaml(text, "") == {"base": {"width": 3, "height": 4}, "wide": {"width": 9, "height": 4},
                                     "both": [{"width": 3, "height": 4}] * 2, "more": {"x": 1, "width": 3, "height": 4}}
     assert parse_yaml("a: 2026-01-01", "") == {"a": "2026-01-01"}, "text: nothing here is a date"

@@ -91,7 +91,8 @@ def test_pools_that_cannot_serve_the_split(tmp_path, scene, message):
 
 
 def test_shares_are_dealt_out():
-    """Any stretch of n sequences has n * share of each, within two, for every seed; twice the same; independent of where it starts."""
+    """Any stretch of n sequences has n * share of each, within two, for every seed; twice the
+    same; independent of where it starts."""
     tree = {"x": {"shares": [{"share": 0.5, "value": "a"}, {"share": 0.3, "value": "b"}, {"share": 0.2, "value": "c"}, {"share": 0.0, "value": "never"}]}}
     worst = 0.0
     for seed in range(6):

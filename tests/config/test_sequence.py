@@ -96,7 +96,8 @@ def test_seeds_that_are_none(tmp_path, given, message):
 
 
 @pytest.mark.parametrize("time, message", [
-    ("{duration: 5000}", "time.duration: with one label interval before and one after, 5000.1 s are more than the 4295.0 s (71.6 minutes)"),
+    ("{duration: 5000}", ("time.duration: with one label interval before and one after, 5000.1 s are more than the 4295.0 s "
+                          "(71.6 minutes)")),
     ("{duration: 4000, label_rate: 0.001}", "time.duration: with one label interval"),
     ("{duration: 100, label_rate: 1e5}", "time.label_rate: 10000000 labels (got 100000.0); expected duration * label_rate of at most 1000000"),
     ("{start: 1.1e7}", "time.start: too large"), ("{start: 9e6}\nreadout: {events_per_second: 1e6}", "time.start: too late for the read-out"),
@@ -155,13 +156,15 @@ def test_field_of_view_is_horizontal_and_the_principal_point_the_centre():
     ("camera: {width: 0}", "camera.width: too small (got 0); expected a whole number from 1 to 16384"),
     ("camera: 7", "camera: not a table of keys (got 7)"),
     ("camera: {fov: 60, focal: 200}", "camera: give fov or focal, not both"),
-    ("camera: {fov: .nan}", "camera.fov: not a finite number (got nan); expected a number greater than 0.01 and less than 179.9, or null"),
+    ("camera: {fov: .nan}", ("camera.fov: not a finite number (got nan); expected a number greater than 0.01 and less than 179.9, "
+                             "or null")),
     ("time: {duration: -1}", "time.duration: too small (got -1); expected a number greater than 0 and at most 172800"),
     ("time: {duration: 0.01}", "time: duration * label_rate must be at least 1 label"),
     ("timeline: {kind: regular}", "timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement'"),
     ("timeline: {kind: budget}", "timeline: give max_time_error_us or max_time_error_px, one of the two"),
     ("timeline: {reconstruction: pchip, kind: uniform}\nevents: {emulator: v2e}",
-     "timeline.reconstruction: v2e follows straight lines alone (got 'pchip'); expected linear, or events.emulator: esim"),
+     ("timeline.reconstruction: v2e follows straight lines alone (got 'pchip'); expected linear, or "
+     "events.emulator: esim")),
     ("timeline: {kind: uniform, reconstruction: spline}", "timeline.reconstruction: unknown choice (got 'spline'); expected 'linear', 'pchip' or 'hermite'"),
     ("timeline: {kind: displacement, min_step_us: 5, max_step_us: 4}", "timeline: min_step_us must not exceed max_step_us = 4.0"),
     ("events: {emulator: easim}", "events.emulator: unknown choice (got 'easim')"),

@@ -1,4 +1,5 @@
-"""What must be true of a data set, whoever is asked: the run, the files, verify, the report, the shards, eflow, explain."""
+"""What must be true of a data set, whoever is asked: the run, the files, verify, the report,
+the shards, eflow, explain."""
 
 from __future__ import annotations
 
@@ -146,7 +147,8 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
             found.expect(not any(name.startswith(prefix) for name in files), f"frames: {prefix} are there")
             continue
         there = any(name.startswith(prefix) for name in files)
-        found.expect(there != (what in out), f"explain: {what} {'is' if what in out else 'is not'} left out, files {'are' if there else 'are not'} there")
+        found.expect(there != (what in out), f"explain: {what} {'is' if what in out else 'is not'} left out, files {'are' if there else 'are not'} "
+                                             "there")
     found.expect(("the sensor's read-out" in out) == (config.readout is None), "explain: read-out")
     if recorded:
         found.same("emulator", explain=passes["frames and event kernel"].variants[0], manifest=manifest["emulator"])

@@ -1,7 +1,9 @@
-"""The table of features: each top-level feature with its kinds, as changes of one tiny configuration, and what may not be combined.
+"""The table of features: each top-level feature with its kinds, as changes of one tiny
+configuration, and what may not be combined.
 
-A *row* is one kind of every feature: a whole configuration. :func:`covering_rows` finds few rows in which any two kinds of any
-two features meet. Whoever adds a feature adds its kinds to ``FEATURES``; ``test_cross.py`` says so when that was forgotten.
+A *row* is one kind of every feature: a whole configuration. :func:`covering_rows` finds few rows in which any two kinds
+of any two features meet. Whoever adds a feature adds its kinds to ``FEATURES``;
+``test_cross.py`` says so when that was forgotten.
 """
 
 from __future__ import annotations
@@ -111,14 +113,17 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
     **{((("between frames", curve)), emulator): "timeline.reconstruction: " + emulator[1].split(",")[0] + " follows straight lines alone"
        for curve in ("pchip", "hermite") for emulator in _STRAIGHT_ONLY},
 }
-"""Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there they are no contradiction."""
+"""Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there
+they are no contradiction."""
 
 TOO_SLOW: set[tuple[Kind, Kind]] = {(one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))}
-"""Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with multi-sampling and anisotropy (beside a
-triangle that ends at the horizon the footprint of a pixel is endless, and it adds up every texel of it)."""
+"""Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with
+multi-sampling and anisotropy (beside a triangle that ends at the horizon the footprint of a pixel is endless, and it
+adds up every texel of it)."""
 
 ELSEWHERE = {
-    "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit and whether the camera moves",
+    "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit and whether the "
+             "camera moves",
     "gl": RUN_LEVEL["gl"],
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}
@@ -168,8 +173,9 @@ def all_pairs() -> set[tuple[Kind, Kind]]:
 
 
 def covering_rows(seed: int = 0, tries: int = 12) -> list[dict[str, str]]:
-    """Rows, accepted each, in which every accepted pair meets. Greedy: each row begins with a pair that is missing and takes of every further
-    feature the kind that brings most of those; the best of ``tries`` orders. The same seed gives the same rows."""
+    """Rows, accepted each, in which every accepted pair meets. Greedy: each row begins with a pair that is missing and
+    takes of every further feature the kind that brings most of those; the best of ``tries``
+    orders. The same seed gives the same rows."""
     rng, missing, rows = random.Random(seed), sorted(all_pairs()), []
     while missing:
         wanted = set(missing)
@@ -191,7 +197,7 @@ def covering_rows(seed: int = 0, tries: int = 12) -> list[dict[str, str]]:
     return rows
 
 
-# ---- is the table whole? -----------------------------------------------------------------------------------------------
+# ---- is the table whole? ---------------------------------------------------------------------------------------------
 
 
 def options_of_the_schema() -> set[tuple[str, Any]]:

@@ -1,4 +1,5 @@
-"""Every feature with every other that it meets: any two kinds are in some data set here, and all who look at that agree.
+"""Every feature with every other that it meets: any two kinds are in some data set here,
+and all who look at that agree.
 
 The rows come from ``features.py``; what agreement means is in ``agreement.py``.
 """
@@ -69,7 +70,7 @@ class Reports(dict):
         pass
 
 
-# ---- the table --------------------------------------------------------------------------------------------------------
+# ---- the table -------------------------------------------------------------------------------------------------------
 
 
 def test_no_feature_is_without_a_row():
@@ -97,7 +98,7 @@ def test_what_contradicts_is_refused_in_one_line(assets, tmp_path, capsys, pair,
     assert not (tmp_path / "out").exists()
 
 
-# ---- the rows ---------------------------------------------------------------------------------------------------------
+# ---- the rows --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("batch", range(BATCHES))
@@ -132,7 +133,7 @@ def test_all_agree(assets, tmp_path, batch):
     assert not found, "\n".join([f"{len(found)} disagreements", *found, json.dumps(rows, indent=1)])
 
 
-# ---- what a pair of rows has to say to each other ---------------------------------------------------------------------------
+# ---- what a pair of rows has to say to each other --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("source", ["random", "explicit", "frames, linear"])
@@ -151,7 +152,8 @@ def test_a_read_out_neither_makes_nor_hides_events(assets, tmp_path, source):
 
 
 def test_executors_and_resume_and_groups(assets, tmp_path):
-    """Scenes, a scene file and frames by two workers, cut short and continued by other means: the bytes of one process."""
+    """Scenes, a scene file and frames by two workers, cut short and continued by other
+    means: the bytes of one process."""
     groups = {name: merged(configuration({"source": source, "timeline": "displacement"}), {"output": {"sequences": 2}})
               for name, source in (("scene", "random"), ("file", "file"), ("recorded", "frames, motion"))}
     template = load_run(recipe(assets, "executors", groups))

@@ -1,4 +1,5 @@
-"""The Ray executor: the same bytes as without Ray, also when a worker or a whole node is lost. Needs the extra [cluster]."""
+"""The Ray executor: the same bytes as without Ray, also when a worker or a whole node is
+lost. Needs the extra [cluster]."""
 
 import contextlib
 import ipaddress
@@ -130,7 +131,8 @@ def test_listening_sockets_are_found_and_told_apart():
             server.listen()
             made[server.getsockname()[1]] = (ipaddress.ip_address(address), loopback)
         # a child's are found as well
-        code = "import socket, sys; s = socket.socket(); s.bind(('0.0.0.0', 0)); s.listen(); print(s.getsockname()[1], flush=True); sys.stdin.read()"
+        code = ("import socket, sys; s = socket.socket(); s.bind(('0.0.0.0', 0)); s.listen(); print(s.getsockname()[1], "
+                "flush=True); sys.stdin.read()")
         child = stack.enter_context(subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
         made[int(child.stdout.readline())] = (ipaddress.ip_address("0.0.0.0"), False)
         found = {s.port: (ipaddress.ip_address(s.address), s.loopback) for s in listening(os.getpid())}

@@ -25,7 +25,8 @@ class WorkerCrashedError(RayError):
 
 
 class FakeRay:
-    """``results``: reference -> what getting it gives, an exception to raise or a message. ``done``: what waiting finds."""
+    """``results``: reference -> what getting it gives, an exception to raise or a message.
+    ``done``: what waiting finds."""
 
     exceptions = SimpleNamespace(RayError=RayError, NodeDiedError=NodeDiedError, WorkerCrashedError=WorkerCrashedError)
     __version__ = "0"
@@ -131,7 +132,8 @@ def test_a_task_is_killed_once_and_for_its_first_reason(ray):
 @pytest.mark.parametrize("done, forced", [(["r1", "r2"], []), (["r1"], ["r2"]), ([], ["r1", "r2"])])
 @pytest.mark.parametrize("ours", [True, False])
 def test_closing(ray, tmp_path, done, forced, ours):
-    """All are asked to end, those that do not are made to, and only for them it waits; a cluster of one's own ends with its folder."""
+    """All are asked to end, those that do not are made to, and only for them it waits; a
+    cluster of one's own ends with its folder."""
     cluster = with_tasks(1, 2)
     cluster._board, cluster._ours, cluster._folder = "board", ours, str(tmp_path / "ray")
     (tmp_path / "ray").mkdir()

@@ -104,7 +104,8 @@ def command(arguments: list[str], environment: dict[str, str]) -> subprocess.Com
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 def test_output_that_cannot_show_every_character(environment):
     """In the one place that all commands go through; and an error's line that holds what the user typed."""
-    code = "import sys; from blinkgl import cli; status = cli.run(['explain', '\\u00b5\\u2603.yaml']); print('1 \\u00b5s \\u2026 2 px\\u00b2 \\u2603'); sys.exit(status)"
+    code = ("import sys; from blinkgl import cli; status = cli.run(['explain', '\\u00b5\\u2603.yaml']); print('1 "
+            "\\u00b5s \\u2026 2 px\\u00b2 \\u2603'); sys.exit(status)")
     done = command(["-c", code], environment)
     assert done.returncode == 2 and done.stderr.startswith(b"error: ") and done.stderr.count(b"\n") == 1
     assert done.stdout in (b"1 us ... 2 px^2 ?\n", b"1 \xb5s ... 2 px\xb2 ?\n")

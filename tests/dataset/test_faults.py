@@ -1,4 +1,5 @@
-"""What others do to a run while it is on: stopped workers, deleted files, clocks that jump, second drivers, links, refusals."""
+"""What others do to a run while it is on: stopped workers, deleted files, clocks that jump,
+second drivers, links, refusals."""
 
 import fcntl
 import json
@@ -67,7 +68,7 @@ class When:
             act(name, message)
 
 
-# ---- which errors are worth another attempt ---------------------------------------------------------------------------
+# ---- which errors are worth another attempt --------------------------------------------------------------------------
 
 
 def caused(error: Exception, cause: BaseException) -> Exception:
@@ -111,7 +112,7 @@ def test_attempts(tmp_path, monkeypatch, error, attempts):
     assert tried.count(1) == attempts and list(outcome.set_aside) == [NAMES[1]] and len(outcome.made) == 2
 
 
-# ---- refused runs -----------------------------------------------------------------------------------------------------
+# ---- refused runs ----------------------------------------------------------------------------------------------------
 
 
 def test_a_refused_run_leaves_nothing(tmp_path, capsys):
@@ -153,7 +154,7 @@ def test_workers_that_cannot_start_leave_the_log_their_error_names(tmp_path, mon
     assert "half an installation" in Path(failure.value.accepted.removeprefix("see ")).read_text()
 
 
-# ---- links ------------------------------------------------------------------------------------------------------------
+# ---- links -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["train", ".run"])
@@ -184,7 +185,7 @@ def test_out_may_be_a_link_and_is_followed_once(reference, tmp_path):
     assert list((tmp_path / "other").iterdir()) == [] and temporaries(tmp_path / "disk2") == []
 
 
-# ---- runs of millions -------------------------------------------------------------------------------------------------
+# ---- runs of millions ------------------------------------------------------------------------------------------------
 
 
 def test_tasks_know_their_numbers(tmp_path):
@@ -257,7 +258,7 @@ def test_the_index_is_sorted_in_parts(reference, tmp_path, monkeypatch):
     assert sorted(p.name for p in many.iterdir()) == ["index.jsonl", "test", "train"]
 
 
-# ---- stopped workers --------------------------------------------------------------------------------------------------
+# ---- stopped workers -------------------------------------------------------------------------------------------------
 
 
 def test_a_stopped_worker_is_named_and_waited_for(reference, tmp_path, monkeypatch):
@@ -296,7 +297,7 @@ def test_a_worker_says_that_it_lives_whatever_it_does(tmp_path):
         process.close()
 
 
-# ---- files deleted under a run ----------------------------------------------------------------------------------------
+# ---- files deleted under a run ---------------------------------------------------------------------------------------
 
 
 def test_a_finished_sequence_that_is_deleted_or_cut_is_mended_by_resume(reference, tmp_path):
@@ -355,7 +356,7 @@ def test_a_record_that_is_deleted_is_written_again(reference, tmp_path):
         run_dataset(template(tmp_path, seed=12), out, resume=True)
 
 
-# ---- clocks -----------------------------------------------------------------------------------------------------------
+# ---- clocks ----------------------------------------------------------------------------------------------------------
 
 
 def foreign_temporary(out: Path) -> Path:
@@ -404,12 +405,13 @@ def test_temporaries_of_other_machines_go_when_a_run_saw_them_lie_for_an_hour(tm
     assert not dead.exists() and other.is_dir()
 
 
-# ---- others at work ---------------------------------------------------------------------------------------------------
+# ---- others at work --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_two_drivers_at_once(reference, tmp_path):
-    """Real processes, started together, on a folder that does not exist yet: one makes everything, the other says one line."""
+    """Real processes, started together, on a folder that does not exist yet: one makes
+    everything, the other says one line."""
     recipe, out = recipe_file(tmp_path, groups=FLY), tmp_path / "deep/out"
     drivers = [start(recipe, "--out", out, "--resume", "--workers", 1) for _ in range(2)]
     said = [driver.communicate(timeout=120)[0] for driver in drivers]
@@ -422,7 +424,8 @@ def test_two_drivers_at_once(reference, tmp_path):
 
 
 def test_a_driver_that_meets_another_takes_nothing_of_it_away(tmp_path):
-    """The loser made no folder, and the winner's empty one is not its to remove; a lock on a folder that is gone is none."""
+    """The loser made no folder, and the winner's empty one is not its to remove; a lock on
+    a folder that is gone is none."""
     out = tmp_path / "out"
     first, second = RunFolder(out), RunFolder(out)
     with first.locked():

@@ -1,4 +1,5 @@
-"""Frame folders in the way of TartanAir become sequences: their own flow as labels, the emulator's events between frames."""
+"""Frame folders in the way of TartanAir become sequences: their own flow as labels, the
+emulator's events between frames."""
 
 import json
 import shutil

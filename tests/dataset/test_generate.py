@@ -360,7 +360,8 @@ def test_peak_memory_does_not_grow_with_the_sequence(tmp_path):
 
 
 def test_progress_grows_and_says_what_each_stage_has_taken(tmp_path, gl):
-    """The same account while it is made and in the end: drawing and reading back among the stages, never less than before."""
+    """The same account while it is made and in the end: drawing and reading back among the
+    stages, never less than before."""
     told = []
 
     def progress(report, fraction):

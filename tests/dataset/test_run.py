@@ -79,7 +79,8 @@ def test_killed_workers_leave_no_trace(reference, tmp_path):
 
 @pytest.mark.slow
 def test_a_worker_that_hangs_is_replaced_and_a_hopeless_sequence_set_aside(reference, tmp_path, monkeypatch):
-    """One sequence's worker is stopped each time it is tried: after the last attempt (two here) the run does without it."""
+    """One sequence's worker is stopped each time it is tried: after the last attempt (two
+    here) the run does without it."""
     monkeypatch.setattr(run_module, "ATTEMPTS", 2)
     executor = Local(1)
 

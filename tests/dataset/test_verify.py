@@ -284,7 +284,8 @@ def test_no_record_stops_it(data, capsys, name, contents):
 
 
 def test_nothing_is_passed_over_in_silence(data, capsys):
-    """A sequence of another machine: what no renderer decides is compared, the rest is counted and said in the last line."""
+    """A sequence of another machine: what no renderer decides is compared, the rest is
+    counted and said in the last line."""
     for name in NAMES[:2]:
         forge(data / name, "", opengl={"renderer": "Voodoo", "version": "1", "vendor": "3dfx", "backend": "egl"})
     shutil.rmtree(data / ".run")
@@ -294,7 +295,8 @@ def test_nothing_is_passed_over_in_silence(data, capsys):
     said = capsys.readouterr().out
     assert "note: no record of the run here" in said
     assert f"note: {NAMES[0]}: made with opengl Voodoo, 1, this machine has" in said and "the bytes were not compared: events.h5" in said
-    assert "4 sequences, 2 made again and compared bit by bit, 2 made again and compared in part: no problem found in what could be compared" in said
+    assert ("4 sequences, 2 made again and compared bit by bit, 2 made again and compared in part: no problem found in "
+            "what could be compared") in said
     # What no renderer decides
     shutil.copy(data / NAMES[1] / "flow/forward/000001.png", data / NAMES[0] / "flow/forward/000001.png")
     forge(data / NAMES[0], "flow/forward/000001.png")
@@ -308,7 +310,8 @@ def test_nothing_is_passed_over_in_silence(data, capsys):
 
 
 def test_twins_that_were_asked_for(tmp_path):
-    """The same scene twice through an emulator that draws nothing, and one seed through two emulators: notes, no problems."""
+    """The same scene twice through an emulator that draws nothing, and one seed through two
+    emulators: notes, no problems."""
     scene = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box", "position": [3, 0, 0]}],
              "camera": {"keyframes": [{"time": t, "position": [0, t, 0]} for t in (0, 1)]}}
     groups = {"own": {"scene": scene, "output": {"sequences": 2}, "events": {"emulator": "esim", "threshold_sigma": 0}},

@@ -1,4 +1,5 @@
-"""The parts of verification by themselves: every limit from both sides, every kind of file that two machines may write differently."""
+"""The parts of verification by themselves: every limit from both sides, every kind of file
+that two machines may write differently."""
 
 from __future__ import annotations
 
@@ -71,7 +72,7 @@ def test_columns_that_are_signed(tmp_path, x):
     assert check_events(path, MANIFEST) == ([] if x >= 0 else ["events.h5: an event outside 20x10 px"])
 
 
-# --- labels ------------------------------------------------------------------------------------------------------------
+# --- labels -----------------------------------------------------------------------------------------------------------
 
 
 def labels_folder(folder: Path, images="700\n3200\n5700\n", forward="700, 3200\n3200, 5700\n", backward="3200, 700\n5700, 3200\n", size=(HEIGHT, WIDTH)) -> dict:
@@ -132,7 +133,7 @@ def test_without_labels_nothing_is_asked(tmp_path):
     assert verify._check_labels(tmp_path, {**MANIFEST, "files": {"events.h5": {}}}) == []
 
 
-# --- two machines ------------------------------------------------------------------------------------------------------
+# --- two machines -----------------------------------------------------------------------------------------------------
 
 
 def pair(tmp_path, name: str) -> tuple[Path, Path]:
@@ -225,7 +226,7 @@ def test_where_two_configurations_differ(a, b, where):
     assert verify._first_difference(a, b) == where
 
 
-# --- what lies between sequences -----------------------------------------------------------------------------------------
+# --- what lies between sequences --------------------------------------------------------------------------------------
 
 
 def test_what_belongs_to_no_sequence(tmp_path):

@@ -1,4 +1,5 @@
-"""Tiny data sets in each layout, fabricated: a random texture of event pixels that moves with a known constant velocity."""
+"""Tiny data sets in each layout, fabricated: a random texture of event pixels that moves with
+a known constant velocity."""
 
 from __future__ import annotations
 
@@ -88,7 +89,8 @@ def blinkflow_set(root: Path, labels: int = 3, height: int = 480, width: int = 6
 
 
 def mvsec_set(root: Path, name: str = "indoor_flying1", images: int = 12, compressed: bool = False) -> Path:
-    """MVSEC: images at 31 Hz, flow at 20 Hz, one px of flow per interval of flow everywhere but a zero (invalid) corner."""
+    """MVSEC: images at 31 Hz, flow at 20 Hz, one px of flow per interval of flow everywhere
+    but a zero (invalid) corner."""
     root.mkdir(parents=True, exist_ok=True)
     t0, height, width = 1.5e9, 260, 346
     stamps = t0 + np.arange(images) / 31

@@ -1,4 +1,5 @@
-"""Augmentations: what they do to events is what they must do to the voxel grid, and they form the groups they should."""
+"""Augmentations: what they do to events is what they must do to the voxel grid, and they
+form the groups they should."""
 
 from dataclasses import replace
 
@@ -55,7 +56,8 @@ def test_they_commute(a, b):
 
 @pytest.mark.parametrize("rectified", [False, True])
 def test_on_voxels_they_are_exact(rectified):
-    """For any normalisation of the grid: flips of the array, minus, and minus the flipped bins with the windows swapped."""
+    """For any normalisation of the grid: flips of the array, minus, and minus the flipped
+    bins with the windows swapped."""
     s = sample(rectified)
     for normalise in ("none", "nonzero", "all"):
         grid = VoxelGrid(15, normalise)

@@ -29,8 +29,8 @@ def test_training_configurations(name):
 
 @pytest.mark.parametrize("name", DATA)
 def test_generation_configurations(name):
-    """Backward flow for time reversal; train and test differ in trajectories (each group has its own seed) and, by content hash, in
-    meshes and textures."""
+    """Backward flow for time reversal; train and test differ in trajectories (each group has its own seed) and, by
+    content hash, in meshes and textures."""
     groups = [g for g in all_groups(load_run(REPOSITORY / "configs" / name)) if g.enabled]
     sides = {side: [g.template.check() for g in groups if g.template.tree["output"].get("split", "train") == side] for side in ("train", "test")}
     seeds = {side: {g.template.seed for g in groups if g.template.tree["output"].get("split", "train") == side} for side in sides}

@@ -1,4 +1,5 @@
-"""``eflow evaluate``, ``predict``, ``submit``, ``bench`` from the command line, on tiny files, with an untrained network."""
+"""``eflow evaluate``, ``predict``, ``submit``, ``bench`` from the command line, on tiny
+files, with an untrained network."""
 
 import json
 import re

@@ -140,7 +140,8 @@ def test_window_attention_with_masked_padding_equals_unpadded(size):
 
 
 def test_global_attention_sees_no_token_of_padding_alone():
-    """21x18 tokens, reduced by 4: as many keys as cells that hold a real token, and 60x80 has the 300 of the blueprint."""
+    """21x18 tokens, reduced by 4: as many keys as cells that hold a real token, and 60x80 has
+    the 300 of the blueprint."""
     layer = attention.GlobalAttention(32, 4, 4, dense=False)
     seen = []
     layer.kv.register_forward_hook(lambda m, inputs, out: seen.append(inputs[0].shape[1]))

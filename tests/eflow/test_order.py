@@ -1,4 +1,5 @@
-"""The order of training samples: a function of (seed, epoch, position), whatever the workers and wherever the run was cut."""
+"""The order of training samples: a function of (seed, epoch, position), whatever the
+workers and wherever the run was cut."""
 
 import numpy as np
 import pytest
@@ -81,7 +82,8 @@ def test_an_error_in_a_loader_process_stays_one_line(tmp_path, workers):
 
 
 def test_augmented_flow_still_explains_the_events(source):
-    """Events of the fabricated set move with exactly its flow: warped to one time they form sharp points, in augmented samples too."""
+    """Events of the fabricated set move with exactly its flow: warped to one time they form
+    sharp points, in augmented samples too."""
     from eflow.data.dataset import augmented
 
     rng = np.random.default_rng(0)

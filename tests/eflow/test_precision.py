@@ -1,4 +1,5 @@
-"""A device that has no bf16 gets fp32 and a line that says so; progress is told from the first moment, on a clock that the test turns."""
+"""A device that has no bf16 gets fp32 and a line that says so; progress is told from the first
+moment, on a clock that the test turns."""
 
 import pytest
 

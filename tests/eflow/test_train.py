@@ -194,7 +194,8 @@ def test_learning_rate_is_one_linear_cycle():
 
 @pytest.mark.slow
 def test_data_parallel_equals_one_process(tmp_path, data):
-    """Two processes over gloo, one sample each, against one process with both: the loss is the mean over all valid pixels."""
+    """Two processes over gloo, one sample each, against one process with both: the loss is
+    the mean over all valid pixels."""
     path = config_file(tmp_path, data, steps=2, optim__ema=0)
     train(load_train_config(path), tmp_path / "one", quiet=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}

@@ -320,8 +320,8 @@ def test_seed_zero_is_a_seed():
 
 @pytest.mark.parametrize("reconstruction, order, intervals", [("pchip", 3, (12, 24, 48)), ("hermite", 4, (2, 3, 4, 6))])
 def test_cubics_converge_faster_than_the_straight_line(reconstruction, order, intervals):
-    """A smooth log intensity, away from its turning points (where any monotone curve is of second order in time), and in
-    so few intervals that the errors stay far above float32's rounding of the frames."""
+    """A smooth log intensity, away from its turning points (where any monotone curve is of second order in time), and
+    in so few intervals that the errors stay far above float32's rounding of the frames."""
     c, period = 0.02, 2000.0  # seconds; so long that 1 us is far below the errors
     signal = lambda s: np.sin(2 * np.pi * s - 1.0)  # steep from 0 to 0.3
     slope = lambda s: 2 * np.pi * np.cos(2 * np.pi * s - 1.0)

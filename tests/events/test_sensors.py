@@ -54,7 +54,8 @@ def test_bus_equals_slow_twin_at_any_chunking(config):
 
 
 def test_an_idle_bus_pays_for_the_row_again():
-    """Two events of a row back to back: the second pays nothing. One in the same row after a pause finds the bus idle and pays."""
+    """Two events of a row back to back: the second pays nothing. One in the same row after a
+    pause finds the bus idle and pays."""
     times = np.array([10, 10, 50, 50, 50, 90], np.int64)
     rows = np.array([3, 3, 3, 3, 7, 7], np.uint16)
     events = Events(np.arange(6, dtype=np.uint16), rows, times, np.zeros(6, np.uint8))

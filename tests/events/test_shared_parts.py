@@ -1,4 +1,5 @@
-"""What kernels and slow twins share, against something that shares nothing with it: NumPy's sorting, roots of cubics, simulated comparators, laws of chance."""
+"""What kernels and slow twins share, against something that shares nothing with it: NumPy's sorting, roots of cubics,
+simulated comparators, laws of chance."""
 
 from __future__ import annotations
 
@@ -99,7 +100,8 @@ def test_the_time_at_which_a_monotone_cubic_passes_a_level():
         for s in (1e-6, 0.01, *rng.uniform(0, 1, 4), 0.999):
             for low in (0.0, s * 0.7, s):
                 found = curve_time(float(cubic(s)), float(alpha), float(beta), float(low))
-                # where the bracket begins at the answer, Newton's step may miss it by a rounding and halves the bracket instead
+                # where the bracket begins at the answer, Newton's step may miss it by a rounding and halves the bracket
+                # instead
                 assert low <= found <= 1 and abs(cubic(found) - cubic(s)) < (1e-13 if low < s else 5e-9)
                 if cubic.deriv()(s) > 0.05:
                     assert abs(found - s) < (1e-11 if low < s else 5e-9)
@@ -142,7 +144,8 @@ def test_rates_become_fixed_point_slopes():
 
 
 def simulated_rate(size: float, k: float) -> float:
-    """Events per time constant of a comparator with levels one threshold apart that watches a first-order autoregression, e^-k per frame."""
+    """Events per time constant of a comparator with levels one threshold apart that watches a first-order
+    autoregression, e^-k per frame."""
     rng = np.random.default_rng(int(1000 * size + 10 * k))
     pixels, steps = 3000, 450
     noise = size * rng.normal(size=pixels)
@@ -241,7 +244,8 @@ def test_shot_noise_falls_to_a_quarter_from_dark_to_full_scale():
 
 
 def test_tables_of_who_makes_noise():
-    """A pixel counts by how much lower its threshold is than the nominal one; ON pixels of a block first, then OFF ones."""
+    """A pixel counts by how much lower its threshold is than the nominal one; ON pixels of
+    a block first, then OFF ones."""
     rng = np.random.default_rng(0)
     on, off = (np.float32(nominal) * rng.uniform(0.5, 2, 1500).astype(np.float32) for nominal in (0.2, 0.3))
     tables = v2e_model.shot_tables(on, off, 0.2, 0.3)

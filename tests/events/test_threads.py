@@ -96,7 +96,8 @@ def test_a_forked_child_has_threads_of_its_own():
 
 @pytest.mark.parametrize("config", [EsimConfig(threshold_sigma=0.05), V2eConfig(preset="noisy"), VoltmeterConfig()], ids=["esim", "v2e", "voltmeter"])
 def test_events_do_not_depend_on_the_number_of_threads(config, monkeypatch):
-    """Large enough for several threads in the kernel and in the sort; more threads than cores, so that they get in each other's way."""
+    """Large enough for several threads in the kernel and in the sort; more threads than cores,
+    so that they get in each other's way."""
     from blinkgl.events import emulator as emulators
 
     frames = np.random.default_rng(3).random((5, 400, 500), np.float32)

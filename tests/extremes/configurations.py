@@ -1,4 +1,5 @@
-"""Hypothesis strategies over the configuration space: plain YAML trees, extreme values first, small images, few frames."""
+"""Hypothesis strategies over the configuration space: plain YAML trees, extreme values
+first, small images, few frames."""
 
 from __future__ import annotations
 
@@ -74,7 +75,8 @@ def motion(interval: float, start: float, where):
 
 @st.composite
 def in_view(draw, interval: float, start: float):
-    """An object that fills much of the image of a level camera near the origin, whatever its size, and moves across it."""
+    """An object that fills much of the image of a level camera near the origin, whatever
+    its size, and moves across it."""
     size = draw(magnitude(1e-4, 1e5, 1.0))
     share = st.floats(-0.6, 0.6)
     place = lambda: [size * draw(st.floats(0.2, 4.0)), size * draw(share), size * draw(share)]

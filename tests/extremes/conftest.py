@@ -1,4 +1,5 @@
-"""``promise(name, measured, bound)``: asserts, and lists what was measured at the end of ``pytest -v tests/extremes``."""
+"""``promise(name, measured, bound)``: asserts, and lists what was measured at the end of
+``pytest -v tests/extremes``."""
 
 from __future__ import annotations
 

@@ -64,7 +64,8 @@ def edge_on(rng, n: int) -> np.ndarray:
 
 
 def nasty() -> np.ndarray:
-    """Every kind at once: points, lines, needles, triangles across and in the camera plane and the near plane, of 1e-6 to 1e6 units."""
+    """Every kind at once: points, lines, needles, triangles across and in the camera plane and
+    the near plane, of 1e-6 to 1e6 units."""
     rng = np.random.default_rng(3)
     line = np.array([[-1.0, 2, 0.1], [1.0, 3, 0.2], [0.0, 2.5, 0.15]])
     needle = np.array([[-1.0, 2, 0.3], [1.0, 2, 0.3], [0.2, 2, 0.3 + 1e-7]])
@@ -123,7 +124,8 @@ def test_slivers_have_the_depth_and_the_light_of_what_they_are(gl, seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_what_is_seen_from_its_edge_is_not_seen(gl, seed):
-    """Snapped corners cover pixels; before there was a guard a third of 60 such pixels were NaN and most others at no depth of the mesh."""
+    """Snapped corners cover pixels; before there was a guard a third of 60 such pixels were NaN
+    and most others at no depth of the mesh."""
     world = scene([thing("edges", 1, sheet(edge_on(np.random.default_rng(seed), 3000)), still())], rig(near=0.01))
     with Renderer(gl, world, RenderConfig()) as renderer:
         assert not renderer.labels(0, LabelRequest("ids")).ids.any() and not renderer.luminance(0).read().any()
@@ -132,8 +134,8 @@ def test_what_is_seen_from_its_edge_is_not_seen(gl, seed):
 @pytest.mark.parametrize("unlit", [True, False])
 @pytest.mark.parametrize("antialiasing", ["none", "taps4"])
 def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing, unlit):
-    """A ground that ends half a pixel below the horizon: in powers of two 1/w is exactly 0 in the row above its last, and derivatives
-    of texture coordinates and normals between those rows are infinite."""
+    """A ground that ends half a pixel below the horizon: in powers of two 1/w is exactly 0 in the row above its last,
+    and derivatives of texture coordinates and normals between those rows are infinite."""
     vertices = np.array([[-128, 128, -1], [128, 128, -1], [-1, 1, -1]], float)
     ground = mesh(vertices, [[2, 1, 0]], np.tile([0, 0, 1.0], (3, 1)), vertices[:, :2] / 4)
     eye = Rig.alone(PinHole(128, 128, 64.0, 64.0, 64.0, 32.0, near=0.25), drift((0, 0, 0), (0, 0.1, 0), LEVEL))
@@ -154,7 +156,8 @@ def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing,
 @pytest.mark.parametrize("size", [1e-12, 1e-3, 1.0, 1e9])
 @pytest.mark.parametrize("offset", [0.0, 30.0])
 def test_lines_are_dropped_and_slivers_are_not(size, offset):
-    """Collinear in float64, and so in nothing that float32 makes of it; and slivers a few roundings high, far thinner than any model has."""
+    """Collinear in float64, and so in nothing that float32 makes of it; and slivers a few
+    roundings high, far thinner than any model has."""
     rng = np.random.default_rng(0)
     corners = slivers(rng, 4000)
     a, b = corners[:, 0] + offset, corners[:, 1] + offset
@@ -225,7 +228,8 @@ def test_the_message_names_what_is_seen_where_and_when(gl, color, background, se
     wall = thing("wall", 7, quad(0.5, 0.5), still((0, 3, 0), FACING), Material(base_color=color, unlit=True))
     world = replace(scene([wall], background=background), t0_ns=250 * MS, t1_ns=500 * MS)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        with pytest.raises(EventDataError, match=rf"^frame 0 at 0\.25 s: intensity at pixel x=\d+, y=\d+ cannot be used: it shows {seen} \(got .*\); expected a finite value") as caught:
+        with pytest.raises(EventDataError, match=rf"^frame 0 at 0\.25 s: intensity at pixel x=\d+, y=\d+ cannot be used: it shows {seen} \(got .*\); "
+                                                 r"expected a finite value") as caught:
             list(simulate_sequence(SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()), labels=False, renderer=renderer))
     assert "\n" not in str(caught.value)
     x, y = caught.value.pixel
@@ -235,7 +239,8 @@ def test_the_message_names_what_is_seen_where_and_when(gl, color, background, se
 @pytest.mark.slow
 @pytest.mark.parametrize("seed, count", [(7, 40), (11, 81), (12, 81), (13, 81), (14, 81)])
 def test_a_sequence_of_81_small_models(gl, tmp_path, seed, count):
-    """640x480, 200 frames and every label, of 81 files, in some of which faces are lines: the first was lost to one NaN pixel in frame 117."""
+    """640x480, 200 frames and every label, of 81 files, in some of which faces are lines: the
+    first was lost to one NaN pixel in frame 117."""
     folder = shared("data/assets/models_cc0")
     tree = {"seed": seed, "camera": {"width": 640, "height": 480}, "time": {"duration": 0.5, "label_rate": 10}, "timeline": {"kind": "uniform", "fps": 199 / 0.6},
             "scene": {"kind": "random", "objects": {"count": count}, "pool": {"primitives": [], "folders": [str(folder)], "keep_materials": True, "test_fraction": 0}},

@@ -1,4 +1,5 @@
-"""The emulators where thresholds, intervals, clocks, counts and durations are extreme; against closed forms and exact integers."""
+"""The emulators where thresholds, intervals, clocks, counts and durations are extreme;
+against closed forms and exact integers."""
 
 from __future__ import annotations
 
@@ -28,8 +29,8 @@ def plain(c, **keys):
 
 @pytest.mark.parametrize("c", [1e-3, 1e-2, 1.0, 10.0])
 def test_thresholds_from_a_thousandth_to_ten(promise, c):
-    """Times on a straight line in ln I. The level is a multiple of C rounded to 2^-25 (1.5e-8 each): the j-th is j 1.5e-8 off,
-    and the line's ends 1.3e-7."""
+    """Times on a straight line in ln I. The level is a multiple of C rounded to 2^-25 (1.5e-8 each): the j-th is j
+    1.5e-8 off, and the line's ends 1.3e-7."""
     rise = 35.0
     esim = Esim(1, 1, plain(c))
     esim.step(np.full((1, 1), 1e-9 + 1e-7, np.float32), 0)
@@ -63,7 +64,8 @@ def test_frame_intervals_from_a_nanosecond_to_100_seconds(emulator, interval_ns)
 
 
 def test_times_are_exact_at_any_clock(promise):
-    """Shifting the clock by 10^6 s, or 10^9, shifts the events and changes nothing else: times are integers throughout."""
+    """Shifting the clock by 10^6 s, or 10^9, shifts the events and changes nothing else: times
+    are integers throughout."""
     frames, times = [picture(k) for k in range(6)], np.cumsum([0, 1, 999_999, 10**6, 33_333_333, SECOND])
     runs = []
     for shift in (0, 10**6 * SECOND, 10**9 * SECOND):
@@ -117,8 +119,8 @@ def soak(frames: int, emulator, shape=(4, 8)):
 
 @pytest.mark.parametrize("frames", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
 def test_references_do_not_drift(promise, frames):
-    """ESIM's reference after N frames is the first log plus (ON C+ - OFF C-), in integers: exact, hence no drift at any N.
-    (A float32 reference would have moved by 2^-24 x 4 x sqrt(events): 1e-4 to 1e-3 after 10^6 frames.)"""
+    """ESIM's reference after N frames is the first log plus (ON C+ - OFF C-), in integers: exact, hence no drift at any
+    N. (A float32 reference would have moved by 2^-24 x 4 x sqrt(events): 1e-4 to 1e-3 after 10^6 frames.)"""
     esim = Esim(4, 8, EsimConfig(threshold_sigma=0.03), seed=1)
     net, first, _ = soak(frames, esim)
     assert net.sum() > 50 * frames
@@ -129,9 +131,10 @@ def test_references_do_not_drift(promise, frames):
 
 @pytest.mark.parametrize("frames", [5_000, pytest.param(200_000, marks=pytest.mark.slow)])
 def test_v2e_reference_drift(promise, frames):
-    """V2E keeps float32 levels of size 4 to 8 ln units, rounded to 4.8e-7 at every event, 1.4e-7 rms. A clip that repeats after
-    150 events per pixel repeats its roundings, so that their mean, 1.4e-7 / sqrt(150), adds up: 1.1e-8 per event, three times
-    that in the worst of 32 pixels. (At the default leak rate the leak moves the reference a hundred times faster.)"""
+    """V2E keeps float32 levels of size 4 to 8 ln units, rounded to 4.8e-7 at every event, 1.4e-7 rms. A clip that
+    repeats after 150 events per pixel repeats its roundings, so that their mean, 1.4e-7 / sqrt(150), adds up: 1.1e-8
+    per event, three times that in the worst of 32 pixels. (At the default leak rate the leak moves
+    the reference a hundred times faster.)"""
     run = make_emulator(V2eConfig(preset="clean", threshold_sigma=0.0), 4, 8, 1)
     net, _first, _ = soak(frames, run)
     assert net.sum() > 20 * frames
@@ -163,8 +166,8 @@ def test_a_still_day_makes_no_event(promise, emulator, interval):
 
 
 def test_a_still_day_of_v2e_noise_keeps_its_rate(promise):
-    """Leak and shot noise over 24 h at their configured rates, to the counting error: nothing accumulates in float32 (the leak's
-    epoch moves along)."""
+    """Leak and shot noise over 24 h at their configured rates, to the counting error: nothing accumulates in float32
+    (the leak's epoch moves along)."""
     config = V2eConfig(leak_rate_hz=0.02, leak_cov_decades=0.0, leak_jitter=0.1, shot_noise_rate_hz=0.01, threshold_sigma=0.0,
                        cutoff_hz=0.0, refractory_us=0.0)
     run, frame = make_emulator(config, 8, 8, 4), np.zeros((8, 8), np.float32)
@@ -177,7 +180,8 @@ def test_a_still_day_of_v2e_noise_keeps_its_rate(promise):
     pixels, seconds = 64, 86_400
     expected_off = 0.5 * 0.01 * (1 - 0.75 * 20 / 275) * pixels * seconds  # half of the shot noise, v2e's rate at intensity 0
     promise("V2E, a still day: OFF noise against its rate, sigmas", abs(off - expected_off) / np.sqrt(expected_off), 4.0)
-    # A shot-noise ON resets the leak's progress, an OFF too: the leak's own count is below its rate; the two halves agree.
+    # A shot-noise ON resets the leak's progress, an OFF too: the leak's own count is below its rate; the two halves
+    # agree.
     promise("V2E, a still day: ON events, second half against first, sigmas", abs(halves[1, 1] - halves[0, 1]) / np.sqrt(2 * halves[0, 1]), 4.0)
     assert on > 0.5 * 0.02 * pixels * seconds
     assert stats.norm.sf(4.0) < 1e-4

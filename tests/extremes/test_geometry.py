@@ -49,7 +49,8 @@ def test_sizes_of_nine_decades_in_one_scene(gl, promise):
 
 
 def test_depth_ratio_of_nine_decades(gl, promise):
-    """Reversed-Z in float32 with the far plane at infinity: depth = near / Z has the same relative resolution everywhere."""
+    """Reversed-Z in float32 with the far plane at infinity: depth = near / Z has the same
+    relative resolution everywhere."""
     depths = np.logspace(-3, 6, 10) * 1.2
     objects = [thing(f"q{k}", k + 1, quad(*[0.5 * z * (k + 1) / 10] * 2), drift((0, z, 0), (1e-3 * z, 1.001 * z, 0), FACING)) for k, z in enumerate(depths)]
     e = compare(gl, scene(objects, rig(near=1e-3, path=drift((0, 0, 0), (1e-6, 0, 0), LEVEL, LEVEL * SPIN))))
@@ -59,8 +60,8 @@ def test_depth_ratio_of_nine_decades(gl, promise):
 
 
 def test_order_of_surfaces_close_behind_one_another(gl, promise):
-    """Slanted, differently split quads a relative 1e-6 apart, from 0.01 to 1e6 units, near plane at 1e-3: interpolated depth is
-    off by a few 2^-24 = 6e-8, so that 1e-6 is safe and 1e-7 is not."""
+    """Slanted, differently split quads a relative 1e-6 apart, from 0.01 to 1e6 units, near plane at 1e-3: interpolated
+    depth is off by a few 2^-24 = 6e-8, so that 1e-6 is safe and 1e-7 is not."""
     tilt, wrong = FACING * Rotation.from_euler("xy", [30, 20], degrees=True), 0
     for z in (1e-2, 1.0, 1e2, 1e4, 1e6):
         pair = [thing("far", 1, quad(z, z, 3), still((0, z * (1 + 1e-6), 0), tilt)), thing("near", 2, quad(z, z, 5), still((0, z, 0), tilt))]
@@ -73,8 +74,9 @@ def test_order_of_surfaces_close_behind_one_another(gl, promise):
 
 @pytest.mark.parametrize("splits, median, worst", [(1, 2e-5, 4e-5), (32, MEDIAN, WORST)])
 def test_a_ground_of_200_km(gl, promise, splits, median, worst):
-    """The local position is interpolated over the triangle: its error is eps times the *triangle*. Two triangles of 2e5 units
-    seen from 1.5 units cost two digits; 32 x 32 cells cost nothing (the shipped ground and sky are subdivided for that)."""
+    """The local position is interpolated over the triangle: its error is eps times the *triangle*. Two triangles of 2e5
+    units seen from 1.5 units cost two digits; 32 x 32 cells cost nothing (the shipped
+    ground and sky are subdivided for that)."""
     e = compare(gl, scene([thing("ground", 1, quad(1e5, 1e5, splits), drift((0, 0, -1.5), (0.1, 0, -1.5)))], moving_camera()))
     promise(f"ground of 2e5 units, {splits} x {splits} cells: flow, median, relative", e.relative, median)
     promise(f"ground of 2e5 units, {splits} x {splits} cells: flow, largest, relative", e.worst, worst)
@@ -82,9 +84,9 @@ def test_a_ground_of_200_km(gl, promise, splits, median, worst):
 
 @pytest.mark.parametrize("away, median, worst", [(0.0, 1e-6, 1e-3), (1e3, 5e-5, 1e-3), (1e4, 1e-3, 1e-2)])
 def test_a_hundred_thousand_repeats_of_a_texture(gl, promise, away, median, worst):
-    """Texture coordinates are float32 and count whole repeats from the mesh's middle: at n repeats from there they resolve
-    n 2^-24 of one, and a steep texture (1.5 per repeat here) shows four times that. Near the middle, bilinear weights of 8 bits
-    are all that is left. (Counted from a corner, the middle of this ground resolved 1/250.)"""
+    """Texture coordinates are float32 and count whole repeats from the mesh's middle: at n repeats from there they
+    resolve n 2^-24 of one, and a steep texture (1.5 per repeat here) shows four times that. Near the middle, bilinear
+    weights of 8 bits are all that is left. (Counted from a corner, the middle of this ground resolved 1/250.)"""
     paint = Material(texture=smooth_texture(1, 64), uv_scale=(1e5, 1e5), unlit=True)
     eye = rig(path=still((away, 0, 0), LEVEL * Rotation.from_rotvec([-0.6, 0, 0])))
     world = scene([thing("ground", 1, quad(1e5, 1e5, 32), still((0, 0, -1.5)), paint)], eye)
@@ -98,15 +100,16 @@ def test_a_hundred_thousand_repeats_of_a_texture(gl, promise, away, median, wors
 
 @pytest.mark.parametrize("distance, area", [(4, 0.1), (30, 0.002)])
 def test_triangles_far_below_a_pixel(gl, promise, distance, area):
-    """41 000 visible triangles on 4 500 or 80 pixels: corners snap to 1/256 px, yet attributes come from the exact plane."""
+    """41 000 visible triangles on 4 500 or 80 pixels: corners snap to 1/256 px, yet
+    attributes come from the exact plane."""
     e = compare(gl, scene([thing("ball", 1, sphere(1.0, 6), drift((0, distance, 0), (0.2, distance, 0.1), TURN, TURN * SPIN))], moving_camera()))
     assert e.wrong_ids == 0
     promise(f"triangles of {area:g} px²: flow, largest, relative", e.worst, WORST)
 
 
 def test_slivers_and_degenerate_triangles(gl, promise):
-    """A plane cut into 400 random slivers, some thinner than 1e-3 px, and triangles without area. The gradient of a sliver's
-    attributes divides by its width: the flow is off by up to 1e-3 px there and nowhere else."""
+    """A plane cut into 400 random slivers, some thinner than 1e-3 px, and triangles without area. The gradient of a
+    sliver's attributes divides by its width: the flow is off by up to 1e-3 px there and nowhere else."""
     rng, n = np.random.default_rng(0), 200
     below, above = np.sort(rng.uniform(-2, 2, n)), np.sort(rng.uniform(-2, 2, n))
     vertices = np.concatenate([np.stack([x, np.full(n, y), np.zeros(n)], 1) for x, y in ((below, -1.5), (above, 1.5))])
@@ -174,8 +177,8 @@ def test_images_of_a_few_pixels(gl, promise, width, height):
 
 @pytest.mark.parametrize("side", [2048, pytest.param(4096, marks=pytest.mark.slow)])
 def test_large_images(gl, promise, side):
-    """gl_FragCoord and the flow's ndc are exact in float32 up to 2^24 half pixels; the error in px grows with the image because
-    the flow does."""
+    """gl_FragCoord and the flow's ndc are exact in float32 up to 2^24 half pixels; the error in px grows with the image
+    because the flow does."""
     world = sized(side, side)
     with Renderer(gl, world, RenderConfig()) as renderer:
         labels = renderer.labels(300 * MS, LabelRequest("ids", "flow_forward"), 310 * MS)

@@ -1,8 +1,9 @@
 """Flow and velocity where the motion, the clock or the place is extreme; against the float64 ray caster.
 
-Why the errors are what they are: flow = (d.xy - ndc d.w) / w' with d = D p. D is rounded to float32 once (6e-8), p comes from
-the rasteriser's perspective interpolation (a few 6e-8 of the triangle's size), and nothing is subtracted that is nearly equal
-unless the true terms are. So the error is a few 1e-7 *of the motion*, however small or large that is.
+Why the errors are what they are: flow = (d.xy - ndc d.w) / w' with d = D p. D is rounded to float32 once (6e-8), p
+comes from the rasteriser's perspective interpolation (a few 6e-8 of the triangle's size), and nothing is subtracted
+that is nearly equal unless the true terms are. So the error is a few 1e-7 *of the
+motion*, however small or large that is.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def test_motion_of_any_size(gl, promise, px):
 
 @pytest.mark.parametrize("offset", [1e3, 1e6])
 def test_far_from_the_origin(gl, promise, offset):
-    """Poses are float64 and camera-relative before they are rounded. What is left is the resolution of the poses themselves,
-    1e6 x 2^-53 = 1.2e-10 units: f / Z times that is the smallest motion that exists there."""
+    """Poses are float64 and camera-relative before they are rounded. What is left is the resolution of the poses
+    themselves, 1e6 x 2^-53 = 1.2e-10 units: f / Z times that is the smallest motion that exists there."""
     world = moved_scene(mixed_scene(textured=False), np.array([offset, -offset, 0.7 * offset]))
     e = compare(gl, world, 300 * MS, 400 * MS)
     promise(f"{offset:g} units from the origin: flow, median, relative", e.relative, MEDIAN)
@@ -83,8 +84,8 @@ def test_far_from_the_origin(gl, promise, offset):
 
 @pytest.mark.parametrize("interval_ns", [1, 1000, 100 * SECOND])
 def test_intervals_from_a_nanosecond_to_100_seconds(gl, promise, interval_ns):
-    """Over a nanosecond the poses differ by 1e-10 of their size: float64 leaves 2^-53 / 1e-10 = 1e-6 of that. The reference sees
-    the same rounded poses; the velocity does not."""
+    """Over a nanosecond the poses differ by 1e-10 of their size: float64 leaves 2^-53 / 1e-10 = 1e-6 of that. The
+    reference sees the same rounded poses; the velocity does not."""
     seconds = interval_ns / SECOND
     pan = LEVEL * Rotation.from_rotvec([0.0, 0.01, 0.02])
     path = drift((0, 4, 0), (1.0, 4.5, -0.4), FACING, FACING * Rotation.from_rotvec([0.1, 0.2, 0.1]), seconds=max(seconds, 1.0))
@@ -145,8 +146,8 @@ def test_frame_times_at_both_ends():
 
 @pytest.mark.parametrize("name", ["ground", "close ground", "wall comes through", "inside a box"])
 def test_surfaces_crossing_the_camera_plane(gl, promise, name):
-    """A point that comes near the camera plane has w' = w + d.w small: the error of w', eps (w + |d.w|), is then large beside
-    it. The flow is as large, and the promise is relative to flow * (1 + Z / Z')."""
+    """A point that comes near the camera plane has w' = w + d.w small: the error of w', eps (w + |d.w|), is then large
+    beside it. The flow is as large, and the promise is relative to flow * (1 + Z / Z')."""
     turn, tip = Rotation.from_rotvec([0.3, 0.5, -0.2]), Rotation.from_rotvec([0.3, 0.2, 0])
     room = cube(3.0)
     room = type(room)(room.vertices, room.faces, room.normals, room.uvs, closed=False)
@@ -170,7 +171,8 @@ def test_everything_behind_the_camera_is_invalid_and_zero(gl):
 
 
 def test_no_motion_is_exactly_no_flow(gl, promise):
-    """Shaking hands that hold still: poses equal, difference matrices zero, flow zero to the bit; also a million units away."""
+    """Shaking hands that hold still: poses equal, difference matrices zero, flow zero to
+    the bit; also a million units away."""
     path = curve(1, (0.1, 4, 0.2), 0.3, 0.4)
     world = scene([thing("ball", 1, sphere(1.0, 3), path), thing("wall", 2, quad(9, 9), still((0, 8, 0), FACING))])
     for offset in (0, 1e6):

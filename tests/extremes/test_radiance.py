@@ -58,7 +58,8 @@ def test_suns_from_nothing_to_1e9(gl, promise, sun, sky):
 
 
 def test_a_hot_texel_among_black_ones(gl, promise):
-    """One texel of 1e9 in a black HDR texture: mip levels keep its mean (they are box means in float32), nothing overflows."""
+    """One texel of 1e9 in a black HDR texture: mip levels keep its mean (they are box means
+    in float32), nothing overflows."""
     image = np.zeros((64, 64, 3), np.float32)
     image[20, 30] = 1e9
     paint = Material(texture=Texture(image), unlit=True)
@@ -75,7 +76,8 @@ def test_a_hot_texel_among_black_ones(gl, promise):
 
 @pytest.mark.parametrize("low, high", [(0.0, 1e9), (1e-12, 1e9), (1e-9, 1e-3), (1e3, 1e9), (0.0, 1e-12)])
 def test_esim_between_any_two_radiances(promise, low, high):
-    """Events count |d ln(I + eps)| / C, the logarithm in 2^-25 steps: off by one at most, where a level is all but reached."""
+    """Events count |d ln(I + eps)| / C, the logarithm in 2^-25 steps: off by one at most,
+    where a level is all but reached."""
     config = EsimConfig(contrast_threshold=0.1, threshold_sigma=0, log_eps=1e-9)
     esim = Esim(1, 1, config)
     esim.step(np.full((1, 1), low, np.float32), 0)
@@ -95,7 +97,8 @@ def test_the_logarithm_against_float64(promise):
 
 
 def test_more_light_than_the_emulators_take_is_refused(gl):
-    """2^30 is where fixed-point logarithms end: the pass draws 1e12 well, the emulator says what it cannot use, and where."""
+    """2^30 is where fixed-point logarithms end: the pass draws 1e12 well, the emulator says
+    what it cannot use, and where."""
     world = scene([thing("wall", 1, quad(9, 9), still((0, 4, 0), FACING), Material(base_color=(1e6,) * 3))], rig(8, 6, 8.0), Light((0, -1, 0), 1e6, 0.0))
     with Renderer(gl, world, RenderConfig()) as renderer:
         luminance = renderer.luminance(0).read()

@@ -314,7 +314,8 @@ def forked(opened: bool, *how: str) -> list[str]:
 def test_a_process_forked_after_a_context_is_told_so_and_does_not_hang():
     new, old, parent = forked(True, "new", "inherited")
     for line in (new, old):
-        assert "this process was forked from one that had opened OpenGL, and would hang; use multiprocessing.get_context('spawn')" in line
+        assert ("this process was forked from one that had opened OpenGL, and would hang; use "
+                "multiprocessing.get_context('spawn')") in line
     assert parent == "parent 2", "the parent goes on"
 
 

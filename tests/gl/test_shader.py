@@ -129,8 +129,8 @@ def test_error_inside_a_define_points_at_its_use(loader):
 
 
 def test_link_error_names_the_program(loader, folder):
-    write(folder, {"program.glsl": "#ifdef VERTEX_SHADER\nout vec2 a; void main() { a = vec2(0); gl_Position = vec4(0); }\n#endif\n"
-                                   "#ifdef FRAGMENT_SHADER\nin vec3 a; out vec4 c; void main() { c = vec4(a, 1); }\n#endif\n"})
+    write(folder, {"program.glsl": "#ifdef VERTEX_SHADER\nout vec2 a; void main() { a = vec2(0); gl_Position = vec4(0); "
+                                   "}\n#endif\n#ifdef FRAGMENT_SHADER\nin vec3 a; out vec4 c; void main() { c = vec4(a, 1); }\n#endif\n"})
     with pytest.raises(ShaderError, match=r"^program\.glsl: .*[Ll]inker"):
         loader.program("program.glsl")
 
@@ -152,7 +152,8 @@ def test_error_formats_of_all_drivers(folder, message):
 def test_warnings_before_the_error_do_not_hide_it(folder):
     sources = {stage: expand("program.glsl", stage, {"GAIN": 1.0}, folder) for stage in ("vertex", "fragment")}
     line = sources["vertex"].origin.index(("program.glsl", 8)) + 1
-    error = translate(f"GLSL Compiler failed\n\nvertex_shader\n=====\n0({line - 1}) : warning C7050: unused\n0({line}) : error C0000: bad\n", sources)
+    error = translate(f"GLSL Compiler failed\n\nvertex_shader\n=====\n0({line - 1}) : warning C7050: unused\n0({line}) : error "
+                      "C0000: bad\n", sources)
     assert str(error) == "program.glsl:8: C0000: bad [vertex stage]"
     assert "program.glsl:7: warning: C7050: unused" in error.detail
 
@@ -174,12 +175,14 @@ def test_error_in_a_generated_line_shows_it(folder):
 
 def test_include_cycle(folder):
     write(folder, {"include/twice.glsl": '#include "value.glsl"\n'})
-    with pytest.raises(ShaderError, match=r"^include/twice\.glsl:1: include cycle: include/value\.glsl -> include/twice\.glsl -> include/value\.glsl$"):
+    with pytest.raises(ShaderError, match=r"^include/twice\.glsl:1: include cycle: include/value\.glsl -> include/twice\.glsl -> "
+                                          r"include/value\.glsl$"):
         expand("program.glsl", "vertex", folder=folder)
 
 
 @pytest.mark.parametrize("line, message", [
-    ('#include "absent.glsl"', r"program\.glsl:2: no such shader file \(got 'include/absent\.glsl'\); expected one of twice\.glsl, value\.glsl"),
+    ('#include "absent.glsl"', (r"program\.glsl:2: no such shader file \(got 'include/absent\.glsl'\); expected one of twice\.glsl, "
+                               r"value\.glsl")),
     ("#include <value.glsl>", r"program\.glsl:2: malformed #include \(got '<value\.glsl>'\)"),
     ("#include", r"program\.glsl:2: malformed #include"),
     ('#include "../program.glsl"', r"program\.glsl:2: include outside the shader folder"),

@@ -1,4 +1,5 @@
-"""What a file claims and Events cannot hold is refused by every reader, with event and value; nothing wraps round, nothing is skipped."""
+"""What a file claims and Events cannot hold is refused by every reader, with event and value;
+nothing wraps round, nothing is skipped."""
 
 from __future__ import annotations
 

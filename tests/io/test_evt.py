@@ -95,7 +95,8 @@ def test_evt2s_counter_has_turned_when_it_falls_by_more_than_half(tmp_path, fall
 @pytest.mark.parametrize("words, bad", [([0x8000, 0x3000 | 2047, 0x4001, 0x4001], 3), ([0x8000, 0x3000 | 2046, 0x4006], 2), ([0x8000, 0x3000 | 2041, 0x5080], 2)])
 def test_a_vector_may_not_leave_the_row(tmp_path, words, bad):
     """The last pixel is 2047; a bit beyond it is damage, a clear one is nothing."""
-    with pytest.raises(AssetError, match=rf"damaged at byte {len(b'% evt 3.0' + b'% end') + 2 + 2 * bad}: no EVT3 word can stand here .got '0x{words[bad]:04x}'"):
+    with pytest.raises(AssetError, match=rf"damaged at byte {len(b'% evt 3.0' + b'% end') + 2 + 2 * bad}: no EVT3 word can stand here .got "
+                                         rf"'0x{words[bad]:04x}'"):
         decoded(tmp_path / "e.raw", "evt3", words)
     assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3800 | 2046, 0x4003, 0x4000]) == [(2046, 0, 0, 1), (2047, 0, 0, 1)]
     assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3000 | 2040, 0x5080]) == [(2047, 0, 0, 0)]

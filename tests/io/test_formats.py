@@ -116,7 +116,8 @@ def test_real_recordings(tmp_path, name, kind, size, count):
         faery = pytest.importorskip("faery", reason="optional extra [formats]")
         a = faery.events_stream_from_file(path).to_array()
         assert all(np.array_equal(a[k], getattr(events, ours)) for k, ours in (("x", "x"), ("y", "y"), ("on", "p")))
-        # The EVT3 recording has TIME_LOW words up to 11 µs ahead that the next word takes back before any event; faery keeps them.
+        # The EVT3 recording has TIME_LOW words up to 11 µs ahead that the next word takes back before any event; faery
+        # keeps them.
         assert np.abs(a["t"].astype(np.int64) - events.t).max() <= (11 if kind == "evt3" else 0)
     source, written = convert(path, tmp_path / "e.h5")
     assert written == count and (source.height, source.width) == size

@@ -1,4 +1,5 @@
-"""HDF5 files are not followed out of themselves, their data sets are checked before they are believed, and nothing of the process changes."""
+"""HDF5 files are not followed out of themselves, their data sets are checked before they are
+believed, and nothing of the process changes."""
 
 from __future__ import annotations
 
@@ -148,7 +149,8 @@ def test_blosc_without_its_parameters_does_not_crash(tmp_path):
 
 
 def test_rows_written_here_are_those_of_the_filter(tmp_path):
-    """Byte for byte what h5py writes through HDF5's filter with one thread, incompressible chunks and partial ones included."""
+    """Byte for byte what h5py writes through HDF5's filter with one thread, incompressible
+    chunks and partial ones included."""
     rng = np.random.default_rng(0)
     rows = np.concatenate([rng.integers(0, 50, 9000), rng.integers(0, 2**63, 4096), np.zeros(500, int)]).astype(np.uint64)
     cuts = [0, 10, 4096, 5000, 12_000, len(rows)]

@@ -98,7 +98,8 @@ def test_a_panel_of_as_many_rows_but_fewer_columns_is_averaged():
 
 
 def test_the_clock():
-    """40 pictures per second of the sequence, played at 20: slowed twice. Late frames are shown as often as they are late."""
+    """40 pictures per second of the sequence, played at 20: slowed twice. Late frames are
+    shown as often as they are late."""
     made = PreviewWriter("p.mp4", 48, 64, t0_us=5_000, flow=False)
     black = np.zeros((48, 64), np.float32)
     assert made._video.fps == 20 and made._slow == 2
@@ -197,7 +198,7 @@ def test_the_legend_is_the_wheel_in_the_lower_right_corner():
     assert not (enough._panel_view(2) == 255).all()
 
 
-# --- colours -----------------------------------------------------------------------------------------------------------
+# --- colours ----------------------------------------------------------------------------------------------------------
 
 
 def middlebury(u: float, v: float) -> np.ndarray:

@@ -18,7 +18,8 @@ def read(path, text: str) -> Events:
 
 
 def decimals(count: int) -> list[str]:
-    """Times of every way to write one: signs, points at either end, exponents of either sign, more digits than a double has."""
+    """Times of every way to write one: signs, points at either end, exponents of either
+    sign, more digits than a double has."""
     rng = np.random.default_rng(0)
     found = []
     for _ in range(count):

@@ -86,7 +86,8 @@ def test_polarity_sum_against_frames(tmp_path):
 
 
 def test_slider_depth_gives_the_figures_on_its_page():
-    """MANIFEST.md: summed polarity against log(I+10) change per interval correlates 0.82-0.88; implied threshold ~0.5-0.6."""
+    """MANIFEST.md: summed polarity against log(I+10) change per interval correlates
+    0.82-0.88; implied threshold ~0.5-0.6."""
     root = shared("data/events/slider_depth")
     result = compare(root / "events_chunk.txt", root)
     assert len(result.a.frame_correlation) == 4

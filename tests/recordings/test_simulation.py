@@ -238,7 +238,8 @@ def test_commands(tmp_path, capsys):
 
 
 def test_real_frames_against_the_real_recording():
-    """The signs and places of the simulated events are the recording's: correlation of polarity sums, per frame interval."""
+    """The signs and places of the simulated events are the recording's: correlation of
+    polarity sums, per frame interval."""
     from blinkgl.recordings.comparison import compare
     root = shared("data/events/slider_depth")
     import tempfile
@@ -251,7 +252,8 @@ def test_real_frames_against_the_real_recording():
 
 
 def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
-    """The DAVIS346's bus carries 12 M events/s: a strobing clip makes more, and what does not fit is lost and counted."""
+    """The DAVIS346's bus carries 12 M events/s: a strobing clip makes more, and what does
+    not fit is lost and counted."""
     from blinkgl.config.sensor import load_sensor
     from blinkgl.show.simulate import emulator_options
 

@@ -18,8 +18,8 @@ FACING = LEVEL.as_matrix() @ np.diag([1.0, -1.0, -1.0])  # a quad's +z towards t
 
 
 def half_plane(angle: float, offset: float, size: int = 48) -> tuple[Scene, np.ndarray]:
-    """A white unlit half plane x cos + y sin < offset (px from the image's middle) on black, seen from the front; and its exact coverage of
-    each pixel, by clipping pixel squares: (size, size) float64."""
+    """A white unlit half plane x cos + y sin < offset (px from the image's middle) on black, seen from the front; and
+    its exact coverage of each pixel, by clipping pixel squares: (size, size) float64."""
     far = 4.0 * size
     normal, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     edge = offset * normal
@@ -50,9 +50,11 @@ def test_the_oracle_is_the_area():
 
 @pytest.mark.parametrize("antialiasing", ["msaa4", "ssaa2", "ssaa4"])
 def test_an_edge_is_as_bright_as_it_covers_the_pixel(gl, antialiasing):
-    """Every value is a whole number of samples, the mean error is zero, and no pixel is off by more than the samples allow; the colour pass likewise."""
+    """Every value is a whole number of samples, the mean error is zero, and no pixel is off by more than the samples
+    allow; the colour pass likewise."""
     count = ANTIALIASING[antialiasing].stored
-    # A straight edge misjudges at most about one row of an n x n grid; four samples on a rotated grid at most one and a half of the four.
+    # A straight edge misjudges at most about one row of an n x n grid; four samples on a rotated grid at most one and a
+    # half of the four.
     worst = {"msaa4": 0.38, "ssaa2": 0.51, "ssaa4": 0.26}[antialiasing]
     errors = []
     for angle in (0.3, 1.0, 2.2, 4.0):
@@ -111,7 +113,8 @@ def stripes(period_texels: int, distance: float, size: int = 64) -> Scene:
 
 @pytest.mark.parametrize("bias", [-2.0, -1.0, 0.0, 1.0])
 def test_mip_bias_moves_the_level_by_that_much(gl, bias):
-    """Four texels on a pixel are level 2: with the bias, what is seen has the contrast that level 2 + bias has, sampled by hand."""
+    """Four texels on a pixel are level 2: with the bias, what is seen has the contrast that
+    level 2 + bias has, sampled by hand."""
     distance, period = 4.0, 16  # 4 texels per pixel: level 2; stripes of 8 texels vanish at level 4
     contrast = {}
     for name, scene_distance, config in (("biased", distance, RenderConfig(mip_bias=bias)), ("plain", distance, RenderConfig())):
@@ -129,7 +132,8 @@ def test_mip_bias_moves_the_level_by_that_much(gl, bias):
 
 
 def test_four_taps_of_a_linear_texture_are_one(gl):
-    """The mean of four places around the centre is the value at the centre where the texture is linear, and unlit flat colours do not change."""
+    """The mean of four places around the centre is the value at the centre where the texture is
+    linear, and unlit flat colours do not change."""
     ramp = np.repeat(np.linspace(0.1, 0.9, 256, dtype=np.float32)[None, :, None], 256, 0).repeat(3, 2)
     body = thing("ramp", 1, quad(1.0, 1.0), still((0, 2.0, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(ramp), unlit=True, double_sided=True))
     world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
@@ -173,7 +177,8 @@ def test_bad_samples_are_refused(gl):
 
 @pytest.mark.parametrize("antialiasing, blurred", [("none", 0.01), ("taps4", 0.25)])
 def test_anisotropy_keeps_stripes_that_run_into_the_distance(gl, antialiasing, blurred):
-    """Stripes along the view on grazing ground: a pixel is as wide as ever and very long, an isotropic mip level averages as wide as long."""
+    """Stripes along the view on grazing ground: a pixel is as wide as ever and very long, an
+    isotropic mip level averages as wide as long."""
     image = np.zeros((64, 64, 3), np.float32)
     image[:, (np.arange(64) // 8) % 2 == 0] = 1.0
     ground = thing("ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True))

@@ -84,7 +84,8 @@ def errors(events: Events, kind: str, sign: float) -> np.ndarray:
 
 @pytest.fixture
 def direction(gl):
-    """+1 or -1: whether u grows along +x on the rendered wall (read off one frame, so the test asks physics, not layout)."""
+    """+1 or -1: whether u grows along +x on the rendered wall (read off one frame, so the
+    test asks physics, not layout)."""
     world = wall("ramp")
     with Renderer(gl, world, PLAIN) as renderer:
         row = renderer.luminance(0).read()[HEIGHT // 2]
@@ -109,11 +110,13 @@ def test_a_sinusoid_converges_with_second_order(gl, direction):
 
 @pytest.mark.parametrize("reconstruction, least, most", [("pchip", 2.3, 4.2), ("hermite", 3.0, 4.6)])
 def test_cubics_converge_faster_on_rendered_frames(gl, direction, monkeypatch, reconstruction, least, most):
-    """Medians, so that the intervals with a turning point, where monotone curves stay of second order, do not decide."""
+    """Medians, so that the intervals with a turning point, where monotone curves stay of
+    second order, do not decide."""
     monkeypatch.setitem(globals(), "DURATION", 2.0)  # ten times slower, so that a microsecond is far below the errors
     monkeypatch.setitem(globals(), "PERIODS_PER_SECOND", PERIODS_PER_SECOND / 10)
     monkeypatch.setitem(globals(), "FOCAL", 500.0)
-    # Rasterisers place samples on 1/256 of a texel: texels far smaller than a pixel, looked up without mip-maps, make that small.
+    # Rasterisers place samples on 1/256 of a texel: texels far smaller than a pixel, looked up without mip-maps, make
+    # that small.
     world, config = wall("sinusoid", 16384), RenderConfig(image_antialiasing="none", mip_bias=-8.0)
     steps = [200_000_000, 166_666_667, 125_000_000]
     medians = [np.median(errors(simulate(gl, "sinusoid", step, world, reconstruction, config), "sinusoid", direction)) for step in steps]
@@ -144,9 +147,10 @@ def test_rates_are_those_of_finer_and_finer_differences(gl, antialiasing):
 
 @pytest.mark.parametrize("antialiasing, gain, error", [("none", np.sinc(1 / 6) ** 2 * np.sinc(0.5 / 6), 0.21), ("taps4", 0.885, 0.17)])
 def test_the_rate_is_taken_over_half_a_pixel(gl, antialiasing, gain, error):
-    """Stripes of six texels, a pixel each, that slide by. Straight lines between texels keep sinc²(1/6) of the true rate, a difference
-    over half a pixel sinc(0.5/6) of that, one over two pixels sinc(2/6): 0.75 in all. Much less than half a pixel is no better:
-    the rate of a straight line between two texels is off by more than the mean over half of it."""
+    """Stripes of six texels, a pixel each, that slide by. Straight lines between texels keep sinc²(1/6) of the true
+    rate, a difference over half a pixel sinc(0.5/6) of that, one over two pixels sinc(2/6): 0.75 in all. Much less than
+    half a pixel is no better: the rate of a straight line between two texels is off by
+    more than the mean over half of it."""
     texels, period, speed, focal = 64, 6.0, 3.0, 64.0
     stripes = 0.5 + 0.3 * np.sin(2 * np.pi * (np.arange(texels) + 0.5) / period)
     paint = Material(texture=Texture(np.tile(stripes.astype(np.float32)[None, :, None], (texels, 1, 3))), unlit=True)

@@ -33,7 +33,8 @@ def hidden(x, y, flow, w, ids, depth_next, ids_next, near, tolerance) -> bool:
 @pytest.mark.parametrize("shape", [(9, 13), (2, 2), (1, 8), (7, 1), (1, 1)])
 @pytest.mark.parametrize("tolerance", [1e-3, 0.05])
 def test_equals_slow_twin(shape, tolerance):
-    """Patches of three objects and of nothing; depths that differ by less and by more than what is allowed; flow beyond the border."""
+    """Patches of three objects and of nothing; depths that differ by less and by more than
+    what is allowed; flow beyond the border."""
     rng = np.random.default_rng(shape[0] * 100 + shape[1])
     answers = set()
     for _ in range(40):

@@ -1,4 +1,5 @@
-"""Passes that read passes, and the handles of what they draw. The toys are defined here and nowhere else; docs/extending.md shows them."""
+"""Passes that read passes, and the handles of what they draw. The toys are defined here and nowhere else;
+docs/extending.md shows them."""
 
 import inspect
 from collections import Counter
@@ -95,7 +96,8 @@ def test_a_pass_reads_another(gl):
 
 
 def test_a_shadow_map_is_a_pass_before_a_pass(gl):
-    """A box over a floor, lit from above: shadows where a ray from the surface to the lamp, cast in float64, meets the box."""
+    """A box over a floor, lit from above: shadows where a ray from the surface to the
+    lamp, cast in float64, meets the box."""
     lamp, facing_up = np.array([0.4, 4.0, 3.0]), np.array([0.0, 0.0, 1.0])
     world = scene([thing("floor", 1, quad(6, 6), still((0, 4, -1))), thing("box", 2, cube(0.4), drift((-0.5, 4, 0.2), (0.5, 4, 0.2)))])
     with Renderer(gl, world, PLAIN) as renderer:
@@ -245,7 +247,8 @@ def test_what_is_read_what_is_viewed_and_what_is_written_into_are_one(gl, antial
 
 
 def test_a_moment_is_computed_once_and_shared(gl):
-    """Poses and their derivatives of one time, however many passes look at it, and labels at those of their neighbours."""
+    """Poses and their derivatives of one time, however many passes look at it, and labels at
+    those of their neighbours."""
     asked = Counter()
 
     class Watched:

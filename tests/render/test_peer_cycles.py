@@ -1,4 +1,5 @@
-"""A path tracer, Blender's Cycles, draws the same scenes. What is written for it is tested without it; what it draws, with the extra [cycles]."""
+"""A path tracer, Blender's Cycles, draws the same scenes. What is written for it is tested without
+it; what it draws, with the extra [cycles]."""
 
 from __future__ import annotations
 
@@ -34,9 +35,9 @@ def exported(world, folder, times=TIMES, settings=CyclesSettings()):
 
 
 def blender_pixel(point: np.ndarray, T_camera: np.ndarray, parameters: dict, width: int, height: int) -> np.ndarray:
-    """(2,) our pixel of a world point in Blender's picture, as its manual describes the camera: it looks along -z with y up; the sensor
-    of ``sensor_width`` stands at ``lens``, is moved by (shift_x, shift_y) sensor widths, and is ``width`` pixels wide; pixels are
-    aspect_y / aspect_x times as high as wide, rows count from the bottom."""
+    """(2,) our pixel of a world point in Blender's picture, as its manual describes the camera: it looks along -z with
+    y up; the sensor of ``sensor_width`` stands at ``lens``, is moved by (shift_x, shift_y) sensor widths, and is
+    ``width`` pixels wide; pixels are aspect_y / aspect_x times as high as wide, rows count from the bottom."""
     x, y, z = np.linalg.inv(T_camera)[:3] @ [*point, 1.0]
     pixel = parameters["sensor_width"] / width
     tall = parameters["pixel_aspect_y"] / parameters["pixel_aspect_x"]
@@ -205,11 +206,12 @@ def band_of(world, t):
 
 @needs_blender
 def test_unlit_pictures_agree(gl):
-    """Geometry, texture coordinates, poses and camera at once: band-limited textures, a principal point off the middle, fx != fy.
+    """Geometry, texture coordinates, poses and camera at once: band-limited textures, a
+    principal point off the middle, fx != fy.
 
-    Inside, both take the mean of the same smooth function over the pixel (16 samples each); what differs is our mip map, a box over up to
-    two texels. A shift of a tenth of a pixel would show as 8e-4 at the median; with 256 paths the median falls to 1e-5.
-    At silhouettes both have 16 samples: 1/16 of a contrast below 0.7 is 0.04 each."""
+    Inside, both take the mean of the same smooth function over the pixel (16 samples each); what differs is our mip
+    map, a box over up to two texels. A shift of a tenth of a pixel would show as 8e-4 at the median; with 256 paths the
+    median falls to 1e-5. At silhouettes both have 16 samples: 1/16 of a contrast below 0.7 is 0.04 each."""
     world = mixed_scene(unlit=True)
     cost = Cost()
     for t, theirs in zip(TIMES, frames(world, TIMES, CyclesSettings(samples=16, shadows=False, bounces=0), cost)):
@@ -224,9 +226,9 @@ def test_unlit_pictures_agree(gl):
 @needs_blender
 @pytest.mark.parametrize("sun, sky", [(1.2, 0.0), (0.0, 1.0)])
 def test_light_without_shadows_is_ours(gl, sun, sky):
-    """Shading normals (smooth and flat, two-sided from behind), the sun's direction, pi in its lamp, the sky's formula. What is left at the
-    99th percentile is the mip map, as above; the sun has a few triangles more, where it grazes: a normal interpolated there points
-    away from its triangle, which a path tracer does not light."""
+    """Shading normals (smooth and flat, two-sided from behind), the sun's direction, pi in its lamp, the sky's formula.
+    What is left at the 99th percentile is the mip map, as above; the sun has a few triangles more, where it grazes: a
+    normal interpolated there points away from its triangle, which a path tracer does not light."""
     world = replace(mixed_scene(), light=Light(sun=sun, sky=sky))
     theirs = next(frames(world, TIMES[:1], CyclesSettings(samples=16, shadows=False, bounces=0)))
     band, true = band_of(world, TIMES[0])
@@ -261,8 +263,8 @@ def test_shadow_of_a_ball_lies_where_it_should():
 
 @needs_blender
 def test_ground_shines_on_a_sheet():
-    """Inter-reflection has a closed form over a wide ground: a vertical sheet gets half of the dome and, of the ground's radiance
-    albedo * sky, half again: L = a_sheet sky (0.5 + 0.5 a_ground)."""
+    """Inter-reflection has a closed form over a wide ground: a vertical sheet gets half of the dome and, of the
+    ground's radiance albedo * sky, half again: L = a_sheet sky (0.5 + 0.5 a_ground)."""
     def paint(albedo, **more):
         return Material(base_color=(albedo,) * 3, **more)
 
@@ -278,7 +280,8 @@ def test_ground_shines_on_a_sheet():
 
 @needs_blender
 def test_one_sided_meshes_vanish_from_behind_and_the_same_seed_draws_the_same(tmp_path):
-    """The camera stands in a closed cube, which BlinkGL culls, and sees the sheet outside; a still scene is the same in every frame."""
+    """The camera stands in a closed cube, which BlinkGL culls, and sees the sheet outside; a
+    still scene is the same in every frame."""
     world = scene([thing("around", 1, cube(0.5), still(), Material(base_color=(1, 0, 0), unlit=True)),
                    thing("sheet", 2, quad(9, 9), still((0, 3, 0), LEVEL), Material(base_color=(0.25,) * 3, unlit=True, double_sided=True))],
                   rig(32, 24, 30.0))

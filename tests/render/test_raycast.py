@@ -28,7 +28,8 @@ def ask(kernel, forest, origins, axes, rays, near=0.0, far=None, skip=None):
 
 
 def every_depth(parts, origins, axes, rays):
-    """(rays, triangles of all parts) depth, inf where missed; whether the front is seen; (part, face) of each column."""
+    """(rays, triangles of all parts) depth, inf where missed; whether the front is seen;
+    (part, face) of each column."""
     depths, fronts, names = [], [], []
     for p, corners in enumerate(parts):
         d = rays @ axes[p][:, :2].T + axes[p][:, 2]
@@ -68,7 +69,8 @@ def forest_with_an_empty_part(parts, cull):
 @pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
 @pytest.mark.parametrize("culled", [False, True])
 def test_nearest_of_all_triangles(kernel, culled):
-    """With a near distance, a far one of each ray, a triangle that a ray passes through, and parts that have no back."""
+    """With a near distance, a far one of each ray, a triangle that a ray passes through,
+    and parts that have no back."""
     parts, origins, axes, rays = world(3)
     cull = [culled, False, False, culled]
     forest = forest_with_an_empty_part(parts, cull)

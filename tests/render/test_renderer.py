@@ -157,7 +157,8 @@ def test_reduced_velocity_samples_the_full_one(gl):
 
 @pytest.mark.parametrize("width, height, every", [(98, 147, 49), (23, 15, 4), (3, 5, 7), (12, 8, 4)])
 def test_small_pictures_cover_the_whole_image(gl, width, height, every):
-    """(98 * (1 / 49) is 1.9999999999999998.) Pixels are W / w apart: a wall that drifts shows its velocity at exactly those places."""
+    """(98 * (1 / 49) is 1.9999999999999998.) Pixels are W / w apart: a wall that drifts shows
+    its velocity at exactly those places."""
     small = (max(1, height // every), max(1, width // every))
     wall = SceneObject("wall", 1, (Part(primitives.cuboid(), Material(unlit=True)),), drift((-1.0, 4, 0), (1.0, 4.5, 0)))
     camera = Rig.alone(PinHole(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2), still(rotation=LEVEL))
@@ -253,8 +254,8 @@ def test_a_surface_nearer_by_more_than_a_thousandth_hides(nearer_id, by, hidden)
 
 @pytest.mark.parametrize("spreads, hidden", [(0.45, False), (0.55, True), (1.5, True), (-3.0, False)])
 def test_half_of_the_spread_around_is_allowed_to_a_curved_surface(spreads, hidden):
-    """1/Z at t' goes up by a tenth per column; the point lies that many times a column's difference behind the mean of its neighbours
-    (besides a thousandth of tolerance)."""
+    """1/Z at t' goes up by a tenth per column; the point lies that many times a column's difference behind the mean of
+    its neighbours (besides a thousandth of tolerance)."""
     inverse = 0.5 * (1 + 0.1 * np.arange(6))
     ids, depth_next = flat_patch(1 / inverse)
     flow = np.full((6, 6, 2), 0.5, np.float32)  # between two columns: the mean of both

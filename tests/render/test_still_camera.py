@@ -44,7 +44,8 @@ def test_identical_to_the_full_redraw(gl, antialiasing):
 
 @pytest.mark.parametrize("kind", ["tri/16"])
 def test_a_small_mover_makes_the_events_of_the_full_redraw(gl, kind):
-    """The benchmark's scene (640x480, a ball whose rectangle is at most a twentieth of the image): every event, pixel, time and polarity."""
+    """The benchmark's scene (640x480, a ball whose rectangle is at most a twentieth of the
+    image): every event, pixel, time and polarity."""
     made = bench_still.measure(gl, kind, 0.035, rounds=12, warm_up=8)  # compares the events itself
     assert made["events"] > 1000 and made["covered"] <= 0.052
 
@@ -90,8 +91,9 @@ def test_other_passes_in_between_do_not_disturb(gl):
 @pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa2"])
 @pytest.mark.parametrize("seed", range(3))
 def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
-    """Frames with and without rates, at times that go back and forth, viewed, read, or not looked at at all; drawn finer by somebody else in
-    between. What is viewed is right, and so is what is said to have changed since any frame."""
+    """Frames with and without rates, at times that go back and forth, viewed, read, or not looked at at all; drawn
+    finer by somebody else in between. What is viewed is right, and so is what is said to
+    have changed since any frame."""
     rng, world = np.random.default_rng(seed), mixed_scene(48, 36, camera_moves=False)
     config = PLAIN.model_copy(update={"antialiasing": antialiasing})
     fine = Luminance(False, samples_of(antialiasing))
@@ -121,7 +123,8 @@ def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
 
 
 def test_the_memory_of_a_view_is_the_renderers(gl):
-    """Nobody can write into it, and what has not changed is not transferred: the same memory, wherever it is asked for."""
+    """Nobody can write into it, and what has not changed is not transferred: the same
+    memory, wherever it is asked for."""
     world = mixed_scene(48, 36, camera_moves=False)
     with Renderer(gl, world, PLAIN) as renderer:
         frame = renderer.luminance(0, rate=True)
@@ -136,7 +139,8 @@ def test_the_memory_of_a_view_is_the_renderers(gl):
 
 
 def test_another_camera_takes_nothing_from_the_first(gl):
-    """look_through: luminance, what has changed in it, and the surfaces that hide points at t' are the other camera's."""
+    """look_through: luminance, what has changed in it, and the surfaces that hide points at
+    t' are the other camera's."""
     world = mixed_scene(48, 36, camera_moves=False)
     other = replace(world.camera, cx=world.camera.cx - 20, fx=world.camera.fx * 1.3)
     request = LabelRequest("flow_forward", "occlusion_forward")

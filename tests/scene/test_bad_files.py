@@ -153,7 +153,8 @@ def test_zeros_within_the_limit_are_an_accessor(tmp_path):
     assert load_asset(tmp_path / "a.glb").parts[0].mesh.normals == pytest.approx(np.tile([0, -1, 0], (3, 1)))
 
 
-PLY = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+PLY = ("ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nelement face "
+       "{}\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
 
 
 @pytest.mark.parametrize("name, text, problem", [
@@ -190,9 +191,9 @@ def test_a_broken_texture_beside_a_mesh_is_named(tmp_path, kind, spoil):
         (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t.png\n")
         (tmp_path / "a.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n")
     else:
-        (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\ncomment TextureFile t.png\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-                                        "property float s\nproperty float t\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-                                        "0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
+        (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\ncomment TextureFile t.png\nelement vertex 3\nproperty float x\nproperty float "
+                                        "y\nproperty float z\nproperty float s\nproperty float t\nelement face 1\nproperty list uchar int "
+                                        "vertex_indices\nend_header\n0 0 0 0 0\n1 0 0 1 0\n0 1 0 0 1\n3 0 1 2\n")
     path = tmp_path / f"a.{kind}"
     assert (load_asset(path).parts[0].material.texture.image == noise).all()
     (tmp_path / "t.png").write_bytes(spoil((tmp_path / "t.png").read_bytes()))

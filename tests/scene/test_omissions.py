@@ -94,8 +94,9 @@ def test_vertex_colours(tmp_path):
     assert said(path) == [] and load_asset(path).parts[0].material.base_color == (0.25, 0.25, 1.0)
     path = glb(tmp_path, None, COLOR_0=(np.eye(3, dtype="f4"), "VEC3"))
     assert said(path) == ["vertex colours (left out)"]
-    header = ("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty uchar green\n"
-              "property uchar blue\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n")
+    header = ("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty "
+              "uchar red\nproperty uchar green\nproperty uchar blue\nelement face 1\nproperty list uchar int "
+              "vertex_indices\nend_header\n")
     for last, expected in (("0 255 0", ["vertex colours (drawn in the most frequent one)"]), ("255 0 0", [])):
         (tmp_path / "a.ply").write_text(header + f"0 0 0 255 0 0\n1 0 0 255 0 0\n0 1 0 {last}\n3 0 1 2\n")
         assert said(tmp_path / "a.ply") == expected

@@ -1,4 +1,5 @@
-"""A read-out, a refractory period and recorded frames through every door: files, arrays, the loop itself, explain, trade."""
+"""A read-out, a refractory period and recorded frames through every door: files, arrays,
+the loop itself, explain, trade."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Frames go through an emulator in one place: whoever makes an emulator of his own forgets the read-out, or the frame that a path lags."""
+"""Frames go through an emulator in one place: whoever makes an emulator of his own forgets the
+read-out, or the frame that a path lags."""
 
 import ast
 from pathlib import Path

@@ -1,4 +1,5 @@
-"""The estimate of time errors against a slow twin: the module's text in other words (roots of cubics, weighted moments, sorted lists of events)."""
+"""The estimate of time errors against a slow twin: the module's text in other words (roots of
+cubics, weighted moments, sorted lists of events)."""
 
 from __future__ import annotations
 
@@ -114,7 +115,8 @@ class SlowTimeError:
 @pytest.mark.parametrize("percentile, in_px", [(75.0, False), (60.0, True)])
 @pytest.mark.parametrize("reconstruction", list(PRIOR))
 def test_equals_slow_twin(reconstruction, percentile, in_px):
-    """Unequal steps, steps in halves, pixels that stand still, turn round or leave (no finite speed); a burst in the middle."""
+    """Unequal steps, steps in halves, pixels that stand still, turn round or leave (no
+    finite speed); a burst in the middle."""
     rng = np.random.default_rng(7)
     target = 0.04 if in_px else 250e-6
     fast, slow = (kind(reconstruction, target, in_px, percentile) for kind in (TimeError, SlowTimeError))
@@ -152,7 +154,8 @@ def test_the_target_is_repeated_in_the_unit_it_was_given_in():
 
 
 def test_before_anything_is_measured_the_prior_decides():
-    """g(1 px) = 0.1 and order 1: d g(d) = 0.1 d^2, so 0.4 px of error allow 2 px, the most that is believed of one measured pixel."""
+    """g(1 px) = 0.1 and order 1: d g(d) = 0.1 d^2, so 0.4 px of error allow 2 px, the most that
+    is believed of one measured pixel."""
     error = TimeError("linear", 0.1, True, 75.0)
     assert error.pace(10.0) == pytest.approx(10.0) and error.pace(0.0) == 0.0 and error.pace(-1.0) == 0.0
     assert TimeError("linear", 0.4, True, 75.0).pace(10.0) == pytest.approx(5.0)

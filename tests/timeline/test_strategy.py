@@ -109,7 +109,8 @@ def run_of(timeline, renderer):
 
 @pytest.mark.parametrize("reconstruction", ["linear", "pchip", "hermite"])
 def test_budget_keeps_to_its_target_and_its_estimate_to_the_truth(gl, world, reconstruction):
-    """Against a much denser run: the promised percentile is within a factor 2 of the estimate and of the target, the median within 3."""
+    """Against a much denser run: the promised percentile is within a factor 2 of the estimate
+    and of the target, the median within 3."""
     target = 200.0
     config = BudgetTimeline(max_time_error_us=target, reconstruction=reconstruction, min_step_us=50, sample_every=2)
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa2", image_antialiasing="none")) as renderer:
@@ -136,7 +137,8 @@ def test_less_error_takes_more_frames(gl, world):
 
 
 def test_budget_finds_the_order_and_the_step_of_a_smooth_signal():
-    """A picture of drifting sinusoids, linear in between: the error of a step is known in closed form, up to the turning points."""
+    """A picture of drifting sinusoids, linear in between: the error of a step is known in closed
+    form, up to the turning points."""
     x = np.linspace(0, 2 * np.pi, 4000, endpoint=False)[None]
     speed_px, wavelength = 50.0, 40.0
     rate = speed_px / wavelength * 2 * np.pi
@@ -153,14 +155,15 @@ def test_budget_finds_the_order_and_the_step_of_a_smooth_signal():
         else:
             t += step
         steps.append(step)
-    # Linear: |t error| = h^2/8 |L''/L'| = h^2/8 rate |tan|, weighted by the events, |cos|: the median of |tan| is at sin = 1/2.
+    # Linear: |t error| = h^2/8 |L''/L'| = h^2/8 rate |tan|, weighted by the events, |cos|: the median of |tan| is at
+    # sin = 1/2.
     expected = math.sqrt(0.5e-3 * 8 / (rate * math.tan(math.pi / 6)))
     assert steps[-1] == pytest.approx(expected, rel=0.2) and error.m == pytest.approx(1.0, abs=0.25)
 
 
 def drifting(config: BudgetTimeline, fast: float = 1.0, seconds: float = 1.5):
-    """What ``budget`` says of 1.5 s of a sinusoid that drifts by 40 rad/s, ``fast`` times that in every second 40 ms, under an image speed
-    that is said to be 50 px/s all the time."""
+    """What ``budget`` says of 1.5 s of a sinusoid that drifts by 40 rad/s, ``fast`` times that in every second 40 ms,
+    under an image speed that is said to be 50 px/s all the time."""
     x, rate, half = np.linspace(0, 2 * np.pi, 600, endpoint=False)[None], 40.0, 0.04
     speed = np.full((1, 600, 2), (50.0, 0.0), np.float32)
     timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(velocity_of_movers=lambda t, n: picture(speed)), Esim.response(ESIM))
@@ -174,7 +177,8 @@ def drifting(config: BudgetTimeline, fast: float = 1.0, seconds: float = 1.5):
 
 
 def test_steps_in_two_halves_measure_the_order():
-    """Cubics are of order 4 on a sinusoid, 3.6 with the turning points. At one length of step nothing but the prior, 2.5, would speak of it."""
+    """Cubics are of order 4 on a sinusoid, 3.6 with the turning points. At one length of step
+    nothing but the prior, 2.5, would speak of it."""
     said = drifting(BudgetTimeline(max_time_error_us=20.0, reconstruction="hermite", min_step_us=20, max_step_us=40_000, sample_every=1))
     assert 3.3 < said["order"] <= 4.0
 
@@ -182,8 +186,9 @@ def test_steps_in_two_halves_measure_the_order():
 @pytest.mark.parametrize("fast", [1.0, 5.0])
 @pytest.mark.parametrize("target", [100.0, 300.0])
 def test_as_many_events_are_beyond_the_target_as_the_percentile_says(fast, target):
-    """The mean of the measurements' logarithms is not the percentile over all events: without the correction the estimate comes out a tenth
-    too small where nothing changes, and 1.6 to 1.9 times too large where motion comes in bursts that the image speed does not tell of."""
+    """The mean of the measurements' logarithms is not the percentile over all events: without the correction the
+    estimate comes out a tenth too small where nothing changes, and 1.6 to 1.9 times too large where motion comes in
+    bursts that the image speed does not tell of."""
     said = drifting(BudgetTimeline(max_time_error_us=target, min_step_us=20, max_step_us=40_000, sample_every=1), fast)
     assert said["percentile"] == 75 and said["p75_us"] == pytest.approx(target, rel=0.06)
 

@@ -88,10 +88,13 @@ def test_what_is_compiled_into_a_kernel_is_compiled_itself():
 
 
 def test_an_edit_is_in_the_kernels_of_whoever_imports_it(tmp_path):
-    """A kernel's callee, a constant of a module, a function that is called on import; not what stands in a method beside them."""
-    files = {"blinkgl/a.py": "from numba.extending import register_jitable\nLIMIT = 3\ndef table():\n    return 1 + 1\nTABLE = table()\n"
-                             "@register_jitable\ndef callee(x):\n    return x * 2\nclass Thing:\n    def method(self):\n        return 4 - 5\n",
-             "blinkgl/b.py": "import numba\nfrom blinkgl.a import callee\n@numba.njit(cache=True)\ndef kernel(x):\n    return callee(x) / 6\n",
+    """A kernel's callee, a constant of a module, a function that is called on import; not what
+    stands in a method beside them."""
+    files = {"blinkgl/a.py": "from numba.extending import register_jitable\nLIMIT = 3\ndef table():\n    return 1 + "
+                             "1\nTABLE = table()\n@register_jitable\ndef callee(x):\n    return x * 2\nclass Thing:\n    "
+                             "def method(self):\n        return 4 - 5\n",
+             "blinkgl/b.py": "import numba\nfrom blinkgl.a import callee\n@numba.njit(cache=True)\ndef kernel(x):\n    "
+                             "return callee(x) / 6\n",
              "blinkgl/c.py": "import numba\nfrom blinkgl import b\n@numba.njit(cache=True)\ndef other(x):\n    return x\n",
              "blinkgl/d.py": "import blinkgl.c\nVALUE = 7\n", "blinkgl/__init__.py": ""}
     (tmp_path / "blinkgl").mkdir()
@@ -118,7 +121,8 @@ def test_own_tests_are_asked_first():
 
 @pytest.mark.slow
 def test_verdicts(tmp_path):
-    """A test that passes, one that fails, one that never ends, a process that dies: each in a child that sees the source as it is by then."""
+    """A test that passes, one that fails, one that never ends, a process that dies: each in a child
+    that sees the source as it is by then."""
     (tmp_path / "thing.py").write_text("VALUE = 1\n")
     (tmp_path / "test_thing.py").write_text("import os, thing\ndef test_right(): assert thing.VALUE == 1\ndef test_spins():\n    while True: pass\n"
                                             "def test_dies(): os._exit(3)\n")

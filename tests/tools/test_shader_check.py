@@ -1,4 +1,5 @@
-"""check and show: every variant compiles, errors point at the user's line, and production does not know the debugger."""
+"""check and show: every variant compiles, errors point at the user's line, and production
+does not know the debugger."""
 
 from __future__ import annotations
 
@@ -114,7 +115,8 @@ def test_production_programs_are_the_same_without_the_debugger(tmp_path, gl, con
 
 
 def test_generation_runs_where_the_debugger_does_not_exist(config, tmp_path):
-    """In a process in which blinkgl.tools cannot be imported and debug.glsl cannot be read; no program but production's is compiled."""
+    """In a process in which blinkgl.tools cannot be imported and debug.glsl cannot be read; no
+    program but production's is compiled."""
     code = f"""
 import hashlib, json, sys
 sys.modules["blinkgl.tools"] = None
@@ -256,7 +258,8 @@ def test_conditions(expression, macros, truth):
     ("a", {"a": "a"}), ("a", {"a": "b", "b": "a"}), ("a0", {f"a{i}": f"a{i + 1} + a{i + 1}" for i in range(60)}), ("1 +" * 50_000 + "1", {}),
 ])
 def test_conditions_that_would_take_for_ever(expression, macros):
-    """Powers, shifts, long numbers, deep brackets, macros that name themselves or double at each step: read or refused at once."""
+    """Powers, shifts, long numbers, deep brackets, macros that name themselves or double at
+    each step: read or refused at once."""
     assert preprocess.evaluate(expression, macros) is False
 
 
@@ -281,8 +284,8 @@ _expressions = st.recursive(
 def test_conditions_against_the_driver(gl, expression):
     """The driver's preprocessor is the oracle."""
     vertex = "#version 430 core\nvoid main() { gl_Position = vec4(0.0); }\n"
-    text = (f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform float no;\n#endif\n"
-            "out vec4 c;\nvoid main() { c = vec4(\n#if " + expression + "\nyes\n#else\nno\n#endif\n); }\n")
+    text = (f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform "
+            "float no;\n#endif\nout vec4 c;\nvoid main() { c = vec4(\n#if " + expression + "\nyes\n#else\nno\n#endif\n); }\n")
     program = gl.ctx.program(vertex_shader=vertex, fragment_shader=text)
     says = "yes" in program
     program.release()
@@ -296,7 +299,8 @@ def test_conditions_of_any_text_are_answered(expression, macros):
 
 
 def test_else_branches():
-    text = "#if 0\na\n#elif 1\nb // c\n#elif 1\nd\n#else\ne\n#endif\n#ifndef X\n#define X 1\nf /* g\nh */ i\n#endif\n#ifdef X\nj\n#endif\n"
+    text = ("#if 0\na\n#elif 1\nb // c\n#elif 1\nd\n#else\ne\n#endif\n#ifndef X\n#define X 1\nf /* g\nh */ "
+            "i\n#endif\n#ifdef X\nj\n#endif\n")
     assert [line.strip() for _, line in preprocess.active_lines(text)] == ["b", "f", "i", "j"]
 
 
@@ -354,7 +358,8 @@ class _Recorder:
     (False, "finish stamp count draw counted stamp finish"),
 ])
 def test_a_stopwatch_waits_around_time_stamps_of_software(is_software, expected):
-    """A stamp taken while llvmpipe's threads still draw would miss the rasteriser's work; a card must not be waited for in between."""
+    """A stamp taken while llvmpipe's threads still draw would miss the rasteriser's work; a
+    card must not be waited for in between."""
     gl = _Recorder(is_software)
     watch = timing.Stopwatch(gl)
     watch.start()

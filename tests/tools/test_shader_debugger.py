@@ -84,7 +84,8 @@ def test_only_the_passes_asked_for(shader, config, tmp_path):
                                                                                       "depth.npy", "depth.png"]
 
 
-# ------------------------------------------------------------------------------------------------- against the reference
+# ------------------------------------------------------------------------------------------------- against the
+# reference
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +139,8 @@ def test_the_mip_bias_of_a_configuration_is_no_error(shader, config):
 
 
 def test_derivative_of_luminance_of_a_sliding_cosine(gl):
-    """A camera slides along a wall painted L(x) = 0.5 + 0.3 cos(k x): dL/dt = -0.3 k sin(k x) dx/dt, on the GPU and in the reference."""
+    """A camera slides along a wall painted L(x) = 0.5 + 0.3 cos(k x): dL/dt = -0.3 k sin(k x)
+    dx/dt, on the GPU and in the reference."""
     speed, depth, width, texels, periods = 0.5, 4.0, 4.0, 128, 2
     k = 2 * np.pi * periods / width
     u = (np.arange(texels) + 0.5) / texels
@@ -266,7 +268,8 @@ def test_ulps():
     assert probe.ulps(np.array([1, 2], np.float32), np.array([1.0, 2.0 + 4 * np.spacing(np.float32(2))])) == 4.0
 
 
-# ------------------------------------------------------------------------------------------------- diff, and the mistakes
+# ------------------------------------------------------------------------------------------------- diff, and the
+# mistakes
 
 
 def test_diff_of_the_shipped_shaders_is_clean(shader, config, tmp_path):

@@ -358,8 +358,9 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         assert page.run("return document.querySelector('#pane-a img').naturalWidth") == WIDTH
         assert page.run("return document.querySelectorAll('#a option').length") == 2 * len(PASSES)
 
-        picture = ("const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = i.naturalWidth; c.height = i.naturalHeight;"
-                   "const g = c.getContext('2d'); g.drawImage(i, 0, 0); return c.toDataURL()")
+        picture = ("const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = "
+                   "i.naturalWidth; c.height = i.naturalHeight;const g = c.getContext('2d'); g.drawImage(i, 0, 0); return "
+                   "c.toDataURL()")
         first = page.run(picture, "#pane-a img")
         page.choose("#time", "0.3")  # scrub
         page.wait("return document.body.dataset.shown === '0.3'")
@@ -370,7 +371,8 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         assert page.run("return document.querySelector('#b').value") == "depth:reference"  # B follows
         page.choose("#view", "difference")
         page.choose("#map", "turbo")
-        page.wait("return document.querySelector('#pane-b figcaption b').textContent === '|A − B|' && location.hash.includes('map=turbo')")
+        page.wait("return document.querySelector('#pane-b figcaption b').textContent === '|A − B|' && "
+                  "location.hash.includes('map=turbo')")
         assert not page.run("return document.querySelector('#pane-b').hidden")
 
         page.click_at("#pane-a img", (40 + 0.5) / WIDTH, (45 + 0.5) / HEIGHT)
@@ -397,7 +399,8 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         page.run("document.querySelector('#compare').click()")
         page.wait("return document.querySelector('#verdict').className === 'bad'", timeout=60)
         assert "level of luminance" in page.text("#verdict") and "a mip bias of +1" in page.text("#verdict")
-        rows = page.run("return [...document.querySelectorAll('#objects tr')].slice(1).map((tr) => [...tr.children].map((td) => td.textContent))")
+        rows = page.run("return [...document.querySelectorAll('#objects tr')].slice(1).map((tr) => [...tr.children].map((td) => "
+                        "td.textContent))")
         assert {cells[0] for cells in rows} == {"floor", "ball"} and all(cells[1] == "level of luminance" for cells in rows)
         page.run("document.querySelector('#objects a').click()")
         page.wait("return document.querySelector('#probe').dataset.pixel === arguments[0]", rows[0][4].replace(" ", ""))

@@ -1,4 +1,5 @@
-"""Headless Chromium over the WebDriver protocol (https://www.w3.org/TR/webdriver2/), with nothing but the standard library."""
+"""Headless Chromium over the WebDriver protocol (https://www.w3.org/TR/webdriver2/), with
+nothing but the standard library."""
 
 from __future__ import annotations
 
@@ -24,7 +25,8 @@ def missing() -> str | None:
 
 
 class Browser:
-    """One window. ``with Browser(folder) as b: b.open(url); b.text("#probe")``; folder: empty, for the profile and logs."""
+    """One window. ``with Browser(folder) as b: b.open(url); b.text("#probe")``; folder:
+    empty, for the profile and logs."""
 
     def __init__(self, folder: Path):
         with socket.socket() as free:
@@ -95,8 +97,8 @@ class Browser:
 
     def click_at(self, selector: str, fx: float, fy: float) -> None:
         """A real mouse click at a fraction of an element's width and height."""
-        x, y = self.run("const e = document.querySelector(arguments[0]); e.scrollIntoView({block: 'nearest'}); const r = e.getBoundingClientRect();"
-                        "return [r.left + arguments[1] * r.width, r.top + arguments[2] * r.height]", selector, fx, fy)
+        x, y = self.run("const e = document.querySelector(arguments[0]); e.scrollIntoView({block: 'nearest'}); const r = "
+                        "e.getBoundingClientRect();return [r.left + arguments[1] * r.width, r.top + arguments[2] * r.height]", selector, fx, fy)
         move = {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": round(x), "y": round(y)}
         mouse = {"type": "pointer", "id": "mouse", "actions": [move, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]}
         self._call("POST", self._session + "/actions", {"actions": [mouse]})

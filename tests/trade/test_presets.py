@@ -1,4 +1,5 @@
-"""The presets of ``quality:`` are on the front: of the sweep they were taken from, and of one that is made again here."""
+"""The presets of ``quality:`` are on the front: of the sweep they were taken from, and of
+one that is made again here."""
 
 from __future__ import annotations
 
@@ -73,7 +74,8 @@ RIVALS = [Setting(f"displacement {px:g} px", r, a, o) for px, r, a, o in (
 
 
 def test_no_rival_beats_a_preset_measured_again(gl, tmp_path):
-    """Cost is what a busy machine cannot change: samples drawn. A rival has to be better by 15 % in both to count: the scene is small."""
+    """Cost is what a busy machine cannot change: samples drawn. A rival has to be better by 15 %
+    in both to count: the scene is small."""
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(CONFIG))
     bench = Bench(gl, load_run(tmp_path / "c.yaml"), Options(clip_s=0.03, tiles=(1, 1, 96, 72), levels=((8, 0.1),), rounds=1))
     presets = [_Preset(name) for name in QUALITIES]
@@ -87,7 +89,8 @@ def test_no_rival_beats_a_preset_measured_again(gl, tmp_path):
 
 
 def drawn(config) -> float:
-    """Samples per frame and pixel; a frame with rates costs twice (measured: docs/trade.md). Half a sample stands for the triangles."""
+    """Samples per frame and pixel; a frame with rates costs twice (measured: docs/trade.md).
+    Half a sample stands for the triangles."""
     return (0.5 + SAMPLES[config.render.antialiasing]) * (2 if config.timeline.reconstruction == "hermite" else 1)
 
 

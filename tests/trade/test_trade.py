@@ -175,7 +175,8 @@ def test_errors(config, tmp_path, capsys):
 
 
 def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path, capsys):
-    """What Cycles would be asked for, drawn by the rasteriser: the same events as the reference it replaces, and named in the sentence."""
+    """What Cycles would be asked for, drawn by the rasteriser: the same events as the reference
+    it replaces, and named in the sentence."""
     asked = []
 
     def frames(scene, times, settings, cost):

@@ -1,4 +1,5 @@
-"""``blinkgl shader check`` and ``show``: compile everything, say what is wrong where, and what is declared for nothing."""
+"""``blinkgl shader check`` and ``show``: compile everything, say what is wrong where, and
+what is declared for nothing."""
 
 from __future__ import annotations
 
@@ -100,7 +101,8 @@ def _add(findings: list[Finding], diagnostic: Diagnostic, program: str, defines:
 
 
 def unused(sources: dict[str, ShaderSource], members: set[str]) -> list[Diagnostic]:
-    """Uniforms and varyings that do nothing in this variant. members : uniforms and attributes the linked program has."""
+    """Uniforms and varyings that do nothing in this variant. members : uniforms and
+    attributes the linked program has."""
     out = []
     text = {stage: active_lines(source.text) for stage, source in sources.items()}
     words = {stage: re.findall(r"\w+", "\n".join(line for _, line in lines)) for stage, lines in text.items()}
@@ -171,7 +173,8 @@ def as_text(result: Result) -> str:
     for found in result.errors:
         d = found.diagnostic
         lines += [f"{d.where}: {d.kind}: {d.text}" + (f" [{d.stage} stage]" if d.stage else ""), d.excerpt,
-                  f"         in {found.count} of {result.programs[found.program]} variants of {found.program}, first {_defines(found.example)}", ""]
+                  (f"         in {found.count} of {result.programs[found.program]} variants of {found.program}, first "
+                  f"{_defines(found.example)}"), ""]
     for found in result.unused:
         d = found.diagnostic
         lines.append(f"{d.where}: {d.text} in {found.count} of {result.programs[found.program]} variants of {found.program}, "

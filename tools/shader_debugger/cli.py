@@ -54,7 +54,8 @@ def probe(
     time: Time = None, seed: Seed = None, sequence: Sequence = None, step: Step = None, shaders: Shaders = None, overrides: Overrides = None,
     json: Json = False,
 ) -> None:
-    """Print every buffer at a pixel beside the float64 reference, where the point is, and why it is invalid or occluded."""
+    """Print every buffer at a pixel beside the float64 reference, where the point is, and why
+    it is invalid or occluded."""
     from blinkgl.tools.shader_debugger.commands import run_probe
 
     subject = _subject(config, seed, sequence, overrides)
@@ -89,7 +90,8 @@ def check(
     device: Annotated[int, typer.Option(min=0, help="EGL device.")] = 0,
     json: Json = False,
 ) -> None:
-    """Compile every program in every variant any configuration can ask for; list what is unused. Exit status 1 on an error."""
+    """Compile every program in every variant any configuration can ask for; list what is
+    unused. Exit status 1 on an error."""
     from blinkgl.tools.shader_debugger import check as checking
 
     result = checking.check(files or [], shaders, backend, device)
@@ -120,7 +122,8 @@ def time(
     repeat: Annotated[int, typer.Option("--repeat", min=1, max=1000, help="Measurements; their median is reported.")] = 15,
     json: Json = False,
 ) -> None:
-    """GPU time of each pass and program variant, split into vertex and fragment work, with draws, triangles and overdraw."""
+    """GPU time of each pass and program variant, split into vertex and fragment work, with
+    draws, triangles and overdraw."""
     from blinkgl.tools.shader_debugger import timing
 
     subject = _subject(config, seed, sequence, overrides)
@@ -135,7 +138,8 @@ def serve(
     host: Annotated[str, typer.Option("--host", help="Address to listen on; anything but 127.0.0.1 lets others in.")] = "127.0.0.1",
     time: Time = None, seed: Seed = None, sequence: Sequence = None, step: Step = None, shaders: Shaders = None, overrides: Overrides = None,
 ) -> None:
-    """A local page: passes, scrubbing, probe by click, differences, and shaders that reload when saved. Ctrl-C ends it."""
+    """A local page: passes, scrubbing, probe by click, differences, and shaders that
+    reload when saved. Ctrl-C ends it."""
     from blinkgl.tools.shader_debugger.server import serve as run_server
 
     subject = _subject(config, seed, sequence, overrides)

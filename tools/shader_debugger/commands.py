@@ -24,7 +24,8 @@ from blinkgl.tools.shader_debugger.verdict import as_text as verdict_text, verdi
 
 
 def write_passes(subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None) -> list[Path]:
-    """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the folder ``out``. Returns the paths.
+    """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the
+    folder ``out``. Returns the paths.
 
     Anti-aliased as the configuration says: these are the arrays that generation uses. Raises BlinkGLError."""
     from blinkgl.io import pictures
@@ -77,7 +78,8 @@ def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = No
 
 def run_diff(subject: Subject, when: When, names: list[str] | None, tolerances: list[str], shaders: str | None = None,
              out: str | None = None) -> tuple[dict, list[Report]]:
-    """Compares the named buffers (default: all that can be); with ``out`` also writes diff.png and NAME_error.npy there.
+    """Compares the named buffers (default: all that can be); with ``out`` also writes
+    diff.png and NAME_error.npy there.
     Returns what :func:`verdict.verdict` says, and the reports."""
     from blinkgl.tools.shader_debugger.compare import QUANTITIES
 
@@ -97,7 +99,8 @@ def run_diff(subject: Subject, when: When, names: list[str] | None, tolerances: 
             path = folder / f"{report.quantity.name}_error.npy"
             with atomic_file(path) as temporary, output_errors(path), temporary.open("wb") as file:
                 np.save(file, report.errors, allow_pickle=False)
-        title = f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = {when.t_ns * 1e-9:.6g} s"
+        title = (f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = "
+                 f"{when.t_ns * 1e-9:.6g} s")
         picture.save_errors(folder / "diff.png", reports, title + "   (log scale; silhouettes and shared edges greyed)")
     return found, reports
 
@@ -118,16 +121,17 @@ def _finite(value):
 
 
 def diff_text(found: dict, reports: list[Report]) -> str:
-    """The verdict, the table, then histogram, suspicions and the worst pixel of each object of each buffer that failed, or of a
-    single one."""
+    """The verdict, the table, then histogram, suspicions and the worst pixel of each object of each buffer that failed,
+    or of a single one."""
     lines = [*verdict_text(found), ""] if not found["passed"] else []
-    lines.append(f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} {'max':>8}   "
-                 "silhouette band: over / pixels")
+    lines.append(f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} "
+                 f"{'max':>8}   silhouette band: over / pixels")
     summaries = [report.summary() for report in reports]
     for s in summaries:
         e, b = s["off_silhouettes"], s["silhouette_band"]
-        lines.append(f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  {s['unit']:<24} "
-                     f"{e['pixels']:>8} {e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   {b['over_tolerance']} / {b['pixels']}")
+        lines.append(f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  "
+                     f"{s['unit']:<24} {e['pixels']:>8} {e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   "
+                     f"{b['over_tolerance']} / {b['pixels']}")
     notes: dict[str, list[str]] = {}
     for s in summaries:
         if s["note"]:
@@ -136,14 +140,15 @@ def diff_text(found: dict, reports: list[Report]) -> str:
     for s in summaries:
         if s["passed"] and len(summaries) > 1:
             continue
-        lines += ["", f"{s['buffer']}: {s['off_silhouettes']['over_tolerance']} of {s['off_silhouettes']['pixels']} graded pixels "
+        lines += ["", f"{s['buffer']}: {s['off_silhouettes']['over_tolerance']} of {s['off_silhouettes']['pixels']} graded "
+                      "pixels "
                   + (f"over {s['tolerance']:g} {s['unit']}" if s["statistic"] == "max" else "differ")]
         lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
         top = max([1, *s["histogram"].values()])
         bars = {name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count}
         lines += [f"  {name:>6} {s['histogram'][name]:>8} {'#' * bar}" for name, bar in bars.items()]
-        lines += [f"  {o['object']}: {o['over_tolerance']} of {o['pixels']} px, median {o['median']:.2g}; worst ({o['x']}, {o['y']}): "
-                  f"error {o['error']:.3g}, GPU {_short(o['gpu'])}, reference {_short(o['reference'])}"
+        lines += [f"  {o['object']}: {o['over_tolerance']} of {o['pixels']} px, median {o['median']:.2g}; worst ({o['x']}, "
+                  f"{o['y']}): error {o['error']:.3g}, GPU {_short(o['gpu'])}, reference {_short(o['reference'])}"
                   + (f", triangle {o['triangle']}" if o["triangle"] >= 0 else "") for o in s["objects"] if o["over_tolerance"]]
     failed = [s for s in summaries if not s["passed"]]
     if failed:

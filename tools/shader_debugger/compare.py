@@ -2,18 +2,20 @@
 
 What is graded, and with which tolerance
 ----------------------------------------
-Pixels in the silhouette band (``reference.silhouette_band``: within one pixel of an id change or a jump in depth) are reported
-apart: there a pixel centre may fall on either side of an edge. Off the band a buffer is graded where both sides see the same
-triangle; where they see neighbouring ones (a pixel centre on a shared edge) only ids and masks are graded.
+Pixels in the silhouette band (``reference.silhouette_band``: within one pixel of an id change or a jump in depth) are
+reported apart: there a pixel centre may fall on either side of an edge. Off the band a buffer is graded where both
+sides see the same triangle; where they see neighbouring ones (a pixel centre on a shared
+edge) only ids and masks are graded.
 
-Order: the buffers are graded in the order in which a pass makes them: where the surface is (local position, depth, id), what the
-pass looks up there (coordinates, level, albedo), the light, and their product. Each look-up is the pass's own, shown by a variant of
-its own source (``include/lookup.glsl``), and what follows from an earlier step is graded with that step as the GPU made it: the
-albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and level, the result against the GPU's own albedo
-times its own light. So the first buffer that fails is where the fault is; ``verdict.py`` says so, object by object.
+Order: the buffers are graded in the order in which a pass makes them: where the surface is (local position, depth, id),
+what the pass looks up there (coordinates, level, albedo), the light, and their product. Each look-up is the pass's own,
+shown by a variant of its own source (``include/lookup.glsl``), and what follows from an earlier step is graded with
+that step as the GPU made it: the albedo against a CPU twin of mip-mapped sampling at the GPU's own coordinates and
+level, the result against the GPU's own albedo times its own light. So the first buffer that fails is where the fault
+is; ``verdict.py`` says so, object by object.
 
-The reference has no mip maps, hence the twin, and a loose tolerance: drivers may make mip maps as they like. With anisotropic
-filtering (``render.anisotropy`` > 1) level and albedo are left out.
+The reference has no mip maps, hence the twin, and a loose tolerance: drivers may make mip maps as they like. With
+anisotropic filtering (``render.anisotropy`` > 1) level and albedo are left out.
 """
 
 from __future__ import annotations
@@ -50,7 +52,8 @@ NOTHING = "nothing hit"
 class Quantity:
     """How one buffer is graded. error : (what the GPU wrote, the reference, both moments) -> (H, W) >= 0 in ``unit``.
 
-    statistic : "max" of the graded pixels' errors, or "mean" (the fraction of pixels, for masks), must not exceed ``tolerance``.
+    statistic : "max" of the graded pixels' errors, or "mean" (the fraction of pixels, for
+    masks), must not exceed ``tolerance``.
     fit : error, in tolerances, that is left to a suspicion that explains the buffer.
     """
 
@@ -81,8 +84,8 @@ def _per_step(g, r, gpu, ref):
 
 
 def _pixels_of_texture(g, r, gpu, ref):
-    """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's rounding.
-    Whole repeats are no shift."""
+    """How far the texture is shifted, in px: at a grazing angle one pixel spans many repeats, and so does float32's
+    rounding. Whole repeats are no shift."""
     shift = g.astype(np.float64) - r
     return length((shift - np.rint(shift)) * ref["texture_size"]) / np.exp2(ref["level"])
 
@@ -148,7 +151,8 @@ def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
 @dataclass(eq=False)
 class Report:
     """Of one buffer. errors : (H, W) float64, nan where not comparable.   graded, band : (H, W) bool.
-    value : the graded statistic.   objects : of each object (the worst ten, worst first) its graded pixels, those over the tolerance,
+    value : the graded statistic.   objects : of each object (the worst ten, worst first) its
+                                    graded pixels, those over the tolerance,
     their median and largest error, and where the largest is: x, y, error, gpu, reference, triangle."""
 
     quantity: Quantity
@@ -203,7 +207,8 @@ def histogram(errors: np.ndarray) -> dict[str, int]:
 
 
 class Comparison:
-    """Masks that all buffers share, and :meth:`report` for one of them. objects : names of the scene's objects, told apart."""
+    """Masks that all buffers share, and :meth:`report` for one of them. objects : names of
+    the scene's objects, told apart."""
 
     def __init__(self, gpu: GpuMoment, ref: ReferenceMoment):
         self.gpu, self.ref = gpu, ref
@@ -218,8 +223,8 @@ class Comparison:
         self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
 
     def owner(self, name: str) -> np.ndarray:
-        """(H, W) number of the object that a pixel's error in buffer ``name`` is put down to: the one that should be there, or, for
-        the local position, the one that was drawn."""
+        """(H, W) number of the object that a pixel's error in buffer ``name`` is put down to: the one that should be
+        there, or, for the local position, the one that was drawn."""
         return self._object_of_part[(self.gpu if name == "local" else self.ref)["part"]]
 
     def names(self) -> list[str]:
@@ -243,14 +248,15 @@ class Comparison:
         return gpu[name], ref[name]
 
     def twin(self, of: str, **more) -> np.ndarray:
-        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own coordinates; 0 where it drew nothing.
+        """(H, W, 3) float64 albedo that pass ``of`` should have found with its own
+        coordinates; 0 where it drew nothing.
         more : as for :meth:`twin_colour`."""
         out = self.twin_colour(of, **more)
         return out if of == "colour" else luma_of(out)
 
     def twin_colour(self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0), material: Material | None = None) -> np.ndarray:
-        """:meth:`twin` in colour, for the luminance, too. Mistakes: a number of levels too coarse; coordinates moved by texels of the
-        full resolution; another material everywhere."""
+        """:meth:`twin` in colour, for the luminance, too. Mistakes: a number of levels too coarse; coordinates moved by
+        texels of the full resolution; another material everywhere."""
         gpu = self.gpu
         out = np.zeros((*gpu["part"].shape, 3))
         for p, (_, part) in enumerate(reference.scene_parts(self.ref.scene)):

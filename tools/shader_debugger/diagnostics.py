@@ -39,7 +39,8 @@ class Diagnostic:
 
 
 def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder) -> list[Diagnostic]:
-    """Every message behind a ShaderError. ``sources``: by stage, empty when the program could not even be put together."""
+    """Every message behind a ShaderError. ``sources``: by stage, empty when the program could
+    not even be put together."""
     found, stage = [], ""
     for line in error.log.splitlines():
         if header := _STAGE.match(line.strip()):
@@ -75,7 +76,8 @@ def _line(text: str, number: int) -> str:
 
 
 def _column(text: str, message: str, column: int) -> int:
-    """A name that the message quotes, if the line has it: drivers count columns after their preprocessor squeezed the blanks."""
+    """A name that the message quotes, if the line has it: drivers count columns after their
+    preprocessor squeezed the blanks."""
     for name in _QUOTED.findall(message):
         if match := re.search(rf"\b{re.escape(name.split('.')[0])}\b", text):
             return match.start() + 1

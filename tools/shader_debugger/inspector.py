@@ -166,7 +166,8 @@ class Inspector:
     # ---- reloading ---------------------------------------------------------------------------------------------
 
     def reload(self) -> None:
-        """Takes the edited shaders when all of them compile and draw; otherwise keeps the old ones and :attr:`errors`."""
+        """Takes the edited shaders when all of them compile and draw; otherwise keeps the old
+        ones and :attr:`errors`."""
         old = self.renderer.gl.shaders
         new = _Loader(self.renderer.gl.ctx, Snapshot.of(self.folder))
         self.renderer.use_shaders(new)

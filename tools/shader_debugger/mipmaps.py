@@ -1,9 +1,9 @@
 """A CPU twin of mip-mapped texture sampling, for grading the albedo where a pixel covers several texels.
 
 The float64 reference samples textures at full resolution: mip maps are the GPU's way to anti-alias, not a property of
-the scene. OpenGL leaves their making to the driver, so this twin (each level half the last one, resampled bilinearly, which
-is the 2 x 2 mean where the size is even; then trilinear sampling, OpenGL 4.6 section 8.14.3) is compared with a loose
-tolerance: it finds wrong coordinates, a wrong texture or a wrong level, not rounding.
+the scene. OpenGL leaves their making to the driver, so this twin (each level half the last one, resampled bilinearly,
+which is the 2 x 2 mean where the size is even; then trilinear sampling, OpenGL 4.6 section 8.14.3) is compared with a
+loose tolerance: it finds wrong coordinates, a wrong texture or a wrong level, not rounding.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Every buffer of one moment by name: :class:`GpuMoment` reads them from OpenGL, :class:`ReferenceMoment` computes them in
-float64. Both hand out the same names, shapes and conventions, each computed when it is first asked for."""
+"""Every buffer of one moment by name: :class:`GpuMoment` reads them from OpenGL, :class:`ReferenceMoment` computes them
+in float64. Both hand out the same names, shapes and conventions, each computed when it is first asked for."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class Pass:
-    """kind : how it is shown: scalar, depth (on a logarithmic scale), signed, ids, mask, light (linear rgb), unit (vectors), uv, motion.
+    """kind : how it is shown: scalar, depth (on a logarithmic scale), signed, ids, mask, light
+    (linear rgb), unit (vectors), uv, motion.
     source : the program and output that write it."""
 
     name: str
@@ -60,8 +61,9 @@ _SHADED = (
 
 
 class OfLabels(Mapping[str, _T]):
-    """By the name of a buffer: one of every view of the labels that are registered now, among fixed ones, in the order in which a mistake shows:
-    where the surface is (``before``, and labels of one time), what it looks like (``shaded``), how it moves.
+    """By the name of a buffer: one of every view of the labels that are registered now, among fixed ones, in the order
+    in which a mistake shows: where the surface is (``before``, and labels of one time), what it
+    looks like (``shaded``), how it moves.
 
     made : entry of a label and one of its views.   before, shaded : the fixed ones."""
 
@@ -125,8 +127,8 @@ class _Lazy:
 
 class GpuMoment(_Lazy):
     """What the GPU wrote. Besides :data:`PASSES`: part (H, W) int32, -1: nothing hit; window (H, W, 4) gl_FragCoord;
-    next_depth_forward|backward (H, W), the depth at t' that the flow program returns; luminance_count, colour_count (H, W), the
-    number of texture look-ups at the pixel.
+    next_depth_forward|backward (H, W), the depth at t' that the flow program returns; luminance_count, colour_count (H,
+    W), the number of texture look-ups at the pixel.
 
     Conventions: depth inf, flow 0 and id 0 where nothing is hit; velocity 0 there.
     """
@@ -171,13 +173,15 @@ class GpuMoment(_Lazy):
 
 
 class ReferenceMoment(_Lazy):
-    """What the GPU should have written, float64, by :mod:`blinkgl.render.reference`. ``frame``: the reference's own frame.
+    """What the GPU should have written, float64, by :mod:`blinkgl.render.reference`.
+    ``frame``: the reference's own frame.
 
-    The level of a look-up is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6, section 8.14,
-    eq. 8.7), from the exact derivatives of uv on the triangle's plane, plus ``mip_bias``; a GPU takes it from 2 x 2 pixels. The
-    albedo, and what follows from it (colour, luminance, log_luminance, dL_dt), is sampled at that level by the CPU twin in
-    :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full resolution, are albedo_level0,
-    colour_level0 and luminance_level0.   texture_size : (H, W, 2) texels, 1 where there is no texture.
+    The level of a look-up is log2 of the longer of the texel footprints of one pixel step in x and y (OpenGL 4.6,
+    section 8.14, eq. 8.7), from the exact derivatives of uv on the triangle's plane, plus ``mip_bias``; a GPU takes it
+    from 2 x 2 pixels. The albedo, and what follows from it (colour, luminance, log_luminance, dL_dt), is sampled at
+    that level by the CPU twin in :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full
+    resolution, are albedo_level0, colour_level0 and luminance_level0.   texture_size : (H, W,
+    2) texels, 1 where there is no texture.
     uv, level, albedo, light : what both passes should look up; luminance_albedo is the luminance of albedo.
     """
 
@@ -259,7 +263,8 @@ def open_reference(subject: Subject, when: When) -> ReferenceMoment:
 
 
 def luma_of(albedo: np.ndarray) -> np.ndarray:
-    """(..., 3) grey of the luminance of (..., 3) albedo: what the event pass, whose textures have one channel, shows as its albedo."""
+    """(..., 3) grey of the luminance of (..., 3) albedo: what the event pass, whose textures
+    have one channel, shows as its albedo."""
     return np.repeat((albedo @ LUMA)[..., None], 3, axis=-1)
 
 

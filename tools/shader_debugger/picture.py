@@ -1,4 +1,5 @@
-"""Arrays as pictures: colour maps, labelled PNGs with colour bars, the contact sheet, error maps. matplotlib draws with Agg."""
+"""Arrays as pictures: colour maps, labelled PNGs with colour bars, the contact sheet,
+error maps. matplotlib draws with Agg."""
 
 from __future__ import annotations
 

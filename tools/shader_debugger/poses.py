@@ -1,7 +1,8 @@
 """Where the surfaces that were drawn should be, and which other pose would have put them where they are.
 
-The debug pass says which point of which object a pixel shows. The true poses say where that point belongs; nothing of the ray
-caster is needed, and so a pose that is wrong is told apart from everything that is looked up or shaded later."""
+The debug pass says which point of which object a pixel shows. The true poses say where that point belongs; nothing of
+the ray caster is needed, and so a pose that is wrong is told apart from everything that is
+looked up or shaded later."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ ROUNDING = 0.01  # px; float32 leaves less
 
 
 def displaced(gpu, ref) -> np.ndarray:
-    """(H, W, 2) px from each pixel's centre to where the point drawn there lies by the true poses; 0 where nothing was drawn, inf where
-    that is out of the camera's sight."""
+    """(H, W, 2) px from each pixel's centre to where the point drawn there lies by the true poses; 0 where nothing was
+    drawn, inf where that is out of the camera's sight."""
     part = gpu["part"]
     out = np.zeros((*part.shape, 2))
     for p, (thing, _) in enumerate(reference.scene_parts(ref.scene)):
@@ -55,7 +56,8 @@ def pose_suspicions(comparison, report) -> list[str]:
     before = left(groups, now, now)
     off = displaced(gpu, ref)[wrong]
     shift = np.median(off, axis=0)
-    whole = {f"everything is shifted by ({-shift[0]:+.3g}, {-shift[1]:+.3g}) px (the principal point, or a pixel's centre)":
+    whole = {f"everything is shifted by ({-shift[0]:+.3g}, {-shift[1]:+.3g}) px (the principal point, or a "
+             "pixel's centre)":
              float(np.nan_to_num(np.quantile(np.linalg.norm(off - shift, axis=1), 0.9), nan=np.inf))}
     if not scene.camera_path.is_static:
         t = _best(scene, now, lambda t: left(groups, t, now))

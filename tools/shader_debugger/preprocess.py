@@ -1,8 +1,8 @@
 """Which lines of an expanded shader the preprocessor leaves alive: #if, #ifdef, #elif, #else, #define of plain values.
 
-Function-like macros are not expanded: lines are kept or dropped whole, which is all that listing declarations needs. The driver's
-own preprocessor remains the one that compiles. Conditions are those of GLSL 4.60, section 3.3: the operators of C on 32-bit integers,
-in a time that grows with the length of the text alone, whatever it says."""
+Function-like macros are not expanded: lines are kept or dropped whole, which is all that listing declarations needs.
+The driver's own preprocessor remains the one that compiles. Conditions are those of GLSL 4.60, section 3.3: the
+operators of C on 32-bit integers, in a time that grows with the length of the text alone, whatever it says."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def evaluate(expression: str, macros: dict[str, str]) -> bool:
 def value(expression: str, macros: dict[str, str]) -> int:
     """The 32-bit integer that an #if expression stands for, names that are not ``macros`` being 0.
 
-    A macro's own name is not expanded again inside its expansion (C++98 16.3.4, which GLSL follows). Raises ConditionError."""
+    A macro's own name is not expanded again inside its expansion (C++98 16.3.4, which GLSL
+    follows). Raises ConditionError."""
     return _Reader(_expanded(expression, macros)).all()
 
 

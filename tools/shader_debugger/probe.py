@@ -1,5 +1,5 @@
-"""One pixel: each buffer beside the float64 reference, where the point is in every frame of reference, and why it is invalid or
-occluded when it is."""
+"""One pixel: each buffer beside the float64 reference, where the point is in every frame of reference, and why it is
+invalid or occluded when it is."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
     """Plain data (JSON) about pixel (x, y):
 
     buffers  : rows of name, unit, gpu, reference, error, error_unit, ulps, ok (None: not graded here), note.
-    surface  : what the reference hit: object, category, instance, part, triangle, front, bary, corners …, and what the GPU drew.
-    positions: rows of name, gpu, reference (4 or 3 numbers each): local, camera, world, clip, window at t and t'.
-    why      : per direction, the reference's reason and the GPU's own for invalid or occluded ("": seen at both times).
+    surface  : what the reference hit: object, category, instance, part, triangle, front, bary, corners …, and what the
+    GPU drew. positions: rows of name, gpu, reference (4 or 3 numbers each): local, camera, world, clip, window at t and
+    t'. why      : per direction, the reference's reason and the GPU's own for invalid or
+                 occluded ("": seen at both times).
     """
     comparison = comparison or Comparison(gpu, ref)
     scene, when = ref.scene, gpu.when
@@ -70,7 +71,8 @@ def _row(name, gpu, ref, comparison, x, y) -> dict:
         error = float(comparison.errors(name)[y, x])
         row["ok"] = None if comparison.band[y, x] else error <= (quantity.tolerance if quantity.statistic == "max" else 0.5)
         if name in ("luminance", "colour"):
-            row["note"] = f"of the GPU's own albedo and light: {np.array2string(np.asarray(comparison.pair(name)[1][y, x]), precision=7)}, {error:.2g} off"
+            row["note"] = ("of the GPU's own albedo and light: "
+                           f"{np.array2string(np.asarray(comparison.pair(name)[1][y, x]), precision=7)}, {error:.2g} off")
     if name == "colour_albedo" and ref["level"][y, x] > 0:
         row["note"] = f"full resolution (level 0): {np.array2string(ref['albedo_level0'][y, x], precision=5)}"
     return row
@@ -102,7 +104,8 @@ def _barycentric(parts, p, gpu, x, y):
 
 
 def _positions(gpu, ref, x, y, seen) -> list[dict]:
-    """The GPU's clip position is what it used: gl_FragCoord at t; at t' the position and depth that its flow implies."""
+    """The GPU's clip position is what it used: gl_FragCoord at t; at t' the position and
+    depth that its flow implies."""
     scene, when = ref.scene, gpu.when
     P = scene.camera.clip_from_cam()
     size = np.array([scene.camera.width, scene.camera.height], float)
@@ -162,8 +165,8 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
     other = int(there["ids"][yn, xn])
     names = {thing.instance_id: thing.name for thing in renderer.scene.objects}
-    return (f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth {there['depth'][yn, xn]:.6g}, "
-            f"the point is at Z' = {w:.6g}")
+    return (f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth "
+            f"{there['depth'][yn, xn]:.6g}, the point is at Z' = {w:.6g}")
 
 
 # ------------------------------------------------------------------------------------------------- text
@@ -181,7 +184,8 @@ def as_text(found: dict) -> str:
         mark = {True: "", False: "!!", None: ""}[row["ok"]]
         error = "" if row["error"] is None else f"{row['error']:.3g}"
         count = "" if row["ulps"] is None else f"{row['ulps']:.3g}"
-        lines.append(f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} {error:>10} {count:>9}  {row['error_unit']}")
+        lines.append(f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} {error:>10} "
+                     f"{count:>9}  {row['error_unit']}")
         if row["note"]:
             lines.append(f"{'':24}{row['note']}")
     lines.append("")
@@ -215,4 +219,5 @@ def _surface_text(s: dict) -> str:
     bary = f", barycentrics {_numbers(s['bary'])}" if s["bary"] is not None else ""
     side = "" if "front" not in s else (", from the front" if s["front"] else ", from behind")
     texture = f", texture {s['texture']}" if s["texture"] else ""
-    return f"{s['object']} (id {s['instance']}, {s['category']}), part {s['part']} {s['mesh']}{texture}, triangle {s['triangle']}{bary}{side}"
+    return (f"{s['object']} (id {s['instance']}, {s['category']}), part {s['part']} {s['mesh']}{texture}, triangle "
+            f"{s['triangle']}{bary}{side}")

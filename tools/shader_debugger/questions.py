@@ -83,7 +83,8 @@ ROUTES: dict[str, dict[str, Reader]] = {
 
 
 def read_query(route: str, text: str) -> dict[str, Any]:
-    """Values of every parameter of a route in :data:`ROUTES`, from the text behind the question mark. Raises ConfigError."""
+    """Values of every parameter of a route in :data:`ROUTES`, from the text behind the
+    question mark. Raises ConfigError."""
     readers = ROUTES[route]
     if len(text) > LONGEST:
         raise ConfigError("the question is too long", where=route, value=len(text), accepted=f"at most {LONGEST} characters")

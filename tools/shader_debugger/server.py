@@ -1,11 +1,12 @@
 """``blinkgl shader serve``: the page and its few routes, over the standard library's HTTP handler.
 
-Listens on 127.0.0.1 unless told otherwise, answers only GET and HEAD of the routes below, and only when the Host header is its own
-address, so that no web site can reach it through a name that resolves to 127.0.0.1 (DNS rebinding). No path is ever turned into
-a file name: the page's three files are read by their fixed names.
+Listens on 127.0.0.1 unless told otherwise, answers only GET and HEAD of the routes below, and only when the Host header
+is its own address, so that no web site can reach it through a name that resolves to 127.0.0.1 (DNS rebinding). No path
+is ever turned into a file name: the page's three files are read by their fixed names.
 
-One thread collects requests, whoever sends them however slowly, and hands them over when their header is there: clients that say
-nothing hold no thread. What they can hold is bounded: connections, bytes of header, seconds, threads, and pages that wait.
+One thread collects requests, whoever sends them however slowly, and hands them over when their header is there: clients
+that say nothing hold no thread. What they can hold is bounded: connections, bytes of header,
+seconds, threads, and pages that wait.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ MOST_QUEUED = 64  # more get 503
 MOST_WAITING = 8  # of THREADS, pages that wait for an edit; more get 503
 LOCAL = ("127.0.0.1", "localhost", "::1")
 HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "X-Frame-Options": "DENY",
-           "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; connect-src 'self'; "
-                                      "base-uri 'none'; form-action 'none'"}
+           "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+                                      "connect-src 'self'; base-uri 'none'; form-action 'none'"}
 
 
 def host_allowed(header: str | None, bound: str, port: int) -> bool:
@@ -185,7 +186,8 @@ class _Arriving:
 
 
 class _Server:
-    """Collects headers in one thread, :meth:`run`, and has a few others answer. Raises OSError when it cannot listen."""
+    """Collects headers in one thread, :meth:`run`, and has a few others answer. Raises
+    OSError when it cannot listen."""
 
     worker: Worker
 

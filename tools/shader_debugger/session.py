@@ -65,7 +65,8 @@ class When:
 
 
 def open_subject(config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()) -> Subject:
-    """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number ``sequence`` (default: its first).
+    """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number
+    ``sequence`` (default: its first).
 
     Raises ConfigError and AssetError."""
     template = load_run(config, overrides, seed=seed)
@@ -116,7 +117,8 @@ def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
 
 
 class EditedFolder:
-    """A user's copy of shaders/, to which :data:`DEBUG_PROGRAM`, and what that includes, is lent when the copy is older than the debugger."""
+    """A user's copy of shaders/, to which :data:`DEBUG_PROGRAM`, and what that includes, is lent
+    when the copy is older than the debugger."""
 
     def __init__(self, folder: Path, inside: str = ""):
         self.path, self._inside = folder, inside
@@ -133,7 +135,8 @@ class EditedFolder:
 
 
 def open_folder(shaders: str | None):
-    """The folder whose shaders are debugged: ``shaders``, or the shipped ones. Raises GLError when it cannot be read."""
+    """The folder whose shaders are debugged: ``shaders``, or the shipped ones. Raises
+    GLError when it cannot be read."""
     if shaders is None:
         return shader_folder()
     folder = Path(shaders)
@@ -148,8 +151,8 @@ def open_folder(shaders: str | None):
 
 
 class Snapshot:
-    """The shader folder as it was at one moment. Programs compile when something first asks for them: without it, a variant asked
-    for after a bad edit would be compiled from the bad file."""
+    """The shader folder as it was at one moment. Programs compile when something first asks for them: without it, a
+    variant asked for after a bad edit would be compiled from the bad file."""
 
     def __init__(self, files: dict[str, bytes], path: str = ""):
         self._files, self.path = files, path
@@ -212,8 +215,8 @@ class DebugPainter(Painter):
 
 @dataclass(frozen=True)
 class Inspection(ScenePass):
-    """Which primitive wrote a pixel, and where on it; 0 where nothing is hit. In [..., 3] of LOCAL: number of the part + 1, an index into
-    ``reference.scene_parts``."""
+    """Which primitive wrote a pixel, and where on it; 0 where nothing is hit. In [..., 3] of LOCAL: number of the part
+    + 1, an index into ``reference.scene_parts``."""
 
     program: ClassVar[str] = DEBUG_PROGRAM
     outputs: ClassVar[tuple[Output, ...]] = (Output("TRIANGLE", "R32UI"), Output("LOCAL", "RGBA32F"), Output("WINDOW", "RGBA32F"))
@@ -258,7 +261,8 @@ LOOKUPS = {"luminance": LuminanceLookup(), "colour": ColourLookup()}
 
 
 class DebugRenderer(Renderer):
-    """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame may be other shaders' work."""
+    """The production renderer, with passes of its own. Always draws whole frames: what is kept from an earlier frame
+    may be other shaders' work."""
 
     def __init__(self, gl: GLContext, scene: Scene, config, painter: type[Painter] = DebugPainter):
         super().__init__(gl, scene, config, whole=True, painter=painter)
@@ -274,23 +278,25 @@ class DebugRenderer(Renderer):
         return {name: frame.read(name) for name in frame.names}
 
     def lookups(self, name: str, t_ns: int) -> dict[str, np.ndarray]:
-        """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant SHOW_LOOKUP):
-        result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, light, count (H, W), the number of look-ups; albedo (H, W, 3).
-        One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
+        """What the pass "luminance" or "colour" looks up and multiplies, float32, as its own source says it (variant
+        SHOW_LOOKUP): result (H, W[, 3]) as the pass writes it; uv (H, W, 2); level, light, count (H, W), the number of
+        look-ups; albedo (H, W, 3). One sample at the pixel's centre whatever the anti-aliasing; 0 where nothing is hit.
 
         Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
         program = LOOKUPS[name].program
         if "show_lookup(" not in "".join(line for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
                                          if not line.startswith("void")):
             raise ShaderError("does not show what it looks up", where=program,
-                              accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the shipped file')
+                              accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the '
+                                       'shipped file')
         frame = self.draw(LOOKUPS[name], t_ns)
         lookup, albedo = frame.read("lookup"), frame.read("albedo")
         return {"result": frame.read(name), "uv": lookup[..., :2], "level": lookup[..., 2], "light": lookup[..., 3], "albedo": albedo[..., :3],
                 "count": albedo[..., 3]}
 
     def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
-        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by the names of their labels: depth, ids …"""
+        """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by
+        the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}
         frame = self.draw(Geometry(names), t_ns, ends)
         return {name: frame.read(name) for name in names}

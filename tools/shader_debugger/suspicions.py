@@ -1,7 +1,8 @@
 """What an error looks like: usual mistakes that turn the right buffer into what the GPU wrote.
 
-Each candidate is the buffer that a correct pipeline with one mistake would give. A candidate that explains nearly every wrong pixel,
-and far better than the right values do, is named; first for the whole image, then, where nothing fits all, for single objects."""
+Each candidate is the buffer that a correct pipeline with one mistake would give. A candidate that explains nearly every
+wrong pixel, and far better than the right values do, is named; first for the whole image, then,
+where nothing fits all, for single objects."""
 
 from __future__ import annotations
 
@@ -136,7 +137,8 @@ def _depth(comparison, name, r, g, on) -> Candidates:
 
 
 def _screen_weights(comparison, on) -> np.ndarray:
-    """(N, 3) weights of the triangle's corners when they are interpolated linearly on the screen, as ``noperspective`` does."""
+    """(N, 3) weights of the triangle's corners when they are interpolated linearly on the
+    screen, as ``noperspective`` does."""
     ref = comparison.ref
     frame = ref.frame
     depths = np.ones((int(on.sum()), 3))
@@ -252,7 +254,8 @@ def _albedo(comparison, name, r, g, on) -> Candidates:
         yield "sRGB is decoded twice (before r, g, b are weighed)", np.repeat(twice[:, None], 3, axis=1)
     yield "sRGB is not decoded", srgb_from_linear(np.clip(r, 0, 1)).astype(np.float64)
     for steps in (1, -1, 2, -2):
-        yield f"sampled {abs(steps)} mip level{'s' * (abs(steps) > 1)} {'coarser' if steps > 0 else 'finer'} than its level says", \
+        yield (f"sampled {abs(steps)} mip level{'s' * (abs(steps) > 1)} {'coarser' if steps > 0 else 'finer'} than "
+               "its level says"), \
             comparison.twin(of, level=steps)[on]
     for x, y in product((0.5, -0.5, 0.0), repeat=2):
         if x or y:
@@ -296,7 +299,8 @@ def _light(comparison, name, r, g, on) -> Candidates:
     blend = _interpolated(comparison, on, "normals", ref.frame.bary[on])
     length = np.linalg.norm(blend, axis=1)
     yield "the interpolated normal is not normalised", light.sun * np.maximum(0.0, facing * length) + light.sky * (0.5 + 0.5 * up * length)
-    # in a frame of its own each: what the sun or the zenith is when it is left in world axes while the normal is in the object's
+    # in a frame of its own each: what the sun or the zenith is when it is left in world axes while the normal is in the
+    # object's
     local = _turned(comparison, on, normal, transposed=True)
     yield "the sun's direction is not turned into the object's axes", \
         light.sun * np.maximum(0.0, local @ np.asarray(light.sun_direction)) + light.sky * (0.5 + 0.5 * up)

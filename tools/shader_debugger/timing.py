@@ -1,19 +1,19 @@
 """GPU time of every pass that generation runs for this configuration, by timer queries (GL_TIMESTAMP before and after).
 
-A pass is timed as a whole, from clearing to the last draw, and waited for. Its *half-resolution twin* is the same pass of the same
-scene with a quarter of the pixels: with V the vertex work and F the fragment work, T = V + F and T_half = V + F / 4, hence
-F = 4/3 (T - T_half). "Vertex" is thus all that does not grow with the pixels: vertex work, clearing, draw calls, and on a
-software renderer, whose time stamps are the CPU's, the program that issues them. Program variants are timed draw by draw in a
-second run, each draw waited for, so that tiled and deferred rasterisers cannot put one draw's work into another's query; their
-sum is therefore larger than the pass.
+A pass is timed as a whole, from clearing to the last draw, and waited for. Its *half-resolution twin* is the same pass
+of the same scene with a quarter of the pixels: with V the vertex work and F the fragment work, T = V + F and T_half = V
++ F / 4, hence F = 4/3 (T - T_half). "Vertex" is thus all that does not grow with the pixels: vertex work, clearing,
+draw calls, and on a software renderer, whose time stamps are the CPU's, the program that issues them. Program variants
+are timed draw by draw in a second run, each draw waited for, so that tiled and deferred rasterisers cannot put one
+draw's work into another's query; their sum is therefore larger than the pass.
 
-llvmpipe bins a whole frame and answers queries tile by tile: inside an open frame, GL_TIME_ELAPSED is that of the last tile (a few
-µs instead of some ms). On software renderers the work is therefore waited for around each time stamp; it then agrees with the
-wall clock.
+llvmpipe bins a whole frame and answers queries tile by tile: inside an open frame, GL_TIME_ELAPSED is that of the last
+tile (a few µs instead of some ms). On software renderers the work is therefore waited for around each time stamp; it
+then agrees with the wall clock.
 
 Frames are drawn whole; under a still camera generation redraws only what moves, which takes less.
-overdraw: fragments that passed the depth test per pixel (GL_SAMPLES_PASSED), 1 when every pixel is shaded once. The first run
-of everything is not counted: programs compile then.
+overdraw: fragments that passed the depth test per pixel (GL_SAMPLES_PASSED), 1 when every pixel is shaded once. The
+first run of everything is not counted: programs compile then.
 """
 
 from __future__ import annotations
@@ -158,7 +158,8 @@ class TimedRenderer(DebugRenderer):
 
 
 def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
-    """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that generation runs for this configuration."""
+    """name -> (call on a renderer, its scale: samples per pixel along x and y) of each pass that
+    generation runs for this configuration."""
     config = subject.config
     asked, render = asked_for(config.labels), config.render
     rate = config.timeline.reconstruction == "hermite"
@@ -221,13 +222,13 @@ def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, r
 
 
 def as_text(result: dict) -> str:
-    lines = [(f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x {result['height']} px, "
-              f"{result['renderer']}, median of {result['repeat']}"), "",
-             (f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} {'fragments':>10} "
-              f"{'overdraw':>8}")]
+    lines = [(f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x "
+              f"{result['height']} px, {result['renderer']}, median of {result['repeat']}"), "",
+             (f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} "
+              f"{'fragments':>10} {'overdraw':>8}")]
     for p in result["passes"]:
-        lines.append(f"{p['pass']:<26} {p['gpu_ms']:>8.3f} {p['wall_ms']:>8.3f} {p['vertex_ms']:>8.3f} {p['fragment_ms']:>8.3f} {p['draws']:>6} "
-                     f"{p['triangles']:>9} {p['fragments']:>10} {p['overdraw']:>8.2f}")
+        lines.append(f"{p['pass']:<26} {p['gpu_ms']:>8.3f} {p['wall_ms']:>8.3f} {p['vertex_ms']:>8.3f} "
+                     f"{p['fragment_ms']:>8.3f} {p['draws']:>6} {p['triangles']:>9} {p['fragments']:>10} {p['overdraw']:>8.2f}")
     lines += ["", "per program variant, each draw waited for (the sum exceeds the pass):"]
     for p in result["passes"]:
         for v in p["variants"]:

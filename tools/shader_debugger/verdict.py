@@ -8,9 +8,11 @@ from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison, Report
 def verdict(comparison: Comparison, reports: list[Report]) -> dict:
     """Plain data (JSON).
 
-    passed : every buffer is within its tolerance.   first : {buffer, title, source, objects, suspicions} of the first that is not.
-    objects : per object that is over a tolerance, in the order of ``first``: object, first (buffer), x, y (the worst pixel there),
-    over_tolerance and pixels (of that buffer), then (the other buffers that are wrong), suspicion ("" when none fits)."""
+    passed : every buffer is within its tolerance.   first : {buffer, title, source, objects,
+                                                     suspicions} of the first that is not.
+    objects : per object that is over a tolerance, in the order of ``first``: object, first (buffer), x, y (the worst
+    pixel there), over_tolerance and pixels (of that buffer), then (the other buffers that are
+    wrong), suspicion ("" when none fits)."""
     order = list(QUANTITIES)
     failed = sorted((r for r in reports if not r.passed), key=lambda r: order.index(r.quantity.name))
     rows: dict[str, dict] = {}
@@ -49,6 +51,7 @@ def as_text(found: dict) -> list[str]:
     for row in found["objects"]:
         place = f"({row['x']}, {row['y']})"
         more = ", ".join(row["then"]) or "nothing"
-        lines.append(f"  {row['object']:<16} {QUANTITIES[row['first']].title:<22} {row['over_tolerance']:>7} {row['pixels']:>7}  {place:<12} {more}"
+        lines.append(f"  {row['object']:<16} {QUANTITIES[row['first']].title:<22} {row['over_tolerance']:>7} "
+                     f"{row['pixels']:>7}  {place:<12} {more}"
                      + (f"; {row['suspicion']}" if row["suspicion"] and row["suspicion"] not in first["suspicions"] else ""))
     return lines

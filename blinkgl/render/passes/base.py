@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 class Output(NamedTuple):
     """An attachment: ``layout(location = i)`` of the fragment stage for the i-th output of a pass.
 
-    format : key of :data:`blinkgl.gl.FORMATS`.   components : how many of its format's are given out, the first ones; 0: all.
+    format : key of :data:`blinkgl.gl.FORMATS`.   components : how many of its format's are
+                                                  given out, the first ones; 0: all.
     planes : names of its components where each is a picture of its own; they are then read by these names."""
 
     name: str
@@ -31,7 +32,8 @@ class Output(NamedTuple):
 
 class Input(NamedTuple):
     """What a pass reads of another one, at the same moment. sampler : the uniform that gets it.
-    output : name of an output of ``of`` (default: its first), or ``DEPTH_BUFFER``, where ``of`` keeps that as a texture."""
+    output : name of an output of ``of`` (default: its first), or ``DEPTH_BUFFER``, where
+    ``of`` keeps that as a texture."""
 
     sampler: str
     of: Pass
@@ -56,14 +58,16 @@ class Shot:
 
 
 class Pass:
-    """One kind of picture of a scene: what is drawn, by which program, into what. A pass is a value (a frozen dataclass) and holds nothing;
-    equal passes share their programs, target and memory, which belong to the renderer: ``renderer.draw(pass, t_ns)`` gives a Frame.
+    """One kind of picture of a scene: what is drawn, by which program, into what. A pass is a value (a frozen
+    dataclass) and holds nothing; equal passes share their programs, target and memory, which belong to the renderer:
+    ``renderer.draw(pass, t_ns)`` gives a Frame.
 
     program : file in shaders/, or the absolute path of one of your own (its includes are those of shaders/).
     outputs : what it writes.   inputs : what it reads, drawn before it.   samples, every : its size beside the image's.
     depth : whether it has a depth buffer; "texture": one that a later pass may read.
     still : whether a camera that stands still has only what moves drawn again.
-    pointwise : each pixel comes of the inputs' pixel at the same place, so that it does not change where they do not."""
+    pointwise : each pixel comes of the inputs' pixel at the same place, so that it does
+    not change where they do not."""
 
     program: ClassVar[str]
     outputs: tuple[Output, ...]
@@ -75,7 +79,8 @@ class Pass:
     pointwise: ClassVar[bool] = False
 
     def size(self, width: int, height: int) -> tuple[int, int]:
-        """Of its target, px, for an image of width x height: ``samples.grid`` times as fine, or every n-th pixel, at least one."""
+        """Of its target, px, for an image of width x height: ``samples.grid`` times as fine,
+        or every n-th pixel, at least one."""
         return max(1, width * self.samples.grid // self.every), max(1, height * self.samples.grid // self.every)
 
     def background(self, scene: Scene) -> tuple[float, ...]:
@@ -83,11 +88,13 @@ class Pass:
         return ()
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
-        """Of the program variant, for a kind of material (None: no material at all); TEXTURED, LIT and TWO_SIDED come on top."""
+        """Of the program variant, for a kind of material (None: no material at all);
+        TEXTURED, LIT and TWO_SIDED come on top."""
         return {}
 
     def seen(self, moment: Moment) -> Moment:
-        """The moment as this pass looks at it: the camera's, unless it draws for another one (``moment.from_place``)."""
+        """The moment as this pass looks at it: the camera's, unless it draws for another one
+        (``moment.from_place``)."""
         return moment
 
     def begin(self, painter: Painter, shot: Shot) -> None:

@@ -39,8 +39,8 @@ class _Luminance(ScenePass):
 
 @dataclass(frozen=True)
 class Luminance(_Luminance):
-    """Output "luminance" and, with ``rate``, "rate": d(luminance)/dt per second of each pixel as the surface it shows moves (edges that
-    pass are not in it), by a shader variant of its own. float32, (H, W) each, at ``samples``."""
+    """Output "luminance" and, with ``rate``, "rate": d(luminance)/dt per second of each pixel as the surface it shows
+    moves (edges that pass are not in it), by a shader variant of its own. float32, (H, W) each, at ``samples``."""
 
     rate: bool = False
     samples: Samples = Samples()
@@ -60,8 +60,8 @@ class Luminance(_Luminance):
 
 @dataclass(frozen=True)
 class Brightness(_Luminance):
-    """Output "brightness", (h, w, 2) float32: luminance and its rate per second on every n-th pixel in x and y, textures filtered as for
-    the whole image."""
+    """Output "brightness", (h, w, 2) float32: luminance and its rate per second on every n-th pixel in x and y,
+    textures filtered as for the whole image."""
 
     every: int = 1
     outputs: ClassVar[tuple[Output, ...]] = (Output("brightness", "RG32F"),)

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Velocity(ScenePass):
-    """Output "velocity", (h, w, 2) float32 px/s of the full-size image, 0 where nothing is hit, on every n-th pixel in x and y.
+    """Output "velocity", (h, w, 2) float32 px/s of the full-size image, 0 where nothing is
+    hit, on every n-th pixel in x and y.
     moving_only : leaves out objects that stand still, also where they hide something."""
 
     every: int = 1

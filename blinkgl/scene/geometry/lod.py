@@ -1,12 +1,13 @@
 """Level of detail: meshes with fewer triangles where the camera never comes near enough to show the difference.
 
-A level is chosen once per mesh, object and sequence, from the nearest that the object comes while it is in view. It never
-changes within a sequence, so it cannot make events; frames and ground truth are drawn from the same scene and agree.
+A level is chosen once per mesh, object and sequence, from the nearest that the object comes while it is in view. It
+never changes within a sequence, so it cannot make events; frames and ground truth are
+drawn from the same scene and agree.
 
-Level k has about 2^(-k/2) of the triangles. It is made by quadric edge collapse (fast-simplification) of the mesh as it is drawn: vertices
-that differ in normal or texture coordinates are different vertices there, so seams and creases are open borders, and borders
-are not touched. No crack can open and no texture can bleed over a seam. What a level got wrong is measured, and a level that
-would be wrong by more than ``error_px`` in the image is not used.
+Level k has about 2^(-k/2) of the triangles. It is made by quadric edge collapse (fast-simplification) of the mesh as it
+is drawn: vertices that differ in normal or texture coordinates are different vertices there, so seams and creases are
+open borders, and borders are not touched. No crack can open and no texture can bleed over a seam. What a level got
+wrong is measured, and a level that would be wrong by more than ``error_px`` in the image is not used.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from blinkgl.scene.geometry.nearest import incident_faces, walk_to_nearest
 from blinkgl.scene.types import Mesh, Part, Scene, SceneObject
 
 TIMES = 129
-"""Poses looked at in a sequence. Something nearer for a moment in between is drawn a little too coarse, but steadily so."""
+"""Poses looked at in a sequence. Something nearer for a moment in between is drawn a
+little too coarse, but steadily so."""
 MIN_FACES = 128
 _CACHE_BYTES = 256_000_000
 _cache: OrderedDict[tuple[str, int], Level] = OrderedDict()
@@ -35,8 +37,10 @@ class Level:
 
     vertices (V, 3) float64, faces (F, 3) int32, normals (V, 3) float32, uvs (V, 2) float32.
     origin : (V,) int64, the original vertex that this one is, unmoved; -1: a new one.
-    error  : how far the level lies from the original, bounding radii: the larger of the largest distance from a vertex of either to the
-             surface of the other, and the root mean square distance on the surface by which the texture is off at the original's vertices."""
+    error  : how far the level lies from the original, bounding radii: the larger of the largest
+    distance from a vertex of either to the
+             surface of the other, and the root mean square distance on the surface by which the
+             texture is off at the original's vertices."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -51,7 +55,8 @@ class Level:
 
 
 def at_level_of_detail(scene: Scene, config: LodConfig) -> Scene:
-    """The scene with meshes no finer than it needs, and a line in its log; the scene itself when ``config.enabled`` is false."""
+    """The scene with meshes no finer than it needs, and a line in its log; the scene itself
+    when ``config.enabled`` is false."""
     if not config.enabled:
         return scene
     objects, before, after = [], 0, 0
@@ -64,9 +69,9 @@ def at_level_of_detail(scene: Scene, config: LodConfig) -> Scene:
 
 
 def largest_scale(scene: Scene, obj: SceneObject, part: Part) -> float:
-    """Pixels in the image per unit of the part's surface, at most, while its bounding sphere is in view: a displacement d of any
-    direction at depth Z moves the image by at most f d / Z sqrt(1 + tan²) (pin-hole), with the tangent of the angle to the optical axis. inf
-    when the camera is as near as the near plane, 0 when the part never is in view."""
+    """Pixels in the image per unit of the part's surface, at most, while its bounding sphere is in view: a displacement
+    d of any direction at depth Z moves the image by at most f d / Z sqrt(1 + tan²) (pin-hole), with the tangent of the
+    angle to the optical axis. inf when the camera is as near as the near plane, 0 when the part never is in view."""
     times = np.linspace(scene.t0_ns, scene.t1_ns, TIMES).astype(np.int64)
     T_world_cam, T_world_obj = scene.camera_path.poses(times), obj.path.poses(times)
     centre, radius = bounding_sphere(part.mesh)
@@ -82,7 +87,8 @@ def bounding_sphere(mesh: Mesh) -> tuple[np.ndarray, float]:
 
 
 def _fitting(mesh: Mesh, scale: float, config: LodConfig) -> Mesh:
-    """The coarsest level whose edges are at most ``edge_px`` (in the mean) and which is wrong by at most ``error_px``."""
+    """The coarsest level whose edges are at most ``edge_px`` (in the mean) and which is wrong
+    by at most ``error_px``."""
     if not 0 < scale < np.inf or len(mesh.faces) < 2 * MIN_FACES:
         return mesh
     centre, radius = bounding_sphere(mesh)
@@ -116,8 +122,9 @@ def area(corners: np.ndarray) -> np.ndarray:
 
 
 def level_of(mesh: Mesh, k: int) -> Level:
-    """Level k >= 1, from the process's cache of levels by content. Two meshes that differ in place and size only share it: their
-    vertices are rounded to 1e-9 radii first, so that the level does not depend on which of them came first."""
+    """Level k >= 1, from the process's cache of levels by content. Two meshes that differ in place and size only share
+    it: their vertices are rounded to 1e-9 radii first, so that the level does not depend on
+    which of them came first."""
     centre, radius = bounding_sphere(mesh)
     unit = np.round((mesh.vertices - centre) / radius, 9) + 0.0
     digest = hashlib.blake2b(digest_size=16)
@@ -138,7 +145,8 @@ def _decimated(mesh: Mesh, faces: int) -> Level:
     renumbered[used] = np.arange(len(used))
     old, triangles = mesh.vertices[used], renumbered[mesh.faces]
     old_normals, old_uvs = mesh.normals[used], mesh.uvs[used].astype(np.float64)
-    # agg: how fast the bound on the error of one collapse is raised; with the default of 7 levels came out twice as wrong as with 4.
+    # agg: how fast the bound on the error of one collapse is raised; with the default of 7 levels came out twice as
+    # wrong as with 4.
     new, new_faces, collapses = fast_simplification.simplify(old, triangles, target_count=max(faces, 1), agg=4.0, preserve_border=True,
                                                              return_collapses=True)
     # The replay finds (V,) which new vertex each old one went into. Its own points are float32.
@@ -146,8 +154,8 @@ def _decimated(mesh: Mesh, faces: int) -> Level:
     new, new_faces = np.asarray(new, np.float64), np.asarray(new_faces, np.int32)
     old_at, new_at = incident_faces(triangles, len(old)), incident_faces(new_faces, len(new))
 
-    # New vertices take their attributes from the nearest point of the old surface, sought from a vertex that went into them: they
-    # stay on its side of every seam.
+    # New vertices take their attributes from the nearest point of the old surface, sought from a vertex that went into
+    # them: they stay on its side of every seam.
     went_in = np.zeros(len(new), np.int64)
     went_in[became] = np.arange(len(old))
     away, face, weights = walk_to_nearest(new, old_at[1][old_at[0][went_in]], old, triangles, *old_at)

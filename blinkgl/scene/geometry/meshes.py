@@ -40,8 +40,8 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
     log : gets a line for each repair.
 
     Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is turned round.
-    Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, too many
-    or no faces.
+    Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, too
+    many or no faces.
     """
     where, label = where or name or "mesh", name or where or "mesh"
     log = [] if log is None else log
@@ -118,17 +118,18 @@ def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def faces_in_float32(mesh: Mesh) -> np.ndarray:
     """(F,) bool, faces that still have a direction when a GPU has rounded the vertices to float32.
 
-    Rounding moves a corner by up to half of 2^-23 times its largest coordinate in each axis, so that corners on one line come
-    out as a triangle up to sqrt(3) times 2^-23 high: what is not higher than twice that unit is a line, and its normal and the
-    slopes of all that is interpolated over it are noise. NaN and what overflows is no line: the renderer refuses such meshes."""
+    Rounding moves a corner by up to half of 2^-23 times its largest coordinate in each axis, so that corners on one
+    line come out as a triangle up to sqrt(3) times 2^-23 high: what is not higher than twice that unit is a line, and
+    its normal and the slopes of all that is interpolated over it are noise. NaN and what overflows is no line: the
+    renderer refuses such meshes."""
     with np.errstate(over="ignore", invalid="ignore"):
         corners = mesh.vertices.astype(np.float32)[mesh.faces].astype(np.float64)
         return ~(_height_and_edge(corners)[0] <= 2.0**-22 * np.abs(corners).max(axis=(1, 2)))
 
 
 def without_collapsed_faces(scene: Scene) -> Scene:
-    """The scene without the faces that are lines in float32 (:func:`faces_in_float32`), and a line in its log that counts them;
-    the scene itself when there are none."""
+    """The scene without the faces that are lines in float32 (:func:`faces_in_float32`), and a line in its log that
+    counts them; the scene itself when there are none."""
     made: dict[int, Mesh | None] = {}  # id of a mesh -> without them; None: nothing is left
     objects, dropped = [], 0
     for obj in scene.objects:
@@ -181,8 +182,8 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
     """(closed, inside_out) of a welded mesh.
 
     Closed: every directed edge is met as often as its reverse (an oriented surface without a boundary, which also
-    admits solids that touch along an edge), and every shell has a positive volume or lies inside the bounding box of one
-    that has.
+    admits solids that touch along an edge), and every shell has a positive volume or lies inside the bounding box of
+    one that has.
     """
     alive = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
     welded = welded[alive]
@@ -212,8 +213,8 @@ def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
 
 
 def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
-    """:func:`closedness`; when that fails also over points merged within ``COARSE_WELD_RELATIVE`` of the extent, gaps that
-    no pixel can show."""
+    """:func:`closedness`; when that fails also over points merged within ``COARSE_WELD_RELATIVE`` of the extent, gaps
+    that no pixel can show."""
     closed, inside_out = closedness(points, welded)
     if closed:
         return closed, inside_out
@@ -228,8 +229,8 @@ def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool
 
 
 def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
-    """(F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point that are
-    joined by edges bent less than ``crease_degrees``."""
+    """(F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point that
+    are joined by edges bent less than ``crease_degrees``."""
     cross = _face_cross(vertices, faces)
     unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
     corners = vertices[faces]
@@ -309,7 +310,8 @@ def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, *
 
 
 def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
-    """Mesh under an affine (4, 4) or linear (3, 3) map; a mirroring one turns the faces round so that they keep facing out."""
+    """Mesh under an affine (4, 4) or linear (3, 3) map; a mirroring one turns the faces
+    round so that they keep facing out."""
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
     vertices = mesh.vertices @ linear.T + (matrix[:3, 3] if matrix.shape[0] == 4 else 0.0)

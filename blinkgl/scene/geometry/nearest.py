@@ -16,9 +16,10 @@ def incident_faces(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarra
 
 @numba.njit(**_JIT)
 def walk_to_nearest(points: np.ndarray, start: np.ndarray, vertices: np.ndarray, faces: np.ndarray, first: np.ndarray, face_at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(distance (n,), face (n,), weights (n, 3)) of the nearest point of the mesh to each point (n, 3): from face ``start`` (n,) to the
-    nearest of the faces that share a vertex with it, as long as one is nearer. A local minimum, never on a part of the mesh that is not
-    connected with the start: on the far side of a texture seam, say. Weights are barycentric."""
+    """(distance (n,), face (n,), weights (n, 3)) of the nearest point of the mesh to each point (n, 3): from face
+    ``start`` (n,) to the nearest of the faces that share a vertex with it, as long as one is nearer. A local minimum,
+    never on a part of the mesh that is not connected with the start: on the far side of a
+    texture seam, say. Weights are barycentric."""
     n = len(points)
     distance, found, weights = np.empty(n), np.empty(n, np.int64), np.empty((n, 3))
     trial = np.empty(3)
@@ -43,8 +44,8 @@ def walk_to_nearest(points: np.ndarray, start: np.ndarray, vertices: np.ndarray,
 
 @numba.njit(**_JIT)
 def _to_triangle(p, vertices, face, weights):
-    """Squared distance of ``p`` to a triangle; fills the weights of its nearest point: the foot of the perpendicular when
-    that is inside, else the nearest of the feet on the edges."""
+    """Squared distance of ``p`` to a triangle; fills the weights of its nearest point: the foot of the perpendicular
+    when that is inside, else the nearest of the feet on the edges."""
     uu = uv = vv = uw = vw = ww = 0.0
     for k in range(3):
         a = vertices[face[0], k]

@@ -28,7 +28,8 @@ PARAMETERS = {
     "extents": "edge lengths in x, y, z, m",
     "width": "edge in x, m",
     "depth": "edge in y, m",
-    "radius": "m; prism, pyramid: of the circle through the polygon's corners; torus: from the axis to the middle of the tube",
+    "radius": "m; prism, pyramid: of the circle through the polygon's corners; torus: from the axis to the "
+              "middle of the tube",
     "tube": "radius of the tube, m, less than radius",
     "height": "along z, m; capsule: of the cylinder between the two half spheres",
     "segments": "faces round the z axis",
@@ -273,8 +274,8 @@ def parameters(kind: str) -> dict[str, float | int | tuple[float, ...]]:
 
 
 def random_primitive(kind: str, index: int) -> Mesh:
-    """The ``index``-th body of a kind, about one unit large. No two have the same proportions, so that bodies of different
-    indices may be told apart by a train/test split; ``source_hash`` is of (kind, index)."""
+    """The ``index``-th body of a kind, about one unit large. No two have the same proportions, so that bodies of
+    different indices may be told apart by a train/test split; ``source_hash`` is of (kind, index)."""
     rng = np.random.default_rng([PRIMITIVE_KINDS.index(kind), index])
 
     def between(low: float, high: float) -> float:

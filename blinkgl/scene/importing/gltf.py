@@ -2,8 +2,8 @@
 
 Its own reader rather than trimesh's, because a scene's cameras, unlit and double-sided materials, node names and
 animations are wanted, and because every count and path a file claims has to be checked before it is believed.
-Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (buffers, accessors), 3.7 (meshes), 3.9 (materials),
-3.10 (cameras), 3.11 (animations); extensions KHR_materials_unlit, KHR_texture_transform.
+Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (buffers, accessors), 3.7 (meshes), 3.9
+(materials), 3.10 (cameras), 3.11 (animations); extensions KHR_materials_unlit, KHR_texture_transform.
 
 Coordinates stay as in the file (y up) until whoever asked turns them z up (:data:`Z_UP`). What a file asks for
 and is not drawn is collected in :attr:`Document.omissions`.
@@ -76,8 +76,8 @@ def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
 
 @dataclass(frozen=True)
 class Node:
-    """name, parent (None at the root), mesh and camera index (None without), rest translation, quaternion x y z w, scale
-    or matrix."""
+    """name, parent (None at the root), mesh and camera index (None without), rest translation, quaternion x y z w,
+    scale or matrix."""
 
     name: str
     parent: int | None
@@ -101,8 +101,8 @@ class Node:
 
 @dataclass(frozen=True, eq=False)
 class Channel:
-    """One animated property of a node: path translation | rotation | scale, times (K,) s, values (K, 3 or 4), interpolation
-    LINEAR | STEP | CUBICSPLINE (then values (K, 3, n): in-tangent, value, out-tangent)."""
+    """One animated property of a node: path translation | rotation | scale, times (K,) s, values (K, 3 or 4),
+    interpolation LINEAR | STEP | CUBICSPLINE (then values (K, 3, n): in-tangent, value, out-tangent)."""
 
     node: int
     path: str
@@ -405,7 +405,8 @@ def _needs(extension: str, where: str) -> AssetError:
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
-    """The file ``name`` below ``folder``. AssetError when it is absolute, leads out by ``..`` or by a link, or is missing."""
+    """The file ``name`` below ``folder``. AssetError when it is absolute, leads out by
+    ``..`` or by a link, or is missing."""
     target = Path(folder) / name
     try:
         within = (name and "\0" not in name and not Path(name).is_absolute() and "\\" not in name

@@ -1,8 +1,8 @@
 """What a glTF 2.0 file's JSON has to look like before it is believed: types, ranges, lengths of all that is read.
 
-The reader (:mod:`blinkgl.scene.importing.gltf`) works on the plain dictionaries; :func:`check` says that they have this shape.
-References from one list into another are checked where they are followed. Names are those of the specification. A
-property that nobody reads is not looked at.
+The reader (:mod:`blinkgl.scene.importing.gltf`) works on the plain dictionaries; :func:`check` says that they have this
+shape. References from one list into another are checked where they are followed. Names are those of the specification.
+A property that nobody reads is not looked at.
 """
 
 from __future__ import annotations

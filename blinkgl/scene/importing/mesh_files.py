@@ -1,4 +1,5 @@
-"""Mesh files (obj, ply, stl through trimesh; glb, gltf through :mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
+"""Mesh files (obj, ply, stl through trimesh; glb, gltf through
+:mod:`blinkgl.scene.importing.gltf`) as :class:`Asset` objects.
 
 What a file claims is checked against limits before anything is allocated for it, and nothing outside the file's own
 folder is read on its behalf.
@@ -61,8 +62,8 @@ def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_B
     keep_materials : parts with the file's materials; else one part, white, with texture coordinates that can carry any
         texture (projected where the file has none or degenerate ones).
     project_uvs : replace the file's texture coordinates; ``uv_size`` is the edge of one repeat.
-    Raises AssetError naming the file: missing, corrupt, NaN, no faces, more than ``max_faces`` triangles or ``max_bytes``
-    bytes, references outside its folder, an extension required that is not drawn.
+    Raises AssetError naming the file: missing, corrupt, NaN, no faces, more than ``max_faces`` triangles or
+    ``max_bytes`` bytes, references outside its folder, an extension required that is not drawn.
     """
     with reading("mesh", str(path)):
         return _load(Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size,

@@ -11,8 +11,8 @@ which is the next time looked at. A body that is thinner than its motion per fra
 Whichever pair is next in time is advanced first, so each step sees all earlier cuts.
 
 Distances: bounding spheres and separating faces of convex static bodies while these suffice, otherwise exact
-triangle-triangle distances (fcl). Two bodies collide when they come within ``tol = tolerance * (the smaller's radius)``;
-the cut is at a separation in (0, tol].
+triangle-triangle distances (fcl). Two bodies collide when they come within
+``tol = tolerance * (the smaller's radius)``; the cut is at a separation in (0, tol].
 
 Rest: a body that touches the ground (or a wall) at t0 was put there. Where that is flat (or convex: a slab), the body
 may slide on it, lift off and land; only sinking more than ``rest_margin`` of its radius into it counts as a
@@ -313,7 +313,8 @@ class _Search:
 
 
 def _body_speed(body: _Body, ta: int, tb: int) -> float:
-    """Upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round: turning moves it nowhere.)"""
+    """Upper bound over [ta, tb] of the speed of any of the body's points. (A pad is round:
+    turning moves it nowhere.)"""
     v, w = body.path.speed_bound(ta, tb)
     return v + w * body.reach
 

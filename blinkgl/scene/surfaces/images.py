@@ -138,7 +138,8 @@ def _most(pixels: int) -> str:
 
 
 def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
-    """Area average in linear light down to a longer side of ``max_size`` px; smaller images are returned as they are."""
+    """Area average in linear light down to a longer side of ``max_size`` px; smaller
+    images are returned as they are."""
     height, width = image.shape[:2]
     if max_size is None or max(height, width) <= max_size:
         return image
@@ -162,8 +163,9 @@ def shrink(image: np.ndarray, max_size: int | None) -> np.ndarray:
 
 def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.ndarray]:
     """The six sides of a box seen from its centre, from an equirectangular image: +x, -x, +y, -y, +z, -z, each (size,
-    size, 3) of the panorama's dtype, upright, not mirrored (right is right for the viewer inside). ``margin``: the image
-    reaches this fraction of a half edge over the box's edges, so that filtering near them finds what is really there.
+    size, 3) of the panorama's dtype, upright, not mirrored (right is right for the viewer inside). ``margin``: the
+    image reaches this fraction of a half edge over the box's edges, so that filtering near
+    them finds what is really there.
 
     The panorama's middle column is seen in direction +x, and longitude grows to the right, i.e. clockwise from above.
     """

@@ -40,8 +40,8 @@ _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 
 
 @dataclass(frozen=True)
 class InMemory:
-    """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand instead of what the
-    configuration says there."""
+    """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand
+    instead of what the configuration says there."""
 
     meshes: dict[str, Mesh] = field(default_factory=dict)
     textures: dict[str, Texture] = field(default_factory=dict)
@@ -83,7 +83,8 @@ def explicit_scene(config: ExplicitSceneConfig, camera: CameraModel, t0_ns: int,
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
-    """The configured pose over [t0, t1], or the path through its key frames (whose times are seconds on the sequence's clock)."""
+    """The configured pose over [t0, t1], or the path through its key frames (whose times are
+    seconds on the sequence's clock)."""
     if not config.keyframes:
         return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
@@ -95,7 +96,8 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
     """(4, 4) T_world_body.
 
     quaternion : the rotation itself; for a camera that of its OpenCV axes.
-    euler, or nothing : turned about the world's x, then y, then z, from rest; a camera at rest looks along +x with z up.
+    euler, or nothing : turned about the world's x, then y, then z, from rest; a camera
+    at rest looks along +x with z up.
     look_at : a camera's z axis (x level), an object's x axis (y level) points there.
     """
     T = np.eye(4)

@@ -5,7 +5,8 @@
     scene = from_pyrender(pyrender_scene, camera, t0_ns, t1_ns)
 
 ``camera`` is a :class:`~blinkgl.camera.CameraModel`. Each node that shows a mesh becomes one object; a
-node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up in all three, get OpenCV axes. glTF's world (y up) is turned z up.
+node's scale is baked into its vertices, what remains is its rigid pose. Cameras, which look along -z with y up in all
+three, get OpenCV axes. glTF's world (y up) is turned z up.
 """
 
 from __future__ import annotations
@@ -140,7 +141,8 @@ def from_pyrender(scene: Any, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 
                   intrinsics: str = "file", up: str = "z", light: Light | None = None, background: float | None = None, max_texture: int = 2048) -> Scene:
     """A ``pyrender.Scene`` (pyrender itself is not imported here).
 
-    camera : width, height and, with intrinsics="config", the rest; "file" takes the main camera's yfov or fx, fy, cx, cy.
+    camera : width, height and, with intrinsics="config", the rest; "file" takes the main
+    camera's yfov or fx, fy, cx, cy.
     light : None takes the direction of the first directional light, if there is one; strengths are BlinkGL's.
     background : None takes the mean of ``scene.bg_color``.
     """
@@ -190,8 +192,8 @@ def unlit(scene: Scene) -> Scene:
 
 
 def split_rigid(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(T, A), both (4, 4), with matrix = T @ A: T rigid, its rotation the nearest to the linear part (polar decomposition),
-    A what is left: scale, shear, mirroring."""
+    """(T, A), both (4, 4), with matrix = T @ A: T rigid, its rotation the nearest to the linear part (polar
+    decomposition), A what is left: scale, shear, mirroring."""
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-300:
@@ -274,7 +276,8 @@ def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0
         T, A = split_rigid(gltf.Z_UP @ document.world(node, values))
         first = A if first is None else first
         if np.abs(A - first).max() > 1e-3 * np.abs(first).max():
-            line = f"{document.path.name}: the changing scale of node '{document.nodes[node].name}' is not supported, its first one is kept"
+            line = (f"{document.path.name}: the changing scale of node '{document.nodes[node].name}' is not supported, "
+                    "its first one is kept")
             document.log.append(line)
         poses.append(T @ local)
     if any(c.interpolation == "STEP" for c in mine):

@@ -36,7 +36,8 @@ def split_of(source_hash: str, test_fraction: float) -> str:
 
 
 class ChangedAsset(AssetError):
-    """A file is not what it was when the pool was listed: which scenes are drawn would depend on when it was looked at."""
+    """A file is not what it was when the pool was listed: which scenes are drawn would
+    depend on when it was looked at."""
 
     def __init__(self, file: Path):
         super().__init__("the file has changed while it was in use", where=str(file), accepted="the file as it was, or a new run")
@@ -44,7 +45,8 @@ class ChangedAsset(AssetError):
 
 @dataclass(frozen=True)
 class Entry:
-    """One mesh or texture that can be loaded. ``source`` is the folder or kind of source, ``file`` None for generated ones."""
+    """One mesh or texture that can be loaded. ``source`` is the folder or kind of source,
+    ``file`` None for generated ones."""
 
     source_hash: str
     name: str
@@ -125,8 +127,9 @@ def _bytes_of(loaded: Texture | Asset) -> int:
 
 
 def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
-    """Primitives, mesh folders and pybullet's URDF meshes. Loads :class:`~blinkgl.scene.importing.mesh_files.Asset` objects that
-    are centred on their bounding box and have bounding radius 1. Raises ConfigError for a folder that is missing or holds no mesh."""
+    """Primitives, mesh folders and pybullet's URDF meshes. Loads :class:`~blinkgl.scene.importing.mesh_files.Asset`
+    objects that are centred on their bounding box and have bounding radius 1. Raises ConfigError for
+    a folder that is missing or holds no mesh."""
     kinds = PRIMITIVE_KINDS if config.primitives == "all" else config.primitives
     entries = []
     for kind in kinds:
@@ -152,7 +155,8 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
 
 
 def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.textures") -> Pool:
-    """Procedural textures, scikit-image's photographs and image folders. Loads :class:`~blinkgl.scene.types.Texture`."""
+    """Procedural textures, scikit-image's photographs and image folders. Loads
+    :class:`~blinkgl.scene.types.Texture`."""
     kinds = TEXTURE_KINDS if config.procedural is True else config.procedural or ()
     entries = [Entry(procedural_hash(kind, index), f"{kind}-{index}", "procedural", kind=kind, index=index)
                for kind in kinds for index in range(config.variants)]

@@ -1,7 +1,7 @@
 """Random worlds: a textured sky box, ground, walls, and objects from a pool, resting or flying, mostly in view.
 
-After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; way-points in free space joined by
-splines; whoever collides stops. The world is z up, in metres, ground at ``ground.height``.
+After "BlinkFlow" (IROS 2023), section III: random scale, rotation, texture and placement; way-points in free space
+joined by splines; whoever collides stops. The world is z up, in metres, ground at ``ground.height``.
 """
 
 from __future__ import annotations

@@ -83,7 +83,8 @@ def test_walking_finds_the_nearest_point():
 @pytest.mark.parametrize("mesh", [stone(), stone(seed=3), primitives.torus()],
                          ids=["stone0", "stone3", "torus"])
 def test_a_level_is_as_wrong_as_it_says_and_no_more(mesh):
-    """Hausdorff distance of densely sampled surfaces, both ways, and the texture at those points, against the level's own figure."""
+    """Hausdorff distance of densely sampled surfaces, both ways, and the texture at those
+    points, against the level's own figure."""
     centre, radius = bounding_sphere(mesh)
     for k in (2, 4):
         level = level_of(mesh, k)
@@ -168,7 +169,8 @@ def test_scale_is_that_of_the_nearest_visible_moment():
 @pytest.mark.parametrize("distance", [15.0, 40.0])
 @pytest.mark.parametrize("error_px", [0.3, 3.0])
 def test_silhouettes_and_edges_in_the_image(distance, error_px):
-    """In the image: the surface is off by at most error_px, edges are in the mean at most edge_px and not far below it."""
+    """In the image: the surface is off by at most error_px, edges are in the mean at most
+    edge_px and not far below it."""
     mesh = stone(subdivisions=5)
     config = LodConfig(enabled=True, edge_px=5.0, error_px=error_px)
     scene = one(mesh, at(distance))

@@ -1,4 +1,5 @@
-"""Primitives against formulas: closedness, outward winding, volume and area with their convergence order, normals, uvs."""
+"""Primitives against formulas: closedness, outward winding, volume and area with their
+convergence order, normals, uvs."""
 
 import math
 

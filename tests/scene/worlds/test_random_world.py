@@ -207,7 +207,8 @@ def message(make):
     ({"objects": {"count": -1}}, "scene.objects.count: too small (got -1)"),
     ({"objects": {"size": [2, 1]}}, "scene.objects.size: the range must be [smallest, largest] (got [2, 1])"),
     ({"objects": {"size": [0, 1]}}, "scene.objects.size.0: too small (got 0)"),
-    ({"pool": {"primitives": ["cube"]}}, "scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid (got ['cube'])"),
+    ({"pool": {"primitives": ["cube"]}}, ("scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, "
+                                         "capsule, prism, pyramid (got ['cube'])")),
     ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),
     ({"pool": {"test_fraction": 1.5}}, "scene.pool.test_fraction: too large (got 1.5); expected a number from 0 to 1"),
     ({"textures": {"procedural": ["noise"]}}, "scene.textures.procedural: must be true, false or a list of value, perlin,"),

@@ -33,8 +33,12 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _global_options(
-    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")
+    ] = False,
 ) -> None:
     """Event-camera and optical-flow data sets by rasterisation."""
 
@@ -58,19 +62,41 @@ def doctor(
 @app.command()
 def generate(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")],
-    num: Annotated[int | None, typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")] = None,
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="Folder for the data set; sequences go to OUT/SPLIT/NAME_000000 ….")
+    ],
+    num: Annotated[
+        int | None, typer.Option("--num", "-n", min=1, help="Number of sequences (default: output.sequences).")
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
-    workers: Annotated[int | None, typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone).")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", "-w", min=1, help="Processes to make sequences in (default: this one alone)."),
+    ] = None,
     executor: Annotated[str, typer.Option(help="Where workers run: local, or ray (extra [cluster]).")] = "local",
-    address: Annotated[str | None, typer.Option(help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1).")] = None,
+    address: Annotated[
+        str | None,
+        typer.Option(
+            help="ray: address of a running cluster (default: RAY_ADDRESS, else one of its own on 127.0.0.1)."
+        ),
+    ] = None,
     gpus: Annotated[float, typer.Option(min=0, help="ray: GPUs per worker; a fraction shares one.")] = 0.0,
-    devices: Annotated[str | None, typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")] = None,
+    devices: Annotated[
+        str | None, typer.Option(help="local: EGL devices dealt out to the workers, e.g. 0,1 (default: all cards).")
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a run: make only what is not whole.")] = False,
-    mixed: Annotated[bool, typer.Option("--mixed", help="Go on although recipe, assets or software have changed since the run began.")] = False,
-    time_limit: Annotated[float, typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers.")] = 3600.0,
+    mixed: Annotated[
+        bool,
+        typer.Option("--mixed", help="Go on although recipe, assets or software have changed since the run began."),
+    ] = False,
+    time_limit: Annotated[
+        float,
+        typer.Option(min=0, help="Seconds that one attempt at a sequence may take; 0: no limit. Needs --workers."),
+    ] = 3600.0,
 ) -> int:
     """Generate event + optical-flow sequences from one YAML file. Exit status 3: done, but
     some sequences were set aside."""
@@ -78,17 +104,31 @@ def generate(
     from blinkgl.show.executors import choose_executor
 
     chosen = choose_executor(executor, workers, address=address, gpus=gpus, devices=devices)
-    return command.run(config, out, num=num, seed=seed, overrides=overrides or [], quiet=quiet, executor=chosen, resume=resume, mixed=mixed,
-                       time_limit_s=time_limit)
+    return command.run(
+        config,
+        out,
+        num=num,
+        seed=seed,
+        overrides=overrides or [],
+        quiet=quiet,
+        executor=chosen,
+        resume=resume,
+        mixed=mixed,
+        time_limit_s=time_limit,
+    )
 
 
 @app.command()
 def verify(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set, split or sequence.")],
-    deep: Annotated[bool, typer.Option("--deep", help="Also generate a sample of sequences again and compare bit by bit.")] = False,
+    deep: Annotated[
+        bool, typer.Option("--deep", help="Also generate a sample of sequences again and compare bit by bit.")
+    ] = False,
     sample: Annotated[int, typer.Option(min=1, help="How many sequences --deep makes again.")] = 3,
     seed: Annotated[int, typer.Option(min=0, help="Which ones.")] = 0,
-    base: Annotated[str | None, typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")] = None,
+    base: Annotated[
+        str | None, typer.Option(help="Folder the recipe's relative paths start from (default: as the run recorded).")
+    ] = None,
 ) -> int:
     """Check a data set: names, manifests, checksums, contents, what the recipe draws. Exit status 2 when something is
     wrong; what could not be compared is noted, and said in the last line."""
@@ -100,9 +140,13 @@ def verify(
 @app.command()
 def explain(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
-    sequence: Annotated[int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
+    sequence: Annotated[
+        int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
+    ] = None,
 ) -> int:
     """Say what a run will model, what it leaves out and why, and what it will cost. Writes nothing."""
     from blinkgl.show import explain as command
@@ -113,27 +157,67 @@ def explain(
 @app.command()
 def trade(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")] = "trade",
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")] = False,
-    only: Annotated[list[str] | None, typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated.")] = None,
-    skip: Annotated[list[str] | None, typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated.")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")] = None,
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="Folder for trade.json, trade.csv, pareto.png and trade.html.")
+    ] = "trade",
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer settings, fewer pixels, a shorter clip: minutes.")
+    ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="TEXT", help="Only settings whose name contains this; may be repeated."),
+    ] = None,
+    skip: Annotated[
+        list[str] | None,
+        typer.Option("--skip", metavar="TEXT", help="No settings whose name contains this; may be repeated."),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Seed of the run (default: the file's).")] = None,
-    sequence: Annotated[int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")] = None,
-    clip: Annotated[float | None, typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")] = None,
-    limit_ms: Annotated[float, typer.Option(min=0.001, help="Events further apart than this are not the same event.")] = 10.0,
+    sequence: Annotated[
+        int | None, typer.Option("--sequence", min=0, help="Which sequence (default: the first).")
+    ] = None,
+    clip: Annotated[
+        float | None, typer.Option(min=1e-4, help="Simulated seconds (default: one label interval; --quick: 0.05).")
+    ] = None,
+    limit_ms: Annotated[
+        float, typer.Option(min=0.001, help="Events further apart than this are not the same event.")
+    ] = 10.0,
     rounds: Annotated[int | None, typer.Option(min=1, help="Timed rounds over all settings (default: 3).")] = None,
-    minutes: Annotated[float | None, typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long.")] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Give up on further rounds and finer references after about this long."),
+    ] = None,
     cost: Annotated[str, typer.Option(help="What the front is drawn over: wall, or cpu on a busy machine.")] = "wall",
-    reference: Annotated[str, typer.Option(help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
-                                           "small camera and a short --clip).")] = "raster",
+    reference: Annotated[
+        str,
+        typer.Option(
+            help="raster, or cycles: judge by the same scene path-traced (extra [cycles]; seconds per frame, so with a "
+            "small camera and a short --clip)."
+        ),
+    ] = "raster",
 ) -> int:
     """Measure what accuracy costs: settings timed and judged against a converged reference,
     as a table, a plot and a page."""
     from blinkgl.show import trade as command
 
-    return command.run(config, out, overrides=overrides or [], quick=quick, only=only or [], skip=skip or [], sequence=sequence, clip=clip,
-                       limit_ms=limit_ms, rounds=rounds, minutes=minutes, cost=cost, reference=reference, seed=seed)
+    return command.run(
+        config,
+        out,
+        overrides=overrides or [],
+        quick=quick,
+        only=only or [],
+        skip=skip or [],
+        sequence=sequence,
+        clip=clip,
+        limit_ms=limit_ms,
+        rounds=rounds,
+        minutes=minutes,
+        cost=cost,
+        reference=reference,
+        seed=seed,
+    )
 
 
 @app.command()
@@ -153,7 +237,9 @@ def export(
     folder: Annotated[str, typer.Argument(metavar="DIR", help="Data set.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Folder for the shards: SPLIT-000000.tar …")],
     shard_mb: Annotated[float, typer.Option("--shard-mb", min=1, help="Size of a shard.")] = 512.0,
-    seed: Annotated[int, typer.Option(min=0, help="Order of the samples; a reader then only has to shuffle shards.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Order of the samples; a reader then only has to shuffle shards.")
+    ] = 0,
 ) -> int:
     """Write a data set as WebDataset shards, one sample per flow label, for training from object storage."""
     from blinkgl.show import export as command
@@ -164,15 +250,34 @@ def export(
 @app.command()
 def simulate(
     source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
-    out: Annotated[str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")],
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")
+    ],
     emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
-    sensor: Annotated[str | None, typer.Option("--sensor", help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.")] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.",
+        ),
+    ] = None,
     config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,
-    overrides: Annotated[list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")] = None,
-    fps: Annotated[float | None, typer.Option(help="Frames per second (default: the video's, or the time stamps).")] = None,
-    timestamps: Annotated[str | None, typer.Option(help="File of frame times: µs as integers, or seconds with a point.")] = None,
-    gamma: Annotated[str | None, typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats).")] = None,
-    interpolate: Annotated[str, typer.Option(help="Between frames: linear, cubic, or motion (dense-flow warp).")] = "linear",
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="key=value", help="Emulator parameter; may be repeated.")
+    ] = None,
+    fps: Annotated[
+        float | None, typer.Option(help="Frames per second (default: the video's, or the time stamps).")
+    ] = None,
+    timestamps: Annotated[
+        str | None, typer.Option(help="File of frame times: µs as integers, or seconds with a point.")
+    ] = None,
+    gamma: Annotated[
+        str | None,
+        typer.Option(help="srgb, linear or an exponent (default: srgb for integer pixels, linear for floats)."),
+    ] = None,
+    interpolate: Annotated[
+        str, typer.Option(help="Between frames: linear, cubic, or motion (dense-flow warp).")
+    ] = "linear",
     max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
     factor: Annotated[int, typer.Option(min=1, max=1000, help="cubic: steps per given frame.")] = 4,
     seed: Annotated[int, typer.Option(help="Seed of the emulator.")] = 0,
@@ -183,15 +288,32 @@ def simulate(
     """Turn any video into events."""
     from blinkgl.show import simulate as command
 
-    return command.run(source, out, emulator=emulator, sensor=sensor, config=config, overrides=overrides or [], quiet=quiet, fps=fps,
-                       timestamps=timestamps, gamma=gamma, interpolate=interpolate, max_px=max_px, factor=factor, seed=seed, preview=preview,
-                       overwrite=overwrite)
+    return command.run(
+        source,
+        out,
+        emulator=emulator,
+        sensor=sensor,
+        config=config,
+        overrides=overrides or [],
+        quiet=quiet,
+        fps=fps,
+        timestamps=timestamps,
+        gamma=gamma,
+        interpolate=interpolate,
+        max_px=max_px,
+        factor=factor,
+        seed=seed,
+        preview=preview,
+        overwrite=overwrite,
+    )
 
 
 @app.command()
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="Event file.")],
-    b: Annotated[str | None, typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")] = None,
+    b: Annotated[
+        str | None, typer.Argument(metavar="B", help="Event file (of any size), or frames (video, folder, .npy).")
+    ] = None,
     frames: Annotated[str | None, typer.Option(help="Frames of the scene, for the log-intensity change.")] = None,
     out: Annotated[str | None, typer.Option("--out", "-o", help="Folder for compare.json and compare.png.")] = None,
     fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
@@ -205,24 +327,48 @@ def compare(
     intervals, polarity against brightness."""
     from blinkgl.show import compare as command
 
-    return command.run(a, b, out, frames=frames, fps=fps, timestamps=timestamps, gamma=gamma, frame_delay_ms=frame_delay_ms,
-                       interval_ms=interval_ms, zero_time=zero_time)
+    return command.run(
+        a,
+        b,
+        out,
+        frames=frames,
+        fps=fps,
+        timestamps=timestamps,
+        gamma=gamma,
+        frame_delay_ms=frame_delay_ms,
+        interval_ms=interval_ms,
+        zero_time=zero_time,
+    )
 
 
 @app.command()
 def convert(
-    source: Annotated[str, typer.Argument(metavar="IN", help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .txt, .csv, .npz, .npy.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="IN", help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .txt, .csv, .npz, .npy."
+        ),
+    ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],
     format: Annotated[str | None, typer.Option("--format", help="Where the ending leaves a choice, e.g. evt2.")] = None,
-    size: Annotated[str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")] = None,
-    zero_time: Annotated[bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")] = False,
-    time_unit: Annotated[str, typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's).")] = "s",
+    size: Annotated[
+        str | None, typer.Option(help="WIDTHxHEIGHT, where the file does not say (default: guessed).")
+    ] = None,
+    zero_time: Annotated[
+        bool, typer.Option("--zero-time", help="Shift times so that the first event is at 0.")
+    ] = False,
+    time_unit: Annotated[
+        str,
+        typer.Option("--time-unit", help="Of .txt and .csv: s (six decimals), or us (integers; a .csv as faery's)."),
+    ] = "s",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
 ) -> int:
     """Convert an event file from one format to another."""
     from blinkgl.show import convert as command
 
-    return command.run(source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite)
+    return command.run(
+        source, target, format=format, size=size, zero_time=zero_time, time_unit=time_unit, overwrite=overwrite
+    )
 
 
 # --- frame ------------------------------------------------------------------------------------------------------------
@@ -258,17 +404,31 @@ def run(arguments: list[str]) -> int:
         return BlinkGLError.exit_status
 
 
-OUT_OF_MEMORY = ("out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process "
-                 "('ulimit -v' shows it)")
-_MACHINE_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO, errno.ENAMETOOLONG,
-                   errno.EMFILE, errno.ENFILE, errno.EFBIG}
+OUT_OF_MEMORY = (
+    "out of memory; use a smaller image, fewer workers or shorter sequences, or raise the limit on the process "
+    "('ulimit -v' shows it)"
+)
+_MACHINE_ERRNOS = {
+    errno.ENOSPC,
+    errno.EDQUOT,
+    errno.EACCES,
+    errno.EPERM,
+    errno.EROFS,
+    errno.EIO,
+    errno.ENAMETOOLONG,
+    errno.EMFILE,
+    errno.ENFILE,
+    errno.EFBIG,
+}
 
 
 def _user_line(error: Exception) -> str | None:
     """The line for an error that the user or the machine caused; None for a bug."""
     if isinstance(error, BlinkGLError):
         return str(error)
-    if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # typer's usage errors; their class moved between versions
+    if hasattr(error, "format_message") and hasattr(
+        error, "exit_code"
+    ):  # typer's usage errors; their class moved between versions
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "blinkgl"
         message = " ".join(error.format_message().split()).rstrip(".")
@@ -294,8 +454,18 @@ def is_out_of_memory(error: BaseException | None) -> bool:
         if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
             return True
         text = str(error).lower()
-        if any(words in text for words in ("cannot allocate memory", "can't allocate memory", "insufficient memory", "bad_alloc", "out of memory",
-                                           "unable to allocate", "failed to map segment")):
+        if any(
+            words in text
+            for words in (
+                "cannot allocate memory",
+                "can't allocate memory",
+                "insufficient memory",
+                "bad_alloc",
+                "out of memory",
+                "unable to allocate",
+                "failed to map segment",
+            )
+        ):
             return True
         error = error.__cause__ or error.__context__
     return False

@@ -26,7 +26,7 @@ def _short(value: Any) -> str:
 def _plain(text: str) -> str:
     """One readable line: what a file or a key is called may hold anything, and be of any length."""
     text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
-    return text if len(text) <= _MAX_TEXT_CHARS else f"{text[:_MAX_TEXT_CHARS // 2]}…{text[-_MAX_TEXT_CHARS // 2:]}"
+    return text if len(text) <= _MAX_TEXT_CHARS else f"{text[: _MAX_TEXT_CHARS // 2]}…{text[-_MAX_TEXT_CHARS // 2 :]}"
 
 
 class BlinkGLError(Exception):
@@ -51,7 +51,11 @@ class BlinkGLError(Exception):
         if value is not ...:
             line += f" (got {_short(value)})"
         if accepted:
-            line += f"; expected {accepted}" if not accepted.startswith(("run ", "try ", "use ", "see ")) else f"; {accepted}"
+            line += (
+                f"; expected {accepted}"
+                if not accepted.startswith(("run ", "try ", "use ", "see "))
+                else f"; {accepted}"
+            )
         super().__init__(line)
 
 
@@ -85,9 +89,33 @@ class EventDataError(BlinkGLError):
     t_ns: int | None = None
 
 
-_MACHINE_TROUBLE = frozenset({errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EBUSY,
-                              errno.ENODEV, errno.ENXIO, errno.EREMOTEIO, errno.ECONNRESET})
-_BUGS = (TypeError, ValueError, LookupError, ArithmeticError, AttributeError, AssertionError, NameError, ImportError, NotImplementedError)
+_MACHINE_TROUBLE = frozenset(
+    {
+        errno.EIO,
+        errno.ESTALE,
+        errno.ETIMEDOUT,
+        errno.EAGAIN,
+        errno.EMFILE,
+        errno.ENFILE,
+        errno.ENOMEM,
+        errno.EBUSY,
+        errno.ENODEV,
+        errno.ENXIO,
+        errno.EREMOTEIO,
+        errno.ECONNRESET,
+    }
+)
+_BUGS = (
+    TypeError,
+    ValueError,
+    LookupError,
+    ArithmeticError,
+    AttributeError,
+    AssertionError,
+    NameError,
+    ImportError,
+    NotImplementedError,
+)
 
 
 def may_pass(error: BaseException) -> bool:

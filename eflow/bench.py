@@ -47,8 +47,18 @@ def machine() -> str:
     return f"{model}, {torch.get_num_threads()} threads, torch {torch.__version__}"
 
 
-def measure(name: str, height: int, width: int, *, training: bool = False, plain: bool = False, repeats: int = 5, warmup: int = 1,
-            precision: str = "fp32", batch: int = 1) -> dict[str, Any]:
+def measure(
+    name: str,
+    height: int,
+    width: int,
+    *,
+    training: bool = False,
+    plain: bool = False,
+    repeats: int = 5,
+    warmup: int = 1,
+    precision: str = "fp32",
+    batch: int = 1,
+) -> dict[str, Any]:
     """Median (and smallest) milliseconds of a forward pass (or forward + backward + AdamW step),
     GMACs of the forward pass and peak memory in MiB.
 
@@ -63,7 +73,10 @@ def measure(name: str, height: int, width: int, *, training: bool = False, plain
     if hasattr(model, "plain"):
         model.plain = plain
     data = {k: torch.randn(batch, model.representation.channels, height, width, device=device) for k in ("old", "new")}
-    target, valid = torch.zeros(batch, 2, height, width, device=device), torch.ones(batch, height, width, dtype=torch.bool, device=device)
+    target, valid = (
+        torch.zeros(batch, 2, height, width, device=device),
+        torch.ones(batch, height, width, dtype=torch.bool, device=device),
+    )
     optimizer = torch.optim.AdamW(model.parameters(), 1e-5)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
@@ -83,22 +96,44 @@ def measure(name: str, height: int, width: int, *, training: bool = False, plain
         began = time.perf_counter()
         step()
         times += [time.perf_counter() - began] if i >= warmup else []
-    peak = torch.cuda.max_memory_allocated() if device.type == "cuda" else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    peak = (
+        torch.cuda.max_memory_allocated()
+        if device.type == "cuda"
+        else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    )
     parameters, gmacs = count(config, height, width, plain=True)
-    return {"model": name, "height": height, "width": width, "batch": batch, "mode": "train" if training else "forward", "plain": plain,
-            "precision": precision, "ms": 1000 * statistics.median(times), "ms_min": 1000 * min(times), "gmacs": gmacs,
-            "gmacs_done": count(config, height, width, plain=False)[1] if not plain and not training else gmacs,
-            "parameters": parameters, "peak_mib": peak / 2**20, "machine": machine()}
+    return {
+        "model": name,
+        "height": height,
+        "width": width,
+        "batch": batch,
+        "mode": "train" if training else "forward",
+        "plain": plain,
+        "precision": precision,
+        "ms": 1000 * statistics.median(times),
+        "ms_min": 1000 * min(times),
+        "gmacs": gmacs,
+        "gmacs_done": count(config, height, width, plain=False)[1] if not plain and not training else gmacs,
+        "parameters": parameters,
+        "peak_mib": peak / 2**20,
+        "machine": machine(),
+    }
 
 
 def isolated(**options) -> dict[str, Any]:
     """:func:`measure` in a fresh process."""
     import json
 
-    code = ("import json\nfrom eflow.bench import "
-            f"measure\nprint(json.dumps(measure(**json.loads({json.dumps(json.dumps(options))}))))")
+    code = (
+        "import json\nfrom eflow.bench import "
+        f"measure\nprint(json.dumps(measure(**json.loads({json.dumps(json.dumps(options))}))))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     if done.returncode:
         tail = done.stderr.strip().splitlines()
-        return {**options, "model": options["name"], "error": "out of memory" if done.returncode < 0 else (tail[-1] if tail else "failed")}
+        return {
+            **options,
+            "model": options["name"],
+            "error": "out of memory" if done.returncode < 0 else (tail[-1] if tail else "failed"),
+        }
     return json.loads(done.stdout.splitlines()[-1])

@@ -36,15 +36,23 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
             head = file.read(9)
         # Eight bytes of header length, then JSON: a length may begin like a pickle, so the brace decides.
         if head[8:] != b"{" and (head[:2] == b"PK" or head[:1] == b"\x80"):
-            raise AssetError("is a PyTorch pickle, which could run any code when loaded; refused", where=str(path), accepted="a .safetensors file")
+            raise AssetError(
+                "is a PyTorch pickle, which could run any code when loaded; refused",
+                where=str(path),
+                accepted="a .safetensors file",
+            )
         with safe_open(path, framework="pt") as file:
             return {k: file.get_tensor(k) for k in file}, dict(file.metadata() or {})
     except FileNotFoundError:
         raise AssetError("no such file", where=str(path)) from None
     except OSError as error:
-        raise AssetError(f"cannot be read: {os.strerror(error.errno) if error.errno else error}".lower(), where=str(path)) from error
+        raise AssetError(
+            f"cannot be read: {os.strerror(error.errno) if error.errno else error}".lower(), where=str(path)
+        ) from error
     except SafetensorError as error:
-        raise AssetError(f"truncated or not a safetensors file ({' '.join(str(error).split())})", where=str(path)) from error
+        raise AssetError(
+            f"truncated or not a safetensors file ({' '.join(str(error).split())})", where=str(path)
+        ) from error
 
 
 def write_tensors(path: Path, tensors: dict[str, Tensor], metadata: dict[str, str]) -> None:
@@ -77,10 +85,14 @@ def find_checkpoint(path: str | os.PathLike, *, averaged: bool = True) -> Checkp
     if path.is_file():
         return Checkpoint(None, path)
     if not path.is_dir():
-        raise AssetError("no such checkpoint", where=str(path), accepted="a .safetensors file, a checkpoint folder or a run folder")
+        raise AssetError(
+            "no such checkpoint", where=str(path), accepted="a .safetensors file, a checkpoint folder or a run folder"
+        )
     folder = path if (path / "weights.safetensors").is_file() else newest(path)
     if folder is None:
-        raise AssetError("no checkpoint in this folder", where=str(path), accepted="weights.safetensors, or checkpoints/<step>")
+        raise AssetError(
+            "no checkpoint in this folder", where=str(path), accepted="weights.safetensors, or checkpoints/<step>"
+        )
     ema = folder / "ema.safetensors"
     return Checkpoint(folder, ema if averaged and ema.is_file() else folder / "weights.safetensors")
 
@@ -103,7 +115,9 @@ def load_model(path: str | os.PathLike, *, averaged: bool = True, expected: Any 
             raise AssetError("checkpoint of another format", where=str(file), value=metadata["format"], accepted=FORMAT)
         tree = json.loads(metadata["model"])
     except (KeyError, ValueError, RecursionError):
-        raise AssetError("safetensors file without a model configuration", where=str(file), accepted="a checkpoint of eflow train") from None
+        raise AssetError(
+            "safetensors file without a model configuration", where=str(file), accepted="a checkpoint of eflow train"
+        ) from None
     config = model_config(tree)
     if expected is not None:
         require_same(config, expected, str(file))
@@ -117,7 +131,12 @@ def require_same(found: Any, expected: Any, where: str) -> None:
     a, b = found.model_dump(), expected.model_dump()
     for key in ["name", *sorted(set(a) | set(b))]:
         if a.get(key) != b.get(key):
-            raise AssetError(f"checkpoint of another model: model.{key} differs", where=where, value=a.get(key), accepted=repr(b.get(key)))
+            raise AssetError(
+                f"checkpoint of another model: model.{key} differs",
+                where=where,
+                value=a.get(key),
+                accepted=repr(b.get(key)),
+            )
 
 
 def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> None:
@@ -130,17 +149,37 @@ def load_weights(model: FlowModel, tensors: dict[str, Tensor], where: str) -> No
         if name not in wanted:
             raise AssetError(f"holds a tensor '{name}' that this model has not", where=where)
         if wanted[name].shape != tensors[name].shape:
-            raise AssetError(f"tensor '{name}' has another shape", where=where, value=tuple(tensors[name].shape),
-                             accepted=str(tuple(wanted[name].shape)))
+            raise AssetError(
+                f"tensor '{name}' has another shape",
+                where=where,
+                value=tuple(tensors[name].shape),
+                accepted=str(tuple(wanted[name].shape)),
+            )
         if wanted[name].is_floating_point() != tensors[name].is_floating_point():
-            raise AssetError(f"tensor '{name}' has another type", where=where, value=str(tensors[name].dtype), accepted=str(wanted[name].dtype))
+            raise AssetError(
+                f"tensor '{name}' has another type",
+                where=where,
+                value=str(tensors[name].dtype),
+                accepted=str(wanted[name].dtype),
+            )
         if not torch.isfinite(tensors[name]).all():
-            raise AssetError(f"tensor '{name}' holds NaN or infinity", where=where, accepted="a checkpoint from before the training diverged")
+            raise AssetError(
+                f"tensor '{name}' holds NaN or infinity",
+                where=where,
+                accepted="a checkpoint from before the training diverged",
+            )
     model.load_state_dict(tensors)
 
 
-def save_checkpoint(run: Path, step: int, model: FlowModel, ema: dict[str, Tensor] | None, optimizer: torch.optim.Optimizer,
-                    state: dict[str, Any], keep: int) -> Path:
+def save_checkpoint(
+    run: Path,
+    step: int,
+    model: FlowModel,
+    ema: dict[str, Tensor] | None,
+    optimizer: torch.optim.Optimizer,
+    state: dict[str, Any],
+    keep: int,
+) -> Path:
     """Writes ``run/checkpoints/<step>`` whole or not at all, and then deletes all but the newest ``keep``."""
     final = run / "checkpoints" / f"{step:09d}"
     with output_errors(final):
@@ -156,7 +195,9 @@ def save_checkpoint(run: Path, step: int, model: FlowModel, ema: dict[str, Tenso
             write_tensors(temporary / "ema.safetensors", ema, metadata)
         write_tensors(temporary / "optimizer.safetensors", optimizer_tensors(model, optimizer), {"format": FORMAT})
         with output_errors(final):
-            (temporary / "state.json").write_text(json.dumps({"format": FORMAT, "step": step, **state}, indent=1) + "\n", encoding="utf-8")
+            (temporary / "state.json").write_text(
+                json.dumps({"format": FORMAT, "step": step, **state}, indent=1) + "\n", encoding="utf-8"
+            )
             fsync(temporary / "state.json")
             fsync(temporary)
             if final.exists():

@@ -19,13 +19,19 @@ app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=F
 
 Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
-Overrides = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
+]
 
 
 @app.callback()
 def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error; allowed after the command, too.")
+    ] = False,
 ) -> None:
     """Train, evaluate and run event-flow networks."""
 
@@ -41,7 +47,9 @@ def train(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/eflow/.")],
     out: Annotated[str, typer.Option("--out", "-o", help="Run folder to make (or to go on in, with --resume).")],
     overrides: Overrides = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in the run folder.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the newest checkpoint in the run folder.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
 ) -> None:
     """Train a network. SIGINT and SIGTERM write a checkpoint and exit 0."""
@@ -79,8 +87,16 @@ def evaluate(
     source = open_source(dataset, _format(format), dt=dt)
     console = plain_console(stderr=True)
     with console.status("evaluating") as status:
-        result = score(model, source, out, pictures=pictures, empty=empty, precision=precision, limit=limit,
-                       progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"))
+        result = score(
+            model,
+            source,
+            out,
+            pictures=pictures,
+            empty=empty,
+            precision=precision,
+            limit=limit,
+            progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
+        )
     show(result)
     if out:
         typer.echo(f"written: {out}/results.json")
@@ -91,14 +107,22 @@ def predict(
     checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
     events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
-    window_ms: Annotated[float, typer.Option("--window-ms", min=0.001, help="Δ: length of each of the two windows.")] = 100.0,
+    window_ms: Annotated[
+        float, typer.Option("--window-ms", min=0.001, help="Δ: length of each of the two windows.")
+    ] = 100.0,
     start_ms: Annotated[float | None, typer.Option("--start-ms", help="From this time after the first event.")] = None,
     end_ms: Annotated[float | None, typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
-    whole: Annotated[bool, typer.Option("--whole", help="One flow: first half against second half, scaled to the whole file.")] = False,
-    truth: Annotated[str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="One flow: first half against second half, scaled to the whole file.")
+    ] = False,
+    truth: Annotated[
+        str | None, typer.Option(help="Ground truth of the flow (.npy, .png, .flo): prints AEE and cosine.")
+    ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
-    warm_start: Annotated[bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")] = False,
+    warm_start: Annotated[
+        bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")
+    ] = False,
     empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
@@ -136,8 +160,10 @@ def predict(
             flow, tensor = predictor(window)
             flow = flow * np.float32(factor)
             count += 1
-            line = (f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
-                    f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px")
+            line = (
+                f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
+                f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px"
+            )
             if gt is not None:
                 valid = np.isfinite(gt).all(-1)
                 hit = np.zeros_like(valid)
@@ -146,13 +172,19 @@ def predict(
                 for name, mask in (("all pixels", valid), ("pixels with events", valid & hit)):
                     m, zero = frame_metrics(flow, gt, mask), frame_metrics(np.zeros_like(flow), gt, mask)
                     if m:
-                        line += (f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE "
-                                 f"{zero['AEE']:.3f} px")
+                        line += (
+                            f"\n  {name}: AEE {m['AEE']:.3f} px, cosine {m['cosine']:.4f}; zero flow AEE "
+                            f"{zero['AEE']:.3f} px"
+                        )
             typer.echo(line)
             if writer:
                 writer.add(window, flow, tensor, gt)
         if not count:
-            raise BlinkGLError(f"shorter than two windows of {span / 1000:g} ms", where=events, accepted="a smaller --window-ms, or --whole")
+            raise BlinkGLError(
+                f"shorter than two windows of {span / 1000:g} ms",
+                where=events,
+                accepted="a smaller --window-ms, or --whole",
+            )
     except BaseException as error:
         if writer:
             writer.__exit__(type(error), error, None)
@@ -181,17 +213,25 @@ def submit(
     precision = _precision(model, precision)
     with plain_console(stderr=True).status("predicting") as status:
         options = {"precision": precision, "progress": lambda i, n: status.update(f"{i}/{n} flows")}
-        count = submit_dsec(model, dataset, out, **options) if benchmark == "dsec" else submit_blinkflow(model, dataset, out, full=full, **options)
+        count = (
+            submit_dsec(model, dataset, out, **options)
+            if benchmark == "dsec"
+            else submit_blinkflow(model, dataset, out, full=full, **options)
+        )
     typer.echo(f"written and checked: {out}, {count} files")
 
 
 @app.command()
 def bench(
     model: Annotated[list[str] | None, typer.Option("--model", "-m", help="May be repeated; default: all.")] = None,
-    size: Annotated[list[str] | None, typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")] = None,
+    size: Annotated[
+        list[str] | None, typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")
+    ] = None,
     repeats: Annotated[int, typer.Option(min=1)] = 5,
     training: Annotated[bool, typer.Option("--training/--no-training", help="Also a training step.")] = True,
-    plain: Annotated[bool, typer.Option("--plain", help="Also the RAFT-style slow twin of lookup and upsampling.")] = False,
+    plain: Annotated[
+        bool, typer.Option("--plain", help="Also the RAFT-style slow twin of lookup and upsampling.")
+    ] = False,
     json_out: Annotated[str | None, typer.Option("--json", help="Also write the rows to this file.")] = None,
     precision: Precision = "fp32",
 ) -> None:
@@ -210,15 +250,39 @@ def bench(
     rows = []
     for name in names:
         for height, width in sizes:
-            modes = [(False, False)] + ([(False, True)] if plain and "flownet" not in name else []) + ([(True, False)] if training else [])
+            modes = (
+                [(False, False)]
+                + ([(False, True)] if plain and "flownet" not in name else [])
+                + ([(True, False)] if training else [])
+            )
             for train_mode, slow in modes:
-                rows.append(benchmark.isolated(name=name, height=height, width=width, training=train_mode, plain=slow, repeats=repeats, precision=precision))
+                rows.append(
+                    benchmark.isolated(
+                        name=name,
+                        height=height,
+                        width=width,
+                        training=train_mode,
+                        plain=slow,
+                        repeats=repeats,
+                        precision=precision,
+                    )
+                )
     table = Table(title=benchmark.machine())
     for c in ("model", "size", "mode", "ms", "GMACs", "M param", "peak MiB"):
         table.add_column(c, justify="left" if c in ("model", "mode") else "right")
     for r in rows:
-        mode = "training step" if r.get("training") or r.get("mode") == "train" else "forward, plain" if r.get("plain") else "forward"
-        cells = [r["error"], "", "", ""] if "error" in r else [f"{r['ms']:.0f}", f"{r['gmacs']:.1f}", f"{r['parameters'] / 1e6:.2f}", f"{r['peak_mib']:.0f}"]
+        mode = (
+            "training step"
+            if r.get("training") or r.get("mode") == "train"
+            else "forward, plain"
+            if r.get("plain")
+            else "forward"
+        )
+        cells = (
+            [r["error"], "", "", ""]
+            if "error" in r
+            else [f"{r['ms']:.0f}", f"{r['gmacs']:.1f}", f"{r['parameters'] / 1e6:.2f}", f"{r['peak_mib']:.0f}"]
+        )
         table.add_row(r["model"], f"{r['width']}x{r['height']}", mode, *cells)
     plain_console().print(table)
     if json_out:
@@ -263,7 +327,7 @@ def _one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
-    """"640x480" to (480, 640)."""
+    """ "640x480" to (480, 640)."""
     if text is None:
         return None
     width, x, height = text.lower().partition("x")

@@ -16,8 +16,12 @@ class VoxelConfig(Config):
     """Input of the correlation networks."""
 
     bins: int = Field(15, ge=2, le=64, description="time bins")
-    normalise: Literal["nonzero", "all", "none"] = Field("nonzero", description="cells that mean and std are taken over")
-    bounds: Literal["window", "events"] = Field("window", description="bins span the window, or its first to last event (E-RAFT's loader)")
+    normalise: Literal["nonzero", "all", "none"] = Field(
+        "nonzero", description="cells that mean and std are taken over"
+    )
+    bounds: Literal["window", "events"] = Field(
+        "window", description="bins span the window, or its first to last event (E-RAFT's loader)"
+    )
 
 
 class _Refined(Config):
@@ -26,9 +30,13 @@ class _Refined(Config):
     input: VoxelConfig = Field(VoxelConfig(), description="the voxel grid")
     iterations: int = Field(12, ge=1, le=64, description="GRU iterations in evaluation")
     train_iterations: int = Field(12, ge=1, le=64, description="GRU iterations in training")
-    context_norm: Literal["batch", "instance"] = Field("batch", description="norm of the context CNN; instance for batches of one or two")
+    context_norm: Literal["batch", "instance"] = Field(
+        "batch", description="norm of the context CNN; instance for batches of one or two"
+    )
     correlation: Literal["auto", "dense", "on_demand"] = Field("auto", description="auto: dense below 8192 tokens")
-    checkpoint_iterations: bool = Field(False, description="recompute each iteration in the backward pass: less memory, ~30 % slower")
+    checkpoint_iterations: bool = Field(
+        False, description="recompute each iteration in the backward pass: less memory, ~30 % slower"
+    )
 
 
 class EraftConfig(_Refined):
@@ -41,16 +49,22 @@ class EFlowFormerConfig(_Refined):
     """E-FlowFormer (BlinkFlow, IROS 2023)."""
 
     name: Literal["eflowformer"] = "eflowformer"
-    variant: Literal["base", "small", "twins"] = Field("base", description="4 layers; 2 layers; 2 layers with dense reduction")
+    variant: Literal["base", "small", "twins"] = Field(
+        "base", description="4 layers; 2 layers; 2 layers with dense reduction"
+    )
     layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: the variant's")
-    init: Literal["match", "zero"] = Field("match", description="start of the GRU: the matching layer's flow, or zero as E-RAFT")
+    init: Literal["match", "zero"] = Field(
+        "match", description="start of the GRU: the matching layer's flow, or zero as E-RAFT"
+    )
 
 
 class EvFlowNetConfig(Config):
     """EV-FlowNet (Zhu et al., RSS 2018), supervised."""
 
     name: Literal["ev_flownet"] = "ev_flownet"
-    input: Literal["counts", "voxel"] = Field("counts", description="4 channels of counts and latest times, or a voxel grid")
+    input: Literal["counts", "voxel"] = Field(
+        "counts", description="4 channels of counts and latest times, or a voxel grid"
+    )
     bins: int = Field(15, ge=2, le=64, description="time bins of the voxel input")
     width: int = Field(64, ge=4, le=512, multiple_of=2, description="channels of the first encoder; 64 as published")
 
@@ -81,7 +95,9 @@ class AugmentConfig(Config):
     horizontal_flip: Probability = Field(0.5, description="probability of mirroring left and right")
     vertical_flip: Probability = Field(0.1, description="probability of turning upside down")
     polarity: Probability = Field(0.5, description="probability that all polarities are swapped")
-    time_reversal: Probability = Field(0.0, description="film backwards, target the backward flow; needs backward labels")
+    time_reversal: Probability = Field(
+        0.0, description="film backwards, target the backward flow; needs backward labels"
+    )
     drop_probability: Probability = Field(0.3, description="probability that events are dropped")
     drop: float = Field(0.3, ge=0, lt=1, description="largest fraction of events dropped")
     hot_probability: Probability = Field(0.2, description="probability that hot pixels are added")
@@ -102,7 +118,9 @@ class SourceConfig(Config):
     """One data set."""
 
     path: str = Field(description="folder; relative to the YAML file")
-    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field("auto", description="layout of the set; auto: told by its files")
+    format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field(
+        "auto", description="layout of the set; auto: told by its files"
+    )
     dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
     weight: float = Field(1.0, gt=0, le=1e6, description="share of this set in the mixture")
 
@@ -117,7 +135,9 @@ class DataConfig(Config):
     batch: int = Field(6, ge=1, le=4096, description="samples per step, over all GPUs")
     workers: int = Field(0, ge=0, le=256, description="loader processes per GPU; 0 loads in the training process")
     empty: Literal["error", "skip"] = Field("error", description="a sample without events: stop, or take the next one")
-    augment: AugmentConfig | None = Field(AugmentConfig(), description="random changes to the training samples; null: none")
+    augment: AugmentConfig | None = Field(
+        AugmentConfig(), description="random changes to the training samples; null: none"
+    )
 
     @rule("crop", "augment.scale_probability")
     def _one_size(crop, scaling):
@@ -142,7 +162,9 @@ class RunConfig(Config):
     """How it runs and what it writes."""
 
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: a card where there is one")
-    precision: Literal["fp32", "bf16"] = Field("fp32", description="bf16: autocast with fp32 islands; fp32 where the device has no bf16 instructions")
+    precision: Literal["fp32", "bf16"] = Field(
+        "fp32", description="bf16: autocast with fp32 islands; fp32 where the device has no bf16 instructions"
+    )
     channels_last: bool = Field(False, description="memory layout that some cards convolve faster in")
     compile: bool = Field(False, description="torch.compile of the update step")
     threads: int | None = Field(None, ge=1, description="CPU threads; null: torch's choice")
@@ -151,7 +173,9 @@ class RunConfig(Config):
     checkpoint_every: int = Field(2000, ge=1, description="steps between checkpoints")
     keep_checkpoints: int = Field(3, ge=1, description="older ones are deleted")
     picture_every: int = Field(2000, ge=1, description="steps between sample pictures")
-    time_limit: float | None = Field(None, gt=0, description="minutes after which training stops with a last validation and a checkpoint; null: none")
+    time_limit: float | None = Field(
+        None, gt=0, description="minutes after which training stops with a last validation and a checkpoint; null: none"
+    )
 
 
 class TrainConfig(Config):
@@ -172,6 +196,13 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     path, tree = Path(path), read_table(path)
     config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p stays
-    sources = {k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k)) for k in ("train", "validate_on")}
-    return config.model_copy(update={"data": config.data.model_copy(update=sources),
-                                     "init_from": absolute(config.init_from) if config.init_from else None})
+    sources = {
+        k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k))
+        for k in ("train", "validate_on")
+    }
+    return config.model_copy(
+        update={
+            "data": config.data.model_copy(update=sources),
+            "init_from": absolute(config.init_from) if config.init_from else None,
+        }
+    )

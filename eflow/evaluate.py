@@ -32,8 +32,17 @@ that frame's ground truth: the best a network could say that saw only the global
 medians know the answer, so they are no methods."""
 
 
-def evaluate(model: FlowModel, source: Source, out: str | os.PathLike | None = None, *, pictures: int = 12, empty: str = "error",
-             precision: str = "fp32", limit: int | None = None, progress: Callable[[int, int, float], None] | None = None) -> dict[str, Any]:
+def evaluate(
+    model: FlowModel,
+    source: Source,
+    out: str | os.PathLike | None = None,
+    *,
+    pictures: int = 12,
+    empty: str = "error",
+    precision: str = "fp32",
+    limit: int | None = None,
+    progress: Callable[[int, int, float], None] | None = None,
+) -> dict[str, Any]:
     """Scores ``model`` on every labelled sample of ``source``.
 
     out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
@@ -49,7 +58,11 @@ def evaluate(model: FlowModel, source: Source, out: str | os.PathLike | None = N
     out = Path(out) if out is not None else None
     dataset = FlowDataset([source], model.representation, empty=empty)
     indices = [int(i) for i in np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round()]
-    shown = {indices[int(i)] for i in np.linspace(0, len(indices) - 1, min(pictures, len(indices))).round()} if pictures else set()
+    shown = (
+        {indices[int(i)] for i in np.linspace(0, len(indices) - 1, min(pictures, len(indices))).round()}
+        if pictures
+        else set()
+    )
     median = _set_median(dataset, indices)
     tallies = {name: Tally() for name in ("network", *BASELINES)}
     spent, sum_aee, scored = 0.0, 0.0, 0
@@ -62,7 +75,11 @@ def evaluate(model: FlowModel, source: Source, out: str | os.PathLike | None = N
         scene = batch["scene"][0]
         metrics = frame_metrics(flow, truth, valid)
         tallies["network"].add(scene, metrics)
-        for name, constant in zip(BASELINES, (np.zeros(2), median, np.median(truth[valid], axis=0) if valid.any() else np.zeros(2)), strict=True):
+        for name, constant in zip(
+            BASELINES,
+            (np.zeros(2), median, np.median(truth[valid], axis=0) if valid.any() else np.zeros(2)),
+            strict=True,
+        ):
             tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
         if metrics:
             sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
@@ -70,12 +87,18 @@ def evaluate(model: FlowModel, source: Source, out: str | os.PathLike | None = N
             progress(done, len(indices), sum_aee / max(scored, 1))
         if out is not None and i in shown:
             name = batch["name"][0].replace("/", "_")
-            write_picture(out / "pictures" / f"{name}.png", comparison(events_of(batch["new"][0].numpy()), flow, truth, valid))
+            write_picture(
+                out / "pictures" / f"{name}.png", comparison(events_of(batch["new"][0].numpy()), flow, truth, valid)
+            )
     if not scored:
         raise AssetError("no sample has a valid ground-truth pixel", accepted="a labelled data set")
     result = {
-        "model": json.loads(model.config.model_dump_json()), "parameters": parameters_of(model), "samples": len(indices),
-        "skipped": tallies["network"].skipped, "ms": 1000 * spent / len(indices), "device": _device_name(model),
+        "model": json.loads(model.config.model_dump_json()),
+        "parameters": parameters_of(model),
+        "samples": len(indices),
+        "skipped": tallies["network"].skipped,
+        "ms": 1000 * spent / len(indices),
+        "device": _device_name(model),
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
     }
     if out is not None:
@@ -111,13 +134,18 @@ def show(result: dict[str, Any], console: Console | None = None) -> None:
     """Two tables: all metrics of the network and the baselines; the network scene by scene. Fits 80 columns."""
     console = console or plain_console()
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
-    table = Table(title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on "
-                        f"{result['device']}")
+    table = Table(
+        title=f"{result['model']['name']}: {result['samples']} samples, {result['ms']:.0f} ms each on "
+        f"{result['device']}"
+    )
     table.add_column("")
     for name in result["methods"]:
         table.add_column(name, justify="right")
     for metric in NAMES:
-        table.add_row(f"{metric} {units.get(metric, '%')}".strip(), *(f"{m['total'][metric]:.3f}" for m in result["methods"].values()))
+        table.add_row(
+            f"{metric} {units.get(metric, '%')}".strip(),
+            *(f"{m['total'][metric]:.3f}" for m in result["methods"].values()),
+        )
     console.print(table)
     scenes = result["methods"]["network"]["scenes"]
     if len(scenes) > 1:

@@ -40,8 +40,12 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
     batch : old, new (N, C, H, W), optional flow_init. Raises EventDataError: too small."""
     height, width = batch["new"].shape[-2:]
     if min(height, width) < model.least:
-        raise EventDataError("input is too small for the network", where=type(model).__name__, value=(height, width),
-                             accepted=f"at least {model.least} px a side")
+        raise EventDataError(
+            "input is too small for the network",
+            where=type(model).__name__,
+            value=(height, width),
+            accepted=f"at least {model.least} px a side",
+        )
     device = next(model.parameters()).device
     batch = {k: v.to(device) if torch.is_tensor(v) else v for k, v in batch.items()}
     was_training = model.training
@@ -51,7 +55,9 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
             out = model(pad_batch(batch, model.divisor))
     finally:
         model.train(was_training)
-    return FlowPrediction([f[..., :height, :width].float() for f in out.flows], out.kind, out.has_match, out.low, out.backward_match)
+    return FlowPrediction(
+        [f[..., :height, :width].float() for f in out.flows], out.kind, out.has_match, out.low, out.backward_match
+    )
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,9 @@ class StreamWindow:
     new: Window
 
 
-def windows(file: EventFile, span_us: int, *, start_us: int | None = None, end_us: int | None = None) -> Iterator[StreamWindow]:
+def windows(
+    file: EventFile, span_us: int, *, start_us: int | None = None, end_us: int | None = None
+) -> Iterator[StreamWindow]:
     """Successive windows of an event file: reference times start + Δ, start + 2Δ, … while
     both windows lie inside [start, end).
 
@@ -100,7 +108,9 @@ def whole_file(file: EventFile) -> tuple[StreamWindow, float]:
 
 def _pair(events: Events, t: int, span: int) -> StreamWindow:
     old, new = events.window(t - span, t), events.window(t, t + span)
-    return StreamWindow(t, Window(old.x, old.y, old.t, old.p, t - span, t), Window(new.x, new.y, new.t, new.p, t, t + span))
+    return StreamWindow(
+        t, Window(old.x, old.y, old.t, old.p, t - span, t), Window(new.x, new.y, new.t, new.p, t, t + span)
+    )
 
 
 class Predictor:
@@ -108,7 +118,16 @@ class Predictor:
     (networks with an iterated low-resolution flow only). empty : "error", or "zero" flow for
     a window without events."""
 
-    def __init__(self, model: FlowModel, height: int, width: int, *, warm_start: bool = False, precision: str = "fp32", empty: str = "error"):
+    def __init__(
+        self,
+        model: FlowModel,
+        height: int,
+        width: int,
+        *,
+        warm_start: bool = False,
+        precision: str = "fp32",
+        empty: str = "error",
+    ):
         self.model, self.height, self.width = model, height, width
         self.warm_start, self.precision, self.empty = warm_start, precision, empty
         self._low: torch.Tensor | None = None
@@ -118,7 +137,10 @@ class Predictor:
         for name in ("old", "new"):
             w = getattr(window, name)
             if not len(w) and self.empty == "error":
-                raise EventDataError(f"no events in the {name} window [{w.t0}, {w.t1}) µs", accepted="use --empty zero to write zero flow there")
+                raise EventDataError(
+                    f"no events in the {name} window [{w.t0}, {w.t1}) µs",
+                    accepted="use --empty zero to write zero flow there",
+                )
         new = self.model.representation(window.new, self.height, self.width)
         if not (len(window.old) and len(window.new)):
             self._low = None
@@ -162,7 +184,9 @@ def read_truth(path: str | os.PathLike, height: int, width: int) -> np.ndarray:
         flow, valid = read_flow_png(path)
         flow = np.where(valid[..., None], flow, np.nan)
     if flow.shape != (height, width, 2):
-        raise AssetError("ground truth of another size", where=str(path), value=flow.shape, accepted=f"({height}, {width}, 2)")
+        raise AssetError(
+            "ground truth of another size", where=str(path), value=flow.shape, accepted=f"({height}, {width}, 2)"
+        )
     return flow
 
 
@@ -180,7 +204,11 @@ class FlowWriter:
             self.final.parent.mkdir(parents=True, exist_ok=True)
             remove_stale(self.final.parent)
             self._tmp = temporary_beside(self.final)
-            for folder in [self._tmp, *([self._tmp / "npy"] if self.npy else []), *([self._tmp / "pictures"] if self.pictures else [])]:
+            for folder in [
+                self._tmp,
+                *([self._tmp / "npy"] if self.npy else []),
+                *([self._tmp / "pictures"] if self.pictures else []),
+            ]:
                 folder.mkdir()
         return self
 

@@ -8,8 +8,15 @@ from torch import Tensor
 from eflow.models.contract import FlowPrediction
 
 
-def sequence_loss(prediction: FlowPrediction, flow: Tensor, valid: Tensor, *, gamma: float = 0.8, match_weight: float = 1.0,
-                  count: Tensor | None = None) -> Tensor:
+def sequence_loss(
+    prediction: FlowPrediction,
+    flow: Tensor,
+    valid: Tensor,
+    *,
+    gamma: float = 0.8,
+    match_weight: float = 1.0,
+    count: Tensor | None = None,
+) -> Tensor:
     """sum over i of w_i · mean over valid pixels of |V_i - V_gt|_1 (both components summed).
 
     flow : (N, 2, H, W) px. valid : (N, H, W) bool; what lies outside (|gt| >= 400 included) may hold anything, NaN too.

@@ -80,12 +80,17 @@ class Tally:
 
     def scenes(self) -> dict[str, dict[str, float]]:
         """Per scene, the mean over its frames, and their number."""
-        return {scene: {**{k: float(np.mean([f[k] for f in rows])) for k in rows[0]}, "frames": len(rows)}
-                for scene, rows in sorted(self.frames.items())}
+        return {
+            scene: {**{k: float(np.mean([f[k] for f in rows])) for k in rows[0]}, "frames": len(rows)}
+            for scene, rows in sorted(self.frames.items())
+        }
 
     def total(self) -> dict[str, float]:
         """Mean over scenes; empty when nothing was scored."""
         scenes = list(self.scenes().values())
         if not scenes:
             return {}
-        return {**{k: float(np.mean([s[k] for s in scenes])) for k in scenes[0] if k != "frames"}, "frames": sum(s["frames"] for s in scenes)}
+        return {
+            **{k: float(np.mean([s[k] for s in scenes])) for k in scenes[0] if k != "frames"},
+            "frames": sum(s["frames"] for s in scenes),
+        }

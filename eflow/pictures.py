@@ -32,7 +32,9 @@ def events_of(tensor: np.ndarray) -> np.ndarray:
     return event_colour(np.stack([level(-tensor), level(tensor)]))
 
 
-def comparison(events: np.ndarray, predicted: np.ndarray, truth: np.ndarray | None = None, valid: np.ndarray | None = None) -> np.ndarray:
+def comparison(
+    events: np.ndarray, predicted: np.ndarray, truth: np.ndarray | None = None, valid: np.ndarray | None = None
+) -> np.ndarray:
     """One RGB strip: events | ground truth | prediction | error (without truth: events | prediction). Flow panels share
     one scale: the 99th percentile of the true speed. events : (H, W, 3) uint8; flows (H, W, 2) px."""
     if truth is None or valid is None or not valid.any():
@@ -40,11 +42,16 @@ def comparison(events: np.ndarray, predicted: np.ndarray, truth: np.ndarray | No
     else:
         largest = float(np.percentile(np.hypot(*truth[valid].T), 99)) or 1.0
         error = np.hypot(*(np.moveaxis(predicted - truth, -1, 0)))
-        panels = [events, flow_colour(truth, largest, valid), flow_colour(predicted, largest), error_colour(error, max(3.0, largest / 2), valid)]
+        panels = [
+            events,
+            flow_colour(truth, largest, valid),
+            flow_colour(predicted, largest),
+            error_colour(error, max(3.0, largest / 2), valid),
+        ]
     height, width = events.shape[:2]
     strip = np.full((height, len(panels) * (width + _GAP) - _GAP, 3), 255, np.uint8)
     for i, panel in enumerate(panels):
-        strip[:, i * (width + _GAP):i * (width + _GAP) + width] = panel
+        strip[:, i * (width + _GAP) : i * (width + _GAP) + width] = panel
     return strip
 
 

@@ -21,8 +21,17 @@ class TrainProgress:
     where : device and precision, in words.   minutes : time limit, counted from ``began`` (s on ``clock``).
     rate : samples/s over the last steps."""
 
-    def __init__(self, steps: int, start: int, batch: int, enabled: bool, where: str = "", minutes: float | None = None,
-                 began: float | None = None, clock: Callable[[], float] = time.monotonic):
+    def __init__(
+        self,
+        steps: int,
+        start: int,
+        batch: int,
+        enabled: bool,
+        where: str = "",
+        minutes: float | None = None,
+        began: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
         self.steps, self.batch, self.enabled, self._clock = steps, batch, enabled, clock
         self.rate, self._loss, self._epe = 0.0, None, None
         self._step, self._time, self._said = start, clock(), -float("inf")
@@ -37,7 +46,12 @@ class TrainProgress:
             limit = "" if self._deadline is None else f", {_hms(self._deadline - self._clock())} at most"
             self._print(f"training: {self.steps - self._step} steps of {self.batch} samples on {self._where}{limit}")
         if self.enabled and self._console.is_terminal:
-            self._live = Progress(plain_column("step {task.completed}/{task.total}"), BarColumn(), plain_column("{task.fields[text]}"), console=self._console)
+            self._live = Progress(
+                plain_column("step {task.completed}/{task.total}"),
+                BarColumn(),
+                plain_column("{task.fields[text]}"),
+                console=self._console,
+            )
             self._task = self._live.add_task("train", total=self.steps, completed=self._step, text="")
             self._live.start()
         return self

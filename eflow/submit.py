@@ -19,14 +19,29 @@ from eflow.data.sources import FolderSource, open_source
 from eflow.infer import predict
 from eflow.models import FlowModel
 
-DSEC_SEQUENCES = ("interlaken_00_b", "interlaken_01_a", "thun_01_a", "thun_01_b", "zurich_city_12_a", "zurich_city_14_c", "zurich_city_15_a")
+DSEC_SEQUENCES = (
+    "interlaken_00_b",
+    "interlaken_01_a",
+    "thun_01_a",
+    "thun_01_b",
+    "zurich_city_12_a",
+    "zurich_city_14_c",
+    "zurich_city_15_a",
+)
 FULL, SAMPLED = 2502001, 2502002
 CELL = 4
 Progress = Callable[[int, int], None]
 
 
-def submit_dsec(model: FlowModel, root: str | os.PathLike, out: str | os.PathLike, *, sequences: tuple[str, ...] = DSEC_SEQUENCES,
-                precision: str = "fp32", progress: Progress | None = None) -> int:
+def submit_dsec(
+    model: FlowModel,
+    root: str | os.PathLike,
+    out: str | os.PathLike,
+    *,
+    sequences: tuple[str, ...] = DSEC_SEQUENCES,
+    precision: str = "fp32",
+    progress: Progress | None = None,
+) -> int:
     """Zip of ``<sequence>/<file_index:06d>.png`` for every row of each test sequence's
     CSV. Returns the number of files.
 
@@ -37,8 +52,12 @@ def submit_dsec(model: FlowModel, root: str | os.PathLike, out: str | os.PathLik
     found = {s.name for s in source.sequences}
     if found != set(sequences):
         missing, foreign = sorted(set(sequences) - found), sorted(found - set(sequences))
-        raise AssetError("not the benchmark's test sequences", where=str(root), value=(f"missing {missing[0]}" if missing else f"foreign {foreign[0]}"),
-                         accepted=f"exactly the {len(sequences)} test sequences")
+        raise AssetError(
+            "not the benchmark's test sequences",
+            where=str(root),
+            value=(f"missing {missing[0]}" if missing else f"foreign {foreign[0]}"),
+            accepted=f"exactly the {len(sequences)} test sequences",
+        )
     wanted = {f"{source.entry(i)[0].name}/{source.entry(i)[1].index:06d}.png" for i in range(len(source))}
     if len(wanted) != len(source):
         raise AssetError("a file index is listed twice", where=str(root))
@@ -46,7 +65,11 @@ def submit_dsec(model: FlowModel, root: str | os.PathLike, out: str | os.PathLik
         with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
             for i, flow in _flows(model, source, precision, progress):
                 sequence, entry = source.entry(i)
-                _member(archive, f"{sequence.name}/{entry.index:06d}.png", _dsec_png(flow, f"{sequence.name}/{entry.index:06d}"))
+                _member(
+                    archive,
+                    f"{sequence.name}/{entry.index:06d}.png",
+                    _dsec_png(flow, f"{sequence.name}/{entry.index:06d}"),
+                )
         check_dsec(temporary, wanted)
     return len(wanted)
 
@@ -55,7 +78,12 @@ def _dsec_png(flow: np.ndarray, name: str) -> bytes:
     """16-bit PNG with the third channel 0, as the benchmark asks."""
     png, lost = encode_flow_png(flow, np.ones(flow.shape[:2], bool))
     if lost:
-        raise OutputError("flow that the submission format cannot hold", where=name, value=f"{lost} pixels", accepted="finite flow within ±256 px")
+        raise OutputError(
+            "flow that the submission format cannot hold",
+            where=name,
+            value=f"{lost} pixels",
+            accepted="finite flow within ±256 px",
+        )
     raw = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
     raw[..., 0] = 0  # BGR: blue is the third channel on disk
     return encode_png(raw)
@@ -67,22 +95,37 @@ def check_dsec(path: str | os.PathLike, wanted: set[str], shape: tuple[int, int]
         names = archive.namelist()
         if sorted(names) != sorted(wanted):
             odd = sorted(set(names) ^ set(wanted)) or sorted(n for n in names if names.count(n) > 1)
-            raise OutputError("submission does not match the CSV", where=str(path), value=odd[0], accepted=f"{len(wanted)} files")
+            raise OutputError(
+                "submission does not match the CSV", where=str(path), value=odd[0], accepted=f"{len(wanted)} files"
+            )
         for name in names:
             image = cv2.imdecode(np.frombuffer(archive.read(name), np.uint8), cv2.IMREAD_UNCHANGED)
             if image is None or image.dtype != np.uint16 or image.shape != (*shape, 3) or image[..., 0].any():
-                raise OutputError("submission holds a wrong image", where=f"{path}: {name}", value=None if image is None else (str(image.dtype), image.shape),
-                                  accepted=f"16-bit RGB {shape} with the third channel 0")
+                raise OutputError(
+                    "submission holds a wrong image",
+                    where=f"{path}: {name}",
+                    value=None if image is None else (str(image.dtype), image.shape),
+                    accepted=f"16-bit RGB {shape} with the third channel 0",
+                )
 
 
-def submit_blinkflow(model: FlowModel, root: str | os.PathLike, out: str | os.PathLike, *, full: bool = False, precision: str = "fp32",
-                     progress: Progress | None = None) -> int:
+def submit_blinkflow(
+    model: FlowModel,
+    root: str | os.PathLike,
+    out: str | os.PathLike,
+    *,
+    full: bool = False,
+    precision: str = "fp32",
+    progress: Progress | None = None,
+) -> int:
     """Zip of ``<scene>/<seq>/<t0 ms>_<t1 ms>.flo`` in the benchmark's own format, one
     sampled pixel per 4x4 cell unless ``full``.
     Raises as :func:`submit_dsec`."""
     source = open_source(root, "blinkflow")
     assert isinstance(source, FolderSource)
-    name = lambda i: f"{source.entry(i)[0].name}/{source.entry(i)[1].from_us // 1000:d}_{source.entry(i)[1].to_us // 1000:d}.flo"
+    name = lambda i: (
+        f"{source.entry(i)[0].name}/{source.entry(i)[1].from_us // 1000:d}_{source.entry(i)[1].to_us // 1000:d}.flo"
+    )
     wanted = {name(i) for i in range(len(source))}
     sizes: dict[str, tuple[int, int]] = {}
     with atomic_file(out, overwrite=False) as temporary:
@@ -94,12 +137,16 @@ def submit_blinkflow(model: FlowModel, root: str | os.PathLike, out: str | os.Pa
                 sizes[name(i)] = flow.shape[:2]
         with zipfile.ZipFile(temporary) as archive:
             if sorted(archive.namelist()) != sorted(wanted):
-                raise OutputError("submission does not match the data set", where=str(out), accepted=f"{len(wanted)} files")
+                raise OutputError(
+                    "submission does not match the data set", where=str(out), accepted=f"{len(wanted)} files"
+                )
             for member in wanted:
                 decoded = decode(archive.read(member))
                 expected = (*sizes[member], 2) if full else (cells(*sizes[member]), 2)
                 if decoded.shape != expected or not np.isfinite(decoded).all():
-                    raise OutputError("submission holds a wrong file", where=member, value=decoded.shape, accepted=str(expected))
+                    raise OutputError(
+                        "submission holds a wrong file", where=member, value=decoded.shape, accepted=str(expected)
+                    )
     return len(wanted)
 
 

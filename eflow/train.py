@@ -67,7 +67,14 @@ def learning_rate(step: int, steps: int, peak: float, warmup: float) -> float:
     return peak + (end - peak) * min((step - top) / max(steps - top, 1), 1)
 
 
-def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, stop_after: int | None = None, quiet: bool = False) -> TrainResult:
+def train(
+    config: TrainConfig,
+    out: str | os.PathLike,
+    *,
+    resume: bool = False,
+    stop_after: int | None = None,
+    quiet: bool = False,
+) -> TrainResult:
     """Trains to ``config.optim.steps``. ``stop_after``: leave after this many steps of this call, as a signal would.
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
@@ -92,35 +99,73 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
     decay, no_decay = [], []
     for p in model.parameters():
         (decay if p.ndim > 1 else no_decay).append(p)
-    optimizer = torch.optim.AdamW([{"params": decay}, {"params": no_decay, "weight_decay": 0.0}], lr=config.optim.lr,
-                                  weight_decay=config.optim.weight_decay)
+    optimizer = torch.optim.AdamW(
+        [{"params": decay}, {"params": no_decay, "weight_decay": 0.0}],
+        lr=config.optim.lr,
+        weight_decay=config.optim.weight_decay,
+    )
     ema = {k: v.detach().clone() for k, v in model.state_dict().items()} if config.optim.ema else None
     start = _resume(out, config, model, optimizer, ema) if resume else 0
 
     sources = [open_source(s.path, s.format, dt=s.dt) for s in config.data.train]
-    dataset = FlowDataset(sources, model.representation, seed=config.seed, augment=config.data.augment, crop=config.data.crop, empty=config.data.empty)
+    dataset = FlowDataset(
+        sources,
+        model.representation,
+        seed=config.seed,
+        augment=config.data.augment,
+        crop=config.data.crop,
+        empty=config.data.empty,
+    )
     _check_sizes(dataset, model, config.data.crop)
     validation = _validation(config, model) if lead else []
     mixture = Mixture([len(s) for s in sources], [s.weight for s in config.data.train], config.seed)
     if config.data.batch % world:
-        raise ConfigError("not a multiple of the number of processes", where="data.batch", value=config.data.batch, accepted=f"a multiple of {world}")
+        raise ConfigError(
+            "not a multiple of the number of processes",
+            where="data.batch",
+            value=config.data.batch,
+            accepted=f"a multiple of {world}",
+        )
     steps = config.optim.steps
     stop = steps if stop_after is None else min(steps, start + stop_after)
     sampler = StepSampler(mixture, config.data.batch, start, stop, rank, world)
 
     if config.run.compile and hasattr(model, "update"):
         model.update.compile()
-    net = DistributedDataParallel(model, device_ids=[device.index] if device.type == "cuda" else None) if world > 1 else model
+    net = (
+        DistributedDataParallel(model, device_ids=[device.index] if device.type == "cuda" else None)
+        if world > 1
+        else model
+    )
     net.train()
     if lead:
         _write_config(out, config)
     step, reason, loss_value, began = start, "finished", float("nan"), time.monotonic()
 
     def save() -> Path:
-        return ckpt.save_checkpoint(out, step, model, ema, optimizer, {"config": json.loads(config.model_dump_json())}, config.run.keep_checkpoints)
+        return ckpt.save_checkpoint(
+            out,
+            step,
+            model,
+            ema,
+            optimizer,
+            {"config": json.loads(config.model_dump_json())},
+            config.run.keep_checkpoints,
+        )
 
-    with _Signals() as signals, _Log(out, start, enabled=lead) as log, TrainProgress(
-            steps, start, config.data.batch, enabled=lead and not quiet, where=f"{device.type}, {precision}", minutes=config.run.time_limit, began=began) as progress:
+    with (
+        _Signals() as signals,
+        _Log(out, start, enabled=lead) as log,
+        TrainProgress(
+            steps,
+            start,
+            config.data.batch,
+            enabled=lead and not quiet,
+            where=f"{device.type}, {precision}",
+            minutes=config.run.time_limit,
+            began=began,
+        ) as progress,
+    ):
         for batch in batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"):
             rate = learning_rate(step, steps, config.optim.lr, config.optim.warmup)
             for group in optimizer.param_groups:
@@ -141,13 +186,21 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
             progress.update(step, loss_value, epe)
             last = step == stop
             if lead and (step % config.run.log_every == 0 or last):
-                log.write(step, "train", loss=loss_value, epe=epe, lr=rate, grad_norm=float(norm), samples_per_s=progress.rate)
+                log.write(
+                    step, "train", loss=loss_value, epe=epe, lr=rate, grad_norm=float(norm), samples_per_s=progress.rate
+                )
             if lead and step % config.run.picture_every == 0:
                 _picture(out / "pictures" / f"{step:09d}.png", batch, flow)
-            reason = signals.reason or ("time limit" if _over(began, config.run.time_limit) else None) or ("stop" if last and step < steps else reason)
+            reason = (
+                signals.reason
+                or ("time limit" if _over(began, config.run.time_limit) else None)
+                or ("stop" if last and step < steps else reason)
+            )
             if world > 1 and not last:
                 reason = _agree(reason, device)
-            ended = step == steps or reason == "time limit"  # the clock ends a training as its last step does; a signal is in a hurry
+            ended = (
+                step == steps or reason == "time limit"
+            )  # the clock ends a training as its last step does; a signal is in a hurry
             if lead and validation and (step % config.run.validate_every == 0 or ended):
                 scores = validate(model, ema, validation, config.run.precision)
                 log.write(step, "validation", **scores)
@@ -168,14 +221,26 @@ def train(config: TrainConfig, out: str | os.PathLike, *, resume: bool = False, 
 def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, float, Tensor]:
     """loss, end-point error of the last field, and that field."""
     kind = batch["new"].device.type
-    with _compile_errors(config.run.compile), torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"):
+    with (
+        _compile_errors(config.run.compile),
+        torch.autocast(kind, torch.bfloat16, enabled=config.run.precision == "bf16"),
+    ):
         prediction = net({k: batch[k] for k in ("old", "new")})
     count = None
-    if world > 1:  # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels
+    if (
+        world > 1
+    ):  # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels
         count = batch["valid"].sum().float()
         dist.all_reduce(count)
         count = count / world
-    loss = sequence_loss(prediction, batch["flow"], batch["valid"], gamma=config.optim.gamma, match_weight=config.optim.match_weight, count=count)
+    loss = sequence_loss(
+        prediction,
+        batch["flow"],
+        batch["valid"],
+        gamma=config.optim.gamma,
+        match_weight=config.optim.match_weight,
+        count=count,
+    )
     with torch.no_grad():
         error = (prediction.flow - torch.where(batch["valid"][:, None], batch["flow"], 0)).norm(dim=1)
         epe = float(error[batch["valid"]].mean()) if batch["valid"].any() else 0.0
@@ -190,12 +255,19 @@ def _compile_errors(enabled: bool):
     except Exception as error:
         if enabled and type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
             reason = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            raise ConfigError(f"torch.compile does not work here: {reason}", where="run.compile", value=True, accepted="false") from error
+            raise ConfigError(
+                f"torch.compile does not work here: {reason}", where="run.compile", value=True, accepted="false"
+            ) from error
         raise
 
 
 @torch.no_grad()
-def validate(model: FlowModel, ema: dict[str, Tensor] | None, validation: list[tuple[str, FlowDataset, list[int]]], precision: str) -> dict[str, float]:
+def validate(
+    model: FlowModel,
+    ema: dict[str, Tensor] | None,
+    validation: list[tuple[str, FlowDataset, list[int]]],
+    precision: str,
+) -> dict[str, float]:
     """AEE per validation set, with the averaged weights; ``zero`` is the AEE of zero flow on the same samples."""
     own = {k: v.detach().clone() for k, v in model.state_dict().items()} if ema is not None else None
     if ema is not None:
@@ -211,7 +283,9 @@ def validate(model: FlowModel, ema: dict[str, Tensor] | None, validation: list[t
                 metrics, zero = frame_metrics(flow, truth, valid), frame_metrics(np.zeros_like(flow), truth, valid)
                 if metrics:
                     rows.append((metrics["AEE"], zero["AEE"]))
-            scores[f"{name}/AEE"], scores[f"{name}/zero"] = (float(v) for v in np.mean(rows, axis=0)) if rows else (float("nan"),) * 2
+            scores[f"{name}/AEE"], scores[f"{name}/zero"] = (
+                (float(v) for v in np.mean(rows, axis=0)) if rows else (float("nan"),) * 2
+            )
         return scores
     finally:
         if own is not None:
@@ -241,7 +315,12 @@ def _setup(config: TrainConfig) -> tuple[int, int, torch.device]:
 def _weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
     model = ckpt.load_model(config.init_from, expected=None)
     if model.config.name != config.model.name:
-        raise AssetError("checkpoint of another model", where=f"init_from: {config.init_from}", value=model.config.name, accepted=config.model.name)
+        raise AssetError(
+            "checkpoint of another model",
+            where=f"init_from: {config.init_from}",
+            value=model.config.name,
+            accepted=config.model.name,
+        )
     return model.state_dict(), config.init_from
 
 
@@ -254,8 +333,12 @@ def _check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] |
         sizes = {f"data.crop is not set, {s.name}": (s.height, s.width) for s in firsts}
     for where, size in sizes.items():
         if min(size) < model.least or any(side % model.divisor for side in size):
-            raise ConfigError("a size the network cannot train on", where=where, value=tuple(size),
-                              accepted=f"multiples of {model.divisor}, at least {model.least} px: set data.crop")
+            raise ConfigError(
+                "a size the network cannot train on",
+                where=where,
+                value=tuple(size),
+                accepted=f"multiples of {model.divisor}, at least {model.least} px: set data.crop",
+            )
 
 
 _FREE = {"run"}
@@ -270,9 +353,17 @@ def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) ->
     state = ckpt.read_state(folder)
     saved, now = state.get("config", {}), json.loads(config.model_dump_json())
     for path in sorted(set(_leaves(saved)) | set(_leaves(now))):
-        if path.split(".")[0] not in _FREE and path != "data.workers" and _leaves(saved).get(path) != _leaves(now).get(path):
-            raise ConfigError("differs from the run that is resumed", where=path, value=_leaves(now).get(path),
-                              accepted=f"{_leaves(saved).get(path)!r}, or a new run with init_from")
+        if (
+            path.split(".")[0] not in _FREE
+            and path != "data.workers"
+            and _leaves(saved).get(path) != _leaves(now).get(path)
+        ):
+            raise ConfigError(
+                "differs from the run that is resumed",
+                where=path,
+                value=_leaves(now).get(path),
+                accepted=f"{_leaves(saved).get(path)!r}, or a new run with init_from",
+            )
     weights, _ = ckpt.read_tensors(folder / "weights.safetensors")
     averaged = ckpt.read_tensors(folder / "ema.safetensors")[0] if ema is not None else {}
     ckpt.load_weights(model, weights, str(folder / "weights.safetensors"))
@@ -286,7 +377,9 @@ def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) ->
 
 def _leaves(tree, prefix: str = "") -> dict[str, object]:
     if isinstance(tree, dict) and tree:
-        return {k: v for key, node in tree.items() for k, v in _leaves(node, f"{prefix}.{key}" if prefix else key).items()}
+        return {
+            k: v for key, node in tree.items() for k, v in _leaves(node, f"{prefix}.{key}" if prefix else key).items()
+        }
     if isinstance(tree, list) and tree and isinstance(tree[0], dict):
         return {k: v for i, node in enumerate(tree) for k, v in _leaves(node, f"{prefix}.{i}").items()}
     return {prefix: tree}
@@ -321,15 +414,29 @@ def _average(ema: dict[str, Tensor], model: FlowModel, decay: float) -> None:
 def _stop_on_nan(out: Path, step: int, batch: dict, loss: float, norm: float) -> None:
     path = out / "nan_batch.json"
     with output_errors(path):
-        path.write_text(json.dumps({"step": step, "loss": str(loss), "grad_norm": str(norm), "samples": batch["name"]}, indent=1) + "\n")
-    raise TrainingError(f"loss or gradient is not finite at step {step}", where=str(path), value=(loss, norm),
-                        accepted="see the samples named there; the last checkpoint is unharmed")
+        path.write_text(
+            json.dumps({"step": step, "loss": str(loss), "grad_norm": str(norm), "samples": batch["name"]}, indent=1)
+            + "\n"
+        )
+    raise TrainingError(
+        f"loss or gradient is not finite at step {step}",
+        where=str(path),
+        value=(loss, norm),
+        accepted="see the samples named there; the last checkpoint is unharmed",
+    )
 
 
 def _picture(path: Path, batch: dict, flow: Tensor) -> None:
     first = lambda k: batch[k][0].detach().float().cpu().numpy()
-    write_picture(path, comparison(events_of(first("new")), flow[0].float().cpu().numpy().transpose(1, 2, 0), first("flow").transpose(1, 2, 0),
-                                   batch["valid"][0].cpu().numpy()))
+    write_picture(
+        path,
+        comparison(
+            events_of(first("new")),
+            flow[0].float().cpu().numpy().transpose(1, 2, 0),
+            first("flow").transpose(1, 2, 0),
+            batch["valid"][0].cpu().numpy(),
+        ),
+    )
 
 
 def _over(began: float, minutes: float | None) -> bool:
@@ -382,7 +489,11 @@ class _Log:
         if self.enabled:
             with output_errors(self.path):
                 lines = self.path.read_text(encoding="utf-8").splitlines() if self.path.is_file() else []
-                kept = [line for line in lines if line.startswith("{") and line.endswith("}") and json.loads(line)["step"] <= self.start]
+                kept = [
+                    line
+                    for line in lines
+                    if line.startswith("{") and line.endswith("}") and json.loads(line)["step"] <= self.start
+                ]
                 self.path.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
                 self._file = open(self.path, "a", encoding="utf-8")
             from torch.utils.tensorboard import SummaryWriter

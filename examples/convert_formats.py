@@ -22,13 +22,17 @@ from blinkgl import (
 def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     flight = Keyframes({0: look_at((-2, -0.5, 0.6), (0, 0, 0)), 0.3: look_at((-2, 0.5, 0.6), (0, 0, 0))})
-    scene = Scene(Camera(120, 90, pose=flight), duration=0.1) + Primitive("sphere", material=Material(procedural="checks"))
+    scene = Scene(Camera(120, 90, pose=flight), duration=0.1) + Primitive(
+        "sphere", material=Material(procedural="checks")
+    )
     write_events(out / "events.h5", record(scene, labels=[]).events, 90, 120)
     for ending in (".raw", ".csv", ".npz"):
         count = convert(out / "events.h5", out / f"events{ending}", size=(90, 120))
         with open_events(out / f"events{ending}") as file:
-            print(f"{file.path.name:10} {file.format:5} {count} events, {file.path.stat().st_size / count:5.1f} bytes "
-                  "each")
+            print(
+                f"{file.path.name:10} {file.format:5} {count} events, {file.path.stat().st_size / count:5.1f} bytes "
+                "each"
+            )
 
 
 def test_final(out: Path) -> None:

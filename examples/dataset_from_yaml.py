@@ -25,10 +25,14 @@ def main(out: Path) -> None:
     outcome = generate(run, out / "data", num=2)
     for index in range(2):
         folder = out / f"data/train/sequence_{index:06d}"
-        print(f"{folder.name}: threshold {run.sequence(index).events.contrast_threshold:.3f}, "
-              f"{len(read_events(folder / 'events.h5'))} events")
-    print(f"{outcome.made.count} sequences, {outcome.made.labels} labels; checked: "
-          f"{'clean' if verify(out / 'data').clean else 'damaged'}")
+        print(
+            f"{folder.name}: threshold {run.sequence(index).events.contrast_threshold:.3f}, "
+            f"{len(read_events(folder / 'events.h5'))} events"
+        )
+    print(
+        f"{outcome.made.count} sequences, {outcome.made.labels} labels; checked: "
+        f"{'clean' if verify(out / 'data').clean else 'damaged'}"
+    )
 
 
 def test_final(out: Path) -> None:

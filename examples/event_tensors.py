@@ -16,7 +16,9 @@ import matplotlib.pyplot as plt
 def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     flight = Keyframes({0: look_at((-2, -0.5, 0.6), (0, 0, 0)), 0.3: look_at((-2, 0.5, 0.6), (0, 0, 0))})
-    scene = Scene(Camera(160, 120, pose=flight), duration=0.1) + Primitive("cuboid", material=Material(procedural="bricks"))
+    scene = Scene(Camera(160, 120, pose=flight), duration=0.1) + Primitive(
+        "cuboid", material=Material(procedural="bricks")
+    )
     recording = record(scene, labels=["flow"])
     events, t0, t1 = recording.window(0), int(recording.t_us[0]), int(recording.image_t_us[1])
 
@@ -42,7 +44,9 @@ def main(out: Path) -> None:
 def test_final(out: Path) -> None:
     made = np.load(out / "tensors.npz")
     assert made["surface"].min() == 0 and 0.9 < made["surface"].max() <= 1
-    assert abs(made["grid"].sum() - (2 * int(made["on"]) - int(made["count"]))) < 1, "every event is in the grid once, by its sign"
+    assert abs(made["grid"].sum() - (2 * int(made["on"]) - int(made["count"]))) < 1, (
+        "every event is in the grid once, by its sign"
+    )
 
 
 if __name__ == "__main__":

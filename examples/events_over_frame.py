@@ -15,16 +15,26 @@ def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     flight = Keyframes({0: look_at((-2.4, -0.5, 1.0), (0, 0, 0.3)), 0.2: look_at((-2.4, 0.5, 1.0), (0, 0, 0.3))})
     scene = Scene(Camera(320, 240, fov=55, pose=flight), duration=0.1, label_rate=10)
-    scene += Primitive("grid", width=6, depth=6, material=Material(procedural="bricks", uv_scale=(4, 4)), category="ground")
+    scene += Primitive(
+        "grid", width=6, depth=6, material=Material(procedural="bricks", uv_scale=(4, 4)), category="ground"
+    )
     scene += Primitive("cuboid", pose=Pose((0, 0, 0.5), euler=(0, 0, 30)), material=Material(photograph="coffee"))
     recording = record(scene, labels=["images"])
 
     events = recording.events.window(100_000, 104_000)  # the 4 ms after the image
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     axes[0].imshow(recording.images[0])
-    axes[1].imshow(recording.images[0].mean(axis=-1) / 2 + 127, cmap="gray", vmin=0, vmax=255)  # pale, for the events to stand out
+    axes[1].imshow(
+        recording.images[0].mean(axis=-1) / 2 + 127, cmap="gray", vmin=0, vmax=255
+    )  # pale, for the events to stand out
     for polarity, colour in ((1, "blue"), (0, "red")):
-        axes[1].scatter(events.x[events.p == polarity], events.y[events.p == polarity], s=0.3, c=colour, label=["OFF", "ON"][polarity])
+        axes[1].scatter(
+            events.x[events.p == polarity],
+            events.y[events.p == polarity],
+            s=0.3,
+            c=colour,
+            label=["OFF", "ON"][polarity],
+        )
     for axis in axes:
         axis.axis("off")
     axes[0].set_title("frame at 100 ms")

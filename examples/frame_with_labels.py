@@ -16,7 +16,9 @@ def main(out: Path) -> None:
     flight = Keyframes({0: look_at((-3, -0.2, 1.2), (0, 0, 0.4)), 0.2: look_at((-2.8, 0.2, 1.2), (0, 0, 0.4))})
     spin = Keyframes({0: Pose((0, 0.7, 0.5)), 0.2: Pose((0, 0.7, 0.5), euler=(0, 0, 40))})
     scene = Scene(Camera(240, 180, fov=50, pose=flight))
-    scene += Primitive("grid", width=10, depth=10, material=Material(procedural="bricks", uv_scale=(8, 8)), category="ground")
+    scene += Primitive(
+        "grid", width=10, depth=10, material=Material(procedural="bricks", uv_scale=(8, 8)), category="ground"
+    )
     scene += Primitive("cuboid", pose=spin, scale=0.9, material=Material(photograph="astronaut"))
     scene += Primitive("capsule", pose=(-0.4, -0.6, 0.5), material=Material(procedural="dots"))
 
@@ -26,8 +28,12 @@ def main(out: Path) -> None:
     np.savez(out / "labels.npz", depth=frame.depth, ids=frame.ids, flow=frame.forward.flow, valid=frame.forward.valid)
 
     speed = np.linalg.norm(frame.forward.flow, axis=-1)
-    panels = {"image": (image, None), "depth, m": (np.where(np.isinf(frame.depth), np.nan, frame.depth), "viridis"),
-              "instance id": (frame.ids, "tab10"), "flow, px": (speed, "magma")}
+    panels = {
+        "image": (image, None),
+        "depth, m": (np.where(np.isinf(frame.depth), np.nan, frame.depth), "viridis"),
+        "instance id": (frame.ids, "tab10"),
+        "flow, px": (speed, "magma"),
+    }
     figure, axes = plt.subplots(1, 4, figsize=(13, 2.9), layout="constrained")
     for axis, (title, (values, colours)) in zip(axes, panels.items()):
         picture = axis.imshow(values, cmap=colours)
@@ -38,13 +44,19 @@ def main(out: Path) -> None:
     step = np.s_[8::16, 8::16]
     y, x = np.mgrid[:180, :240]
     flow = frame.forward.flow[step]
-    axes[3].quiver(x[step], y[step], flow[..., 0], flow[..., 1], color="white", angles="xy", scale_units="xy", scale=0.8)
+    axes[3].quiver(
+        x[step], y[step], flow[..., 0], flow[..., 1], color="white", angles="xy", scale_units="xy", scale=0.8
+    )
     figure.savefig(out / "labels.png", dpi=80)
     plt.close(figure)
-    print(f"depth {frame.depth.min():.2f} m to {frame.depth[np.isfinite(frame.depth)].max():.2f} m, ids "
-          f"{np.unique(frame.ids).tolist()}")
-    print(f"largest flow {speed.max():.1f} px, {100 * frame.forward.occluded.mean():.1f} % of the pixels occluded at "
-          "its end")
+    print(
+        f"depth {frame.depth.min():.2f} m to {frame.depth[np.isfinite(frame.depth)].max():.2f} m, ids "
+        f"{np.unique(frame.ids).tolist()}"
+    )
+    print(
+        f"largest flow {speed.max():.1f} px, {100 * frame.forward.occluded.mean():.1f} % of the pixels occluded at "
+        "its end"
+    )
 
 
 def test_final(out: Path) -> None:

@@ -47,11 +47,15 @@ def counts(events: Events, t0_us: int, t1_us: int, shape: tuple[int, int]) -> np
 def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     flight = Keyframes({0: look_at((-2, -0.5, 0.6), (0, 0, 0)), 0.5: look_at((-2, 0.5, 0.6), (0, 0, 0))})
-    scene = Scene(Camera(64, 48, pose=flight), duration=0.3, label_rate=10) + Primitive("cuboid", material=Material(procedural="fbm"))
+    scene = Scene(Camera(64, 48, pose=flight), duration=0.3, label_rate=10) + Primitive(
+        "cuboid", material=Material(procedural="fbm")
+    )
     for k, (grid, flow, valid) in enumerate(samples(scene)):
         np.savez(out / f"{k}.npz", grid=grid, flow=flow, valid=valid)
-        print(f"window {k}: {np.abs(grid).sum():.0f} events after those that cancel, flow of "
-              f"{np.abs(flow[:, valid]).mean():.2f} px on average")
+        print(
+            f"window {k}: {np.abs(grid).sum():.0f} events after those that cancel, flow of "
+            f"{np.abs(flow[:, valid]).mean():.2f} px on average"
+        )
 
 
 def test_final(out: Path) -> None:

@@ -36,8 +36,12 @@ class Position(Label):
 def main(out: Path) -> None:
     register(Position())
     scene = Scene(Camera(160, 120, fov=60, pose=look_at((-3, -2, 2), (0, 0, 0.4))), duration=0.2, label_rate=10)
-    scene += Primitive("grid", width=6, depth=6, material=Material(procedural="bricks", uv_scale=(8, 8)), category="ground")
-    scene += Primitive("torus", pose=Pose((0, 0, 0.5), euler=(60, 0, 0)), scale=1.4, material=Material(photograph="astronaut"))
+    scene += Primitive(
+        "grid", width=6, depth=6, material=Material(procedural="bricks", uv_scale=(8, 8)), category="ground"
+    )
+    scene += Primitive(
+        "torus", pose=Pose((0, 0, 0.5), euler=(60, 0, 0)), scale=1.4, material=Material(photograph="astronaut")
+    )
     with Renderer(scene) as renderer:
         image, frame = renderer.image(0.1), renderer.frame(0.1, ["position"])
     made = generate(scene, out / "data", labels=["position"])
@@ -53,8 +57,10 @@ def main(out: Path) -> None:
     axes[1].set(title="the same pixels from above", xlabel="x, m", ylabel="y, m", aspect="equal")
     figure.savefig(out / "position.png", dpi=80)
     plt.close(figure)
-    print(f"{made.made.count} sequence with {made.made.labels} labels; z from {seen[:, 2].min():.2f} m to "
-          f"{seen[:, 2].max():.2f} m")
+    print(
+        f"{made.made.count} sequence with {made.made.labels} labels; z from {seen[:, 2].min():.2f} m to "
+        f"{seen[:, 2].max():.2f} m"
+    )
 
 
 def test_final(out: Path) -> None:

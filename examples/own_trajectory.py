@@ -26,8 +26,10 @@ def main(out: Path) -> None:
 
     middle = recording.flow[0][50:70, 76:84]
     np.save(out / "middle.npy", middle)
-    print(f"{len(times)} key frames, {len(recording.events)} events; the column's middle moves "
-          f"{np.median(middle[..., 0]):+.2f} px in 0.1 s")
+    print(
+        f"{len(times)} key frames, {len(recording.events)} events; the column's middle moves "
+        f"{np.median(middle[..., 0]):+.2f} px in 0.1 s"
+    )
 
 
 def test_final(out: Path) -> None:

@@ -16,8 +16,15 @@ def main(out: Path) -> None:
     squares = np.where(odd[..., None], (230, 200, 60), (40, 60, 110)).astype(np.uint8)  # an image of your own, sRGB
 
     scene = Scene(Camera(240, 180, fov=55, pose=flight), light=Light(elevation=50), duration=0.2, label_rate=10)
-    scene += Primitive("grid", width=8, depth=8, material=Material(procedural="bricks", uv_scale=(6, 6)), category="ground")
-    scene += Primitive("cuboid", extents=(0.8, 0.8, 0.8), pose=Pose((0, -0.6, 0.4), euler=(0, 0, 30)), material=Material(photograph="coffee"))
+    scene += Primitive(
+        "grid", width=8, depth=8, material=Material(procedural="bricks", uv_scale=(6, 6)), category="ground"
+    )
+    scene += Primitive(
+        "cuboid",
+        extents=(0.8, 0.8, 0.8),
+        pose=Pose((0, -0.6, 0.4), euler=(0, 0, 30)),
+        material=Material(photograph="coffee"),
+    )
     scene += Primitive("sphere", radius=0.4, pose=(0, 0.7, 0.4), material=Material(squares, uv_scale=(2, 1)))
     scene += Primitive("torus", pose=Pose((-0.6, 0.1, 0.2), euler=(60, 0, 0)), material=Material(color=(0.7, 0.1, 0.1)))
 

@@ -14,7 +14,9 @@ from eflow.data.sources import open_source
 def main(out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     flight = Keyframes({0: look_at((-2, -0.5, 0.6), (0, 0, 0)), 0.5: look_at((-2, 0.5, 0.6), (0, 0, 0))})
-    scene = Scene(Camera(64, 48, pose=flight), duration=0.4, label_rate=10) + Primitive("cuboid", material=Material(procedural="fbm"))
+    scene = Scene(Camera(64, 48, pose=flight), duration=0.4, label_rate=10) + Primitive(
+        "cuboid", material=Material(procedural="fbm")
+    )
     generate(scene, out / "data")
 
     dataset = FlowDataset([open_source(out / "data")], VoxelGrid(bins=5))

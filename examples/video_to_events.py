@@ -16,9 +16,18 @@ def main(out: Path) -> None:
             disc = np.hypot(x - 20 - 8 * k, y - 48) < 14
             video.append_data(np.repeat(np.where(disc, 220, 40 + x // 2).astype(np.uint8)[..., None], 3, axis=2))
 
-    report = simulate_file(out / "disc.mp4", out / "events.h5", sensor="davis346", emulator="v2e", interpolate="motion", preview=out / "events.mp4")
-    print(f"{report.frames} frames, {report.steps} steps with those in between, {report.events} events, "
-          f"{100 * report.on / report.events:.0f} % ON")
+    report = simulate_file(
+        out / "disc.mp4",
+        out / "events.h5",
+        sensor="davis346",
+        emulator="v2e",
+        interpolate="motion",
+        preview=out / "events.mp4",
+    )
+    print(
+        f"{report.frames} frames, {report.steps} steps with those in between, {report.events} events, "
+        f"{100 * report.on / report.events:.0f} % ON"
+    )
 
 
 def test_final(out: Path) -> None:

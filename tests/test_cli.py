@@ -64,13 +64,19 @@ def test_shader_error_shows_its_source(failing, capsys):
     assert outcome(capsys, "fail") == (2, "", "error: a.glsl:3: bad\n\n> 3 | x\n")
 
 
-@pytest.mark.parametrize("error, line", [
-    (OSError(errno.ENOSPC, "No space left on device", "out/events.h5"), "out/events.h5: no space left on device"),
-    (OSError(errno.ENOSPC, "No space left on device"), "no space left on device"),
-    (OSError("Can't write data (file write failed: errno = 28, error message = 'No space left on device')"), "no space left on device"),
-    (PermissionError(errno.EACCES, "Permission denied", "/data"), "/data: permission denied"),
-    (OSError(errno.EROFS, "Read-only file system", "/data"), "/data: read-only file system"),
-])
+@pytest.mark.parametrize(
+    "error, line",
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "out/events.h5"), "out/events.h5: no space left on device"),
+        (OSError(errno.ENOSPC, "No space left on device"), "no space left on device"),
+        (
+            OSError("Can't write data (file write failed: errno = 28, error message = 'No space left on device')"),
+            "no space left on device",
+        ),
+        (PermissionError(errno.EACCES, "Permission denied", "/data"), "/data: permission denied"),
+        (OSError(errno.EROFS, "Read-only file system", "/data"), "/data: read-only file system"),
+    ],
+)
 def test_the_machines_errors_are_one_line_and_2(failing, capsys, error, line):
     failing(error)
     assert outcome(capsys, "fail") == (2, "", f"error: {line}\n")
@@ -88,12 +94,15 @@ def test_a_bug_keeps_its_traceback(failing, capsys):
     assert status == 1 and "ZeroDivisionError" in err and "bug in BlinkGL" in err
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (("--nope",), ["--nope", "see 'blinkgl --help'"]),
-    (("doctr",), ["doctr", "see 'blinkgl --help'"]),
-    (("doctor", "--device", "-1"), ["--device", "see 'blinkgl doctor --help'"]),
-    (("doctor", "extra"), ["extra", "see 'blinkgl doctor --help'"]),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("--nope",), ["--nope", "see 'blinkgl --help'"]),
+        (("doctr",), ["doctr", "see 'blinkgl --help'"]),
+        (("doctor", "--device", "-1"), ["--device", "see 'blinkgl doctor --help'"]),
+        (("doctor", "extra"), ["extra", "see 'blinkgl doctor --help'"]),
+    ],
+)
 def test_usage_errors_are_one_line_and_2(capsys, arguments, words):
     status, out, err = outcome(capsys, *arguments)
     assert (status, out) == (2, "")
@@ -108,21 +117,32 @@ def test_version_and_help(capsys):
 
 
 def test_help_imports_nothing_heavy():
-    code = ("import sys; from blinkgl import cli; cli.run(['--help']);heavy = {'numpy', 'numba', 'moderngl', 'trimesh', "
-            "'scipy', 'cv2', 'h5py', 'torch', 'matplotlib', 'pydantic'} & set(sys.modules);sys.exit(f'imported: "
-            "{sorted(heavy)}' if heavy else 0)")
+    code = (
+        "import sys; from blinkgl import cli; cli.run(['--help']);heavy = {'numpy', 'numba', 'moderngl', 'trimesh', "
+        "'scipy', 'cv2', 'h5py', 'torch', 'matplotlib', 'pydantic'} & set(sys.modules);sys.exit(f'imported: "
+        "{sorted(heavy)}' if heavy else 0)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
 
 
 def test_a_reader_that_leaves_early_is_no_error():
-    done = subprocess.run(f"{sys.executable} -m blinkgl.cli --help | true", shell=True, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        f"{sys.executable} -m blinkgl.cli --help | true", shell=True, capture_output=True, text=True, timeout=60
+    )
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("error", [MemoryError(), MemoryError("Unable to allocate 7.45 GiB for an array"),
-                                   OSError(12, "Cannot allocate memory"), RuntimeError("LLVM ERROR: out of memory"),
-                                   RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        MemoryError("Unable to allocate 7.45 GiB for an array"),
+        OSError(12, "Cannot allocate memory"),
+        RuntimeError("LLVM ERROR: out of memory"),
+        RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes"),
+    ],
+)
 @pytest.mark.parametrize("program", ["blinkgl", "eflow"])
 def test_no_memory_left_is_one_line_that_says_what_helps(program, error, capsys, monkeypatch):
     from eflow import cli as eflow_cli
@@ -134,14 +154,25 @@ def test_no_memory_left_is_one_line_that_says_what_helps(program, error, capsys,
     monkeypatch.setattr(module, "app", fail)
     status = module.run(["doctor"])
     err = capsys.readouterr().err
-    assert status == 2 and err.count("\n") == 1 and "error: out of memory; use a smaller image" in err and "ulimit -v" in err
+    assert (
+        status == 2
+        and err.count("\n") == 1
+        and "error: out of memory; use a smaller image" in err
+        and "ulimit -v" in err
+    )
 
 
 def test_a_memory_limit_ends_a_command_in_one_line(tmp_path):
     """simulate of frames that do not fit into what 'ulimit -v' leaves."""
     np.lib.format.open_memmap(tmp_path / "frames.npy", "w+", np.uint8, (2, 30_000, 30_000))[:1, :1, :1] = 1
-    command = (f"ulimit -v 3000000; exec {sys.executable} -m blinkgl.cli simulate {tmp_path}/frames.npy --fps 100 -o "
-               f"{tmp_path}/e.npz")
-    done = subprocess.run(command, shell=True, capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
-    assert done.returncode == 2 and done.stderr.startswith("error: out of memory; ") and done.stderr.count("\n") == 1, done.stderr
+    command = (
+        f"ulimit -v 3000000; exec {sys.executable} -m blinkgl.cli simulate {tmp_path}/frames.npy --fps 100 -o "
+        f"{tmp_path}/e.npz"
+    )
+    done = subprocess.run(
+        command, shell=True, capture_output=True, text=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    )
+    assert done.returncode == 2 and done.stderr.startswith("error: out of memory; ") and done.stderr.count("\n") == 1, (
+        done.stderr
+    )
     assert not (tmp_path / "e.npz").exists()

@@ -27,24 +27,38 @@ FRONT = ("arguments", "drawing", "files", "runs", "scenes", "sensors", "sequence
 
 def box_scene(**more) -> blinkgl.Scene:
     """A box passes the camera: 32 x 24 px, two labels at 20 Hz."""
-    path = blinkgl.Keyframes({0: blinkgl.look_at((-2, -0.3, 0.8), (0, 0, 0)), 0.2: blinkgl.look_at((-2, 0.3, 0.8), (0, 0, 0))})
+    path = blinkgl.Keyframes(
+        {0: blinkgl.look_at((-2, -0.3, 0.8), (0, 0, 0)), 0.2: blinkgl.look_at((-2, 0.3, 0.8), (0, 0, 0))}
+    )
     settings = {"duration": 0.1, "label_rate": 20, "seed": 3, **more}
-    return blinkgl.Scene(blinkgl.Camera(32, 24, pose=path), **settings) + blinkgl.Primitive("cuboid", material=blinkgl.Material(procedural="bricks", seed=2))
+    return blinkgl.Scene(blinkgl.Camera(32, 24, pose=path), **settings) + blinkgl.Primitive(
+        "cuboid", material=blinkgl.Material(procedural="bricks", seed=2)
+    )
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
 def test_import_brings_nothing_with_it():
-    code = ("import sys, blinkgl; blinkgl.__version__; dir(blinkgl); print([m for m in sys.modules if "
-            "m.startswith('blinkgl.') or m in ('numpy', 'numba', 'moderngl', 'pydantic')])")
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    code = (
+        "import sys, blinkgl; blinkgl.__version__; dir(blinkgl); print([m for m in sys.modules if "
+        "m.startswith('blinkgl.') or m in ('numpy', 'numba', 'moderngl', 'pydantic')])"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    )
 
 
 def test_table_list_and_type_checker_agree():
     assert sorted(blinkgl._HOME) == sorted(blinkgl.__all__) and 30 <= len(blinkgl.__all__) <= 45
     tree = ast.parse((REPOSITORY / "blinkgl/__init__.py").read_text(encoding="utf-8"))
-    typed = [node for branch in tree.body if isinstance(branch, ast.If) for node in branch.body if isinstance(node, ast.ImportFrom)]
+    typed = [
+        node
+        for branch in tree.body
+        if isinstance(branch, ast.If)
+        for node in branch.body
+        if isinstance(node, ast.ImportFrom)
+    ]
     assert {name.name: node.module for node in typed for name in node.names} == blinkgl._HOME
     assert set(blinkgl.__all__) <= set(dir(blinkgl))
     with pytest.raises(AttributeError, match="no_such_name"):
@@ -56,7 +70,10 @@ def test_every_name_exists_and_says_what_it_takes(name):
     value = getattr(blinkgl, name)
     text = inspect.getdoc(value)
     assert text and len(text) > 20
-    for place in [value, *(vars(value).values() if inspect.isclass(value) and value.__module__.startswith("blinkgl.front") else ())]:
+    for place in [
+        value,
+        *(vars(value).values() if inspect.isclass(value) and value.__module__.startswith("blinkgl.front") else ()),
+    ]:
         if not inspect.isfunction(place) or (place.__name__.startswith("_") and place.__name__ != "__init__"):
             continue
         signature = inspect.signature(place)
@@ -78,8 +95,16 @@ def test_pages_use_no_other_path():
         if page.suffix not in (".md", ".py", ".ipynb"):
             continue
         for module, names in re.findall(r"from (blinkgl\.[\w.]+) import ([\w, ]+)", page.read_text(encoding="utf-8")):
-            wrong += [f"{page.name}: from {module} import {name}" for name in names.replace(" ", "").split(",") if name in blinkgl._HOME]
-        wrong += [f"{page.name}: {found}" for found in re.findall(r"blinkgl\.front\.\w+", page.read_text(encoding="utf-8")) if page.name != "architecture.md"]
+            wrong += [
+                f"{page.name}: from {module} import {name}"
+                for name in names.replace(" ", "").split(",")
+                if name in blinkgl._HOME
+            ]
+        wrong += [
+            f"{page.name}: {found}"
+            for found in re.findall(r"blinkgl\.front\.\w+", page.read_text(encoding="utf-8"))
+            if page.name != "architecture.md"
+        ]
     assert wrong == []
 
 
@@ -93,7 +118,9 @@ def test_nothing_shadows_a_room():
 
 
 def test_a_scene_in_python_is_the_scene_of_its_yaml():
-    scene = box_scene(background=0.4) + blinkgl.Primitive("sphere", radius=0.2, pose=blinkgl.Pose((0, 1, 0), euler=(0, 0, 30)), scale=2.0)
+    scene = box_scene(background=0.4) + blinkgl.Primitive(
+        "sphere", radius=0.2, pose=blinkgl.Pose((0, 1, 0), euler=(0, 0, 30)), scale=2.0
+    )
     template = scene.template()
     template = RunTemplate(yaml.safe_load(yaml.safe_dump(template.tree)), template.base)
     config = template.sequence(0)
@@ -101,8 +128,12 @@ def test_a_scene_in_python_is_the_scene_of_its_yaml():
     theirs = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns)
     assert [o.name for o in ours.objects] == [o.name for o in theirs.objects] == ["cuboid", "sphere"]
     for a, b in zip(ours.objects, theirs.objects):
-        assert np.array_equal(a.parts[0].mesh.vertices, b.parts[0].mesh.vertices) and np.array_equal(a.path.pose(0), b.path.pose(0))
-        assert a.parts[0].material.texture is b.parts[0].material.texture is None or np.array_equal(a.parts[0].material.texture.image, b.parts[0].material.texture.image)
+        assert np.array_equal(a.parts[0].mesh.vertices, b.parts[0].mesh.vertices) and np.array_equal(
+            a.path.pose(0), b.path.pose(0)
+        )
+        assert a.parts[0].material.texture is b.parts[0].material.texture is None or np.array_equal(
+            a.parts[0].material.texture.image, b.parts[0].material.texture.image
+        )
     assert np.array_equal(ours.camera.K, theirs.camera.K) and ours.light == theirs.light and ours.background == 0.4
 
 
@@ -110,7 +141,9 @@ def test_record_is_what_generate_writes(tmp_path):
     scene = box_scene()
     labels = ("images", "flow", "flow_backward", "occlusion", "depth")
     recording = blinkgl.record(scene, emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels)
-    outcome = blinkgl.generate(scene, tmp_path / "out", emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels)
+    outcome = blinkgl.generate(
+        scene, tmp_path / "out", emulator={"emulator": "v2e", "cutoff_hz": 100}, sensor="davis346", labels=labels
+    )
     assert outcome.made.events == len(recording.events) > 100
     folder = tmp_path / "out/train/sequence_000000"
     with DsecEventReader(folder / "events.h5") as file:
@@ -122,6 +155,7 @@ def test_record_is_what_generate_writes(tmp_path):
         assert np.array_equal(valid, recording.valid[k]) and np.abs(flow - recording.flow[k]).max() <= 1 / 256
         assert np.array_equal(np.load(folder / f"depth/{k:06d}.npy"), recording.labels[k].depth)
         import cv2
+
         assert np.array_equal(cv2.imread(str(folder / f"images/{k:06d}.png"))[..., ::-1], recording.images[k])
     assert recording.t_us.tolist() == [50_000, 100_000] and recording.image_t_us.tolist() == [50_000, 100_000, 150_000]
     assert len(recording.window(0)) == np.count_nonzero((written.t >= 50_000) & (written.t < 100_000))
@@ -130,9 +164,22 @@ def test_record_is_what_generate_writes(tmp_path):
 
 def test_record_of_a_yaml_is_what_generate_writes(tmp_path):
     path = tmp_path / "run.yaml"
-    path.write_text(yaml.safe_dump({"seed": 5, "camera": {"width": 32, "height": 24}, "time": {"duration": 0.1, "label_rate": 20},
-                                    "scene": {"kind": "random", "objects": {"count": 2}, "pool": {"urdfs": False}, "textures": {"photographs": False}},
-                                    "preview": {"enabled": False}}))
+    path.write_text(
+        yaml.safe_dump(
+            {
+                "seed": 5,
+                "camera": {"width": 32, "height": 24},
+                "time": {"duration": 0.1, "label_rate": 20},
+                "scene": {
+                    "kind": "random",
+                    "objects": {"count": 2},
+                    "pool": {"urdfs": False},
+                    "textures": {"photographs": False},
+                },
+                "preview": {"enabled": False},
+            }
+        )
+    )
     run = blinkgl.load(path, ["output.sequences=2"])
     recording = blinkgl.record(run, index=1)
     run_dataset(run, tmp_path / "out")
@@ -142,9 +189,15 @@ def test_record_of_a_yaml_is_what_generate_writes(tmp_path):
 def test_arrays_as_mesh_and_image():
     image = np.zeros((8, 8, 3), np.uint8)
     image[:, 4:] = 255
-    square = dict(vertices=[[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]], faces=[[0, 2, 1], [0, 3, 2]], uvs=[[0, 1], [1, 1], [1, 0], [0, 0]])
+    square = dict(
+        vertices=[[0, -1, -1], [0, 1, -1], [0, 1, 1], [0, -1, 1]],
+        faces=[[0, 2, 1], [0, 3, 2]],
+        uvs=[[0, 1], [1, 1], [1, 0], [0, 0]],
+    )
     camera = blinkgl.Camera(32, 32, fov=53.13, pose=(-2, 0, 0))
-    scene = blinkgl.Scene(camera, light=blinkgl.Light(unlit=True), background=0.5) + blinkgl.Mesh(**square, material=blinkgl.Material(image, double_sided=True))
+    scene = blinkgl.Scene(camera, light=blinkgl.Light(unlit=True), background=0.5) + blinkgl.Mesh(
+        **square, material=blinkgl.Material(image, double_sided=True)
+    )
     frame = blinkgl.render_frame(scene, 0.0, ["images", "depth", "ids"])
     # The camera looks along +x, so that +y, where u is 1, is on its left.
     assert np.allclose(frame.depth[8:24, 8:24], 2, atol=1e-4) and (frame.ids[8:24, 8:24] == 1).all()
@@ -160,9 +213,13 @@ def test_renderer_draws_what_record_records():
     with blinkgl.Renderer(scene) as renderer:
         assert np.array_equal(renderer.image(0.05), recording.images[0])
         frame = renderer.frame(0.05, ["flow", "ids"])
-        assert np.array_equal(frame.forward.flow, recording.flow[0]) and np.array_equal(frame.ids, recording.labels[0].ids)
+        assert np.array_equal(frame.forward.flow, recording.flow[0]) and np.array_equal(
+            frame.ids, recording.labels[0].ids
+        )
         half = renderer.frame(0.05, ["flow"], to=0.075)
-        assert np.median(half.forward.flow[..., 0][half.forward.valid]) == pytest.approx(np.median(recording.flow[0][..., 0][recording.valid[0]]) / 2, rel=0.1)
+        assert np.median(half.forward.flow[..., 0][half.forward.valid]) == pytest.approx(
+            np.median(recording.flow[0][..., 0][recording.valid[0]]) / 2, rel=0.1
+        )
         emulator = blinkgl.Esim(24, 32, contrast_threshold=0.2)
         assert len(emulator.step(renderer.luminance(0.0), 0)) == 0 < len(emulator.step(renderer.luminance(0.1), 10**8))
 
@@ -230,7 +287,10 @@ WRONG = [
     ("index", lambda d: b.record(box_scene(), index=-1)),
     ("emulator", lambda d: b.record(box_scene(), emulator="dvs")),
     ("emulator", lambda d: b.record(box_scene(), emulator=3)),
-    ("esim.contrast_threshold", lambda d: b.record(box_scene(), emulator={"emulator": "esim", "contrast_threshold": "low"})),
+    (
+        "esim.contrast_threshold",
+        lambda d: b.record(box_scene(), emulator={"emulator": "esim", "contrast_threshold": "low"}),
+    ),
     ("sensor", lambda d: b.record(box_scene(), sensor="eye")),
     ("quality", lambda d: b.record(box_scene(), quality="best")),
     ("timeline", lambda d: b.record(box_scene(), timeline="uniform")),

@@ -41,23 +41,25 @@ FILES = {
     "seed.yaml": "seed: -1\n",
     "inline.yaml": "scene: {kind: explicit, objects: [{primitive: cuboid}]}\n",
     "name.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
-                 "objects: [{mesh: b}]}\n",
+    "objects: [{mesh: b}]}\n",
     "texture.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
-                    "materials: {m: {texture: missing.png}}, objects: [{mesh: a, material: m}]}\n",
+    "materials: {m: {texture: missing.png}}, objects: [{mesh: a, material: m}]}\n",
     "primitive.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: dodecahedron}}, "
-                      "objects: [{mesh: a}]}\n",
+    "objects: [{mesh: a}]}\n",
     "parameter.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: sphere, "
-                      "parameters: {sides: 3}}}, objects: [{mesh: a}]}\n",
+    "parameters: {sides: 3}}}, objects: [{mesh: a}]}\n",
     "mesh.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {file: broken.obj}}, "
-                 "objects: [{mesh: a}]}\n",
+    "objects: [{mesh: a}]}\n",
     "glb.yaml": "scene: {kind: file, path: broken.glb}\n",
     "keyframes.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
-                      "objects: [{mesh: a, keyframes: [{time: 1}, {time: 0}]}]}\n",
+    "objects: [{mesh: a, keyframes: [{time: 1}, {time: 0}]}]}\n",
     "turn.yaml": "scene: {kind: explicit, camera: {position: [-3, 0, 0]}, meshes: {a: {primitive: cuboid}}, "
-                 "objects: [{mesh: a, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 40000]}]}]}\n",
+    "objects: [{mesh: a, keyframes: [{time: 0}, {time: 1, euler: [0, 0, 40000]}]}]}\n",
     "corner.yaml": "timeline: {min_step_us: {uniform: [100, 900]}, max_step_us: {uniform: [500, 2000]}}\n",
     "long.yaml": "time: {duration: 5000}\n",
-    "bomb.yaml": "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" if k else "a0: &a0 [1]\n" for k in range(10)),
+    "bomb.yaml": "".join(
+        f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" if k else "a0: &a0 [1]\n" for k in range(10)
+    ),
     "pool.yaml": "scene: {kind: random, pool: {folders: [nowhere]}}\n",
     "frames.yaml": "frames: {folders: [nowhere], fps: 30}\n",
     "broken.obj": "v 0 0 0\nf 1 2 3\n",
@@ -68,19 +70,113 @@ FILES = {
     "outside.csv": "0.001,500,2,1\n",
     "notes.md": "# notes\n",
 }
-COMMANDS = ["", "generate missing.yaml --out out", "generate unknown_key.yaml --out out", "generate brackets.yaml --out out", "generate tabs.yaml --out out", "generate list.yaml --out out", "generate type.yaml --out out", "generate negative.yaml --out out", "generate fraction.yaml --out out", "generate both.yaml --out out", "generate kind.yaml --out out", "generate flow.yaml --out out", "generate emulator.yaml --out out", "generate curve.yaml --out out", "generate sensor.yaml --out out", "generate quality.yaml --out out", "generate empty_range.yaml --out out", "generate bad_range.yaml --out out", "generate weights.yaml --out out", "generate seed.yaml --out out", "generate inline.yaml --out out", "generate name.yaml --out out", "generate texture.yaml --out out", "generate primitive.yaml --out out", "generate parameter.yaml --out out", "generate mesh.yaml --out out", "generate glb.yaml --out out", "generate keyframes.yaml --out out", "generate turn.yaml --out out", "generate corner.yaml --out out", "generate long.yaml --out out", "generate bomb.yaml --out out", "generate pool.yaml --out out", "generate frames.yaml --out out", "generate good.yaml --out notes.md", "generate good.yaml --out out --set camera.width", "generate good.yaml --out out --set camera.width=[1,2]", "generate good.yaml --out out --set camera.width.x=3", "generate good.yaml --out out --executor slurm", "generate good.yaml --out out --devices 0,one", "generate good.yaml --out out --address 10.0.0.1:6379", "explain missing.yaml", "explain kind.yaml", "verify nowhere", "verify notes.md", "report nowhere", "export nowhere --out shards", "simulate missing.mp4 --out events.h5", "simulate notes.md --out events.h5", "simulate pictures --out events.h5", "simulate pictures --out events.xyz --fps 100", "simulate pictures --out events.h5 --fps 100 --sensor davis1000", "simulate pictures --out events.h5 --fps 100 --emulator magic", "simulate pictures --out events.h5 --fps 100 --gamma wide", "convert missing.h5 events.raw", "convert broken.h5 events.raw", "convert broken.raw events.h5", "convert words.txt events.h5", "convert outside.csv events.h5 --size 240x180", "convert outside.csv events.h5 --size big", "convert notes.md events.h5", "compare missing.h5 broken.h5", "trade missing.yaml --out trade", "trade frames.yaml --out trade", "shader show nothing.glsl", "shader probe good.yaml --time 0.3 --pixel middle", "shader probe good.yaml --time 900 --pixel 1,1", "shader diff good.yaml --time 0.3 --tolerance much --out diff", "shader passes good.yaml --time 0.3 --shaders nowhere --out passes", ""][1:-1]
-EFLOW_COMMANDS = ["", "train missing.yaml --out run", "train unknown_key.yaml --out run", "evaluate nowhere nowhere --out scores", "predict nowhere broken.h5 --out flow", "submit nowhere nowhere --out submission.zip", ""][1:-1]
+COMMANDS = [
+    "",
+    "generate missing.yaml --out out",
+    "generate unknown_key.yaml --out out",
+    "generate brackets.yaml --out out",
+    "generate tabs.yaml --out out",
+    "generate list.yaml --out out",
+    "generate type.yaml --out out",
+    "generate negative.yaml --out out",
+    "generate fraction.yaml --out out",
+    "generate both.yaml --out out",
+    "generate kind.yaml --out out",
+    "generate flow.yaml --out out",
+    "generate emulator.yaml --out out",
+    "generate curve.yaml --out out",
+    "generate sensor.yaml --out out",
+    "generate quality.yaml --out out",
+    "generate empty_range.yaml --out out",
+    "generate bad_range.yaml --out out",
+    "generate weights.yaml --out out",
+    "generate seed.yaml --out out",
+    "generate inline.yaml --out out",
+    "generate name.yaml --out out",
+    "generate texture.yaml --out out",
+    "generate primitive.yaml --out out",
+    "generate parameter.yaml --out out",
+    "generate mesh.yaml --out out",
+    "generate glb.yaml --out out",
+    "generate keyframes.yaml --out out",
+    "generate turn.yaml --out out",
+    "generate corner.yaml --out out",
+    "generate long.yaml --out out",
+    "generate bomb.yaml --out out",
+    "generate pool.yaml --out out",
+    "generate frames.yaml --out out",
+    "generate good.yaml --out notes.md",
+    "generate good.yaml --out out --set camera.width",
+    "generate good.yaml --out out --set camera.width=[1,2]",
+    "generate good.yaml --out out --set camera.width.x=3",
+    "generate good.yaml --out out --executor slurm",
+    "generate good.yaml --out out --devices 0,one",
+    "generate good.yaml --out out --address 10.0.0.1:6379",
+    "explain missing.yaml",
+    "explain kind.yaml",
+    "verify nowhere",
+    "verify notes.md",
+    "report nowhere",
+    "export nowhere --out shards",
+    "simulate missing.mp4 --out events.h5",
+    "simulate notes.md --out events.h5",
+    "simulate pictures --out events.h5",
+    "simulate pictures --out events.xyz --fps 100",
+    "simulate pictures --out events.h5 --fps 100 --sensor davis1000",
+    "simulate pictures --out events.h5 --fps 100 --emulator magic",
+    "simulate pictures --out events.h5 --fps 100 --gamma wide",
+    "convert missing.h5 events.raw",
+    "convert broken.h5 events.raw",
+    "convert broken.raw events.h5",
+    "convert words.txt events.h5",
+    "convert outside.csv events.h5 --size 240x180",
+    "convert outside.csv events.h5 --size big",
+    "convert notes.md events.h5",
+    "compare missing.h5 broken.h5",
+    "trade missing.yaml --out trade",
+    "trade frames.yaml --out trade",
+    "shader show nothing.glsl",
+    "shader probe good.yaml --time 0.3 --pixel middle",
+    "shader probe good.yaml --time 900 --pixel 1,1",
+    "shader diff good.yaml --time 0.3 --tolerance much --out diff",
+    "shader passes good.yaml --time 0.3 --shaders nowhere --out passes",
+    "",
+][1:-1]
+EFLOW_COMMANDS = [
+    "",
+    "train missing.yaml --out run",
+    "train unknown_key.yaml --out run",
+    "evaluate nowhere nowhere --out scores",
+    "predict nowhere broken.h5 --out flow",
+    "submit nowhere nowhere --out submission.zip",
+    "",
+][1:-1]
 
 
 def test_every_sentence_is_reviewed():
-    assert messages.text() == messages.GOLDEN.read_text(), "python -m blinkgl.tools.messages writes the file anew: read what has changed"
+    assert messages.text() == messages.GOLDEN.read_text(), (
+        "python -m blinkgl.tools.messages writes the file anew: read what has changed"
+    )
 
 
 def test_sentences_are_for_people():
     for line in (line for lines in messages.sentences().values() for line in lines):
         said = re.sub(r"\{[^{}]*\}", "X", line)
         assert not said.rstrip().endswith("."), f"an error is a clause, not a sentence with a full stop: {line}"
-        for word in ("NoneType", "dtype", "kwargs", "TypeError", "KeyError", "NotImplemented", "assert", "TODO", "tuple", "ndarray", "Traceback", "pydantic"):
+        for word in (
+            "NoneType",
+            "dtype",
+            "kwargs",
+            "TypeError",
+            "KeyError",
+            "NotImplemented",
+            "assert",
+            "TODO",
+            "tuple",
+            "ndarray",
+            "Traceback",
+            "pydantic",
+        ):
             assert word not in said, f"'{word}' is for programmers: {line}"
         assert "  " not in said.strip() or "{" in line, line
         problem = said.split(": ", 1)[-1]

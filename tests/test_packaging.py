@@ -21,7 +21,13 @@ import yaml
 import blinkgl
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-PACKAGES = {"blinkgl": "blinkgl", "eflow": "eflow", "shaders": "blinkgl/shaders", "configs": "blinkgl/configs", "tools": "blinkgl/tools"}
+PACKAGES = {
+    "blinkgl": "blinkgl",
+    "eflow": "eflow",
+    "shaders": "blinkgl/shaders",
+    "configs": "blinkgl/configs",
+    "tools": "blinkgl/tools",
+}
 
 PROBE = """
 import json, sys
@@ -52,8 +58,12 @@ def source(tmp_path_factory):
 
 
 def run(*command: str | Path, cwd: Path) -> str:
-    environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
-    done = subprocess.run([str(c) for c in command], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+    environment = {
+        key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+    }
+    done = subprocess.run(
+        [str(c) for c in command], cwd=cwd, env=environment, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
     return done.stdout
 
@@ -73,7 +83,10 @@ def expected_files() -> set[str]:
     found = set()
     for here, there in PACKAGES.items():
         for path in (REPOSITORY / here).rglob("*"):
-            if path.suffix in (".py", ".typed", ".glsl", ".yaml", ".html", ".js", ".css") and "__pycache__" not in path.parts:
+            if (
+                path.suffix in (".py", ".typed", ".glsl", ".yaml", ".html", ".js", ".css")
+                and "__pycache__" not in path.parts
+            ):
                 found.add(f"{there}/{path.relative_to(REPOSITORY / here).as_posix()}")
     return found
 
@@ -91,13 +104,18 @@ def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
     assert json.loads(run(bin_ / "blinkgl", "doctor", "--json", cwd=elsewhere))["ok"]
     # a shader that includes another, compiled from where it was installed
     name = next(name for name, text in sorted(probe["shaders"].items()) if "#include" in text)
-    run(python, "-c", f"from blinkgl.gl import expand\nassert '#include' not in expand({name!r}, 'vertex').text", cwd=elsewhere)
+    run(
+        python,
+        "-c",
+        f"from blinkgl.gl import expand\nassert '#include' not in expand({name!r}, 'vertex').text",
+        cwd=elsewhere,
+    )
 
 
 def test_wheel(source, tmp_path):
     pytest.importorskip("build")
     run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
-    wheel, = (tmp_path / "dist").iterdir()
+    (wheel,) = (tmp_path / "dist").iterdir()
     assert wheel.name == f"blinkgl-{blinkgl.__version__}-py3-none-any.whl"
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
@@ -106,7 +124,18 @@ def test_wheel(source, tmp_path):
     assert not [name for name in names if name.startswith(("tests/", "docs/"))]
     assert any(name.endswith("LICENSE") for name in names)
     bin_ = fresh_environment(tmp_path / "venv")
-    run(sys.executable, "-m", "pip", "--python", bin_ / "python", "install", "--no-deps", "--no-index", wheel, cwd=tmp_path)
+    run(
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        bin_ / "python",
+        "install",
+        "--no-deps",
+        "--no-index",
+        wheel,
+        cwd=tmp_path,
+    )
     check_installation(bin_, tmp_path / "venv", tmp_path)
 
 
@@ -114,16 +143,20 @@ def test_wheel(source, tmp_path):
 def test_wheel_in_an_empty_environment_runs_the_demo(source, tmp_path):
     """Everything comes from the wheel and from the package index, at the versions of constraints.txt."""
     run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", tmp_path / "dist", source, cwd=tmp_path)
-    wheel, = (tmp_path / "dist").iterdir()
+    (wheel,) = (tmp_path / "dist").iterdir()
     run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
     bin_ = tmp_path / "venv" / "bin"
     command = [bin_ / "pip", "install", "-q", "-c", REPOSITORY / "constraints.txt", wheel]
     done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
-    if done.returncode and re.search(r"No matching distribution|Could not find|Connection|Temporary failure", done.stderr):
+    if done.returncode and re.search(
+        r"No matching distribution|Could not find|Connection|Temporary failure", done.stderr
+    ):
         pytest.skip(f"the package index cannot be reached: {done.stderr.splitlines()[-1]}")
     assert done.returncode == 0, done.stderr
     check_installation(bin_, tmp_path / "venv", tmp_path)
-    demo = run(bin_ / "python", "-c", "import blinkgl.configs as c; print(c.__path__[0] + '/demo.yaml')", cwd=tmp_path).strip()
+    demo = run(
+        bin_ / "python", "-c", "import blinkgl.configs as c; print(c.__path__[0] + '/demo.yaml')", cwd=tmp_path
+    ).strip()
     run(bin_ / "blinkgl", "generate", demo, "--out", tmp_path / "demo", "--set", "time.duration=0.3", cwd=tmp_path)
     assert "1 sequence" in run(bin_ / "blinkgl", "verify", tmp_path / "demo", cwd=tmp_path)
     made = tmp_path / "demo/train/demo_000000"
@@ -132,13 +165,30 @@ def test_wheel_in_an_empty_environment_runs_the_demo(source, tmp_path):
 
 def test_editable(source, tmp_path):
     bin_ = fresh_environment(tmp_path / "venv")
-    run(sys.executable, "-m", "pip", "--python", bin_ / "python", "install", "--no-deps", "--no-index", "--no-build-isolation", "-e", source, cwd=tmp_path)
+    run(
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        bin_ / "python",
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+        "-e",
+        source,
+        cwd=tmp_path,
+    )
     check_installation(bin_, source, tmp_path)
     changed = source / "shaders" / "include" / "only_here.glsl"
     changed.write_text("// new\n")  # an editable install sees new files at once
-    run(bin_ / "python", "-c", "from importlib import resources\nassert "
-                               "resources.files('blinkgl.shaders').joinpath('include/only_here.glsl').is_file()",
-        cwd=tmp_path)
+    run(
+        bin_ / "python",
+        "-c",
+        "from importlib import resources\nassert "
+        "resources.files('blinkgl.shaders').joinpath('include/only_here.glsl').is_file()",
+        cwd=tmp_path,
+    )
 
 
 def test_constraints_pin_what_setup_cfg_asks_for():
@@ -212,7 +262,12 @@ def test_the_container_installs_what_setup_sh_asks_for():
     assert {line[1:] for line in ignored if line.startswith("!")} == copied
     setup = (REPOSITORY / "tools/setup.sh").read_text(encoding="utf-8")
     wanted = set(re.search(r'packages="([^$"]+)"', setup)[1].split()) | {"python3-venv", "libosmesa6"}
-    installed = {word for step in cpu if step.instruction == "RUN" and "apt-get install" in step.text for word in step.text.split()}
+    installed = {
+        word
+        for step in cpu
+        if step.instruction == "RUN" and "apt-get install" in step.text
+        for word in step.text.split()
+    }
     assert wanted <= installed
     nvidia = stage((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"), "nvidia")[1]
     assert nvidia[: len(cpu)] == cpu and any("graphics" in step.text for step in nvidia if step.instruction == "ENV")
@@ -236,4 +291,8 @@ def test_the_recipe_copies_and_sets_as_docker_does(tmp_path):
         (context / name).write_text(name)
     copy(context, root, state, "f ./")
     copy(context, root, state, "d /there")
-    assert sorted(p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file()) == ["src/f", "there/e/h", "there/g"]
+    assert sorted(p.relative_to(root).as_posix() for p in root.rglob("*") if p.is_file()) == [
+        "src/f",
+        "there/e/h",
+        "there/g",
+    ]

@@ -8,8 +8,12 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-ROOMS = sorted(p.parent for folder in ("blinkgl", "eflow", "shaders", "configs", "tools") for p in (ROOT / folder).rglob("__init__.py")
-               if p.parent != ROOT / "blinkgl")
+ROOMS = sorted(
+    p.parent
+    for folder in ("blinkgl", "eflow", "shaders", "configs", "tools")
+    for p in (ROOT / folder).rglob("__init__.py")
+    if p.parent != ROOT / "blinkgl"
+)
 
 
 @pytest.mark.parametrize("room", ROOMS, ids=lambda p: p.relative_to(ROOT).as_posix())
@@ -28,7 +32,9 @@ def test_every_room_is_installed():
     text = (ROOT / "setup.cfg").read_text(encoding="utf-8")
     named = set(re.search(r"\npackages =\n((?:    .+\n)+)", text).group(1).split())
     here = {p.relative_to(ROOT).as_posix().replace("/", ".") for p in ROOMS}
-    assert named == {"blinkgl"} | {name if name.startswith(("blinkgl", "eflow")) else f"blinkgl.{name}" for name in here}
+    assert named == {"blinkgl"} | {
+        name if name.startswith(("blinkgl", "eflow")) else f"blinkgl.{name}" for name in here
+    }
 
 
 def test_every_room_is_on_the_map():
@@ -56,7 +62,16 @@ def test_data_flows_one_way():
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("blinkgl."):
                 names = [f"{node.module}.{name.name}" for name in node.names]
-                there = {_room(n if (ROOT / (n.replace(".", "/") + ".py")).is_file() or (ROOT / n.replace(".", "/")).is_dir() else node.module) for n in names}
+                there = {
+                    _room(
+                        n
+                        if (ROOT / (n.replace(".", "/") + ".py")).is_file() or (ROOT / n.replace(".", "/")).is_dir()
+                        else node.module
+                    )
+                    for n in names
+                }
                 arrows.setdefault(_room(module), set()).update(there - {_room(module)})
     graphlib.TopologicalSorter(arrows).prepare()  # raises CycleError, which names the circle
-    assert not arrows["blinkgl.events"] & {"blinkgl.scene", "blinkgl.gl", "blinkgl.render"} and not arrows["blinkgl.io"] & {"blinkgl.render", "blinkgl.gl"}
+    assert not arrows["blinkgl.events"] & {"blinkgl.scene", "blinkgl.gl", "blinkgl.render"} and not arrows[
+        "blinkgl.io"
+    ] & {"blinkgl.render", "blinkgl.gl"}

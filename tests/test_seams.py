@@ -75,7 +75,11 @@ class Toy(Emulator):
 
     def __init__(self, height, width, config, seed=0, reconstruction="linear"):
         super().__init__(height, width, seed, reconstruction)
-        self.config, self._level, self._free_ns = config, np.zeros(height * width, np.float32), np.zeros(height * width, np.int64)
+        self.config, self._level, self._free_ns = (
+            config,
+            np.zeros(height * width, np.float32),
+            np.zeros(height * width, np.int64),
+        )
 
     @classmethod
     def response(cls, config):
@@ -95,17 +99,29 @@ class Toy(Emulator):
         self._level[fires] += moved[fires]
         self._free_ns[fires] = t_ns + round(1000 * self.config.dead_us)
         y, x = np.divmod(fires, self.width)
-        return Events(x.astype(np.uint16), y.astype(np.uint16), np.full(len(fires), t_ns // 1000), (moved[fires] > 0).astype(np.uint8))
+        return Events(
+            x.astype(np.uint16),
+            y.astype(np.uint16),
+            np.full(len(fires), t_ns // 1000),
+            (moved[fires] > 0).astype(np.uint8),
+        )
 
     def _signal(self, frame):
         return np.log((self._decode[frame] if frame.dtype == np.uint8 else frame) + np.float32(0.01))
 
 
 SMALL = {
-    "seed": 3, "camera": {"width": 64, "height": 48}, "time": {"duration": 0.1, "label_rate": 20},
-    "scene": {"kind": "random", "objects": {"count": 3, "distance": [2, 4]}, "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
-              "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64}},
-    "events": {"emulator": "toy", "dead_us": {"uniform": [100, 2000]}}, "preview": {"enabled": False},
+    "seed": 3,
+    "camera": {"width": 64, "height": 48},
+    "time": {"duration": 0.1, "label_rate": 20},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 3, "distance": [2, 4]},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+        "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64},
+    },
+    "events": {"emulator": "toy", "dead_us": {"uniform": [100, 2000]}},
+    "preview": {"enabled": False},
 }
 
 
@@ -122,8 +138,11 @@ def written(folder, **changes):
     return path
 
 
-@pytest.mark.parametrize("timeline", [{"kind": "displacement", "max_px": 1}, {"kind": "brightness", "max_fraction_of_threshold": 2}],
-                         ids=lambda t: t["kind"])
+@pytest.mark.parametrize(
+    "timeline",
+    [{"kind": "displacement", "max_px": 1}, {"kind": "brightness", "max_fraction_of_threshold": 2}],
+    ids=lambda t: t["kind"],
+)
 def test_a_toy_emulator_is_generated_and_verified(toy, tmp_path, capsys, timeline):
     out = tmp_path / "out"
     (made,) = generate_run(load_run(written(tmp_path, timeline=timeline)), out)
@@ -146,8 +165,15 @@ def test_a_toy_emulator_is_explained(toy, tmp_path, capsys):
 
 def test_a_toy_emulator_simulates(toy, tmp_path, capsys):
     for k in range(6):
-        cv2.imwrite(str(tmp_path / f"{k}.png"), np.roll(np.tile(np.arange(0, 256, 8, np.uint8), (24, 1)), 3 * k, axis=1))
-    assert run(["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "e.h5"), "-e", "toy", "--set", "dead_us=0"]) == 0
+        cv2.imwrite(
+            str(tmp_path / f"{k}.png"), np.roll(np.tile(np.arange(0, 256, 8, np.uint8), (24, 1)), 3 * k, axis=1)
+        )
+    assert (
+        run(
+            ["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "e.h5"), "-e", "toy", "--set", "dead_us=0"]
+        )
+        == 0
+    )
     assert "events in 0.05 s" in capsys.readouterr().out
     assert run(["simulate", str(tmp_path), "--fps", "100", "-o", str(tmp_path / "n.h5"), "-e", "toi"]) == 2
     told = capsys.readouterr().err
@@ -171,8 +197,12 @@ def test_a_toy_emulator_is_traded(toy, tmp_path):
     options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5),), rounds=1)
     settings = (Setting("displacement 2 px"), Setting("displacement 2 px", "pchip"))
     result = trade(load_run(written(tmp_path)), options=options, settings=settings)
-    assert [s["name"] for s in result["settings"]] == ["displacement 2 px, linear, none"], "the toy follows straight lines alone"
-    assert result["sizes"]["full"]["emulator"]["emulator"] == "toy" and result["sizes"]["full"]["levels"][0]["events"] > 0
+    assert [s["name"] for s in result["settings"]] == ["displacement 2 px, linear, none"], (
+        "the toy follows straight lines alone"
+    )
+    assert (
+        result["sizes"]["full"]["emulator"]["emulator"] == "toy" and result["sizes"]["full"]["levels"][0]["events"] > 0
+    )
     write(result, tmp_path / "trade")
     assert "Events by TOY without noise" in (tmp_path / "trade" / "trade.html").read_text()
 
@@ -185,11 +215,16 @@ def test_the_configuration_knows_a_toy_emulator_while_it_is_registered(tmp_path)
         load_run(written(tmp_path, **tree))
     register(Toy)
     try:
-        with pytest.raises(ConfigError, match=r"events.dead_us: too large \(got 2000000000.0\); expected a number from 0 to 1e.09"):
+        with pytest.raises(
+            ConfigError, match=r"events.dead_us: too large \(got 2000000000.0\); expected a number from 0 to 1e.09"
+        ):
             load_run(written(tmp_path, **tree))
         with pytest.raises(ConfigError, match="events.dead: unknown key; expected 'dead_us' .nearest"):
             load_run(written(tmp_path, events={"emulator": "toy", "dead": 1}))
-        with pytest.raises(ConfigError, match="toy follows straight lines alone .got 'pchip'.; expected linear, or events.emulator: esim"):
+        with pytest.raises(
+            ConfigError,
+            match="toy follows straight lines alone .got 'pchip'.; expected linear, or events.emulator: esim",
+        ):
             load_run(written(tmp_path), ["timeline.reconstruction=pchip"])
         assert load_run(written(tmp_path), ["quality=fast"]).sequence(0).timeline.reconstruction == "linear"
         assert "## `events` with `emulator: toy`" in page()
@@ -233,15 +268,27 @@ def test_nothing_else_asks_which_kind_an_emulator_is():
     found = {}
     for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            here = {ast.Compare: lambda n: [n.left, *n.comparators], ast.Dict: lambda n: n.keys, ast.Tuple: lambda n: n.elts, ast.List: lambda n: n.elts,
-                    ast.Set: lambda n: n.elts}.get(type(node), lambda n: [])(node)
-            said = {n.value for n in here if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in EMULATORS}
+            here = {
+                ast.Compare: lambda n: [n.left, *n.comparators],
+                ast.Dict: lambda n: n.keys,
+                ast.Tuple: lambda n: n.elts,
+                ast.List: lambda n: n.elts,
+                ast.Set: lambda n: n.elts,
+            }.get(type(node), lambda n: [])(node)
+            said = {
+                n.value
+                for n in here
+                if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in EMULATORS
+            }
             if isinstance(node, ast.Name) and node.id in models:
                 said.add(node.id)
             if said:
                 found.setdefault(path.relative_to(root).as_posix(), set()).update(said)
     assert found.pop("config/sequence.py") == {"EsimConfig"}, "the default of `events:`"
-    assert set(found) == {"config/events.py", *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter", "reference"))}
+    assert set(found) == {
+        "config/events.py",
+        *(f"events/{name}.py" for name in ("esim", "v2e", "v2e_model", "voltmeter", "reference")),
+    }
 
 
 # --- what is forgotten is named -------------------------------------------------------------------------------------
@@ -254,9 +301,12 @@ def toy_with(part, line=None):
     body, name = tree.body[0].body, part
     if part.startswith("Config."):
         body, name = next(n for n in body if isinstance(n, ast.ClassDef)).body, part.removeprefix("Config.")
-    named = lambda node: getattr(node, "name", None) or getattr(getattr(node, "target", None) or getattr(node, "targets", [None])[0], "id", None)
+    named = lambda node: (
+        getattr(node, "name", None)
+        or getattr(getattr(node, "target", None) or getattr(node, "targets", [None])[0], "id", None)
+    )
     (at,) = (k for k, node in enumerate(body) if named(node) == name)
-    body[at:at + 1] = ast.parse(line).body if line else []
+    body[at : at + 1] = ast.parse(line).body if line else []
     made = {}
     exec(compile(tree, "toy", "exec"), {**globals()}, made)
     return made["Toy"]
@@ -265,10 +315,24 @@ def toy_with(part, line=None):
 def refused(emulator, match):
     with pytest.raises(TypeError, match=match):
         register(emulator)
-    assert list(EMULATORS) == list(EmulatorConfig.members.models) == ["esim", "v2e", "voltmeter"], "nothing is half registered"
+    assert list(EMULATORS) == list(EmulatorConfig.members.models) == ["esim", "v2e", "voltmeter"], (
+        "nothing is half registered"
+    )
 
 
-@pytest.mark.parametrize("part", ["Config", "Config.emulator", "Config.reconstructions", "Config.from_sensor", "response", "noiseless", "_start", "_advance"])
+@pytest.mark.parametrize(
+    "part",
+    [
+        "Config",
+        "Config.emulator",
+        "Config.reconstructions",
+        "Config.from_sensor",
+        "response",
+        "noiseless",
+        "_start",
+        "_advance",
+    ],
+)
 def test_a_part_that_is_forgotten_is_named(part):
     name = "Toy" if part in ("Config", "Config.emulator") else "'toy'"
     refused(toy_with(part), f"^emulator {name}: `{part}` is missing$")
@@ -277,19 +341,38 @@ def test_a_part_that_is_forgotten_is_named(part):
 FREE = "@classmethod\ndef {}(cls, _): return {}"
 
 
-@pytest.mark.parametrize("part, line, problem", [
-    ("Config", "Config = dict", "emulator Toy: `Config` is <class 'dict'> and not an EmulatorConfig of its own"),
-    ("Config.emulator", "emulator: str = 'toy'", "emulator Toy: `Config.emulator` is not of the form"),
-    ("Config.dead_us", "dead_us: float", "`Config` has keys without a default: dead_us"),
-    ("Config.reconstructions", "reconstructions = 'linear'", "`Config.reconstructions` is 'linear' and not a tuple"),
-    ("Config.reconstructions", "reconstructions = ('pchip',)", "not a tuple of 'linear' and"),
-    ("Config.from_sensor", FREE.format("from_sensor", "3"), "`Config.from_sensor` gives 3 and not a table of keys"),
-    ("Config.from_sensor", FREE.format("from_sensor", "{'dead': 1}"), "`Config.from_sensor` fails: dead: unknown key"),
-    ("Config.from_sensor", FREE.format("from_sensor", "_.thresholds"), "`Config.from_sensor` fails: .*no attribute 'thresholds'"),
-    ("response", FREE.format("response", "0.2"), "`response` gives 0.2 and not a Response"),
-    ("noiseless", FREE.format("noiseless", "None"), "`noiseless` gives None and not the configuration of an emulator in the table"),
-    ("Config.emulator", "emulator: Literal['v2e'] = 'v2e'", "emulator 'v2e': there is one already, V2e"),
-])
+@pytest.mark.parametrize(
+    "part, line, problem",
+    [
+        ("Config", "Config = dict", "emulator Toy: `Config` is <class 'dict'> and not an EmulatorConfig of its own"),
+        ("Config.emulator", "emulator: str = 'toy'", "emulator Toy: `Config.emulator` is not of the form"),
+        ("Config.dead_us", "dead_us: float", "`Config` has keys without a default: dead_us"),
+        (
+            "Config.reconstructions",
+            "reconstructions = 'linear'",
+            "`Config.reconstructions` is 'linear' and not a tuple",
+        ),
+        ("Config.reconstructions", "reconstructions = ('pchip',)", "not a tuple of 'linear' and"),
+        ("Config.from_sensor", FREE.format("from_sensor", "3"), "`Config.from_sensor` gives 3 and not a table of keys"),
+        (
+            "Config.from_sensor",
+            FREE.format("from_sensor", "{'dead': 1}"),
+            "`Config.from_sensor` fails: dead: unknown key",
+        ),
+        (
+            "Config.from_sensor",
+            FREE.format("from_sensor", "_.thresholds"),
+            "`Config.from_sensor` fails: .*no attribute 'thresholds'",
+        ),
+        ("response", FREE.format("response", "0.2"), "`response` gives 0.2 and not a Response"),
+        (
+            "noiseless",
+            FREE.format("noiseless", "None"),
+            "`noiseless` gives None and not the configuration of an emulator in the table",
+        ),
+        ("Config.emulator", "emulator: Literal['v2e'] = 'v2e'", "emulator 'v2e': there is one already, V2e"),
+    ],
+)
 def test_a_part_of_the_wrong_kind_is_named(part, line, problem):
     refused(toy_with(part, line), problem)
 
@@ -358,7 +441,9 @@ def seen_from(folder, k):
     y, x = np.mgrid[: depth.shape[0], : depth.shape[1]]
     rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(poses["K"]).T
     T = poses["T_world_cam"][k + 1]  # the first is that of the pre-roll's start
-    return np.where(np.isinf(depth)[..., None], 0, (rays * np.where(np.isinf(depth), 0, depth)[..., None]) @ T[:3, :3].T + T[:3, 3])
+    return np.where(
+        np.isinf(depth)[..., None], 0, (rays * np.where(np.isinf(depth), 0, depth)[..., None]) @ T[:3, :3].T + T[:3, 3]
+    )
 
 
 def test_a_toy_label_is_generated_verified_shown_and_exported(made, capsys, tmp_path):
@@ -381,7 +466,9 @@ def test_what_verify_says_of_a_toy_label(position, made, monkeypatch):
     (_folder,) = (made / "train").iterdir()
     assert verify_dataset(made).clean
     monkeypatch.setattr(Position, "problem", lambda self, value: "below the floor" if value.min() < 99 else None)
-    assert verify_dataset(made).problems == {"train/sequence_000000": [f"position/{k:06d}.npy: below the floor" for k in range(2)]}
+    assert verify_dataset(made).problems == {
+        "train/sequence_000000": [f"position/{k:06d}.npy: below the floor" for k in range(2)]
+    }
     monkeypatch.undo()
     monkeypatch.setattr(Position, "channels", 2)
     (line, _) = verify_dataset(made).problems["train/sequence_000000"]
@@ -404,7 +491,9 @@ def test_a_toy_label_is_explained(position, tmp_path, capsys):
     with_it, without = (explain(load_run(labelled(tmp_path), [f"labels.position={on}"])) for on in ("true", "false"))
     size = [next(p.bytes for p in told.passes if p.name == "labels") for told in (with_it, without)]
     assert size[0] - size[1] == 64 * 48 * 16
-    assert next(p.why for p in with_it.passes if p.name == "labels") == "depth, flow_forward, occlusion_forward, position"
+    assert (
+        next(p.why for p in with_it.passes if p.name == "labels") == "depth, flow_forward, occlusion_forward, position"
+    )
     assert not any(what == "position" for what, _ in with_it.left_out)
     assert ("position", "labels.position: false") in without.left_out
 
@@ -421,9 +510,15 @@ def test_a_toy_label_is_resumed(position, tmp_path):
 def test_a_toy_label_at_the_front_door(position, tmp_path):
     source = load_run(labelled(tmp_path))
     recording = blinkgl.record(source, labels=["position", "flow"])
-    assert recording.labels[0].position.shape == (48, 64, 3) and recording.labels[0].depth is None and recording.images is None
+    assert (
+        recording.labels[0].position.shape == (48, 64, 3)
+        and recording.labels[0].depth is None
+        and recording.images is None
+    )
     blinkgl.generate(source, tmp_path / "door", labels=["position", "flow"])
-    np.testing.assert_array_equal(np.load(tmp_path / "door/train/sequence_000000/position/000001.npy"), recording.labels[1].position)
+    np.testing.assert_array_equal(
+        np.load(tmp_path / "door/train/sequence_000000/position/000001.npy"), recording.labels[1].position
+    )
     with blinkgl.Renderer(source) as renderer:
         frame = renderer.frame(0.05, ["position"])
     np.testing.assert_array_equal(frame.position, recording.labels[0].position)
@@ -435,9 +530,17 @@ def test_a_toy_label_at_the_front_door(position, tmp_path):
 def test_what_has_no_labels_is_not_disturbed_by_one(command, position, tmp_path):
     if command == "trade":
         options = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5),), rounds=1)
-        assert trade(load_run(labelled(tmp_path)), options=options, settings=(Setting("displacement 2 px"),))["settings"]
+        assert trade(load_run(labelled(tmp_path)), options=options, settings=(Setting("displacement 2 px"),))[
+            "settings"
+        ]
     else:
-        assert sum(len(e) for e in frames_to_events([np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)], fps=1000)) > 0
+        assert (
+            sum(
+                len(e)
+                for e in frames_to_events([np.full((3, 4), level, np.float32) for level in (0.1, 0.2, 0.4)], fps=1000)
+            )
+            > 0
+        )
 
 
 def shader(*arguments):
@@ -448,7 +551,12 @@ def test_shader_diff_judges_a_toy_label(position, tmp_path, capsys, monkeypatch)
     path = labelled(tmp_path)
     assert shader("diff", path, "--pass", "position", "--json") == 0
     (report,) = json.loads(capsys.readouterr().out)["buffers"]
-    assert report["buffer"] == "position" and report["unit"] == "m" and report["value"] < 1e-4 and report["off_silhouettes"]["pixels"] > 1000
+    assert (
+        report["buffer"] == "position"
+        and report["unit"] == "m"
+        and report["value"] < 1e-4
+        and report["off_silhouettes"]["pixels"] > 1000
+    )
     assert shader("probe", path, "--pixel", "30,20") == 0
     assert re.search(r"^ *position +\S+  \S+  \S+", capsys.readouterr().out, re.M)
     for wrong, line in (("0.5 * world_from_local", "half the right value"), ("-world_from_local", "the sign is wrong")):
@@ -476,7 +584,9 @@ def test_only_what_is_asked_for_is_compiled(position, drawing):
     renderer.forget()
     renderer.gl.shaders.clear()
     renderer.labels(t_ns, LabelRequest("position"))
-    assert {tuple(name for name, _ in defines if name.startswith("OUT_")) for _, defines in renderer.gl.shaders.compiled} == {("OUT_POSITION",)}
+    assert {
+        tuple(name for name, _ in defines if name.startswith("OUT_")) for _, defines in renderer.gl.shaders.compiled
+    } == {("OUT_POSITION",)}
 
 
 def test_the_configuration_knows_a_toy_label_while_it_is_registered(tmp_path):
@@ -485,7 +595,10 @@ def test_the_configuration_knows_a_toy_label_while_it_is_registered(tmp_path):
         load_run(labelled(tmp_path))
     register_label(Position())
     try:
-        assert load_run(labelled(tmp_path)).sequence(0).labels.position is True and SequenceConfig().labels.position is False
+        assert (
+            load_run(labelled(tmp_path)).sequence(0).labels.position is True
+            and SequenceConfig().labels.position is False
+        )
         with pytest.raises(ConfigError, match="labels.positoin: unknown key; expected 'position' .nearest"):
             load_run(labelled(tmp_path, labels={"positoin": True}))
         with pytest.raises(ConfigError, match="labels.position: not true or false .got 3"):
@@ -508,10 +621,17 @@ def test_the_page_shows_this_toy_label():
 
 def test_reading_a_yaml_needs_neither_opengl_nor_a_compiler(tmp_path):
     (tmp_path / "a.yaml").write_text(yaml.safe_dump({"labels": {"depth": True, "flow": ["backward"]}}))
-    code = ("import sys; from blinkgl.config.sequence import load_run; "
-            "print(load_run(sys.argv[1]).sequence(0).labels.depth);assert not {'moderngl', 'numba', 'cv2', 'h5py', "
-            "'blinkgl.gl', 'blinkgl.render'} & set(sys.modules), sorted(sys.modules)")
-    assert subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.yaml")], capture_output=True, text=True, check=True).stdout == "True\n"
+    code = (
+        "import sys; from blinkgl.config.sequence import load_run; "
+        "print(load_run(sys.argv[1]).sequence(0).labels.depth);assert not {'moderngl', 'numba', 'cv2', 'h5py', "
+        "'blinkgl.gl', 'blinkgl.render'} & set(sys.modules), sorted(sys.modules)"
+    )
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path / "a.yaml")], capture_output=True, text=True, check=True
+        ).stdout
+        == "True\n"
+    )
 
 
 def test_nothing_else_lists_labels():
@@ -522,18 +642,30 @@ def test_nothing_else_lists_labels():
     found = {}
     for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            here = {ast.Dict: lambda n: n.keys, ast.Tuple: lambda n: n.elts, ast.List: lambda n: n.elts, ast.Set: lambda n: n.elts}.get(type(node), lambda n: [])(node)
-            said = {n.value for n in here if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in names}
+            here = {
+                ast.Dict: lambda n: n.keys,
+                ast.Tuple: lambda n: n.elts,
+                ast.List: lambda n: n.elts,
+                ast.Set: lambda n: n.elts,
+            }.get(type(node), lambda n: [])(node)
+            said = {
+                n.value for n in here if isinstance(n, ast.Constant) and isinstance(n.value, str) and n.value in names
+            }
             if said:
                 found.setdefault(path.relative_to(root).as_posix(), set()).update(said)
     elsewhere = {path: said for path, said in found.items() if not path.startswith("labels/")}
-    assert elsewhere.pop("dataset/frames.py", elsewhere.pop("sequence/recorded.py", None)) == {"flow_forward", "occlusion_forward"}, "what recorded frames bring"
+    assert elsewhere.pop("dataset/frames.py", elsewhere.pop("sequence/recorded.py", None)) == {
+        "flow_forward",
+        "occlusion_forward",
+    }, "what recorded frames bring"
     assert {path for path in elsewhere if not path.startswith("scene/")} == set()  # a mesh has normals, too
 
 
 def position_with(**changes):
     """The class above with parts replaced; None: taken out."""
-    body = {name: value for name, value in vars(Position).items() if not name.startswith("__") or name == "__doc__"} | changes
+    body = {
+        name: value for name, value in vars(Position).items() if not name.startswith("__") or name == "__doc__"
+    } | changes
     return type("Position", (Label,), {name: value for name, value in body.items() if value is not None})
 
 
@@ -544,37 +676,49 @@ def label_refused(label, match):
     assert list(LABELS) == known and list(LabelsConfig.model_fields) == keys, "nothing is half registered"
 
 
-@pytest.mark.parametrize("part, said", [
-    ("name", "label Position: `name` is missing"), ("about", "label 'position': `about` is missing"), ("reference", "label 'position': `reference` is missing"),
-    ("tolerance", "label 'position': `tolerance` is missing"), ("buffer", "label 'position': `buffer` is missing, and so is `finish`"),
-    ("glsl", "label 'position': `glsl` is missing, and so is the file shaders/include/labels/position.glsl"),
-])
+@pytest.mark.parametrize(
+    "part, said",
+    [
+        ("name", "label Position: `name` is missing"),
+        ("about", "label 'position': `about` is missing"),
+        ("reference", "label 'position': `reference` is missing"),
+        ("tolerance", "label 'position': `tolerance` is missing"),
+        ("buffer", "label 'position': `buffer` is missing, and so is `finish`"),
+        ("glsl", "label 'position': `glsl` is missing, and so is the file shaders/include/labels/position.glsl"),
+    ],
+)
 def test_a_part_of_a_label_that_is_forgotten_is_named(part, said):
     label_refused(position_with(**{part: None})(), f"^{re.escape(said)}")
 
 
-@pytest.mark.parametrize("changes, said", [
-    (dict(name="Position"), "`name` is 'Position' and not a word of a-z"),
-    (dict(name="depth"), "label 'depth': `name` is taken"),
-    (dict(name="float_flow"), "label 'float_flow': `glsl` does not define vec4 label_float_flow()"),
-    (dict(name="model", glsl=Position.glsl.replace("position", "model"), keys={"copy": Key(bool, Field(False))}), "label 'model': `keys`: 'copy' cannot be a key"),
-    (dict(keys={"depth": Key(bool, Field(False))}), "label 'position': `keys`: 'depth' is a key already"),
-    (dict(keys={"position": bool}), "`keys` is {'position': <class 'bool'>} and not a table of Keys"),
-    (dict(kind="vectors"), "`kind` is 'vectors' and none of scalar, depth"),
-    (dict(buffer="RGB32F"), "`buffer` is 'RGB32F' and none of R32F, RG32F, RGBA32F, R32UI"),
-    (dict(buffer="RG32F"), "`glsl` does not define vec2 label_position()"),
-    (dict(glsl=3), "`glsl` is 3 and not text"),
-    (dict(varyings=("world",)), "`varyings` is ('world',) and not a tuple of some of local, normal"),
-    (dict(varyings="local"), "`varyings` is 'local' and not a tuple"),
-    (dict(needs=("dpeth",)), "`needs` is ('dpeth',) and not a tuple of some of images, depth"),
-    (dict(there=("depth",)), "`there` is said, but not `towards`"),
-    (dict(there=("images",), towards="forward"), "`there` names a label without a `buffer`"),
-    (dict(towards="onward"), "`towards` is 'onward' and neither"),
-    (dict(forms=()), "`forms` is () and not a tuple of one Form or more"),
-    (dict(forms=(Form("position", "npy"),)), "`forms` cannot both be written and read"),
-    (dict(forms=(npy("depth"),)), "`forms` writes where label 'depth' does: depth/000000.npy"),
-    (dict(tolerance="small"), "`tolerance` is 'small' and not a number >= 0"),
-])
+@pytest.mark.parametrize(
+    "changes, said",
+    [
+        (dict(name="Position"), "`name` is 'Position' and not a word of a-z"),
+        (dict(name="depth"), "label 'depth': `name` is taken"),
+        (dict(name="float_flow"), "label 'float_flow': `glsl` does not define vec4 label_float_flow()"),
+        (
+            dict(name="model", glsl=Position.glsl.replace("position", "model"), keys={"copy": Key(bool, Field(False))}),
+            "label 'model': `keys`: 'copy' cannot be a key",
+        ),
+        (dict(keys={"depth": Key(bool, Field(False))}), "label 'position': `keys`: 'depth' is a key already"),
+        (dict(keys={"position": bool}), "`keys` is {'position': <class 'bool'>} and not a table of Keys"),
+        (dict(kind="vectors"), "`kind` is 'vectors' and none of scalar, depth"),
+        (dict(buffer="RGB32F"), "`buffer` is 'RGB32F' and none of R32F, RG32F, RGBA32F, R32UI"),
+        (dict(buffer="RG32F"), "`glsl` does not define vec2 label_position()"),
+        (dict(glsl=3), "`glsl` is 3 and not text"),
+        (dict(varyings=("world",)), "`varyings` is ('world',) and not a tuple of some of local, normal"),
+        (dict(varyings="local"), "`varyings` is 'local' and not a tuple"),
+        (dict(needs=("dpeth",)), "`needs` is ('dpeth',) and not a tuple of some of images, depth"),
+        (dict(there=("depth",)), "`there` is said, but not `towards`"),
+        (dict(there=("images",), towards="forward"), "`there` names a label without a `buffer`"),
+        (dict(towards="onward"), "`towards` is 'onward' and neither"),
+        (dict(forms=()), "`forms` is () and not a tuple of one Form or more"),
+        (dict(forms=(Form("position", "npy"),)), "`forms` cannot both be written and read"),
+        (dict(forms=(npy("depth"),)), "`forms` writes where label 'depth' does: depth/000000.npy"),
+        (dict(tolerance="small"), "`tolerance` is 'small' and not a number >= 0"),
+    ],
+)
 def test_a_part_of_a_label_of_the_wrong_kind_is_named(changes, said):
     label_refused(position_with(**changes)(), re.escape(said))
 
@@ -592,25 +736,73 @@ def drawing():
     source = RunTemplate(PLAIN | {"labels": {}}, Path())
     config = source.sequence(0)
     with create_context() as gl:
-        scene = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, split="train", seed=config.seed, sequence=0, base=Path())
+        scene = build_scene(
+            config.scene,
+            config.camera,
+            config.time.t0_ns,
+            config.time.t1_ns,
+            split="train",
+            seed=config.seed,
+            sequence=0,
+            base=Path(),
+        )
         with Renderer(gl, scene, config.render) as renderer:
             yield renderer, config.time.t0_ns
 
 
-@pytest.mark.parametrize("changes, error, said", [
-    (dict(uniforms=None), TypeError, "label 'position': `uniforms` gives no 'world_from_local'"),
-    (dict(uniforms=lambda self, shot: {"world_from_locla": shot.moment.T_world_obj[:, :3]}), TypeError, "label 'position': `uniforms` gives no 'world_from_local'"),
-    (dict(uniforms=lambda self, shot: {"world_from_local": shot.moment.T_world_obj[:, :3], "more": shot.moment.T_world_obj}), TypeError,
-     "label 'position': `uniforms` gives 'more', which its `glsl` does not use"),
-    (dict(uniforms=lambda self, shot: {"world_from_local": np.eye(4)[:3]}), TypeError, "'world_from_local' of shape (3, 4), which does not begin with the"),
-    (dict(uniforms=lambda self, shot: {"mvp": shot.moment.mvp}), TypeError, "label 'position': `uniforms` gives 'mvp', which the pass gives, too"),
-    (dict(finish=lambda self, drawn: drawn.raw("position")), TypeError, "label 'position': `finish` gives (48, 64, 4) float32 and not (48, 64, 3) float32"),
-    (dict(finish=lambda self, drawn: drawn.raw("position")[..., :3] > 0), TypeError, "label 'position': `finish` gives (48, 64, 3) bool and not (48, 64, 3) float32"),
-    (dict(finish=lambda self, drawn: drawn.raw("depth")), TypeError, "label 'position': `finish` looks at 'depth', which is not among its `needs`"),
-    (dict(finish=lambda self, drawn: drawn.there("depth")), TypeError, "label 'position': `finish` looks at 'depth', which is not among its `there`"),
-    (dict(varyings=()), ShaderError, "include/labels/position.glsl:5: "),
-    (dict(glsl=Position.glsl.replace("1.0);", "1.0)")), ShaderError, "include/labels/position.glsl:6: "),
-])
+@pytest.mark.parametrize(
+    "changes, error, said",
+    [
+        (dict(uniforms=None), TypeError, "label 'position': `uniforms` gives no 'world_from_local'"),
+        (
+            dict(uniforms=lambda self, shot: {"world_from_locla": shot.moment.T_world_obj[:, :3]}),
+            TypeError,
+            "label 'position': `uniforms` gives no 'world_from_local'",
+        ),
+        (
+            dict(
+                uniforms=lambda self, shot: {
+                    "world_from_local": shot.moment.T_world_obj[:, :3],
+                    "more": shot.moment.T_world_obj,
+                }
+            ),
+            TypeError,
+            "label 'position': `uniforms` gives 'more', which its `glsl` does not use",
+        ),
+        (
+            dict(uniforms=lambda self, shot: {"world_from_local": np.eye(4)[:3]}),
+            TypeError,
+            "'world_from_local' of shape (3, 4), which does not begin with the",
+        ),
+        (
+            dict(uniforms=lambda self, shot: {"mvp": shot.moment.mvp}),
+            TypeError,
+            "label 'position': `uniforms` gives 'mvp', which the pass gives, too",
+        ),
+        (
+            dict(finish=lambda self, drawn: drawn.raw("position")),
+            TypeError,
+            "label 'position': `finish` gives (48, 64, 4) float32 and not (48, 64, 3) float32",
+        ),
+        (
+            dict(finish=lambda self, drawn: drawn.raw("position")[..., :3] > 0),
+            TypeError,
+            "label 'position': `finish` gives (48, 64, 3) bool and not (48, 64, 3) float32",
+        ),
+        (
+            dict(finish=lambda self, drawn: drawn.raw("depth")),
+            TypeError,
+            "label 'position': `finish` looks at 'depth', which is not among its `needs`",
+        ),
+        (
+            dict(finish=lambda self, drawn: drawn.there("depth")),
+            TypeError,
+            "label 'position': `finish` looks at 'depth', which is not among its `there`",
+        ),
+        (dict(varyings=()), ShaderError, "include/labels/position.glsl:5: "),
+        (dict(glsl=Position.glsl.replace("1.0);", "1.0)")), ShaderError, "include/labels/position.glsl:6: "),
+    ],
+)
 def test_what_shows_only_when_a_label_is_drawn_is_named_then(changes, error, said, drawing):
     renderer, t_ns = drawing
     register_label(position_with(**changes)())
@@ -632,16 +824,31 @@ def test_a_label_may_look_at_others_and_at_another_time(drawing):
         seen.update(depth=drawn.raw("depth"), flow=drawn.value("flow_forward"), there=drawn.there("depth"))
         return drawn.raw("flow_forward")[..., 2]
 
-    changes = dict(name="next_depth", buffer=None, glsl=None, uniforms=None, channels=0, finish=finish, towards="forward", needs=("depth", "flow_forward"), there=("depth",))
+    changes = dict(
+        name="next_depth",
+        buffer=None,
+        glsl=None,
+        uniforms=None,
+        channels=0,
+        finish=finish,
+        towards="forward",
+        needs=("depth", "flow_forward"),
+        there=("depth",),
+    )
     register_label(position_with(**changes)())
     try:
         later = t_ns + 10**7
         frame = renderer.labels(t_ns, LabelRequest("next_depth"), later)
         whole = renderer.labels(t_ns, LabelRequest("depth", "flow_forward", "next_depth"), later)
-        for name, value in {"depth": np.where(seen["depth"] > 0, seen["depth"], np.inf), "next_depth": frame.next_depth}.items():
+        for name, value in {
+            "depth": np.where(seen["depth"] > 0, seen["depth"], np.inf),
+            "next_depth": frame.next_depth,
+        }.items():
             np.testing.assert_array_equal(getattr(whole, name), value)
         np.testing.assert_array_equal(whole.forward.flow, seen["flow"].flow)
-        np.testing.assert_array_equal(np.where(seen["there"] > 0, seen["there"], np.inf), renderer.labels(later, LabelRequest("depth")).depth)
+        np.testing.assert_array_equal(
+            np.where(seen["there"] > 0, seen["there"], np.inf), renderer.labels(later, LabelRequest("depth")).depth
+        )
         with pytest.raises(TypeError, match="label 'next_depth' leads to another time: t_forward_ns"):
             renderer.labels(t_ns, LabelRequest("next_depth"))
     finally:
@@ -651,10 +858,16 @@ def test_a_label_may_look_at_others_and_at_another_time(drawing):
         LabelFrame(0, {}).next_depth  # noqa: B018
 
 
-@pytest.mark.parametrize("reference, said", [
-    (lambda self, scene, frame: frame.depth, "label 'position': `reference` gives (48, 64) and not (48, 64, 3)"),
-    (lambda self, scene, frame: frame.deep, "label 'position': `reference` fails: 'ReferenceFrame' object has no attribute 'deep'"),
-])
+@pytest.mark.parametrize(
+    "reference, said",
+    [
+        (lambda self, scene, frame: frame.depth, "label 'position': `reference` gives (48, 64) and not (48, 64, 3)"),
+        (
+            lambda self, scene, frame: frame.deep,
+            "label 'position': `reference` fails: 'ReferenceFrame' object has no attribute 'deep'",
+        ),
+    ],
+)
 def test_a_reference_that_is_none_is_named(reference, said, tmp_path, capsys):
     register_label(position_with(reference=reference)())
     try:

@@ -10,7 +10,9 @@ def test_values_of_the_standard():
     """IEC 61966-2-1: 0.5 encoded is 0.21404 in linear light; the linear piece ends at 0.04045."""
     assert linear_from_srgb(0.5) == pytest.approx(0.2140411, abs=1e-7)
     assert linear_from_srgb(0.04045) == pytest.approx(0.04045 / 12.92)
-    assert linear_from_srgb(np.float64(0.5)).dtype == np.float64 and linear_from_srgb(np.float32(0.5)).dtype == np.float32
+    assert (
+        linear_from_srgb(np.float64(0.5)).dtype == np.float64 and linear_from_srgb(np.float32(0.5)).dtype == np.float32
+    )
 
 
 def test_inverse():

@@ -15,7 +15,7 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
-PROGRAM = '''
+PROGRAM = """
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,7 @@ not_a_frame: int = blinkgl.render_frame(scene, 0.1)  # wrong
 not_read: Events = blinkgl.read_flow("flow.png")  # wrong
 recording.no_such_thing  # wrong
 blinkgl.no_such_name  # wrong
-'''
+"""
 
 
 def public_functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef | ast.AsyncFunctionDef, bool]]:
@@ -76,11 +76,15 @@ def public_functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef | ast.A
                 waiting.append((node.body, True))
             elif isinstance(node, (ast.If, ast.Try, ast.With)):
                 waiting.append((node.body, inside))
-            elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and (not node.name.startswith("_") or node.name.endswith("__")):
+            elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and (
+                not node.name.startswith("_") or node.name.endswith("__")
+            ):
                 yield node, inside and not any("staticmethod" in ast.unparse(d) for d in node.decorator_list)
 
 
-@pytest.mark.parametrize("room", sorted({p.relative_to(REPOSITORY).parts[1] for p in (REPOSITORY / "blinkgl").rglob("*.py")}))
+@pytest.mark.parametrize(
+    "room", sorted({p.relative_to(REPOSITORY).parts[1] for p in (REPOSITORY / "blinkgl").rglob("*.py")})
+)
 def test_public_signatures_say_their_types(room):
     place = REPOSITORY / "blinkgl" / room
     bare = []
@@ -100,10 +104,23 @@ def test_a_users_program_is_checked(tmp_path):
     pytest.importorskip("pyrefly", reason="the extra [dev] is not installed")
     (tmp_path / "program.py").write_text(PROGRAM, encoding="utf-8")
     program = next(file.locate() for file in metadata.files("pyrefly") or () if file.name == "pyrefly")
-    command = [program, "check", "--preset", "strict", "--output-format", "json", "--python-interpreter-path", sys.executable,
-               "--search-path", REPOSITORY, "program.py"]
+    command = [
+        program,
+        "check",
+        "--preset",
+        "strict",
+        "--output-format",
+        "json",
+        "--python-interpreter-path",
+        sys.executable,
+        "--search-path",
+        REPOSITORY,
+        "program.py",
+    ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     errors = json.loads(done.stdout)["errors"]
     wrong = {number for number, line in enumerate(PROGRAM.split("\n"), 1) if line.endswith("# wrong")}
     assert done.returncode == 1 and len(wrong) == 17
-    assert {e["line"] for e in errors} == wrong, "\n".join(f"{e['line']}: {e['description']}" for e in errors if e["line"] not in wrong)
+    assert {e["line"] for e in errors} == wrong, "\n".join(
+        f"{e['line']}: {e['description']}" for e in errors if e["line"] not in wrong
+    )

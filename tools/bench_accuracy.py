@@ -25,7 +25,9 @@ from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
 
-REQUEST = LabelRequest("depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
+REQUEST = LabelRequest(
+    "depth", "ids", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward"
+)
 
 
 def compare(gl, template, index: int) -> dict[str, float]:
@@ -43,9 +45,14 @@ def compare(gl, template, index: int) -> dict[str, float]:
     same = (ours.ids == exact.instance) & (exact.instance > 0)
     inside = same & ~band
     norm = lambda v: np.hypot(v[..., 0], v[..., 1])
-    result = {"sequence": index, "triangles": triangles, "pixels": int(same.size), "band": int(band.sum()),
-              "ids_wrong": int(((ours.ids != exact.instance) & ~band).sum()),
-              "ids_wrong_in_band": int(((ours.ids != exact.instance) & band).sum())}
+    result = {
+        "sequence": index,
+        "triangles": triangles,
+        "pixels": int(same.size),
+        "band": int(band.sum()),
+        "ids_wrong": int(((ours.ids != exact.instance) & ~band).sum()),
+        "ids_wrong_in_band": int(((ours.ids != exact.instance) & band).sum()),
+    }
     depth = np.abs(ours.depth - exact.depth)[inside] / exact.depth[inside]
     result.update(depth_median=float(np.median(depth)), depth_max=float(depth.max()))
     speed = norm(exact.velocity)[inside]
@@ -55,11 +62,16 @@ def compare(gl, template, index: int) -> dict[str, float]:
         mine, theirs = getattr(ours, name), getattr(exact, name)
         both = inside & mine.valid & theirs.valid
         error = norm(mine.flow - theirs.flow)[both]
-        result.update({f"{name}_median": float(np.median(error)), f"{name}_max": float(error.max()),
-                       f"{name}_largest_flow": float(norm(theirs.flow)[both].max()),
-                       f"{name}_valid_differs": int(((mine.valid != theirs.valid) & inside).sum()),
-                       f"{name}_occlusion_differs": int(((mine.occluded != theirs.occluded) & both).sum()),
-                       f"{name}_occluded": int(theirs.occluded[both].sum())})
+        result.update(
+            {
+                f"{name}_median": float(np.median(error)),
+                f"{name}_max": float(error.max()),
+                f"{name}_largest_flow": float(norm(theirs.flow)[both].max()),
+                f"{name}_valid_differs": int(((mine.valid != theirs.valid) & inside).sum()),
+                f"{name}_occlusion_differs": int(((mine.occluded != theirs.occluded) & both).sum()),
+                f"{name}_occluded": int(theirs.occluded[both].sum()),
+            }
+        )
     return result
 
 
@@ -87,7 +99,10 @@ def main() -> None:
     for name in ("forward", "backward"):
         line(f"{name} flow, px: median / max", lambda r: f"{r[name + '_median']:.1e} / {r[name + '_max']:.1e}")
         line("  of flows up to, px", lambda r: f"{r[name + '_largest_flow']:.0f}")
-        line(f"{name} occlusion that differs", lambda r: f"{r[name + '_occlusion_differs']} of {r[name + '_occluded']:,} hidden")
+        line(
+            f"{name} occlusion that differs",
+            lambda r: f"{r[name + '_occlusion_differs']} of {r[name + '_occluded']:,} hidden",
+        )
     console.print(table)
     if options.json:
         with open(options.json, "w", encoding="utf-8") as file:

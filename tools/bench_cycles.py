@@ -76,17 +76,37 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     config = EsimConfig(threshold_sigma=0.0)
     height, width = scene.camera.height, scene.camera.width
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(islice(displacement_times(options.max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t).read())), options.frames))
+        times = list(
+            islice(
+                displacement_times(
+                    options.max_px,
+                    1000,
+                    20_000_000,
+                    scene.t0_ns,
+                    scene.t1_ns,
+                    lambda t: largest_speed(renderer.velocity_of_movers(t).read()),
+                ),
+                options.frames,
+            )
+        )
         maps = np.stack([np.linalg.norm(renderer.velocity(t).read(), axis=-1) for t in times])
     speeds = SpeedMaps(np.array(times) // 1000, maps)
     step = float(np.median(np.diff(times)))
     everything = CyclesSettings(samples=options.samples, bounces=4)
-    traced = {"our light": replace(everything, shadows=False, bounces=0), "shadows": replace(everything, bounces=0), "everything": everything,
-              "everything, another seed": replace(everything, seed=1)}
+    traced = {
+        "our light": replace(everything, shadows=False, bounces=0),
+        "shadows": replace(everything, bounces=0),
+        "everything": everything,
+        "everything, another seed": replace(everything, seed=1),
+    }
     costs, streams, first = {}, {}, {}
     for name in (*ANTIALIASINGS, *traced):
         cost = costs[name] = Cost()
-        source = rasterised(gl, scene, times, name, cost) if name in ANTIALIASINGS else frames(scene, times, traced[name], cost)
+        source = (
+            rasterised(gl, scene, times, name, cost)
+            if name in ANTIALIASINGS
+            else frames(scene, times, traced[name], cost)
+        )
 
         def event_frames(name=name, source=source):
             for t, frame in zip(times, source):
@@ -95,7 +115,9 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
 
         camera = EventCamera(config, None, height, width, seed=1)
         streams[name] = Events.concatenate([events for _, events in emulate(event_frames(), camera)])
-        console.print(f"{name}: {len(streams[name]):,} events, {np.median(cost.wall_s):.3f} s per frame", highlight=False)
+        console.print(
+            f"{name}: {len(streams[name]):,} events, {np.median(cost.wall_s):.3f} s per frame", highlight=False
+        )
     rows = [("filtering", a, "our light") for a in ANTIALIASINGS]
     rows += [("shadows", "our light", "shadows"), ("bounces", "shadows", "everything")]
     rows += [("all", a, "everything") for a in ANTIALIASINGS] + [("noise", "everything, another seed", "everything")]
@@ -105,46 +127,89 @@ def clip(gl, scene: Scene, options, console: Console) -> dict:
     for cause, judged, truth in rows:
         e = event_errors(streams[truth], streams[judged], speeds, t0, t1, limit_us=limit)
         log = lambda name: np.log(first[name] + config.log_eps)
-        errors.append({"cause": cause, "judged": judged, "reference": truth, **e.to_dict(),
-                       "log_rmse": float(np.sqrt(np.mean((log(judged) - log(truth)) ** 2)))})
+        errors.append(
+            {
+                "cause": cause,
+                "judged": judged,
+                "reference": truth,
+                **e.to_dict(),
+                "log_rmse": float(np.sqrt(np.mean((log(judged) - log(truth)) ** 2))),
+            }
+        )
     if options.pictures:
         folder = Path(options.pictures)
         folder.mkdir(parents=True, exist_ok=True)
         for name, frame in first.items():
             cv2.imwrite(str(folder / f"{name.replace(', ', '-').replace(' ', '-')}.png"), to_srgb8(frame))
-    return {"width": width, "height": height, "frames": len(times), "milliseconds": (times[-1] - times[0]) / 1e6, "median_step_us": step / 1000,
-            "limit_us": limit, "samples": options.samples, "costs": {name: asdict(cost) for name, cost in costs.items()}, "errors": errors}
+    return {
+        "width": width,
+        "height": height,
+        "frames": len(times),
+        "milliseconds": (times[-1] - times[0]) / 1e6,
+        "median_step_us": step / 1000,
+        "limit_us": limit,
+        "samples": options.samples,
+        "costs": {name: asdict(cost) for name, cost in costs.items()},
+        "errors": errors,
+    }
 
 
 def speed(gl, scene: Scene, max_px: float, options) -> dict:
     """Part 2. EEVEE and Cycles draw two frames; the first (shader compilation, acceleration structure) is set apart."""
     with Renderer(gl, scene, RenderConfig()) as renderer:
-        times = list(displacement_times(max_px, 1000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t).read())))
+        times = list(
+            displacement_times(
+                max_px,
+                1000,
+                20_000_000,
+                scene.t0_ns,
+                scene.t1_ns,
+                lambda t: largest_speed(renderer.velocity_of_movers(t).read()),
+            )
+        )
         triangles = renderer.triangles
     few = [times[0], times[len(times) // 2]]
     rows = []
 
     def add(name: str, cost: Cost, first: bool):
         skip = 1 if first else 0
-        rows.append({"renderer": name, "wall_s": float(np.median(cost.wall_s[skip:])), "cpu_s": float(np.median(cost.cpu_s[skip:])),
-                     "first_wall_s": cost.wall_s[0], "first_cpu_s": cost.cpu_s[0], "frames": len(cost.wall_s) - skip})
+        rows.append(
+            {
+                "renderer": name,
+                "wall_s": float(np.median(cost.wall_s[skip:])),
+                "cpu_s": float(np.median(cost.cpu_s[skip:])),
+                "first_wall_s": cost.wall_s[0],
+                "first_cpu_s": cost.cpu_s[0],
+                "frames": len(cost.wall_s) - skip,
+            }
+        )
 
     for antialiasing in ANTIALIASINGS:
         cost = Cost()
         for _ in rasterised(gl, scene, times[::10], antialiasing, cost):
             pass
         add(f"BlinkGL luminance, {antialiasing}", cost, first=False)
-    for name, settings in (("EEVEE, 1 sample", CyclesSettings(1, engine="eevee")), ("EEVEE, 16 samples", CyclesSettings(16, engine="eevee")),
-                           ("Cycles, 1 path", CyclesSettings(1)), ("Cycles, 16 paths", CyclesSettings(16)),
-                           (f"Cycles, {options.samples} paths", CyclesSettings(options.samples))):
+    for name, settings in (
+        ("EEVEE, 1 sample", CyclesSettings(1, engine="eevee")),
+        ("EEVEE, 16 samples", CyclesSettings(16, engine="eevee")),
+        ("Cycles, 1 path", CyclesSettings(1)),
+        ("Cycles, 16 paths", CyclesSettings(16)),
+        (f"Cycles, {options.samples} paths", CyclesSettings(options.samples)),
+    ):
         if settings.engine == "eevee" and options.no_eevee:
             continue
         cost = Cost()
         for _ in frames(scene, few, settings, cost):
             pass
         add(name, cost, first=True)
-    return {"width": scene.camera.width, "height": scene.camera.height, "triangles": triangles, "max_px": max_px, "rows": rows,
-            "frames_per_simulated_second": (len(times) - 1) / ((times[-1] - times[0]) / 1e9)}
+    return {
+        "width": scene.camera.width,
+        "height": scene.camera.height,
+        "triangles": triangles,
+        "max_px": max_px,
+        "rows": rows,
+        "frames_per_simulated_second": (len(times) - 1) / ((times[-1] - times[0]) / 1e9),
+    }
 
 
 def main() -> None:
@@ -156,7 +221,9 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=160, help="of the clip, px")
     parser.add_argument("--samples", type=int, default=128, help="paths per pixel")
     parser.add_argument("--max-px", type=float, default=0.5, help="largest motion between two frames of the clip")
-    parser.add_argument("--partners", type=float, default=4.0, help="events are partners up to this many median frame steps apart")
+    parser.add_argument(
+        "--partners", type=float, default=4.0, help="events are partners up to this many median frame steps apart"
+    )
     parser.add_argument("--only", choices=["clip", "speed"])
     parser.add_argument("--no-eevee", action="store_true")
     parser.add_argument("--json", metavar="FILE")
@@ -181,33 +248,67 @@ def main() -> None:
             result["speed"] = speed(gl, scene, getattr(config.timeline, "max_px", 1.0), options)
             _show_speed(console, result["speed"])
         result["load_after"] = os.getloadavg()
-    console.print("load, 1 and 5 minutes, before and after:", *(f"{n:.1f}" for n in (*result["load_before"][:2], *result["load_after"][:2])))
+    console.print(
+        "load, 1 and 5 minutes, before and after:",
+        *(f"{n:.1f}" for n in (*result["load_before"][:2], *result["load_after"][:2])),
+    )
     if options.json:
         Path(options.json).write_text(json.dumps(result, indent=1))
 
 
 def _show_clip(console: Console, r: dict) -> None:
-    table = Table(title=f"events, {r['width']}x{r['height']}, {r['frames']} frames of {r['milliseconds']:.0f} ms, {r['samples']} "
-                        f"paths; partners within {r['limit_us'] / 1000:.1f} ms", title_justify="left")
-    for name in ("cause", "judged", "by", "events", "missed", "extra", "time median, p95 / µs", "px", "voxel L2", "log RMSE"):
+    table = Table(
+        title=f"events, {r['width']}x{r['height']}, {r['frames']} frames of {r['milliseconds']:.0f} ms, {r['samples']} "
+        f"paths; partners within {r['limit_us'] / 1000:.1f} ms",
+        title_justify="left",
+    )
+    for name in (
+        "cause",
+        "judged",
+        "by",
+        "events",
+        "missed",
+        "extra",
+        "time median, p95 / µs",
+        "px",
+        "voxel L2",
+        "log RMSE",
+    ):
         table.add_column(name, justify="left" if name in ("cause", "judged", "by") else "right")
     for e in r["errors"]:
-        table.add_row(e["cause"], e["judged"], e["reference"], f"{100 * e['count']:+.1f} %", f"{100 * e['missed']:.1f} %", f"{100 * e['extra']:.1f} %",
-                      f"{e['time_median_us']:.0f}, {e['time_p95_us']:.0f}", f"{e['shift_median_px']:.3f}, {e['shift_p95_px']:.2f}", f"{e['voxel']:.2f}",
-                      f"{e['log_rmse']:.3f}")
+        table.add_row(
+            e["cause"],
+            e["judged"],
+            e["reference"],
+            f"{100 * e['count']:+.1f} %",
+            f"{100 * e['missed']:.1f} %",
+            f"{100 * e['extra']:.1f} %",
+            f"{e['time_median_us']:.0f}, {e['time_p95_us']:.0f}",
+            f"{e['shift_median_px']:.3f}, {e['shift_p95_px']:.2f}",
+            f"{e['voxel']:.2f}",
+            f"{e['log_rmse']:.3f}",
+        )
     console.print(table)
 
 
 def _show_speed(console: Console, r: dict) -> None:
     rate = r["frames_per_simulated_second"]
-    table = Table(title=f"{r['width']}x{r['height']}, {r['triangles']:,} triangles, {rate:.0f} frames per simulated second "
-                        f"(displacement {r['max_px']:g} px)",
-                  title_justify="left")
+    table = Table(
+        title=f"{r['width']}x{r['height']}, {r['triangles']:,} triangles, {rate:.0f} frames per simulated second "
+        f"(displacement {r['max_px']:g} px)",
+        title_justify="left",
+    )
     for name in ("renderer", "s per frame", "processor s", "first frame", "s per simulated s", "times BlinkGL"):
         table.add_column(name, justify="left" if name == "renderer" else "right")
     for row in r["rows"]:
-        table.add_row(row["renderer"], f"{row['wall_s']:.4f}", f"{row['cpu_s']:.4f}", f"{row['first_wall_s']:.3f}", f"{row['wall_s'] * rate:.1f}",
-                      f"{row['cpu_s'] / r['rows'][0]['cpu_s']:.1f}")
+        table.add_row(
+            row["renderer"],
+            f"{row['wall_s']:.4f}",
+            f"{row['cpu_s']:.4f}",
+            f"{row['first_wall_s']:.3f}",
+            f"{row['wall_s'] * rate:.1f}",
+            f"{row['cpu_s'] / r['rows'][0]['cpu_s']:.1f}",
+        )
     console.print(table)
 
 

@@ -37,7 +37,10 @@ def voxels(height: int, width: int, events: int, rounds: int) -> dict[str, float
     uniform = rng.integers(0, width, events), rng.integers(0, height, events)
     # Along moving edges, as a camera sees them: 400 lines, each event at its line's place at its time.
     line = rng.integers(0, 400, events)
-    edges = (rng.random(400)[line] * width + 20 * t / 1e5) % width, (rng.random(400)[line] * height + 40 * rng.random(events)) % height
+    edges = (
+        (rng.random(400)[line] * width + 20 * t / 1e5) % width,
+        (rng.random(400)[line] * height + 40 * rng.random(events)) % height,
+    )
     out = {}
     for name, (x, y) in (("uniform", uniform), ("edges", edges)):
         for kind, dtype in (("integer pixels", np.uint16), ("rectified", np.float32)):
@@ -79,7 +82,9 @@ def inference(name: str, height: int, width: int, rounds: int, threads: int) -> 
     workers = {}
     for variant, (plain, keep) in VARIANTS.items():
         pipe, other = context.Pipe()
-        process = context.Process(target=_inference, args=(other, name, height, width, plain, keep, threads), daemon=True)
+        process = context.Process(
+            target=_inference, args=(other, name, height, width, plain, keep, threads), daemon=True
+        )
         process.start()
         workers[variant] = (pipe, process)
     times, flows = {v: [] for v in VARIANTS}, {}
@@ -94,10 +99,15 @@ def inference(name: str, height: int, width: int, rounds: int, threads: int) -> 
         process.join()
     median = {v: np.median(times[v], axis=0) for v in VARIANTS}
     twins = [v for v in VARIANTS if v != "fast"]
-    return {"seconds": {v: float(m[0]) for v, m in median.items()}, "processor_seconds": {v: float(m[1]) for v, m in median.items()},
-            "ratio": {v: float(median[v][0] / median["fast"][0]) for v in twins},
-            "ratio_processor": {v: float(median[v][1] / median["fast"][1]) for v in twins},
-            "px": {v: float(np.abs(flows[v] - flows["fast"]).max()) for v in twins}, "mean_flow_px": float(np.abs(flows["fast"]).mean()), "times": times}
+    return {
+        "seconds": {v: float(m[0]) for v, m in median.items()},
+        "processor_seconds": {v: float(m[1]) for v, m in median.items()},
+        "ratio": {v: float(median[v][0] / median["fast"][0]) for v in twins},
+        "ratio_processor": {v: float(median[v][1] / median["fast"][1]) for v in twins},
+        "px": {v: float(np.abs(flows[v] - flows["fast"]).max()) for v in twins},
+        "mean_flow_px": float(np.abs(flows["fast"]).mean()),
+        "times": times,
+    }
 
 
 def samples(folder: str, count: int = 50) -> dict[str, float]:
@@ -112,7 +122,10 @@ def samples(folder: str, count: int = 50) -> dict[str, float]:
     whole, grids = [], []
     for i in indices:
         raw = source[i]
-        for times, run in ((whole, lambda: dataset[i]), (grids, lambda: [grid(w, raw.height, raw.width) for w in (raw.old, raw.new)])):
+        for times, run in (
+            (whole, lambda: dataset[i]),
+            (grids, lambda: [grid(w, raw.height, raw.width) for w in (raw.old, raw.new)]),
+        ):
             began = time.perf_counter()
             run()
             times.append(time.perf_counter() - began)
@@ -121,7 +134,9 @@ def samples(folder: str, count: int = 50) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--model", default="eflowformer", choices=["eflowformer", "eflowformer-small", "eflowformer-twins", "eraft"])
+    parser.add_argument(
+        "--model", default="eflowformer", choices=["eflowformer", "eflowformer-small", "eflowformer-twins", "eraft"]
+    )
     parser.add_argument("--size", default="640x480")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
@@ -136,14 +151,22 @@ def main() -> None:
         print(f"voxel grid, {name}: {value:.1f} M events/s on one core")
     if a.data:
         result["samples"] = samples(a.data)
-        print("one sample: {sample_ms:.2f} ms from files, of which its grids {grids_ms:.2f} ms".format(**result["samples"]))
+        print(
+            "one sample: {sample_ms:.2f} ms from files, of which its grids {grids_ms:.2f} ms".format(
+                **result["samples"]
+            )
+        )
     result["inference"] = r = inference(a.model, height, width, a.rounds, a.threads)
     for variant in VARIANTS:
-        line = (f"{a.model} {a.size}, {variant}: {r['seconds'][variant]:.2f} s, processor "
-                f"{r['processor_seconds'][variant]:.2f} s")
+        line = (
+            f"{a.model} {a.size}, {variant}: {r['seconds'][variant]:.2f} s, processor "
+            f"{r['processor_seconds'][variant]:.2f} s"
+        )
         if variant in r["ratio"]:
-            line += (f"; {r['ratio'][variant]:.2f} times the fast path's time ({r['ratio_processor'][variant]:.2f} times "
-                     f"its processor time), flows of {r['mean_flow_px']:.1f} px agree to {r['px'][variant]:.1e} px")
+            line += (
+                f"; {r['ratio'][variant]:.2f} times the fast path's time ({r['ratio_processor'][variant]:.2f} times "
+                f"its processor time), flows of {r['mean_flow_px']:.1f} px agree to {r['px'][variant]:.1e} px"
+            )
         print(line)
     if a.json:
         Path(a.json).write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")

@@ -38,11 +38,21 @@ EMULATORS = {
     "Voltmeter": VoltmeterConfig(),
 }
 # Millions of events per second at 640x480, `mid`, on two cores where the peer can use them, else on one.
-PEERS = {"ESIM": ("rpg_esim", 5.46), "ESIM, spread C": ("rpg_esim", 5.46), "V2E clean": ("v2e", 3.13),
-         "V2E noisy": ("v2e", 0.65), "Voltmeter": ("DVS-Voltmeter", 0.20)}
+PEERS = {
+    "ESIM": ("rpg_esim", 5.46),
+    "ESIM, spread C": ("rpg_esim", 5.46),
+    "V2E clean": ("v2e", 3.13),
+    "V2E noisy": ("v2e", 0.65),
+    "Voltmeter": ("DVS-Voltmeter", 0.20),
+}
 FLOOR = {"mid": 70.0, "dense": 153.0}
-TARGETS = {("ESIM", "mid"): 50, ("ESIM", "dense"): 100, ("V2E clean", "mid"): 30, ("V2E noisy", "mid"): 10,
-           ("Voltmeter", "mid"): 10}
+TARGETS = {
+    ("ESIM", "mid"): 50,
+    ("ESIM", "dense"): 100,
+    ("V2E clean", "mid"): 30,
+    ("V2E noisy", "mid"): 10,
+    ("Voltmeter", "mid"): 10,
+}
 
 
 def clip(kind: str, frames: int) -> tuple[np.ndarray, float]:
@@ -84,9 +94,14 @@ def measure(config, frames: np.ndarray, passes: int) -> dict[str, float]:
     results = [one_pass(config, frames) for _ in range(passes)]
     took, events, steps = np.array([r[0] for r in results]), results[0][1], len(frames) - 1
     emulator = make_emulator(config, HEIGHT, WIDTH, 0)
-    return {"Mev/s": events / np.median(took) / 1e6, "best Mev/s": events / took.min() / 1e6,
-            "frames/s": steps / np.median(took), "ns/px-frame": np.median(took) / steps / (HEIGHT * WIDTH) * 1e9,
-            "events/px-frame": events / steps / (HEIGHT * WIDTH), "state B/px": emulator.state_bytes_per_pixel}
+    return {
+        "Mev/s": events / np.median(took) / 1e6,
+        "best Mev/s": events / took.min() / 1e6,
+        "frames/s": steps / np.median(took),
+        "ns/px-frame": np.median(took) / steps / (HEIGHT * WIDTH) * 1e9,
+        "events/px-frame": events / steps / (HEIGHT * WIDTH),
+        "state B/px": emulator.state_bytes_per_pixel,
+    }
 
 
 def quiet(passes: int, steps: int) -> dict[str, float]:
@@ -106,8 +121,12 @@ def quiet(passes: int, steps: int) -> dict[str, float]:
     log = bench.seconds(lambda: log_block(frame.reshape(-1), np.float32(1e-3), out), repeat=10 * passes)["median"]
     numba.set_num_threads(threads)
     pixel = 1e9 / (HEIGHT * WIDTH)
-    return {"float frame": whole * pixel, "of that the logarithm": log * pixel, "without": (whole - log) * pixel,
-            "8-bit frame": table * pixel}
+    return {
+        "float frame": whole * pixel,
+        "of that the logarithm": log * pixel,
+        "without": (whole - log) * pixel,
+        "8-bit frame": table * pixel,
+    }
 
 
 def peak_mib() -> float:
@@ -126,9 +145,22 @@ def main() -> None:
     for kind in ("mid", "dense"):
         codes, speed = clip(kind, frames)
         floats = codes.astype(np.float32) / np.float32(255)
-        table = Table(title=f"{kind}: {WIDTH}x{HEIGHT}, {frames} frames at {FPS} fps, {speed:.2f} px/frame, median of {passes}")
-        for column in ("emulator", "input", "ev/px-frame", "Mev/s", "best", "frames/s", "ns/px-frame", "B/px", "x peer",
-                       "of floor", "target"):
+        table = Table(
+            title=f"{kind}: {WIDTH}x{HEIGHT}, {frames} frames at {FPS} fps, {speed:.2f} px/frame, median of {passes}"
+        )
+        for column in (
+            "emulator",
+            "input",
+            "ev/px-frame",
+            "Mev/s",
+            "best",
+            "frames/s",
+            "ns/px-frame",
+            "B/px",
+            "x peer",
+            "of floor",
+            "target",
+        ):
             table.add_column(column, justify="left" if column in ("emulator", "input") else "right")
         for name, config in EMULATORS.items():
             for kind_of_input, source in (("uint8", codes), ("float32", floats)):
@@ -140,15 +172,26 @@ def main() -> None:
                     figures["of floor"] = figures["Mev/s"] / FLOOR[kind]
                 target = TARGETS.get((name, kind))
                 report["clips"].setdefault(kind, {}).setdefault(name, {})[kind_of_input] = figures
-                table.add_row(name, kind_of_input, f"{figures['events/px-frame']:.3f}", f"{figures['Mev/s']:.1f}",
-                              f"{figures['best Mev/s']:.1f}", f"{figures['frames/s']:.0f}", f"{figures['ns/px-frame']:.2f}",
-                              f"{figures['state B/px']:.0f}", f"{figures[f'x {peer}']:.1f}" if kind == "mid" and peer else "",
-                              f"{figures['of floor']:.2f}" if name == "ESIM" else "", f">= {target}" if target else "")
+                table.add_row(
+                    name,
+                    kind_of_input,
+                    f"{figures['events/px-frame']:.3f}",
+                    f"{figures['Mev/s']:.1f}",
+                    f"{figures['best Mev/s']:.1f}",
+                    f"{figures['frames/s']:.0f}",
+                    f"{figures['ns/px-frame']:.2f}",
+                    f"{figures['state B/px']:.0f}",
+                    f"{figures[f'x {peer}']:.1f}" if kind == "mid" and peer else "",
+                    f"{figures['of floor']:.2f}" if name == "ESIM" else "",
+                    f">= {target}" if target else "",
+                )
         console.print(table)
     report["quiet ns per pixel-frame"] = {k: float(v) for k, v in quiet(passes, frames).items()}
-    console.print("quiet pixels, ESIM, one core, ns per pixel-frame:",
-                  {k: round(v, 2) for k, v in report["quiet ns per pixel-frame"].items()},
-                  "(target <= 0.6 without the logarithm)")
+    console.print(
+        "quiet pixels, ESIM, one core, ns per pixel-frame:",
+        {k: round(v, 2) for k, v in report["quiet ns per pixel-frame"].items()},
+        "(target <= 0.6 without the logarithm)",
+    )
 
     # Memory: the same clip ten times over must not need more than once.
     for name, config in EMULATORS.items():

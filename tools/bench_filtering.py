@@ -34,22 +34,25 @@ from blinkgl.timeline.speed import largest_speed
 from blinkgl.trade.matching import match_events
 
 PLAIN = RenderConfig(image_antialiasing="none")
-SETTINGS = {name: RenderConfig(image_antialiasing="none", **changes) for name, changes in {
-    "none, mip -1": {"mip_bias": -1.0},
-    "none, mip -0.5": {"mip_bias": -0.5},
-    "none": {},
-    "none, aniso 4": {"anisotropy": 4.0},
-    "msaa4": {"antialiasing": "msaa4"},
-    "msaa4, mip -0.5": {"antialiasing": "msaa4", "mip_bias": -0.5},
-    "taps4": {"antialiasing": "taps4"},
-    "taps4, mip -0.5": {"antialiasing": "taps4", "mip_bias": -0.5},
-    "taps4, mip -1": {"antialiasing": "taps4", "mip_bias": -1.0},
-    "ssaa2": {"antialiasing": "ssaa2"},
-    "ssaa2, mip -0.5": {"antialiasing": "ssaa2", "mip_bias": -0.5},
-    "ssaa2, mip -1": {"antialiasing": "ssaa2", "mip_bias": -1.0},
-    "ssaa4": {"antialiasing": "ssaa4"},
-    "ssaa4, mip -0.5": {"antialiasing": "ssaa4", "mip_bias": -0.5},
-}.items()}
+SETTINGS = {
+    name: RenderConfig(image_antialiasing="none", **changes)
+    for name, changes in {
+        "none, mip -1": {"mip_bias": -1.0},
+        "none, mip -0.5": {"mip_bias": -0.5},
+        "none": {},
+        "none, aniso 4": {"anisotropy": 4.0},
+        "msaa4": {"antialiasing": "msaa4"},
+        "msaa4, mip -0.5": {"antialiasing": "msaa4", "mip_bias": -0.5},
+        "taps4": {"antialiasing": "taps4"},
+        "taps4, mip -0.5": {"antialiasing": "taps4", "mip_bias": -0.5},
+        "taps4, mip -1": {"antialiasing": "taps4", "mip_bias": -1.0},
+        "ssaa2": {"antialiasing": "ssaa2"},
+        "ssaa2, mip -0.5": {"antialiasing": "ssaa2", "mip_bias": -0.5},
+        "ssaa2, mip -1": {"antialiasing": "ssaa2", "mip_bias": -1.0},
+        "ssaa4": {"antialiasing": "ssaa4"},
+        "ssaa4, mip -0.5": {"antialiasing": "ssaa4", "mip_bias": -0.5},
+    }.items()
+}
 
 
 def finer(scene: Scene, factor: int) -> Scene:
@@ -94,7 +97,7 @@ def judge(gl, scene: Scene, settings: dict, times: list[int], factor: int, limit
     names = list(settings)
     for k, t_ns in enumerate(times):
         true = np.log(reference.step(t_ns) + 1e-3)
-        for name in names[k % len(names):] + names[: k % len(names)]:
+        for name in names[k % len(names) :] + names[: k % len(names)]:
             squares[name] += float(np.mean((np.log(judged[name].step(t_ns) + 1e-3) - true) ** 2))
     height, width = scene.camera.height, scene.camera.width
     true, out = reference.events, {}
@@ -102,9 +105,15 @@ def judge(gl, scene: Scene, settings: dict, times: list[int], factor: int, limit
         events = one.events
         matching = match_events(true, events, height, width, limit_us)
         late = np.abs(matching.dt_us[matching.matched])
-        out[name] = {"events": len(events) / len(true), "missed": float((~matching.matched).mean()), "extra": matching.extra / len(true),
-                     "time_median_us": float(np.median(late)), "log_rmse": float(np.sqrt(squares[name] / len(times))),
-                     "ms": 1e3 * float(np.median(one.wall)), "cpu_ms": 1e3 * float(np.median(one.cpu))}
+        out[name] = {
+            "events": len(events) / len(true),
+            "missed": float((~matching.matched).mean()),
+            "extra": matching.extra / len(true),
+            "time_median_us": float(np.median(late)),
+            "log_rmse": float(np.sqrt(squares[name] / len(times))),
+            "ms": 1e3 * float(np.median(one.wall)),
+            "cpu_ms": 1e3 * float(np.median(one.cpu)),
+        }
         one.renderer.release()
     reference.renderer.release()
     return {"reference_events": len(true), "settings": out}
@@ -113,13 +122,27 @@ def judge(gl, scene: Scene, settings: dict, times: list[int], factor: int, limit
 def displacement_frames(gl, scene: Scene, max_px: float, count: int) -> list[int]:
     """The first ``count`` times, ns, between which nothing moves further than ``max_px``."""
     with Renderer(gl, scene, PLAIN) as renderer:
-        return list(islice(displacement_times(max_px, 200_000, 20_000_000, scene.t0_ns, scene.t1_ns, lambda t: largest_speed(renderer.velocity_of_movers(t, 4).read())), count))
+        return list(
+            islice(
+                displacement_times(
+                    max_px,
+                    200_000,
+                    20_000_000,
+                    scene.t0_ns,
+                    scene.t1_ns,
+                    lambda t: largest_speed(renderer.velocity_of_movers(t, 4).read()),
+                ),
+                count,
+            )
+        )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("config", nargs="?", default=str(resources.files("blinkgl.configs") / "flying_objects.yaml"))
-    parser.add_argument("--set", action="append", default=["camera.width=346", "camera.height=260"], metavar="KEY=VALUE")
+    parser.add_argument(
+        "--set", action="append", default=["camera.width=346", "camera.height=260"], metavar="KEY=VALUE"
+    )
     parser.add_argument("--sequences", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--frames", type=int, default=120)
     parser.add_argument("--factor", type=int, default=8, help="the reference's samples per pixel along x and y")
@@ -128,17 +151,32 @@ def main() -> None:
     parser.add_argument("--json")
     arguments = parser.parse_args()
     run = load_run(arguments.config, arguments.set)
-    report = {"frames": arguments.frames, "factor": arguments.factor, "max_px": arguments.max_px, "limit_ms": arguments.limit, "sequences": {}}
+    report = {
+        "frames": arguments.frames,
+        "factor": arguments.factor,
+        "max_px": arguments.max_px,
+        "limit_ms": arguments.limit,
+        "sequences": {},
+    }
     with create_context() as gl:
         report["machine"] = bench.machine_line(gl.renderer)
         for index in arguments.sequences:
             config = run.sequence(index)
             scene = sequence_scene(config, index, run.base)
             times = displacement_frames(gl, scene, arguments.max_px, arguments.frames)
-            report["sequences"][index] = judge(gl, scene, SETTINGS, times, arguments.factor, int(arguments.limit * 1e3),
-                                               EsimConfig(contrast_threshold=0.2))
+            report["sequences"][index] = judge(
+                gl,
+                scene,
+                SETTINGS,
+                times,
+                arguments.factor,
+                int(arguments.limit * 1e3),
+                EsimConfig(contrast_threshold=0.2),
+            )
     results = [s["settings"] for s in report["sequences"].values()]
-    report["mean"] = {name: {key: float(np.mean([r[name][key] for r in results])) for key in results[0][name]} for name in SETTINGS}
+    report["mean"] = {
+        name: {key: float(np.mean([r[name][key] for r in results])) for key in results[0][name]} for name in SETTINGS
+    }
     print_table(report)
     if arguments.json:
         with open(arguments.json, "w", encoding="utf-8") as file:
@@ -146,13 +184,24 @@ def main() -> None:
 
 
 def print_table(report: dict) -> None:
-    table = Table(title=f"against {report['factor']}x{report['factor']} samples; {report['machine']}", title_justify="left")
+    table = Table(
+        title=f"against {report['factor']}x{report['factor']} samples; {report['machine']}", title_justify="left"
+    )
     for column in ("setting", "events", "missed", "extra", "wrong", "log RMSE", "ms", "times none", "cpu times none"):
         table.add_column(column, justify="left" if column == "setting" else "right")
     plain = report["mean"]["none"]
     for name, r in report["mean"].items():
-        table.add_row(name, f"{r['events']:.3f}", f"{r['missed']:.3f}", f"{r['extra']:.3f}", f"{r['missed'] + r['extra']:.3f}", f"{r['log_rmse']:.3f}",
-                      f"{r['ms']:.2f}", f"{r['ms'] / plain['ms']:.2f}", f"{r['cpu_ms'] / plain['cpu_ms']:.2f}")
+        table.add_row(
+            name,
+            f"{r['events']:.3f}",
+            f"{r['missed']:.3f}",
+            f"{r['extra']:.3f}",
+            f"{r['missed'] + r['extra']:.3f}",
+            f"{r['log_rmse']:.3f}",
+            f"{r['ms']:.2f}",
+            f"{r['ms'] / plain['ms']:.2f}",
+            f"{r['cpu_ms'] / plain['cpu_ms']:.2f}",
+        )
     Console(width=160).print(table)
 
 

@@ -49,8 +49,13 @@ SECOND = 1_000_000_000
 
 # Frames/s of the luminance pass (R32F, clear and read-back included) of the probe that BlinkGL was planned with, on 2
 # cores of an AVX-512 Xeon under llvmpipe: one process with two threads, and two processes. None: not measured.
-FLOOR = {("full", 640, 480): (86, 114), ("tri/16", 640, 480): (278, 359), ("tri/16", 346, 260): (533, 860),
-         ("tri/16", 1280, 720): (122, 136), ("sky + ground", 640, 480): (None, 617)}
+FLOOR = {
+    ("full", 640, 480): (86, 114),
+    ("tri/16", 640, 480): (278, 359),
+    ("tri/16", 346, 260): (533, 860),
+    ("tri/16", 1280, 720): (122, 136),
+    ("sky + ground", 640, 480): (None, 617),
+}
 OBJECTS, FULL_SEGMENTS = 10, (100, 56)  # ten spheres of 11,000 triangles: 111k with sky and ground, as the probe's
 
 
@@ -74,8 +79,11 @@ def probe_scene(kind: str, width: int, height: int, lit: bool = False) -> Scene:
     objects.append(SceneObject("ground", 100, (Part(ground, material),), StaticPath(lowered), "ground"))
     box = primitives.cuboid(extents=(100.0, 100.0, 100.0), subdivisions=4)
     inside = Mesh(box.vertices, np.ascontiguousarray(box.faces[:, ::-1]), -box.normals, box.uvs)
-    objects.append(SceneObject("sky", 101, (Part(inside, Material(procedural_texture("fbm", 77, 1024), unlit=True)),),
-                               StaticPath(), "sky"))
+    objects.append(
+        SceneObject(
+            "sky", 101, (Part(inside, Material(procedural_texture("fbm", 77, 1024), unlit=True)),), StaticPath(), "sky"
+        )
+    )
     level = Rotation.from_matrix(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]))
     keys = np.linspace(0, 2 * SECOND, 4).astype(np.int64)
     turns = Rotation.concatenate([level * Rotation.from_rotvec(rng.normal(0, 0.05, 3)) for _ in keys])
@@ -90,24 +98,40 @@ def event_pass(gl, kind: str, width: int, height: int, lit: bool, repeat: int) -
     """Frames/s of Renderer.luminance over moments spread across two seconds."""
     with Renderer(gl, probe_scene(kind, width, height, lit), PLAIN) as renderer:
         moment = iter(range(1 << 30))
-        timed = bench.seconds(lambda: renderer.luminance(next(moment) * 7_000_000 % (2 * SECOND)).view(), repeat, warm_up=8)
+        timed = bench.seconds(
+            lambda: renderer.luminance(next(moment) * 7_000_000 % (2 * SECOND)).view(), repeat, warm_up=8
+        )
         floor = FLOOR.get((kind, width, height), (None, None))
         fps = 1 / timed["median"]
-        return {"scene": kind, "lit": lit, "width": width, "height": height, "triangles": renderer.triangles, "fps": fps,
-                "fps_best": 1 / timed["min"], "floor_one_process": floor[0], "floor_two_processes": floor[1],
-                "ratio_one_process": fps / floor[0] if floor[0] else None, "ratio_two_processes": fps / floor[1] if floor[1] else None}
+        return {
+            "scene": kind,
+            "lit": lit,
+            "width": width,
+            "height": height,
+            "triangles": renderer.triangles,
+            "fps": fps,
+            "fps_best": 1 / timed["min"],
+            "floor_one_process": floor[0],
+            "floor_two_processes": floor[1],
+            "ratio_one_process": fps / floor[0] if floor[0] else None,
+            "ratio_two_processes": fps / floor[1] if floor[1] else None,
+        }
 
 
 def still_camera(gl, kind: str, movers: int, repeat: int) -> dict:
     """Full redraw against redrawing only what moves: luminance and ESIM together, the same events."""
     scene = probe_scene(kind, 640, 480)
-    objects = tuple(o if i < movers else replace(o, path=StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
+    objects = tuple(
+        o if i < movers else replace(o, path=StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects)
+    )
     scene = replace(scene, objects=objects).with_path(StaticPath(scene.camera_path.pose(0)))
     result = {"scene": kind, "movers": movers}
     events = {}
     for name in ("full redraw", "what moves"):
         with Renderer(gl, scene, PLAIN, whole=name == "full redraw") as renderer:
-            event_pass = emulate(drawn(renderer, itertools.count(0, 2_000_000)), EventCamera(EsimConfig(), None, 480, 640, seed=1))
+            event_pass = emulate(
+                drawn(renderer, itertools.count(0, 2_000_000)), EventCamera(EsimConfig(), None, 480, 640, seed=1)
+            )
             made = events[name] = []
             frame = lambda run=event_pass, made=made: made.append(len(next(run)[1]))
             result[name] = 1 / bench.seconds(frame, repeat, warm_up=8)["median"]
@@ -145,9 +169,13 @@ def peer(gl, quick: bool) -> dict:
 
         ours = bench.seconds(both, 10 if quick else 40)["median"]
         luminance = bench.seconds(lambda: renderer.luminance(next(moments)).read(), 10 if quick else 40)["median"]
-    return {"pyrender_s_per_frame": theirs["seconds_per_frame"], "blinkgl_colour_depth_s_per_frame": ours,
-            "blinkgl_luminance_s_per_frame": luminance, "ratio_colour_depth": theirs["seconds_per_frame"] / ours,
-            "ratio_luminance": theirs["seconds_per_frame"] / luminance}
+    return {
+        "pyrender_s_per_frame": theirs["seconds_per_frame"],
+        "blinkgl_colour_depth_s_per_frame": ours,
+        "blinkgl_luminance_s_per_frame": luminance,
+        "ratio_colour_depth": theirs["seconds_per_frame"] / ours,
+        "ratio_luminance": theirs["seconds_per_frame"] / luminance,
+    }
 
 
 def main() -> None:
@@ -161,15 +189,27 @@ def main() -> None:
     with create_context() as gl:
         result["machine"] = bench.machine_line(gl.renderer)
         console.print(result["machine"], highlight=False, soft_wrap=True)
-        cases = [("full", 640, 480), ("tri/16", 640, 480), ("sky + ground", 640, 480), ("tri/16", 346, 260), ("tri/16", 1280, 720)]
+        cases = [
+            ("full", 640, 480),
+            ("tri/16", 640, 480),
+            ("sky + ground", 640, 480),
+            ("tri/16", 346, 260),
+            ("tri/16", 1280, 720),
+        ]
         result["event_pass"] = [event_pass(gl, *case, lit=False, repeat=repeat) for case in cases]
         result["event_pass"] += [event_pass(gl, *case, lit=True, repeat=repeat) for case in cases[:2]]
         _show_event_pass(console, result["event_pass"])
-        result["still_camera"] = [still_camera(gl, kind, movers, repeat) for kind in ("tri/16", "full") for movers in (1, 3)]
+        result["still_camera"] = [
+            still_camera(gl, kind, movers, repeat) for kind in ("tri/16", "full") for movers in (1, 3)
+        ]
         for r in result["still_camera"]:
-            console.print(f"still camera, {r['scene']}, {r['movers']} of 10 objects moving: {r['full redraw']:.0f} frames/s "
-                          f"drawn whole, {r['what moves']:.0f} where something moves: {r['ratio']:.1f}x (luminance and ESIM, "
-                          "same events)", highlight=False, soft_wrap=True)
+            console.print(
+                f"still camera, {r['scene']}, {r['movers']} of 10 objects moving: {r['full redraw']:.0f} frames/s "
+                f"drawn whole, {r['what moves']:.0f} where something moves: {r['ratio']:.1f}x (luminance and ESIM, "
+                "same events)",
+                highlight=False,
+                soft_wrap=True,
+            )
         if options.peer:
             result["peer"] = peer(gl, options.quick)
             console.print("pyrender:", result["peer"])
@@ -182,13 +222,29 @@ def main() -> None:
 
 def _show_event_pass(console: Console, rows: list[dict]) -> None:
     table = Table(title="event pass (luminance, read back)", title_justify="left")
-    for column in ("scene", "light", "size", "triangles", "frames/s", "best", "of floor, 1 process", "of floor, 2 processes"):
+    for column in (
+        "scene",
+        "light",
+        "size",
+        "triangles",
+        "frames/s",
+        "best",
+        "of floor, 1 process",
+        "of floor, 2 processes",
+    ):
         table.add_column(column, justify="left" if column in ("scene", "light", "size") else "right")
     ratio = lambda value, floor: f"{value:.2f} of {floor}" if floor else "–"
     for r in rows:
-        table.add_row(r["scene"], "sun + sky" if r["lit"] else "unlit", f"{r['width']}x{r['height']}", f"{r['triangles']:,}",
-                      f"{r['fps']:.0f}", f"{r['fps_best']:.0f}", ratio(r["ratio_one_process"], r["floor_one_process"]),
-                      ratio(r["ratio_two_processes"], r["floor_two_processes"]))
+        table.add_row(
+            r["scene"],
+            "sun + sky" if r["lit"] else "unlit",
+            f"{r['width']}x{r['height']}",
+            f"{r['triangles']:,}",
+            f"{r['fps']:.0f}",
+            f"{r['fps_best']:.0f}",
+            ratio(r["ratio_one_process"], r["floor_one_process"]),
+            ratio(r["ratio_two_processes"], r["floor_two_processes"]),
+        )
     console.print(table)
 
 

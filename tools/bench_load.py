@@ -32,15 +32,21 @@ from blinkgl.events import make_emulator
 from blinkgl.machine import bench
 from blinkgl.tools.bench_events import FPS, HEIGHT, WIDTH, clip
 
-EMULATORS = {"ESIM": EsimConfig(contrast_threshold=0.2, threshold_sigma=0.0), "V2E": V2eConfig(), "Voltmeter": VoltmeterConfig()}
+EMULATORS = {
+    "ESIM": EsimConfig(contrast_threshold=0.2, threshold_sigma=0.0),
+    "V2E": V2eConfig(),
+    "Voltmeter": VoltmeterConfig(),
+}
 THREADS = (1, 2)
 
 
 @contextlib.contextmanager
 def spinning(count: int) -> Iterator[None]:
     """``count`` processes that keep a core busy each, for as long as the block lasts."""
-    program = ("import os\nparent = os.getppid()\nwhile os.getppid() == "
-               "parent:\n    sum(range(100_000))")  # none outlives this process
+    program = (
+        "import os\nparent = os.getppid()\nwhile os.getppid() == "
+        "parent:\n    sum(range(100_000))"
+    )  # none outlives this process
     children = [subprocess.Popen([sys.executable, "-c", program]) for _ in range(count)]
     try:
         yield
@@ -85,10 +91,17 @@ def measure(versions: dict[str, subprocess.Popen], rounds: int) -> list[dict]:
                     reply = json.loads(process.stdout.readline())
                     if number:
                         seen.setdefault((name, version, threads), []).append(reply)
-    return [{"emulator": name, "version": version, "threads": threads, "digest": replies[0]["digest"],
-             **{k: float(np.median([r[k] for r in replies])) for k in ("wall_ms", "cpu_ms")},
-             "wall_ms_min": min(r["wall_ms"] for r in replies)}
-            for (name, version, threads), replies in seen.items()]
+    return [
+        {
+            "emulator": name,
+            "version": version,
+            "threads": threads,
+            "digest": replies[0]["digest"],
+            **{k: float(np.median([r[k] for r in replies])) for k in ("wall_ms", "cpu_ms")},
+            "wall_ms_min": min(r["wall_ms"] for r in replies),
+        }
+        for (name, version, threads), replies in seen.items()
+    ]
 
 
 def main() -> None:
@@ -102,12 +115,24 @@ def main() -> None:
     if options.answer:
         answer()
         return
-    program = ("import sys; sys.path.insert(0, sys.argv.pop(1)); name = sys.argv.pop(1); exec(compile(open(name).read(), "
-               "name, 'exec'))")
-    folders = {"this": Path(__file__).resolve().parents[1], **({"against": Path(options.against).resolve()} if options.against else {})}
-    versions = {version: subprocess.Popen([sys.executable, "-c", program, str(folder), __file__, "--answer"], stdin=subprocess.PIPE,
-                                          stdout=subprocess.PIPE, text=True, env={**os.environ, "NUMBA_NUM_THREADS": str(max(THREADS))})
-                for version, folder in folders.items()}
+    program = (
+        "import sys; sys.path.insert(0, sys.argv.pop(1)); name = sys.argv.pop(1); exec(compile(open(name).read(), "
+        "name, 'exec'))"
+    )
+    folders = {
+        "this": Path(__file__).resolve().parents[1],
+        **({"against": Path(options.against).resolve()} if options.against else {}),
+    }
+    versions = {
+        version: subprocess.Popen(
+            [sys.executable, "-c", program, str(folder), __file__, "--answer"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "NUMBA_NUM_THREADS": str(max(THREADS))},
+        )
+        for version, folder in folders.items()
+    }
     try:
         with spinning(options.load):
             rows = measure(versions, options.rounds)
@@ -115,17 +140,33 @@ def main() -> None:
         for process in versions.values():
             process.stdin.close()
             process.wait()
-    report = {"machine": bench.machine_line(), "load": options.load, "load_average": os.getloadavg()[0], "rounds": options.rounds, "rows": rows}
+    report = {
+        "machine": bench.machine_line(),
+        "load": options.load,
+        "load_average": os.getloadavg()[0],
+        "rounds": options.rounds,
+        "rows": rows,
+    }
     console = Console(width=120)
     console.print(report["machine"], highlight=False, soft_wrap=True)
-    table = Table(title=f"{options.load} spinning processes beside it (load average {report['load_average']:.1f}); ms a frame, "
-                        f"median of {options.rounds}")
+    table = Table(
+        title=f"{options.load} spinning processes beside it (load average {report['load_average']:.1f}); ms a frame, "
+        f"median of {options.rounds}"
+    )
     for column in ("emulator", "version", "threads", "wall", "fastest", "processor", "wall x1 thread", "digest"):
         table.add_column(column)
     alone = {(r["emulator"], r["version"]): r["wall_ms"] for r in rows if r["threads"] == 1}
     for r in rows:
-        table.add_row(r["emulator"], r["version"], str(r["threads"]), f"{r['wall_ms']:.2f}", f"{r['wall_ms_min']:.2f}", f"{r['cpu_ms']:.2f}",
-                      f"{r['wall_ms'] / alone[r['emulator'], r['version']]:.2f}", r["digest"])
+        table.add_row(
+            r["emulator"],
+            r["version"],
+            str(r["threads"]),
+            f"{r['wall_ms']:.2f}",
+            f"{r['wall_ms_min']:.2f}",
+            f"{r['cpu_ms']:.2f}",
+            f"{r['wall_ms'] / alone[r['emulator'], r['version']]:.2f}",
+            r["digest"],
+        )
     console.print(table)
     if options.json:
         Path(options.json).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")

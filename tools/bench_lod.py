@@ -40,15 +40,15 @@ def fine_meshes(folder: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=5)
     for i in range(MESHES):
         rng = np.random.default_rng(i)
-        if i % 3 == 0:      # a stone: no texture coordinates, so they are projected from six sides
+        if i % 3 == 0:  # a stone: no texture coordinates, so they are projected from six sides
             points = ball.vertices * rng.uniform(0.6, 1.0, 3)
             for octave in range(3):
                 phase = ball.vertices @ rng.normal(size=(3, 4)) * 2.5 * 2**octave + rng.uniform(0, 2 * np.pi, 4)
                 points = points * (1 + 0.06 / 2**octave * np.sin(phase).mean(axis=1, keepdims=True))
             trimesh.Trimesh(points, ball.faces, process=False).export(folder / f"stone{i}.ply")
-        elif i % 3 == 1:    # a knot's tube: texture coordinates along and around it
+        elif i % 3 == 1:  # a knot's tube: texture coordinates along and around it
             (folder / f"knot{i}.obj").write_text(_surface(*_knot(rng)))
-        else:               # a uv sphere, flattened
+        else:  # a uv sphere, flattened
             (folder / f"ball{i}.obj").write_text(_surface(*_ball(rng)))
 
 
@@ -63,7 +63,9 @@ def _grid(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _knot(rng):
     u, v, faces = _grid(24, 300)
     p, q = [(2, 3), (3, 2), (2, 5), (1, 1)][rng.integers(4)]
-    centre = lambda t: np.stack([(2 + np.cos(q * t)) * np.cos(p * t), (2 + np.cos(q * t)) * np.sin(p * t), np.sin(q * t)], -1)
+    centre = lambda t: np.stack(
+        [(2 + np.cos(q * t)) * np.cos(p * t), (2 + np.cos(q * t)) * np.sin(p * t), np.sin(q * t)], -1
+    )
     t = 2 * np.pi * u
     along = centre(t + 1e-4) - centre(t - 1e-4)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -77,7 +79,9 @@ def _knot(rng):
 def _ball(rng):
     u, v, faces = _grid(60, 90)
     theta, phi = np.pi * np.clip(v, 1e-4, 1 - 1e-4), 2 * np.pi * u
-    points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], 1) * rng.uniform(0.5, 1, 3)
+    points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], 1) * rng.uniform(
+        0.5, 1, 3
+    )
     return points, np.stack([u, v], 1), faces
 
 
@@ -88,12 +92,21 @@ def _surface(points, uvs, faces) -> str:
 
 
 def random_scene(folder: Path, arguments) -> Scene:
-    tree = {"seed": arguments.seed, "camera": {"width": arguments.size[0], "height": arguments.size[1], "fov": 65},
-            "scene": {"kind": "random", "objects": {"count": arguments.objects, "size": [0.6, 2.6], "distance": [2, 12], "flying": 0.7},
-                      "pool": {"primitives": [], "folders": [str(folder)], "urdfs": False, "test_fraction": 0.0},
-                      "textures": {"photographs": False}, "camera_motion": {"speed": [0.2, 1.2], "rotation_rate": [5, 30]}}}
+    tree = {
+        "seed": arguments.seed,
+        "camera": {"width": arguments.size[0], "height": arguments.size[1], "fov": 65},
+        "scene": {
+            "kind": "random",
+            "objects": {"count": arguments.objects, "size": [0.6, 2.6], "distance": [2, 12], "flying": 0.7},
+            "pool": {"primitives": [], "folders": [str(folder)], "urdfs": False, "test_fraction": 0.0},
+            "textures": {"photographs": False},
+            "camera_motion": {"speed": [0.2, 1.2], "rotation_rate": [5, 30]},
+        },
+    }
     config = RunTemplate(tree, folder).sequence(0)
-    return build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, seed=config.seed, sequence=0, base=folder)
+    return build_scene(
+        config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, seed=config.seed, sequence=0, base=folder
+    )
 
 
 class Everything(Renderer):
@@ -118,13 +131,20 @@ def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> d
         started = time.perf_counter()
         renderer = kind(gl, scene, config)
         out[name] = {"setup_s": time.perf_counter() - started, "triangles": renderer.triangles}
-        made[name] = (renderer, EventCamera(EsimConfig(contrast_threshold=0.2), None, *shape, 0), np.empty(shape, np.float32), [], [], [])
+        made[name] = (
+            renderer,
+            EventCamera(EsimConfig(contrast_threshold=0.2), None, *shape, 0),
+            np.empty(shape, np.float32),
+            [],
+            [],
+            [],
+        )
         renderer.luminance(times[0]).read(out=made[name][2])
         renderer.stats.triangles = renderer.stats.frames = 0
     names = list(variants)
     for k in range(rounds):
         t = times[k % len(times)] + (k // len(times)) * (times[-1] - times[0])
-        for name in names[k % len(names):] + names[: k % len(names)]:
+        for name in names[k % len(names) :] + names[: k % len(names)]:
             renderer, camera, frame, wall, cpu, both = made[name]
             w, c = time.perf_counter(), time.process_time()
             renderer.luminance(times[k % len(times)]).read(out=frame)
@@ -133,8 +153,12 @@ def timing(gl, scene: Scene, variants: dict, times: list[int], rounds: int) -> d
             camera.step(EventFrame(t + k, frame))
             both.append(time.perf_counter() - w)
     for name, (renderer, _, _, wall, cpu, both) in made.items():
-        out[name] |= {"drawn": renderer.stats.triangles / renderer.stats.frames, "ms": 1e3 * float(np.median(wall)),
-                      "cpu_ms": 1e3 * float(np.median(cpu)), "with_events_ms": 1e3 * float(np.median(both))}
+        out[name] |= {
+            "drawn": renderer.stats.triangles / renderer.stats.frames,
+            "ms": 1e3 * float(np.median(wall)),
+            "cpu_ms": 1e3 * float(np.median(cpu)),
+            "with_events_ms": 1e3 * float(np.median(both)),
+        }
         renderer.release()
     return out
 
@@ -158,15 +182,32 @@ def main() -> None:
         fine_meshes(Path(folder))
         scene = random_scene(Path(folder), arguments)
         report["machine"] = bench.machine_line(gl.renderer)
-        levels = [LodConfig(enabled=True, edge_px=edge, error_px=error) for edge in arguments.edge for error in arguments.error]
+        levels = [
+            LodConfig(enabled=True, edge_px=edge, error_px=error)
+            for edge in arguments.edge
+            for error in arguments.error
+        ]
         times = displacement_frames(gl, scene, arguments.max_px, max(arguments.frames, arguments.rounds))
         for antialiasing in arguments.antialiasing:
             plain = RenderConfig(antialiasing=antialiasing, image_antialiasing="none")
-            settings = {"full meshes": plain} | {f"edge {lod.edge_px:g} px, error {lod.error_px:g} px": plain.model_copy(update={"lod": lod}) for lod in levels}
-            variants = {"no culling": (Everything, plain)} | {name: (Renderer, config) for name, config in settings.items()}
+            settings = {"full meshes": plain} | {
+                f"edge {lod.edge_px:g} px, error {lod.error_px:g} px": plain.model_copy(update={"lod": lod})
+                for lod in levels
+            }
+            variants = {"no culling": (Everything, plain)} | {
+                name: (Renderer, config) for name, config in settings.items()
+            }
             result = report[antialiasing] = {"timing": timing(gl, scene, variants, times, arguments.rounds)}
             if arguments.frames:
-                result |= judge(gl, scene, settings, times[: arguments.frames], arguments.factor, 10_000, EsimConfig(contrast_threshold=0.2))
+                result |= judge(
+                    gl,
+                    scene,
+                    settings,
+                    times[: arguments.frames],
+                    arguments.factor,
+                    10_000,
+                    EsimConfig(contrast_threshold=0.2),
+                )
             print_table(antialiasing, result, report["machine"])
     if arguments.json:
         Path(arguments.json).write_text(json.dumps(report, indent=1), encoding="utf-8")
@@ -174,17 +215,47 @@ def main() -> None:
 
 def print_table(antialiasing: str, result: dict, machine: str) -> None:
     table = Table(title=f"antialiasing {antialiasing}; {machine}", title_justify="left")
-    for column in ("meshes", "triangles", "drawn", "set-up s", "ms", "cpu ms", "faster", "cpu", "with ESIM", "events", "missed", "extra", "wrong", "moved by"):
+    for column in (
+        "meshes",
+        "triangles",
+        "drawn",
+        "set-up s",
+        "ms",
+        "cpu ms",
+        "faster",
+        "cpu",
+        "with ESIM",
+        "events",
+        "missed",
+        "extra",
+        "wrong",
+        "moved by",
+    ):
         table.add_column(column, justify="left" if column == "meshes" else "right")
     full = result["timing"]["full meshes"]
     judged = result.get("settings", {})
     for name, r in result["timing"].items():
-        row = [name, f"{r['triangles']:,}", f"{r['drawn']:,.0f}", f"{r['setup_s']:.2f}", f"{r['ms']:.2f}", f"{r['cpu_ms']:.2f}",
-               f"{full['ms'] / r['ms']:.2f}x", f"{full['cpu_ms'] / r['cpu_ms']:.2f}x", f"{full['with_events_ms'] / r['with_events_ms']:.2f}x"]
+        row = [
+            name,
+            f"{r['triangles']:,}",
+            f"{r['drawn']:,.0f}",
+            f"{r['setup_s']:.2f}",
+            f"{r['ms']:.2f}",
+            f"{r['cpu_ms']:.2f}",
+            f"{full['ms'] / r['ms']:.2f}x",
+            f"{full['cpu_ms'] / r['cpu_ms']:.2f}x",
+            f"{full['with_events_ms'] / r['with_events_ms']:.2f}x",
+        ]
         if name in judged:
             j, plain = judged[name], judged["full meshes"]
             wrong, own = j["missed"] + j["extra"], plain["missed"] + plain["extra"]
-            row += [f"{j['events']:.4f}", f"{j['missed']:.4f}", f"{j['extra']:.4f}", f"{wrong:.4f}", f"{100 * (wrong / own - 1):+.1f} %"]
+            row += [
+                f"{j['events']:.4f}",
+                f"{j['missed']:.4f}",
+                f"{j['extra']:.4f}",
+                f"{wrong:.4f}",
+                f"{100 * (wrong / own - 1):+.1f} %",
+            ]
         table.add_row(*row)
     Console(width=190).print(table)
 

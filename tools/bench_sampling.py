@@ -43,12 +43,30 @@ EMULATOR = EsimConfig(threshold_sigma=0.0)
 
 _US, _PX = (40, 80, 160, 320, 640, 1280, 2560), (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 WAYS: dict[str, list[Any]] = {
-    **{f"uniform, {r}": [UniformTimeline(fps=n / (DURATION_NS * 1e-9), reconstruction=r) for n in (20, 32, 52, 84, 136, 220)] for r in ("linear", "hermite")},
-    **{f"displacement, {r}": [DisplacementTimeline(max_px=px, reconstruction=r, **STEPS) for px in (0.35, 0.6, 1.0, 1.7, 2.9, 5.0)]
-       for r in ("linear", "pchip", "hermite")},
-    "brightness, hermite": [BrightnessTimeline(max_fraction_of_threshold=f, reconstruction="hermite", **STEPS) for f in (0.7, 1.2, 2.0, 3.4, 5.8, 10.0)],
-    **{f"budget µs, {r}": [BudgetTimeline(max_time_error_us=us, reconstruction=r, **STEPS) for us in _US] for r in ("linear", "pchip", "hermite")},
-    **{f"budget px, {r}": [BudgetTimeline(max_time_error_px=px, reconstruction=r, **STEPS) for px in _PX] for r in ("linear", "hermite")},
+    **{
+        f"uniform, {r}": [
+            UniformTimeline(fps=n / (DURATION_NS * 1e-9), reconstruction=r) for n in (20, 32, 52, 84, 136, 220)
+        ]
+        for r in ("linear", "hermite")
+    },
+    **{
+        f"displacement, {r}": [
+            DisplacementTimeline(max_px=px, reconstruction=r, **STEPS) for px in (0.35, 0.6, 1.0, 1.7, 2.9, 5.0)
+        ]
+        for r in ("linear", "pchip", "hermite")
+    },
+    "brightness, hermite": [
+        BrightnessTimeline(max_fraction_of_threshold=f, reconstruction="hermite", **STEPS)
+        for f in (0.7, 1.2, 2.0, 3.4, 5.8, 10.0)
+    ],
+    **{
+        f"budget µs, {r}": [BudgetTimeline(max_time_error_us=us, reconstruction=r, **STEPS) for us in _US]
+        for r in ("linear", "pchip", "hermite")
+    },
+    **{
+        f"budget px, {r}": [BudgetTimeline(max_time_error_px=px, reconstruction=r, **STEPS) for px in _PX]
+        for r in ("linear", "hermite")
+    },
 }
 BASES = ("uniform, linear", "displacement, linear")
 
@@ -85,11 +103,20 @@ class WarpedPath:
 
 def random_scene(seed: int, still_camera: bool = False) -> Scene:
     motion = {"kind": "static"} if still_camera else {"speed": [0.4, 1.2], "rotation_rate": [10, 30]}
-    tree = {"camera": {"width": WIDTH, "height": HEIGHT}, "time": {"duration": 0.6, "label_rate": 1 / 0.6},
-            "scene": {"kind": "random", "objects": {"count": 12, "distance": [2, 8]}, "camera_motion": motion,
-                      "object_motion": {"speed": [0.2, 1.5], "rotation_rate": [20, 120], "static_share": 0.4}}}
+    tree = {
+        "camera": {"width": WIDTH, "height": HEIGHT},
+        "time": {"duration": 0.6, "label_rate": 1 / 0.6},
+        "scene": {
+            "kind": "random",
+            "objects": {"count": 12, "distance": [2, 8]},
+            "camera_motion": motion,
+            "object_motion": {"speed": [0.2, 1.5], "rotation_rate": [20, 120], "static_share": 0.4},
+        },
+    }
     c = validate(SequenceConfig, tree)
-    scene = build_scene(c.scene, c.camera, c.time.t0_ns, c.time.t1_ns, split="train", seed=seed, sequence=0, base=Path("."))
+    scene = build_scene(
+        c.scene, c.camera, c.time.t0_ns, c.time.t1_ns, split="train", seed=seed, sequence=0, base=Path(".")
+    )
     warp = lambda path: path if path.is_static else WarpedPath(path, scene.t0_ns, DURATION_NS)
     objects = list(scene.objects)
     if still_camera:  # the first that moves runs fast, the others on their own slow clock
@@ -115,19 +142,32 @@ def simulate(timeline, renderer: Renderer) -> tuple[Events, Simulation]:
 def measure(scene: Scene, gl, antialiasing: str, thin: int, say) -> dict[str, list[Run]]:
     t0, t1 = scene.t0_ns // 1000, scene.t1_ns // 1000
     with Renderer(gl, scene, RenderConfig(antialiasing=antialiasing)) as renderer:
-        dense, run = simulate(DisplacementTimeline(max_px=1 / 32, percentile=99, min_step_us=5, max_step_us=2000, sample_every=6), renderer)
+        dense, run = simulate(
+            DisplacementTimeline(max_px=1 / 32, percentile=99, min_step_us=5, max_step_us=2000, sample_every=6),
+            renderer,
+        )
         times = np.linspace(scene.t0_ns, scene.t1_ns, 121).astype(np.int64)
-        speeds = SpeedMaps(times // 1000, np.stack([np.hypot(*np.moveaxis(renderer.velocity(int(t)).read(), -1, 0)) for t in times]))
+        speeds = SpeedMaps(
+            times // 1000, np.stack([np.hypot(*np.moveaxis(renderer.velocity(int(t)).read(), -1, 0)) for t in times])
+        )
         say(f"  reference: {run.frames} frames, {len(dense):,} events")
         results: dict[str, list[Run]] = {}
         for name, settings in WAYS.items():
             results[name] = []
             for timeline in settings[::thin]:
                 events, run = simulate(timeline, renderer)
-                results[name].append(Run(run.frames, event_errors(dense, events, speeds, t0, t1, limit_us=LIMIT_US), run.timeline.info()))
-            say(f"  {name}: " + ", ".join(f"{r.frames} ({r.errors.time_median_us:.0f}/{r.errors.time_p95_us:.0f} µs, "
-                                          f"{r.errors.shift_median_px:.3f}/{r.errors.shift_p95_px:.3f} px, {100 * r.errors.missed:.0f} % "
-                                          "missed)" for r in results[name]))
+                results[name].append(
+                    Run(run.frames, event_errors(dense, events, speeds, t0, t1, limit_us=LIMIT_US), run.timeline.info())
+                )
+            say(
+                f"  {name}: "
+                + ", ".join(
+                    f"{r.frames} ({r.errors.time_median_us:.0f}/{r.errors.time_p95_us:.0f} µs, "
+                    f"{r.errors.shift_median_px:.3f}/{r.errors.shift_p95_px:.3f} px, {100 * r.errors.missed:.0f} % "
+                    "missed)"
+                    for r in results[name]
+                )
+            )
     return results
 
 
@@ -157,7 +197,11 @@ def compare(results: list[dict[str, list[Run]]], unit: tuple[str, str], base: st
                 e = run.errors
                 wanted = [getattr(e, f"{unit[0]}_{q}_{unit[1]}") for q in ("median", "p95")]
                 ratios.append(run.frames / frames_needed(result[name], unit, *wanted))
-        table[name] = {"mean": float(np.exp(np.mean(np.log(ratios)))), "least": float(min(ratios)), "most": float(max(ratios))}
+        table[name] = {
+            "mean": float(np.exp(np.mean(np.log(ratios)))),
+            "least": float(min(ratios)),
+            "most": float(max(ratios)),
+        }
     return table
 
 
@@ -180,19 +224,33 @@ def main() -> None:
             results[name] = measure(random_scene(*arguments), gl, options.antialiasing, 2 if options.quick else 1, say)
     tables = {}
     for unit in (("time", "us"), ("shift", "px")):
-        table = Table(title=f"frames of the base per frame of each way, same median and 95th percentile in {unit[1]} (mixed "
-                            "motion; geometric mean, least … most)", title_justify="left")
+        table = Table(
+            title=f"frames of the base per frame of each way, same median and 95th percentile in {unit[1]} (mixed "
+            "motion; geometric mean, least … most)",
+            title_justify="left",
+        )
         table.add_column("sampling, reconstruction")
         for base in BASES:
             table.add_column(f"base: {base}", justify="right")
         columns = {base: compare(list(results.values()), unit, base) for base in BASES}
         for way in WAYS:
-            table.add_row(way, *(f"{c[way]['mean']:.2f}  ({c[way]['least']:.2f} … {c[way]['most']:.2f})" for c in columns.values()))
+            table.add_row(
+                way,
+                *(f"{c[way]['mean']:.2f}  ({c[way]['least']:.2f} … {c[way]['most']:.2f})" for c in columns.values()),
+            )
         console.print(table)
         tables[unit[1]] = columns
     if options.json:
-        runs = {scene: {way: [{"frames": r.frames, **r.errors.to_dict(), "info": r.info} for r in rs] for way, rs in result.items()} for scene, result in results.items()}
-        Path(options.json).write_text(json.dumps({"antialiasing": options.antialiasing, "runs": runs, "ratios": tables}, indent=1))
+        runs = {
+            scene: {
+                way: [{"frames": r.frames, **r.errors.to_dict(), "info": r.info} for r in rs]
+                for way, rs in result.items()
+            }
+            for scene, result in results.items()
+        }
+        Path(options.json).write_text(
+            json.dumps({"antialiasing": options.antialiasing, "runs": runs, "ratios": tables}, indent=1)
+        )
 
 
 if __name__ == "__main__":

@@ -48,8 +48,15 @@ def one_mover(kind: str, coverage: float) -> Scene:
     distance = 2 * radius * focal / np.sqrt(coverage * WIDTH * HEIGHT)
     speed = PX_PER_FRAME / (STEP_NS * 1e-9) * distance / focal  # units per second, across the image
     seen = lambda s: at[:3, :3] @ [s, 0.1 * s, distance] + at[:3, 3]
-    path = KeyframePath([0, 2 * SECOND], [seen(-speed / 4), seen(speed * 7 / 4)], [Rotation.identity().as_quat()] * 2, interpolation="linear")
-    objects = tuple(replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects))
+    path = KeyframePath(
+        [0, 2 * SECOND],
+        [seen(-speed / 4), seen(speed * 7 / 4)],
+        [Rotation.identity().as_quat()] * 2,
+        interpolation="linear",
+    )
+    objects = tuple(
+        replace(o, path=path if i == 0 else StaticPath(o.path.pose(0))) for i, o in enumerate(scene.objects)
+    )
     return replace(scene, objects=objects).with_path(StaticPath(at))
 
 
@@ -73,7 +80,9 @@ class Way:
         done = time.perf_counter()
         self.events.append(self.camera.step(EventFrame(t_ns, luminance, rows=self.frame.rows_changed_since(before))))
         end = time.perf_counter()
-        self.stages.append((stats.render_s - drawn, stats.readback_s - read, end - done, end - wall, time.process_time() - cpu))
+        self.stages.append(
+            (stats.render_s - drawn, stats.readback_s - read, end - done, end - wall, time.process_time() - cpu)
+        )
         if self.frame.changed is not None:
             self.covered.append(sum(r.area for r in self.frame.changed) / (WIDTH * HEIGHT))
 
@@ -90,11 +99,17 @@ def measure(gl, kind: str, coverage: float, rounds: int, warm_up: int = 10) -> d
                 way.step(k * STEP_NS)
     full, quick = (Events.concatenate(w.events) for w in ways.values())
     assert all(np.array_equal(getattr(full, name), getattr(quick, name)) for name in ("x", "y", "t", "p"))
-    result = {"scene": kind, "triangles": ways["full redraw"].renderer.triangles, "events": len(full),
-              "covered": float(np.mean(ways["what moves"].covered[warm_up:]))}
+    result = {
+        "scene": kind,
+        "triangles": ways["full redraw"].renderer.triangles,
+        "events": len(full),
+        "covered": float(np.mean(ways["what moves"].covered[warm_up:])),
+    }
     for name, way in ways.items():
         stages = np.array(way.stages[warm_up:]) * 1e3
-        result[name] = {s: float(v) for s, v in zip(STAGES, np.median(stages, axis=0))} | {"mean": float(stages[:, 3].mean())}
+        result[name] = {s: float(v) for s, v in zip(STAGES, np.median(stages, axis=0))} | {
+            "mean": float(stages[:, 3].mean())
+        }
         way.renderer.release()
     result["ratio"] = {s: result["full redraw"][s] / result["what moves"][s] for s in (*STAGES, "mean")}
     return result
@@ -102,17 +117,27 @@ def measure(gl, kind: str, coverage: float, rounds: int, warm_up: int = 10) -> d
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--coverage", type=float, default=0.035, help="of the image, by the ball alone; what is redrawn is a little more")
+    parser.add_argument(
+        "--coverage",
+        type=float,
+        default=0.035,
+        help="of the image, by the ball alone; what is redrawn is a little more",
+    )
     parser.add_argument("--rounds", type=int, default=200)
     parser.add_argument("--json")
     arguments = parser.parse_args()
     with create_context() as gl:
-        report = {"machine": bench.machine_line(gl.renderer), "results": [measure(gl, kind, arguments.coverage, arguments.rounds) for kind in ("tri/16", "full")]}
+        report = {
+            "machine": bench.machine_line(gl.renderer),
+            "results": [measure(gl, kind, arguments.coverage, arguments.rounds) for kind in ("tri/16", "full")],
+        }
     table = Table(title=report["machine"], title_justify="left")
     for column in ("scene", "way", *(f"{s} ms" for s in (*STAGES, "mean"))):
         table.add_column(column, justify="left" if column in ("scene", "way") else "right")
     for r in report["results"]:
-        title = f"{r['scene']} ({r['triangles']:,} triangles; {100 * r['covered']:.1f} % redrawn; {r['events']:,} events)"
+        title = (
+            f"{r['scene']} ({r['triangles']:,} triangles; {100 * r['covered']:.1f} % redrawn; {r['events']:,} events)"
+        )
         for name in ("full redraw", "what moves"):
             table.add_row(title, name, *(f"{r[name][s]:.3f}" for s in (*STAGES, "mean")))
             title = ""

@@ -36,9 +36,16 @@ def measure(template: RunTemplate, workers: int, sequences: int) -> dict[str, fl
     with tempfile.TemporaryDirectory(prefix="blinkgl-bench-") as folder:
         before = os.getloadavg()[0]
         outcome = run_dataset(template, f"{folder}/out", Local(workers), num=sequences)
-        costs = [json.loads(line) for line in (Path(folder) / "out" / RUN_FOLDER / "costs.jsonl").read_text().splitlines()]
-    return {"workers": workers, "elapsed_s": outcome.elapsed_s, "cpu_s": sum(c["cpu_s"] for c in costs), "load_before": before,
-            "peak_rss_mb": max(c["peak_rss_kib"] for c in costs) / 1024}
+        costs = [
+            json.loads(line) for line in (Path(folder) / "out" / RUN_FOLDER / "costs.jsonl").read_text().splitlines()
+        ]
+    return {
+        "workers": workers,
+        "elapsed_s": outcome.elapsed_s,
+        "cpu_s": sum(c["cpu_s"] for c in costs),
+        "load_before": before,
+        "peak_rss_mb": max(c["peak_rss_kib"] for c in costs) / 1024,
+    }
 
 
 def main() -> None:
@@ -54,22 +61,49 @@ def main() -> None:
     recipe = str(resources.files("blinkgl.configs").joinpath("blinkflow_mini.yaml"))
     template = load_run(recipe, SIZE + ONE_GROUP)
     measure(template, 1, 1)  # kernels and file caches
-    runs = [measure(template, workers, arguments.sequences) for _ in range(arguments.rounds) for workers in (1, arguments.workers)]
-    median = {w: {k: float(np.median([r[k] for r in runs if r["workers"] == w])) for k in runs[0]} for w in {1, arguments.workers}}
+    runs = [
+        measure(template, workers, arguments.sequences)
+        for _ in range(arguments.rounds)
+        for workers in (1, arguments.workers)
+    ]
+    median = {
+        w: {k: float(np.median([r[k] for r in runs if r["workers"] == w])) for k in runs[0]}
+        for w in {1, arguments.workers}
+    }
     table = Table("workers", "elapsed s", "processor s", "cores used", "load before", "largest process MB")
     for w, m in sorted(median.items()):
-        table.add_row(str(w), f"{m['elapsed_s']:.1f}", f"{m['cpu_s']:.1f}", f"{m['cpu_s'] / m['elapsed_s']:.2f}", f"{m['load_before']:.1f}", f"{m['peak_rss_mb']:.0f}")
+        table.add_row(
+            str(w),
+            f"{m['elapsed_s']:.1f}",
+            f"{m['cpu_s']:.1f}",
+            f"{m['cpu_s'] / m['elapsed_s']:.2f}",
+            f"{m['load_before']:.1f}",
+            f"{m['peak_rss_mb']:.0f}",
+        )
     console.print(table)
     ratio = median[1]["elapsed_s"] / median[arguments.workers]["elapsed_s"]
-    console.print(f"{arguments.workers} workers against 1: {ratio:.2f}x, medians of {arguments.rounds} rounds of "
-                  f"{arguments.sequences} sequences", highlight=False)
+    console.print(
+        f"{arguments.workers} workers against 1: {ratio:.2f}x, medians of {arguments.rounds} rounds of "
+        f"{arguments.sequences} sequences",
+        highlight=False,
+    )
     memory = {}
     if arguments.memory:
         for seconds in (1, 60):
-            memory[seconds] = measure(load_run(recipe, [*SIZE, *ONE_GROUP, f"time.duration={seconds}", "timeline={kind: uniform, fps: 40}"]), 1, 1)["peak_rss_mb"]
-        console.print(f"largest resident size of a worker: {memory[1]:.0f} MB after 1 s, {memory[60]:.0f} MB after 60 s", highlight=False)
+            memory[seconds] = measure(
+                load_run(recipe, [*SIZE, *ONE_GROUP, f"time.duration={seconds}", "timeline={kind: uniform, fps: 40}"]),
+                1,
+                1,
+            )["peak_rss_mb"]
+        console.print(
+            f"largest resident size of a worker: {memory[1]:.0f} MB after 1 s, {memory[60]:.0f} MB after 60 s",
+            highlight=False,
+        )
     if arguments.json:
-        Path(arguments.json).write_text(json.dumps({"machine": machine_line(), "runs": runs, "ratio": ratio, "peak_rss_mb": memory}, indent=1) + "\n")
+        Path(arguments.json).write_text(
+            json.dumps({"machine": machine_line(), "runs": runs, "ratio": ratio, "peak_rss_mb": memory}, indent=1)
+            + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -28,8 +28,12 @@ from eflow.config import load_train_config
 
 AGAIN = 75
 """Exit status for "not finished, run again" (sysexits' EX_TEMPFAIL)."""
-MODELS = {"eflowformer": "{name: eflowformer, variant: base}", "eflowformer-small": "{name: eflowformer, variant: small}",
-          "eraft": "{name: eraft}", "ev_flownet": "{name: ev_flownet, input: voxel}"}
+MODELS = {
+    "eflowformer": "{name: eflowformer, variant: base}",
+    "eflowformer-small": "{name: eflowformer, variant: small}",
+    "eraft": "{name: eraft}",
+    "ev_flownet": "{name: ev_flownet, input: voxel}",
+}
 SHOWN = ("AEE", "outlier", "1PE", "AE2D", "AE3D")
 
 
@@ -81,7 +85,12 @@ def log(run: Path, kind: str) -> list[dict]:
 def train(steps: Steps, a: argparse.Namespace, name: str, data: Path, overrides: list[str]) -> Path:
     """Trains to the last step, or leaves the program for another time."""
     run = a.out / name
-    sets = [f"model={MODELS[name]}", f"data.train=[{{path: {data / 'train'}}}]", f"data.validate_on=[{{path: {data / 'test'}}}]", *overrides]
+    sets = [
+        f"model={MODELS[name]}",
+        f"data.train=[{{path: {data / 'train'}}}]",
+        f"data.validate_on=[{{path: {data / 'test'}}}]",
+        *overrides,
+    ]
     wanted = load_train_config(a.config, sets).optim.steps
     done = max((int(p.name) for p in (run / "checkpoints").glob("*") if p.name.isdigit()), default=0)
     if done < wanted:
@@ -97,12 +106,34 @@ def train(steps: Steps, a: argparse.Namespace, name: str, data: Path, overrides:
 
 def table(rows: list[dict], zero: dict[str, float]) -> str:
     """Markdown."""
-    head = ["", "M parameters", "steps", "AEE px", "outlier %", "1PE %", "AE2D deg", "AE3D deg", "forward ms", "training step ms", "training samples/s",
-            "peak MiB forward", "training"]
+    head = [
+        "",
+        "M parameters",
+        "steps",
+        "AEE px",
+        "outlier %",
+        "1PE %",
+        "AE2D deg",
+        "AE3D deg",
+        "forward ms",
+        "training step ms",
+        "training samples/s",
+        "peak MiB forward",
+        "training",
+    ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for r in rows:
-        cells = [r["name"], f"{r['parameters'] / 1e6:.2f}", str(r["steps"]), *(f"{r['scores'][k]:.3f}" for k in SHOWN), f"{r['forward']['ms']:.0f}",
-                 f"{r['training']['ms']:.0f}", f"{r['samples_per_s']:.1f}", f"{r['forward']['peak_mib']:.0f}", f"{r['training']['peak_mib']:.0f}"]
+        cells = [
+            r["name"],
+            f"{r['parameters'] / 1e6:.2f}",
+            str(r["steps"]),
+            *(f"{r['scores'][k]:.3f}" for k in SHOWN),
+            f"{r['forward']['ms']:.0f}",
+            f"{r['training']['ms']:.0f}",
+            f"{r['samples_per_s']:.1f}",
+            f"{r['forward']['peak_mib']:.0f}",
+            f"{r['training']['peak_mib']:.0f}",
+        ]
         lines.append("| " + " | ".join(cells) + " |")
     lines.append("| zero flow | | | " + " | ".join(f"{zero[k]:.3f}" for k in SHOWN) + " | | | | | |")
     return "\n".join(lines) + "\n"
@@ -115,7 +146,9 @@ def main() -> None:
     parser.add_argument("--config", type=Path, default=configs / "h100_30min.yaml")
     parser.add_argument("--data", type=Path, default=configs / "h100_data.yaml")
     parser.add_argument("--models", nargs="+", default=["eflowformer", "eraft"], choices=list(MODELS))
-    parser.add_argument("--set", action="append", default=[], metavar="a.b=c", help="override of the training configuration")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="a.b=c", help="override of the training configuration"
+    )
     parser.add_argument("--data-set", action="append", default=[], metavar="a.b=c", help="override of the data recipe")
     parser.add_argument("--minutes", type=float, help="stop within this time, to be run again")
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
@@ -126,31 +159,63 @@ def main() -> None:
     began = time.monotonic()
 
     generate = ["generate", str(a.data), "--out", str(data), "--workers", str(a.workers), "--quiet"]
-    steps.run("blinkgl.cli", *generate, *(x for s in a.data_set for x in ("--set", s)), *(["--resume"] if data.exists() else []))
+    steps.run(
+        "blinkgl.cli",
+        *generate,
+        *(x for s in a.data_set for x in ("--set", s)),
+        *(["--resume"] if data.exists() else []),
+    )
     runs = {name: train(steps, a, name, data, a.set) for name in a.models}
     rows = []
     for name, run in runs.items():
         config = read_table(run / "config.yaml")
         precision, scores, bench = config["run"]["precision"], a.out / f"{name}_scores", a.out / f"{name}_bench.json"
         if not (scores / "results.json").is_file():
-            steps.run("eflow.cli", "evaluate", str(run), str(data / "test"), "--out", str(scores), "--empty", "skip", "--precision", precision)
+            steps.run(
+                "eflow.cli",
+                "evaluate",
+                str(run),
+                str(data / "test"),
+                "--out",
+                str(scores),
+                "--empty",
+                "skip",
+                "--precision",
+                precision,
+            )
         if not bench.is_file():
-            steps.run("eflow.cli", "bench", "-m", name, "--size", a.bench_size, "--precision", precision, "--json", str(bench))
+            steps.run(
+                "eflow.cli", "bench", "-m", name, "--size", a.bench_size, "--precision", precision, "--json", str(bench)
+            )
         result = json.loads((scores / "results.json").read_text(encoding="utf-8"))
         timed = json.loads(bench.read_text(encoding="utf-8"))["rows"]
         trained = log(run, "train")
         if error := next((r["error"] for r in timed if "error" in r), None):
             bench.unlink()
             sys.exit(f"error: {bench}: {error}")
-        rows.append({"name": name, "parameters": result["parameters"], "steps": trained[-1]["step"], "scores": result["methods"]["network"]["total"],
-                     "samples_per_s": float(np.median([line["samples_per_s"] for line in trained])),
-                     "forward": next(r for r in timed if r["mode"] == "forward"), "training": next(r for r in timed if r["mode"] == "train"),
-                     "zero": result["methods"]["zero flow"]["total"], "device": result["device"]})
+        rows.append(
+            {
+                "name": name,
+                "parameters": result["parameters"],
+                "steps": trained[-1]["step"],
+                "scores": result["methods"]["network"]["total"],
+                "samples_per_s": float(np.median([line["samples_per_s"] for line in trained])),
+                "forward": next(r for r in timed if r["mode"] == "forward"),
+                "training": next(r for r in timed if r["mode"] == "train"),
+                "zero": result["methods"]["zero flow"]["total"],
+                "device": result["device"],
+            }
+        )
     if len({r["steps"] for r in rows}) > 1:
         sys.exit(f"error: steps differ ({', '.join(str(r['steps']) for r in rows)}): no comparison on equal terms")
     text = table(rows, rows[0]["zero"])
     (a.out / "table.md").write_text(text, encoding="utf-8")
-    (a.out / "comparison.json").write_text(json.dumps({"rows": rows, "machine": rows[0]["forward"]["machine"], "seconds": time.monotonic() - began}, indent=1) + "\n")
+    (a.out / "comparison.json").write_text(
+        json.dumps(
+            {"rows": rows, "machine": rows[0]["forward"]["machine"], "seconds": time.monotonic() - began}, indent=1
+        )
+        + "\n"
+    )
     print(rows[0]["forward"]["machine"], f"time and memory at {a.bench_size}, batch 1", sep="; ")
     print(text)
 

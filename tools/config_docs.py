@@ -57,13 +57,20 @@ def page() -> str:
 
 def _primitives() -> str:
     """What `scene.meshes.<name>.parameters` may hold, from the builders' own signatures."""
-    lines = ["\n## Primitives\n\n", ("`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, "
-                                     "parameters: {radius: 0.2, height: 2}}`. All stand upright (z is their axis) and are centred on the "
-                                     "origin; sizes are in the world's units (m), before the object's `scale`.\n\n"),
-             "| kind | parameters and defaults | what it is |\n|---|---|---|\n"]
+    lines = [
+        "\n## Primitives\n\n",
+        (
+            "`scene.meshes.<name>`: `{primitive: KIND, parameters: {…}}`, for example `{primitive: cylinder, "
+            "parameters: {radius: 0.2, height: 2}}`. All stand upright (z is their axis) and are centred on the "
+            "origin; sizes are in the world's units (m), before the object's `scale`.\n\n"
+        ),
+        "| kind | parameters and defaults | what it is |\n|---|---|---|\n",
+    ]
     for kind, build in BUILDERS.items():
-        values = ", ".join(f"`{name}: {list(value) if isinstance(value, tuple) else value}`" for name,
-                           value in parameters(kind).items())
+        values = ", ".join(
+            f"`{name}: {list(value) if isinstance(value, tuple) else value}`"
+            for name, value in parameters(kind).items()
+        )
         lines.append(f"| `{kind}` | {values} | {' '.join((build.__doc__ or '').split()).replace('``', '`')} |\n")
     lines.append("\n| parameter | meaning |\n|---|---|\n")
     lines += [f"| `{name}` | {meaning} |\n" for name, meaning in PARAMETERS.items()]
@@ -90,14 +97,21 @@ def _section(model: type[BaseModel], path: str, done: set, note: str = "") -> li
             marker = (child, inner)
             if marker not in done:
                 done.add(marker)
-                below += _section(child, inner + ("." + "<name>" if _is_dict(info.annotation) else "[]" if _is_list(info.annotation) else ""),
-                                  done, suffix)
+                below += _section(
+                    child,
+                    inner
+                    + ("." + "<name>" if _is_dict(info.annotation) else "[]" if _is_list(info.annotation) else ""),
+                    done,
+                    suffix,
+                )
     head = f"\n## {title}\n\n{about}\n\n| key | type | default | meaning |\n|---|---|---|---|\n"
     return [head, *rows, *below]
 
 
 def _about(info: FieldInfo) -> str:
-    return "; ".join(" ".join((m.__doc__ or "").split()).split(". ")[0].rstrip(".") for m in _models(info.annotation)[:1])
+    return "; ".join(
+        " ".join((m.__doc__ or "").split()).split(". ")[0].rstrip(".") for m in _models(info.annotation)[:1]
+    )
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
@@ -142,7 +156,9 @@ def _name(annotation: Any) -> str:
         return "null"
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "table"
-    return {"float": "number", "int": "integer", "str": "text", "bool": "true/false"}.get(getattr(annotation, "__name__", ""), str(annotation))
+    return {"float": "number", "int": "integer", "str": "text", "bool": "true/false"}.get(
+        getattr(annotation, "__name__", ""), str(annotation)
+    )
 
 
 def _default(info: FieldInfo) -> str:

@@ -42,7 +42,11 @@ def main(folder: Path) -> int:
         arrays = {name: stored[name] for name in stored.files}
     started, cpu = time.perf_counter(), time.process_time()
     scene, bodies, camera = build(bpy, job, arrays)
-    say(blender=f"Blender {bpy.app.version_string}", setup_s=time.perf_counter() - started, setup_cpu_s=time.process_time() - cpu)
+    say(
+        blender=f"Blender {bpy.app.version_string}",
+        setup_s=time.perf_counter() - started,
+        setup_cpu_s=time.process_time() - cpu,
+    )
     exr = folder / "frame.exr"
     for k in range(job["frames"]):
         for body, poses in zip(bodies, arrays["poses"]):
@@ -69,11 +73,14 @@ def quaternion(R: np.ndarray) -> np.ndarray:
     """(4,) w, x, y, z of a rotation matrix (Shepperd 1978: divides by the largest component)."""
     xx, yy, zz = np.diagonal(R)
     squares = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
-    products = np.array([
-        [0, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-        [0, 0, R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
-        [0, 0, 0, R[1, 2] + R[2, 1]],
-        [0, 0, 0, 0]])
+    products = np.array(
+        [
+            [0, R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [0, 0, R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
+            [0, 0, 0, R[1, 2] + R[2, 1]],
+            [0, 0, 0, 0],
+        ]
+    )
     k = int(squares.argmax())
     q = (products + products.T)[k]
     q[k] = squares[k]
@@ -132,7 +139,9 @@ def make_mesh(bpy, k: int, arrays: dict):
     mesh.from_pydata(arrays[f"vertices{k}"], [], faces, shade_flat=False)
     mesh.uv_layers.new().uv.foreach_set("vector", arrays[f"uvs{k}"][faces.ravel()].ravel())
     # A plain vector attribute of this name is taken as it is; normals_split_custom_set would round to 16 bits.
-    mesh.attributes.new("custom_normal", "FLOAT_VECTOR", "POINT").data.foreach_set("vector", arrays[f"normals{k}"].ravel())
+    mesh.attributes.new("custom_normal", "FLOAT_VECTOR", "POINT").data.foreach_set(
+        "vector", arrays[f"normals{k}"].ravel()
+    )
     mesh.update()
     return mesh
 
@@ -167,7 +176,9 @@ def make_material(bpy, paint: dict, k: int, images: dict, arrays: dict, even_sky
         colour.default_value = [*paint["base_color"], 1.0]
     if paint["texture"] is not None:
         picture = add("ShaderNodeTexImage")
-        picture.image = images.get(paint["texture"]) or images.setdefault(paint["texture"], make_image(bpy, paint["texture"], arrays))
+        picture.image = images.get(paint["texture"]) or images.setdefault(
+            paint["texture"], make_image(bpy, paint["texture"], arrays)
+        )
         picture.interpolation, picture.extension = "Linear", "REPEAT"
         product = add("ShaderNodeVectorMath")
         product.operation = "MULTIPLY"

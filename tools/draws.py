@@ -46,18 +46,46 @@ WORLDS: dict[str, dict[str, Any]] = {
     "default": {},
     "walls, no sky": {"walls": {"count": 3}, "sky": None},
     "no ground, all flying": {"ground": None, "objects": {"count": 5, "flying": 1.0, "tint": 0.0}},
-    "crowd": {"objects": {"count": 14, "size": [0.4, 1.0], "distance": [1.5, 6], "in_view": 0.5, "flying": 0.3}, "region": {"width": 12, "height": 3}},
-    "one sky": {"sky": {"per_face": False, "size": 60, "brightness": [0.5, 0.9], "repeat": [2, 5]}, "ground": {"height": -0.5, "subdivisions": 4}},
-    "shaken": {"camera_motion": {"shake": 2.0, "rotation_rate": 90, "view_cone": 10, "roll": 3, "speed": [1, 2]}, "object_motion": {"static_share": 0.5}},
-    "winding": {"object_motion": {"waypoints": 3, "smoothness": 0.0, "speed": [2, 4], "rotation_rate": [400, 700]}, "camera_motion": {"smoothness": 1.0, "waypoints": 9}},
-    "still": {"camera_motion": {"kind": "static"}, "object_motion": {"speed": 0, "rotation_rate": [30, 60]}, "light": {"sun": 1.3, "sky": 0.2}},
+    "crowd": {
+        "objects": {"count": 14, "size": [0.4, 1.0], "distance": [1.5, 6], "in_view": 0.5, "flying": 0.3},
+        "region": {"width": 12, "height": 3},
+    },
+    "one sky": {
+        "sky": {"per_face": False, "size": 60, "brightness": [0.5, 0.9], "repeat": [2, 5]},
+        "ground": {"height": -0.5, "subdivisions": 4},
+    },
+    "shaken": {
+        "camera_motion": {"shake": 2.0, "rotation_rate": 90, "view_cone": 10, "roll": 3, "speed": [1, 2]},
+        "object_motion": {"static_share": 0.5},
+    },
+    "winding": {
+        "object_motion": {"waypoints": 3, "smoothness": 0.0, "speed": [2, 4], "rotation_rate": [400, 700]},
+        "camera_motion": {"smoothness": 1.0, "waypoints": 9},
+    },
+    "still": {
+        "camera_motion": {"kind": "static"},
+        "object_motion": {"speed": 0, "rotation_rate": [30, 60]},
+        "light": {"sun": 1.3, "sky": 0.2},
+    },
     "unlit": {"light": {"unlit": True}, "object_motion": {"kind": "static"}, "camera_motion": {"rotation_rate": 0}},
 }
 EMULATORS: dict[str, Any] = {
-    "esim": EsimConfig(), "esim spread, jitter": EsimConfig(contrast_threshold=0.15, contrast_threshold_off=0.25, threshold_sigma=0.05, threshold_jitter=0.1, refractory_us=900),
-    "v2e": V2eConfig(), "v2e clean": V2eConfig(preset="clean"), "v2e noisy": V2eConfig(preset="noisy", hot_pixel_fraction=0.02),
-    "v2e photoreceptor noise": V2eConfig(preset="noisy", shot_noise_rate_hz=40.0, photoreceptor_noise=True, cutoff_hz=40.0),
-    "voltmeter": VoltmeterConfig(), "voltmeter DVS240": VoltmeterConfig(preset="DVS240"),
+    "esim": EsimConfig(),
+    "esim spread, jitter": EsimConfig(
+        contrast_threshold=0.15,
+        contrast_threshold_off=0.25,
+        threshold_sigma=0.05,
+        threshold_jitter=0.1,
+        refractory_us=900,
+    ),
+    "v2e": V2eConfig(),
+    "v2e clean": V2eConfig(preset="clean"),
+    "v2e noisy": V2eConfig(preset="noisy", hot_pixel_fraction=0.02),
+    "v2e photoreceptor noise": V2eConfig(
+        preset="noisy", shot_noise_rate_hz=40.0, photoreceptor_noise=True, cutoff_hz=40.0
+    ),
+    "voltmeter": VoltmeterConfig(),
+    "voltmeter DVS240": VoltmeterConfig(preset="DVS240"),
 }
 
 
@@ -72,44 +100,83 @@ def told(values: Any) -> list[float]:
 
 
 def told_mesh(mesh) -> list[float]:
-    return [float(mesh.closed), *(n for part in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs) for n in told(part))]
+    return [
+        float(mesh.closed),
+        *(n for part in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs) for n in told(part)),
+    ]
 
 
 def told_events(events: Events) -> list[int]:
     place = np.arange(len(events)) % 101
-    return [len(events), *(int((column.astype(np.int64) * place).sum()) for column in (events.x, events.y, events.t, events.p))]
+    return [
+        len(events),
+        *(int((column.astype(np.int64) * place).sum()) for column in (events.x, events.y, events.t, events.p)),
+    ]
 
 
 def told_scene(scene: Scene) -> dict[str, Any]:
     camera = scene.camera
     said: dict[str, Any] = {
-        "log": list(scene.log), "light": told([*scene.light.sun_direction, scene.light.sun, scene.light.sky]),
-        "camera": [camera.fx, camera.fy, camera.cx, camera.cy, *told(scene.camera_path.poses(TIMES_NS)), *told(np.stack([scene.camera_path.derivative(int(t)) for t in TIMES_NS]))],
+        "log": list(scene.log),
+        "light": told([*scene.light.sun_direction, scene.light.sun, scene.light.sky]),
+        "camera": [
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            *told(scene.camera_path.poses(TIMES_NS)),
+            *told(np.stack([scene.camera_path.derivative(int(t)) for t in TIMES_NS])),
+        ],
     }
     for thing in scene.objects:
         said[f"{thing.instance_id} {thing.category} {thing.name}"] = [
-            *told(thing.path.poses(TIMES_NS)), *told(np.stack([thing.path.derivative(int(t)) for t in TIMES_NS])),
-            *(n for part in thing.parts for n in (*told_mesh(part.mesh), *part.material.base_color, *part.material.uv_scale, float(part.material.unlit),
-                                                 float(part.material.double_sided), )),
-            *(part.material.texture.name for part in thing.parts if part.material.texture)]
+            *told(thing.path.poses(TIMES_NS)),
+            *told(np.stack([thing.path.derivative(int(t)) for t in TIMES_NS])),
+            *(
+                n
+                for part in thing.parts
+                for n in (
+                    *told_mesh(part.mesh),
+                    *part.material.base_color,
+                    *part.material.uv_scale,
+                    float(part.material.unlit),
+                    float(part.material.double_sided),
+                )
+            ),
+            *(part.material.texture.name for part in thing.parts if part.material.texture),
+        ]
     return said
 
 
 def textures() -> dict[str, Any]:
-    return {f"{kind} {index}": told(procedural_texture(kind, index, 48).image / 255) for kind in TEXTURE_KINDS for index in range(6)}
+    return {
+        f"{kind} {index}": told(procedural_texture(kind, index, 48).image / 255)
+        for kind in TEXTURE_KINDS
+        for index in range(6)
+    }
 
 
 def bodies() -> dict[str, Any]:
-    return {f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in PRIMITIVE_KINDS for index in range(3)}
+    return {
+        f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in PRIMITIVE_KINDS for index in range(3)
+    }
 
 
 def shapes() -> dict[str, Any]:
     """Primitives of other parameters than the usual ones; meshes whose normals and texture
     coordinates are made here."""
-    other = {"cuboid": dict(extents=(1.0, 2.0, 0.5), subdivisions=3), "cylinder": dict(radius=0.3, height=2.0, segments=7, rings=4), "sphere": dict(radius=2.0, segments=9, rings=5),
-             "icosphere": dict(radius=1.5, subdivisions=2), "cone": dict(radius=0.7, height=0.4, segments=6, rings=3), "torus": dict(radius=2.0, tube=0.3, segments=8, tube_segments=5),
-             "capsule": dict(radius=0.4, height=1.5, segments=7, rings=6), "prism": dict(sides=5, radius=1.2, height=0.6), "pyramid": dict(sides=3, radius=0.8, height=1.7),
-             "grid": dict(width=2.0, depth=3.0, subdivisions=3)}
+    other = {
+        "cuboid": dict(extents=(1.0, 2.0, 0.5), subdivisions=3),
+        "cylinder": dict(radius=0.3, height=2.0, segments=7, rings=4),
+        "sphere": dict(radius=2.0, segments=9, rings=5),
+        "icosphere": dict(radius=1.5, subdivisions=2),
+        "cone": dict(radius=0.7, height=0.4, segments=6, rings=3),
+        "torus": dict(radius=2.0, tube=0.3, segments=8, tube_segments=5),
+        "capsule": dict(radius=0.4, height=1.5, segments=7, rings=6),
+        "prism": dict(sides=5, radius=1.2, height=0.6),
+        "pyramid": dict(sides=3, radius=0.8, height=1.7),
+        "grid": dict(width=2.0, depth=3.0, subdivisions=3),
+    }
     said = {kind: told_mesh(BUILDERS[kind](**keys)) for kind, keys in other.items()}
     for kind in ("cuboid", "sphere", "prism", "torus"):
         mesh = BUILDERS[kind](**other[kind])
@@ -120,25 +187,51 @@ def shapes() -> dict[str, Any]:
 
 def worlds() -> dict[str, Any]:
     camera = CameraConfig(width=96, height=72)
-    return {name: told_scene(build_scene(world(keys), camera, 0, END_NS, seed=3, sequence=k)) for k, (name, keys) in enumerate(WORLDS.items())}
+    return {
+        name: told_scene(build_scene(world(keys), camera, 0, END_NS, seed=3, sequence=k))
+        for k, (name, keys) in enumerate(WORLDS.items())
+    }
 
 
 def world(keys: dict[str, Any]) -> RandomSceneConfig:
-    return validate(RandomSceneConfig, {"kind": "random", "objects": {"count": 6}, **keys, "textures": {"max_size": 32, "variants": 10, "photographs": False}, "pool": {"urdfs": False}})
+    return validate(
+        RandomSceneConfig,
+        {
+            "kind": "random",
+            "objects": {"count": 6},
+            **keys,
+            "textures": {"max_size": 32, "variants": 10, "photographs": False},
+            "pool": {"urdfs": False},
+        },
+    )
 
 
 def coarse() -> dict[str, Any]:
     """The default world at a level of detail."""
     scene = build_scene(world(WORLDS["default"]), CameraConfig(width=96, height=72), 0, END_NS, seed=3)
-    return {thing.name: [n for part in thing.parts for n in told_mesh(part.mesh)] for thing in at_level_of_detail(scene, LodConfig(enabled=True)).objects}
+    return {
+        thing.name: [n for part in thing.parts for n in told_mesh(part.mesh)]
+        for thing in at_level_of_detail(scene, LodConfig(enabled=True)).objects
+    }
 
 
 def clip(frames: int = 6, height: int = 37, width: int = 45) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(frames, times ns, rates) of a random walk of 8-bit codes, looked up in a table that
     is exact on every machine."""
     dice = np.random.default_rng(4)
-    codes = np.clip(np.cumsum(dice.integers(-40, 41, (frames, height, width)) * (dice.random((frames, height, width)) < 0.5), axis=0) + 120, 1, 255)
-    return (codes.astype(np.float32) / np.float32(256)) ** 2, 7_123 + np.cumsum(dice.integers(10**6, 4 * 10**7, frames)), dice.integers(-64, 65, codes.shape).astype(np.float32)
+    codes = np.clip(
+        np.cumsum(
+            dice.integers(-40, 41, (frames, height, width)) * (dice.random((frames, height, width)) < 0.5), axis=0
+        )
+        + 120,
+        1,
+        255,
+    )
+    return (
+        (codes.astype(np.float32) / np.float32(256)) ** 2,
+        7_123 + np.cumsum(dice.integers(10**6, 4 * 10**7, frames)),
+        dice.integers(-64, 65, codes.shape).astype(np.float32),
+    )
 
 
 def events() -> dict[str, Any]:
@@ -161,25 +254,37 @@ PARTS = (textures, bodies, shapes, worlds, coarse, events)
 
 
 def drawn(parts=PARTS) -> dict[str, Any]:
-    """"PART/NAME" -> what was drawn, as the golden file has it."""
+    """ "PART/NAME" -> what was drawn, as the golden file has it."""
     return {f"{part.__name__}/{name}": value for part in parts for name, value in part().items()}
 
 
 def differences(golden: Any, now: Any, where: str = "") -> list[str]:
     """Where two tables say different things, one line each."""
     if isinstance(golden, dict) and isinstance(now, dict):
-        lines = [f"{where}: {', '.join(map(repr, sorted(golden.keys() ^ now.keys())))} only in one of them"] if golden.keys() != now.keys() else []
-        return lines + [line for key in golden.keys() & now.keys() for line in differences(golden[key], now[key], f"{where}/{key}")]
+        lines = (
+            [f"{where}: {', '.join(map(repr, sorted(golden.keys() ^ now.keys())))} only in one of them"]
+            if golden.keys() != now.keys()
+            else []
+        )
+        return lines + [
+            line for key in golden.keys() & now.keys() for line in differences(golden[key], now[key], f"{where}/{key}")
+        ]
     same = golden == now
     if isinstance(golden, list) and isinstance(now, list) and len(golden) == len(now):
         near = lambda a: CLOSE_PIXELS if where.startswith("/textures/") else CLOSE * max(abs(a), 1e-3)
-        same = all(abs(a - b) <= near(a) if isinstance(a, float) and isinstance(b, float) else a == b for a, b in zip(golden, now))
+        same = all(
+            abs(a - b) <= near(a) if isinstance(a, float) and isinstance(b, float) else a == b
+            for a, b in zip(golden, now)
+        )
     return [] if same else [f"{where}: {golden!r} became {now!r}"]
 
 
 def written(table: dict[str, Any]) -> str:
     """As JSON, one line for each thing drawn."""
-    lines = (f"{json.dumps(key, ensure_ascii=False)}: {json.dumps(value, ensure_ascii=False)}" for key, value in table.items())
+    lines = (
+        f"{json.dumps(key, ensure_ascii=False)}: {json.dumps(value, ensure_ascii=False)}"
+        for key, value in table.items()
+    )
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 

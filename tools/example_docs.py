@@ -22,15 +22,32 @@ from PIL import Image
 ROOT = Path("examples")
 PAGE = Path("docs/examples.md")
 PICTURES = {
-    "scene_in_python": ("scene.png", "example_scene.png", "a checked ball, a red ring and a box with a photograph on a brick floor"),
+    "scene_in_python": (
+        "scene.png",
+        "example_scene.png",
+        "a checked ball, a red ring and a box with a photograph on a brick floor",
+    ),
     "frame_with_labels": ("labels.png", "example_labels.png", "image, depth, instance ids and flow of one frame"),
     "own_label": ("position.png", "example_own_label.png", "a frame, and a map of where its surfaces are"),
     "events_over_frame": ("events.png", "example_events.png", "a frame, and the events that follow it drawn over it"),
     "event_tensors": ("tensors.png", "example_tensors.png", "a time surface and the five bins of a voxel grid"),
 }
 """Of an example: the picture it makes, its name in docs/images, and what it shows."""
-ORDER = ("scene_in_python", "frame_with_labels", "own_label", "own_trajectory", "video_to_events", "events_over_frame", "event_tensors",
-         "dataset_from_yaml", "torch_dataloader", "online_windows", "compare_recordings", "convert_formats", "sensors")
+ORDER = (
+    "scene_in_python",
+    "frame_with_labels",
+    "own_label",
+    "own_trajectory",
+    "video_to_events",
+    "events_over_frame",
+    "event_tensors",
+    "dataset_from_yaml",
+    "torch_dataloader",
+    "online_windows",
+    "compare_recordings",
+    "convert_formats",
+    "sensors",
+)
 
 HEADER = """# Examples
 
@@ -66,7 +83,11 @@ def run(name: str, out: Path, root: Path = ROOT) -> str:
 
 def cells(notebook: Path) -> list[str]:
     """The code cells of a notebook, in order."""
-    return ["".join(cell["source"]) for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"] if cell["cell_type"] == "code"]
+    return [
+        "".join(cell["source"])
+        for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+        if cell["cell_type"] == "code"
+    ]
 
 
 def section(name: str, output: str, root: Path = ROOT) -> str:

@@ -36,7 +36,10 @@ BASE = {
         "pool": {"urdfs": False},
         "textures": {"variants": 12, "photographs": False, "max_size": 128},
     },
-    "labels": {"flow": ["forward", "backward"], **{name: True for name, info in LabelsConfig.model_fields.items() if info.annotation is bool}},
+    "labels": {
+        "flow": ["forward", "backward"],
+        **{name: True for name, info in LabelsConfig.model_fields.items() if info.annotation is bool},
+    },
 }
 STILL = "scene.camera_motion={speed: 0, rotation_rate: 0}"
 CASES: dict[str, list[str]] = {
@@ -56,13 +59,19 @@ CASES: dict[str, list[str]] = {
     "lod": ["render.lod={enabled: true}"],
     "still": [STILL, "render.antialiasing=ssaa2"],
     "still_hermite": [STILL, "timeline={kind: uniform, fps: 200, reconstruction: hermite}"],
-    "esim_noisy": ["events={emulator: esim, contrast_threshold: {uniform: [0.1, 0.3]}, threshold_sigma: 0.05, refractory_us: 300}"],
+    "esim_noisy": [
+        "events={emulator: esim, contrast_threshold: {uniform: [0.1, 0.3]}, threshold_sigma: 0.05, refractory_us: 300}"
+    ],
 }
 
 
 def sums(folder: Path) -> dict[str, str]:
     """Path below the folder -> SHA-256 of the file."""
-    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
 
 
 def sequence(overrides: list[str], scratch: Path) -> dict[str, str]:
@@ -111,8 +120,12 @@ def main(arguments: list[str] | None = None) -> int:
     if not options.against:
         return 0
     before = json.loads(options.against.read_text())["cases"]
-    different = [f"{case}/{path}" for case in wanted for path in sorted(made[case].keys() | before.get(case, {}).keys())
-                 if made[case].get(path) != before.get(case, {}).get(path)]
+    different = [
+        f"{case}/{path}"
+        for case in wanted
+        for path in sorted(made[case].keys() | before.get(case, {}).keys())
+        if made[case].get(path) != before.get(case, {}).get(path)
+    ]
     print(f"{sum(map(len, made.values()))} files, {len(different)} differ", *different, sep="\n  ")
     return 1 if different else 0
 

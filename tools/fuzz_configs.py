@@ -61,25 +61,94 @@ DRAWS = 12
 """Sequences drawn of every accepted configuration."""
 GOOD = ("made", "accepted", "refused")
 
-_TEXTS = {"name": ["a", "flying_1", "x.y-z"], "path": ["scene.glb"], "file": ["m.obj"], "mesh": ["m", "n"], "material": ["m", None], "photograph": ["astronaut"],
-          "texture": ["t.png"], "images": ["image_left", "."], "sensor": [*sensor_names(), "DAVIS-346"], "folders": ["frames"], "panoramas": []}
-_WRONG = [None, True, -1, 0, 2.5, 1e30, -1e30, float("nan"), float("inf"), 10**30, "", "word", "1e-4", [], [1], {}, {"x": 1}, [[]], {"kind": "other"}, "9" * 50]
-_BAD_DISTRIBUTIONS = [{"uniform": [2, 1]}, {"uniform": [1]}, {"uniform": "ab"}, {"log_uniform": [0, 1]}, {"integer": [1, 2.5]}, {"choice": []}, {"weighted": {}},
-                      {"shares": [{"share": 0.5, "value": 1}]}, {"uniform": [-1e308, 1e308]}, {"integer": [0, 1e300]}, {"choice": {"a": 1}}]
+_TEXTS = {
+    "name": ["a", "flying_1", "x.y-z"],
+    "path": ["scene.glb"],
+    "file": ["m.obj"],
+    "mesh": ["m", "n"],
+    "material": ["m", None],
+    "photograph": ["astronaut"],
+    "texture": ["t.png"],
+    "images": ["image_left", "."],
+    "sensor": [*sensor_names(), "DAVIS-346"],
+    "folders": ["frames"],
+    "panoramas": [],
+}
+_WRONG = [
+    None,
+    True,
+    -1,
+    0,
+    2.5,
+    1e30,
+    -1e30,
+    float("nan"),
+    float("inf"),
+    10**30,
+    "",
+    "word",
+    "1e-4",
+    [],
+    [1],
+    {},
+    {"x": 1},
+    [[]],
+    {"kind": "other"},
+    "9" * 50,
+]
+_BAD_DISTRIBUTIONS = [
+    {"uniform": [2, 1]},
+    {"uniform": [1]},
+    {"uniform": "ab"},
+    {"log_uniform": [0, 1]},
+    {"integer": [1, 2.5]},
+    {"choice": []},
+    {"weighted": {}},
+    {"shares": [{"share": 0.5, "value": 1}]},
+    {"uniform": [-1e308, 1e308]},
+    {"integer": [0, 1e300]},
+    {"choice": {"a": 1}},
+]
 
 # What keeps a run so small that a few hundred of them take minutes: (path, value or function of a random generator).
 SMALL = {
-    "output": {"sequences": 1}, "gl": {}, "preview.rate": 5.0, "preview.slowdown": 2.0,
-    "camera.width": lambda r: r.choice([1, 2, 17, 24, 32]), "camera.height": lambda r: r.choice([1, 3, 16, 24]),
-    "time": lambda r: {"duration": r.choice([0.02, {"uniform": [0.02, 0.03]}]), "label_rate": r.choice([50.0, {"integer": [50, 70]}]),
-                       "start": r.choice([0, 0.1, 1e6, {"uniform": [0, 5]}])},
-    "events.max_events_per_step": 100_000, "readout.queue_events": lambda r: r.choice([1, 16, 4096]),
+    "output": {"sequences": 1},
+    "gl": {},
+    "preview.rate": 5.0,
+    "preview.slowdown": 2.0,
+    "camera.width": lambda r: r.choice([1, 2, 17, 24, 32]),
+    "camera.height": lambda r: r.choice([1, 3, 16, 24]),
+    "time": lambda r: {
+        "duration": r.choice([0.02, {"uniform": [0.02, 0.03]}]),
+        "label_rate": r.choice([50.0, {"integer": [50, 70]}]),
+        "start": r.choice([0, 0.1, 1e6, {"uniform": [0, 5]}]),
+    },
+    "events.max_events_per_step": 100_000,
+    "readout.queue_events": lambda r: r.choice([1, 16, 4096]),
 }
-SMALL_TIMELINE = {"uniform": {"fps": lambda r: r.choice([20, 200, {"uniform": [50, 400]}])},
-                  None: {"min_step_us": lambda r: r.choice([1000, {"uniform": [800, 2000]}]), "max_step_us": lambda r: r.choice([4000, 20000])}}
-SMALL_SCENE = {"objects.count": lambda r: r.choice([0, 1, 3, {"integer": [0, 3]}]), "pool": {"primitives": ["cuboid", "icosphere"], "variants": 2, "test_fraction": 0.5},
-               "textures": {"procedural": ["perlin", "checks"], "variants": 2, "photographs": False, "max_size": 32, "test_fraction": 0.5},
-               "sky.panoramas": [], "sky.subdivisions": 2, "ground.subdivisions": 2, "object_motion.waypoints": 3, "camera_motion.waypoints": 3}
+SMALL_TIMELINE = {
+    "uniform": {"fps": lambda r: r.choice([20, 200, {"uniform": [50, 400]}])},
+    None: {
+        "min_step_us": lambda r: r.choice([1000, {"uniform": [800, 2000]}]),
+        "max_step_us": lambda r: r.choice([4000, 20000]),
+    },
+}
+SMALL_SCENE = {
+    "objects.count": lambda r: r.choice([0, 1, 3, {"integer": [0, 3]}]),
+    "pool": {"primitives": ["cuboid", "icosphere"], "variants": 2, "test_fraction": 0.5},
+    "textures": {
+        "procedural": ["perlin", "checks"],
+        "variants": 2,
+        "photographs": False,
+        "max_size": 32,
+        "test_fraction": 0.5,
+    },
+    "sky.panoramas": [],
+    "sky.subdivisions": 2,
+    "ground.subdivisions": 2,
+    "object_motion.waypoints": 3,
+    "camera_motion.waypoints": 3,
+}
 
 
 # --- configurations ---------------------------------------------------------------------------------------------------
@@ -116,8 +185,13 @@ class Maker:
 
     def _consistent(self, tree: dict[str, Any]) -> dict[str, Any]:
         """Of keys that exclude one another mostly one, and of ranges mostly what is in order."""
-        for group in (("fov", "focal"), ("quaternion", "euler", "look_at"), ("texture", "procedural", "photograph"), ("primitive", "file"),
-                      ("max_time_error_us", "max_time_error_px")):
+        for group in (
+            ("fov", "focal"),
+            ("quaternion", "euler", "look_at"),
+            ("texture", "procedural", "photograph"),
+            ("primitive", "file"),
+            ("max_time_error_us", "max_time_error_px"),
+        ):
             said = [key for key in group if tree.get(key) is not None]
             if len(said) > 1 and self.rng.random() < 0.9:
                 for key in said[1:]:
@@ -165,11 +239,18 @@ class Maker:
         if origin is typing.Literal:
             return rng.choice(arguments)
         if origin is dict:
-            return {key: self._plain(key, rng.choice(members(arguments[1])), []) for key in ("m", "n") if name != "parameters"}
+            return {
+                key: self._plain(key, rng.choice(members(arguments[1])), [])
+                for key in ("m", "n")
+                if name != "parameters"
+            }
         if origin in (tuple, list):
             if arguments[-1] is Ellipsis:
                 least = next((m.min_length for m in metadata if isinstance(m, annotated_types.MinLen)), 0)
-                return [self.value(name, arguments[0], []) for _ in range(rng.choice([least, 1, 2]) if name != "keyframes" else rng.choice([0, 2, 3]))]
+                return [
+                    self.value(name, arguments[0], [])
+                    for _ in range(rng.choice([least, 1, 2]) if name != "keyframes" else rng.choice([0, 2, 3]))
+                ]
             made = [self._plain(name, rng.choice(members(a)), _metadata(a)) for a in arguments]
             return sorted(made) if len(made) == 2 and rng.random() < 0.9 else made
         if annotation is bool:
@@ -183,7 +264,9 @@ class Maker:
         for m in metadata:
             low = float(getattr(m, "ge", getattr(m, "gt", low)))
             high = float(getattr(m, "le", getattr(m, "lt", high)))
-        if any(hasattr(m, "ge") or hasattr(m, "gt") for m in metadata) and not any(hasattr(m, "le") or hasattr(m, "lt") for m in metadata):
+        if any(hasattr(m, "ge") or hasattr(m, "gt") for m in metadata) and not any(
+            hasattr(m, "le") or hasattr(m, "lt") for m in metadata
+        ):
             high = max(1e6, low * 10)
         rng = self.rng
         if rng.random() < self.ends:
@@ -218,7 +301,11 @@ def make(seed: int, what: str, number: int) -> Case:
             models = [m for m in members(info.annotation) if is_model(m)]
             if name == "scene" and rng.random() < 0.7:
                 models = models[:1]
-            tree[name] = maker.table(rng.choice(models)) if models and rng.random() < 0.85 else maker.value(name, info.annotation, info.metadata)
+            tree[name] = (
+                maker.table(rng.choice(models))
+                if models and rng.random() < 0.85
+                else maker.value(name, info.annotation, info.metadata)
+            )
     for name in ("seed", "gl", "output"):
         if _has_distribution(tree.get(name)):
             del tree[name]
@@ -231,11 +318,20 @@ def make(seed: int, what: str, number: int) -> Case:
     for _ in range(rng.choice([0, 0, 1, 2])):
         _damage(rng, tree)
     if rng.random() < 0.1:
-        case.tree = {**tree, "groups": {"a": {}, "b": {k: tree.pop(k) for k in list(tree)[:2]}, **({"c": copy.deepcopy(rng.choice(_WRONG))} if rng.random() < 0.2 else {})}}
+        case.tree = {
+            **tree,
+            "groups": {
+                "a": {},
+                "b": {k: tree.pop(k) for k in list(tree)[:2]},
+                **({"c": copy.deepcopy(rng.choice(_WRONG))} if rng.random() < 0.2 else {}),
+            },
+        }
     if rng.random() < 0.15:
         paths = [p for p in _paths(SequenceConfig) if p]
         for _ in range(rng.choice([1, 2])):
-            text = to_yaml(rng.choice([*_WRONG[:-1], 1, 0.5, {"uniform": [1, 2]}])).strip().removesuffix("\n...").strip()
+            text = (
+                to_yaml(rng.choice([*_WRONG[:-1], 1, 0.5, {"uniform": [1, 2]}])).strip().removesuffix("\n...").strip()
+            )
             case.overrides.append(".".join(rng.choice(paths)) + "=" + text)
     return case
 
@@ -289,8 +385,22 @@ def _damage(rng: random.Random, tree: dict[str, Any]) -> None:
 def _shrink(rng: random.Random, tree: dict[str, Any]) -> None:
     """Forces what decides the cost of a run; the rest stays as it is."""
     for node in (tree, tree.get("scene")):
-        for key in [k for k, v in node.items() if is_distribution(v)] if isinstance(node, dict) and not is_distribution(node) else []:
-            if key in ("camera", "timeline", "scene", "objects", "sky", "ground", "camera_motion", "object_motion", "meshes"):
+        for key in (
+            [k for k, v in node.items() if is_distribution(v)]
+            if isinstance(node, dict) and not is_distribution(node)
+            else []
+        ):
+            if key in (
+                "camera",
+                "timeline",
+                "scene",
+                "objects",
+                "sky",
+                "ground",
+                "camera_motion",
+                "object_motion",
+                "meshes",
+            ):
                 del node[key]
     if isinstance(tree.get("camera"), dict):
         for key in ("near", "fov", "focal", "cx", "cy"):
@@ -303,7 +413,11 @@ def _shrink(rng: random.Random, tree: dict[str, Any]) -> None:
         elif top in tree:
             del tree[top]
     timeline = tree.get("timeline")
-    if not isinstance(timeline, dict) or _has_distribution({"x": timeline.get("kind")}) or (len(timeline) == 1 and _has_distribution(timeline)):
+    if (
+        not isinstance(timeline, dict)
+        or _has_distribution({"x": timeline.get("kind")})
+        or (len(timeline) == 1 and _has_distribution(timeline))
+    ):
         timeline = tree["timeline"] = {"kind": rng.choice(["uniform", "displacement", "brightness"])}
     quality = tree.get("quality") is not None
     for key, value in SMALL_TIMELINE["uniform" if timeline.get("kind", "displacement") == "uniform" else None].items():
@@ -311,19 +425,35 @@ def _shrink(rng: random.Random, tree: dict[str, Any]) -> None:
     if quality and timeline.get("kind") == "uniform":
         tree.pop("quality")
     scene = tree.get("scene")
-    if isinstance(scene, dict) and scene.get("kind") == "explicit" and not _has_distribution({"x": scene.get("meshes")}):
-        scene["meshes"] = {"m": {"primitive": rng.choice(["cuboid", "cone", "torus"])}, "n": {"primitive": "icosphere", "parameters": {"subdivisions": 1}}}
+    if (
+        isinstance(scene, dict)
+        and scene.get("kind") == "explicit"
+        and not _has_distribution({"x": scene.get("meshes")})
+    ):
+        scene["meshes"] = {
+            "m": {"primitive": rng.choice(["cuboid", "cone", "torus"])},
+            "n": {"primitive": "icosphere", "parameters": {"subdivisions": 1}},
+        }
         scene["materials"] = {"m": {"procedural": rng.choice(["perlin", "dots"]), "max_size": 32}}
     else:
-        scene = tree["scene"] = scene if isinstance(scene, dict) and scene.get("kind", "random") == "random" and len(scene) > 1 else {}
+        scene = tree["scene"] = (
+            scene if isinstance(scene, dict) and scene.get("kind", "random") == "random" and len(scene) > 1 else {}
+        )
         for path, value in SMALL_SCENE.items():
             top, _, rest = path.partition(".")
             if not rest or isinstance(scene.setdefault(top, {}), dict):
                 _put(scene, path, value(rng) if callable(value) else value)
     if tree.get("frames") is not None:
-        tree["frames"] = {**(tree["frames"] if isinstance(tree["frames"], dict) and not _has_distribution(tree["frames"]) else {}), "folders": ["frames"],
-                          "images": "images", "flow": None, "first": 0, "count": rng.choice([None, 3, 5]), "fps": rng.choice([10, {"uniform": [10, 100]}]),
-                          "max_px": 1.0}
+        tree["frames"] = {
+            **(tree["frames"] if isinstance(tree["frames"], dict) and not _has_distribution(tree["frames"]) else {}),
+            "folders": ["frames"],
+            "images": "images",
+            "flow": None,
+            "first": 0,
+            "count": rng.choice([None, 3, 5]),
+            "fps": rng.choice([10, {"uniform": [10, 100]}]),
+            "max_px": 1.0,
+        }
 
 
 def _put(tree: dict[str, Any], path: str, value: Any) -> None:
@@ -377,9 +507,18 @@ def attempt(what: str, number: int, case: Case, folder: Path, gl: Any = None) ->
         kind = "lines" if "\n" in message or len(message) > 1000 else kind
         return Outcome(what, number, kind, message, time.process_time() - started, "" if kind == "refused" else detail)
     except MemoryError as error:
-        return Outcome(what, number, "died", f"MemoryError {error}", time.process_time() - started, traceback.format_exc())
+        return Outcome(
+            what, number, "died", f"MemoryError {error}", time.process_time() - started, traceback.format_exc()
+        )
     except Exception as error:  # noqa: BLE001 - what a fuzz is for
-        return Outcome(what, number, "bug", f"{type(error).__name__}: {error}"[:300], time.process_time() - started, traceback.format_exc())
+        return Outcome(
+            what,
+            number,
+            "bug",
+            f"{type(error).__name__}: {error}"[:300],
+            time.process_time() - started,
+            traceback.format_exc(),
+        )
     return Outcome(what, number, kind, message, time.process_time() - started)
 
 
@@ -407,7 +546,9 @@ def _generate(template: Any, plan: Any, folder: Path, gl: Any) -> str:
     shutil.rmtree(out, ignore_errors=True)
     task = plan.tasks[0]
     generate_sequence(plan.config(task), task.index, out, gl, base=template.base)
-    return "; ".join(f"{name}: {line}" for name, lines in verify_dataset(out).problems.items() for line in lines if name != ".")[:300]
+    return "; ".join(
+        f"{name}: {line}" for name, lines in verify_dataset(out).problems.items() for line in lines if name != "."
+    )[:300]
 
 
 def work(seed: int, memory_mb: int) -> None:
@@ -451,13 +592,24 @@ class Worker:
     """A process that may die. ``try_one`` restarts it as often as it has to."""
 
     def __init__(self, seed: int, memory_mb: int, cpu_s: float):
-        self.arguments = [sys.executable, "-m", "blinkgl.tools.fuzz_configs", "--worker", "--seed", str(seed), "--memory", str(memory_mb)]
+        self.arguments = [
+            sys.executable,
+            "-m",
+            "blinkgl.tools.fuzz_configs",
+            "--worker",
+            "--seed",
+            str(seed),
+            "--memory",
+            str(memory_mb),
+        ]
         self.cpu_s, self.process = cpu_s, None
         self.said = tempfile.TemporaryFile("w+")  # noqa: SIM115 - lives as long as the worker
 
     def try_one(self, what: str, number: int) -> Outcome:
         if self.process is None:
-            self.process = subprocess.Popen(self.arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.said, text=True, bufsize=1)
+            self.process = subprocess.Popen(
+                self.arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self.said, text=True, bufsize=1
+            )
         process = self.process
         with contextlib.suppress(BrokenPipeError):  # it is dead; what it said comes below
             process.stdin.write(f"{what} {number}\n")
@@ -497,7 +649,16 @@ def _cpu_seconds(pid: int) -> float:
         return 0.0
 
 
-def fuzz(seed: int, count: int, runs: int, out: Path | None = None, *, memory_mb: int = 2000, cpu_s: float = 20.0, console: Console | None = None) -> dict[str, Any]:
+def fuzz(
+    seed: int,
+    count: int,
+    runs: int,
+    out: Path | None = None,
+    *,
+    memory_mb: int = 2000,
+    cpu_s: float = 20.0,
+    console: Console | None = None,
+) -> dict[str, Any]:
     """Tries ``count`` configurations to read and ``runs`` to generate; returns the report.
     The failures' YAML goes to ``out``."""
     console = console or plain_console(quiet=True)
@@ -513,21 +674,38 @@ def fuzz(seed: int, count: int, runs: int, out: Path | None = None, *, memory_mb
                 if out is not None:
                     out.mkdir(parents=True, exist_ok=True)
                     case = make(seed, what, number)
-                    (out / f"{what}_{number}.yaml").write_text(f"# {command}\n# --set {case.overrides}\n# {outcome.kind}: {outcome.message}\n{case.text}")
+                    (out / f"{what}_{number}.yaml").write_text(
+                        f"# {command}\n# --set {case.overrides}\n# {outcome.kind}: {outcome.message}\n{case.text}"
+                    )
     finally:
         worker.close()
-    return {"seed": seed, "machine": machine_line(), "outcomes": {what: dict(Counter(o.kind for o in outcomes if o.what == what)) for what in ("read", "run")},
-            "slowest_cpu_s": {what: max((o.cpu_s for o in outcomes if o.what == what), default=0.0) for what in ("read", "run")},
-            "failures": [asdict(o) for o in outcomes if not o.good]}
+    return {
+        "seed": seed,
+        "machine": machine_line(),
+        "outcomes": {what: dict(Counter(o.kind for o in outcomes if o.what == what)) for what in ("read", "run")},
+        "slowest_cpu_s": {
+            what: max((o.cpu_s for o in outcomes if o.what == what), default=0.0) for what in ("read", "run")
+        },
+        "failures": [asdict(o) for o in outcomes if not o.good],
+    }
 
 
 def show(report: dict[str, Any], console: Console) -> None:
     table = Table(title=f"configurations, seed {report['seed']}", title_justify="left")
-    for column in ("", "made and verified", "accepted and drawn", "refused in one line", "defects", "slowest, processor s"):
+    for column in (
+        "",
+        "made and verified",
+        "accepted and drawn",
+        "refused in one line",
+        "defects",
+        "slowest, processor s",
+    ):
         table.add_column(column, justify="left" if not column else "right")
     for what, kinds in report["outcomes"].items():
         bad = sum(n for kind, n in kinds.items() if kind not in GOOD)
-        table.add_row(what, *(f"{kinds.get(kind, 0):,}" for kind in GOOD), str(bad), f"{report['slowest_cpu_s'][what]:.2f}")
+        table.add_row(
+            what, *(f"{kinds.get(kind, 0):,}" for kind in GOOD), str(bad), f"{report['slowest_cpu_s'][what]:.2f}"
+        )
     console.print(table)
 
 
@@ -549,7 +727,15 @@ def main(arguments: list[str] | None = None) -> int:
     console = plain_console()
     if options.only:
         return _only(options.seed, *options.only.split(":"))
-    report = fuzz(options.seed, options.count, options.runs, options.out, memory_mb=options.memory, cpu_s=options.cpu, console=console)
+    report = fuzz(
+        options.seed,
+        options.count,
+        options.runs,
+        options.out,
+        memory_mb=options.memory,
+        cpu_s=options.cpu,
+        console=console,
+    )
     show(report, console)
     if options.json:
         options.json.write_text(json.dumps(report, indent=1) + "\n")

@@ -40,14 +40,24 @@ from pathlib import Path
 
 import numpy as np
 
-if __name__ == "__main__":  # a process with threads cannot be forked safely; where this is imported they are somebody else's
+if (
+    __name__ == "__main__"
+):  # a process with threads cannot be forked safely; where this is imported they are somebody else's
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(_name, "1")
 
 from blinkgl.errors import BlinkGLError
 from blinkgl.tools.fuzz_formats import FORMATS, MARK, Format
 
-OK, REFUSED, WRONG, TRACEBACK, CRASH, HANG, MEMORY = "ok", "refused", "wrong answer", "traceback", "crash", "hang", "memory"
+OK, REFUSED, WRONG, TRACEBACK, CRASH, HANG, MEMORY = (
+    "ok",
+    "refused",
+    "wrong answer",
+    "traceback",
+    "crash",
+    "hang",
+    "memory",
+)
 DEFECTS = (WRONG, TRACEBACK, CRASH, HANG, MEMORY)
 _LONGEST_LINE = 700
 _KEPT = 2
@@ -91,7 +101,15 @@ class Report:
         return sum(self.outcomes.get(k, 0) for k in DEFECTS)
 
 
-def fuzz(fmt: Format, mutants: int, *, seed: int = 0, limits: Limits = Limits(), out: Path | None = None, only: int | None = None) -> Report:
+def fuzz(
+    fmt: Format,
+    mutants: int,
+    *,
+    seed: int = 0,
+    limits: Limits = Limits(),
+    out: Path | None = None,
+    only: int | None = None,
+) -> Report:
     """Reads ``mutants`` mutants of a format. ``out``: folder for those that show a defect. Raises RuntimeError when the
     whole file is not read well, which is a fault of the table."""
     report = Report(fmt.name)
@@ -114,8 +132,10 @@ def fuzz(fmt: Format, mutants: int, *, seed: int = 0, limits: Limits = Limits(),
                 elif outcome.kind in DEFECTS:
                     _note(report, task, index, outcome, out)
                 if only is not None:
-                    print(f"{fmt.name} #{index}: {task.mutant(index)[2]} of {task.mutant(index)[0]}: {outcome.kind}: "
-                          f"{outcome.detail}\n{outcome.trace}")
+                    print(
+                        f"{fmt.name} #{index}: {task.mutant(index)[2]} of {task.mutant(index)[0]}: {outcome.kind}: "
+                        f"{outcome.detail}\n{outcome.trace}"
+                    )
     report.seconds = time.perf_counter() - start
     return report
 
@@ -132,7 +152,7 @@ class _Task:
             raise RuntimeError(f"{fmt.name}: the whole file is not read well: {outcome}")
         gc.collect()
         gc.freeze()
-        (_, whole), = self.outcomes([None])
+        ((_, whole),) = self.outcomes([None])
         if whole.kind != OK:
             raise RuntimeError(f"{fmt.name}: the whole file, read in a child: {whole}")
         self.usual_mb = whole.peak_mb
@@ -192,7 +212,10 @@ class _Task:
         elif os.WIFSIGNALED(status):
             yield waiting[0], Outcome(CRASH, signal.Signals(os.WTERMSIG(status)).name)
         else:
-            yield waiting[0], Outcome(CRASH, f"the process ended by itself with status {os.waitstatus_to_exitcode(status)}")
+            yield (
+                waiting[0],
+                Outcome(CRASH, f"the process ended by itself with status {os.waitstatus_to_exitcode(status)}"),
+            )
 
     def _child(self, indices: list[int | None], pipe: int) -> None:
         try:
@@ -205,13 +228,21 @@ class _Task:
             resource.setrlimit(resource.RLIMIT_AS, (size + (8 * self.limits.memory_mb << 20),) * 2)
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
             for index in indices:
-                resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time()) + 1 + self.limits.cpu_s, resource.RLIM_INFINITY))
+                resource.setrlimit(
+                    resource.RLIMIT_CPU, (int(time.process_time()) + 1 + self.limits.cpu_s, resource.RLIM_INFINITY)
+                )
                 outcome = self._judged(index)
-                peak = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
+                peak = (
+                    max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+                    / 1024
+                )
                 hog = peak > self.usual_mb + self.limits.memory_mb
                 if hog and outcome.kind in (OK, REFUSED):
-                    outcome = Outcome(MEMORY, f"more than {self.limits.memory_mb} MB beyond the usual: {peak - self.usual_mb:.0f} MB, then "
-                                              f"{outcome.kind} {outcome.detail[:200]}")
+                    outcome = Outcome(
+                        MEMORY,
+                        f"more than {self.limits.memory_mb} MB beyond the usual: {peak - self.usual_mb:.0f} MB, then "
+                        f"{outcome.kind} {outcome.detail[:200]}",
+                    )
                 _say(pipe, replace(outcome, peak_mb=peak))
                 if hog:  # the peak stays: the next mutant gets a new process
                     break
@@ -240,14 +271,22 @@ class _Task:
 def _say(pipe: int, outcome: Outcome) -> None:
     text = json.dumps(asdict(outcome)).encode("utf-8", "replace") + b"\n"
     while text:
-        text = text[os.write(pipe, text):]
+        text = text[os.write(pipe, text) :]
 
 
 def _note(report: Report, task: _Task, index: int, outcome: Outcome, out: Path | None) -> None:
     fmt, seed, (target, data, mutator) = task.format, task.seed, task.mutant(index)
     place = outcome.detail if outcome.kind == TRACEBACK else outcome.detail.split(":")[0][:80]
-    found = report.defects.setdefault(f"{outcome.kind}: {place}", {"count": 0, "mutants": [], "mutator": mutator, "message": outcome.trace or outcome.detail,
-                                                                   "repeat": f"python -m blinkgl.tools.fuzz_files --formats \"{fmt.name}\" --seed {seed} --only {index}"})
+    found = report.defects.setdefault(
+        f"{outcome.kind}: {place}",
+        {
+            "count": 0,
+            "mutants": [],
+            "mutator": mutator,
+            "message": outcome.trace or outcome.detail,
+            "repeat": f'python -m blinkgl.tools.fuzz_files --formats "{fmt.name}" --seed {seed} --only {index}',
+        },
+    )
     found["count"] += 1
     if len(found["mutants"]) < _KEPT:
         found["mutants"].append(index)
@@ -255,7 +294,9 @@ def _note(report: Report, task: _Task, index: int, outcome: Outcome, out: Path |
             path = out / f"{fmt.name.replace(' ', '_')}-{index}" / target
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-            (out / f"{fmt.name.replace(' ', '_')}-{index}" / "what.txt").write_text(f"{found['repeat']}\n{outcome.kind}: {outcome.detail}\n{outcome.trace}\n")
+            (out / f"{fmt.name.replace(' ', '_')}-{index}" / "what.txt").write_text(
+                f"{found['repeat']}\n{outcome.kind}: {outcome.detail}\n{outcome.trace}\n"
+            )
 
 
 def _judged(fmt: Format, folder: Path) -> Outcome:
@@ -277,7 +318,11 @@ def _judged(fmt: Format, folder: Path) -> Outcome:
 
 def _place(error: BaseException) -> str:
     """Type of the exception and the innermost line of ours."""
-    frames = [f for f in traceback.extract_tb(error.__traceback__) if "/tools/" not in f.filename and ("blinkgl" in f.filename or "eflow" in f.filename)]
+    frames = [
+        f
+        for f in traceback.extract_tb(error.__traceback__)
+        if "/tools/" not in f.filename and ("blinkgl" in f.filename or "eflow" in f.filename)
+    ]
     where = f"{Path(frames[-1].filename).name}:{frames[-1].lineno} {frames[-1].name}" if frames else "?"
     return f"{type(error).__name__} at {where}"
 
@@ -289,16 +334,35 @@ def show(reports: list[Report]) -> None:
     console = Console(width=150 if not sys.stdout.isatty() else None)
     table = Table("format", "mutants", "ok", "refused", "defects", "s")
     for r in reports:
-        table.add_row(r.format, str(r.mutants), str(r.outcomes.get(OK, 0)), str(r.outcomes.get(REFUSED, 0)), str(r.defective), f"{r.seconds:.0f}")
+        table.add_row(
+            r.format,
+            str(r.mutants),
+            str(r.outcomes.get(OK, 0)),
+            str(r.outcomes.get(REFUSED, 0)),
+            str(r.defective),
+            f"{r.seconds:.0f}",
+        )
     total = Counter()
     for r in reports:
         total.update(r.outcomes)
-    table.add_row("all", str(sum(r.mutants for r in reports)), str(total[OK]), str(total[REFUSED]), str(sum(r.defective for r in reports)), f"{sum(r.seconds for r in reports):.0f}")
+    table.add_row(
+        "all",
+        str(sum(r.mutants for r in reports)),
+        str(total[OK]),
+        str(total[REFUSED]),
+        str(sum(r.defective for r in reports)),
+        f"{sum(r.seconds for r in reports):.0f}",
+    )
     console.print(table)
     for r in reports:
         for what, found in sorted(r.defects.items(), key=lambda item: -item[1]["count"]):
-            console.print(f"{r.format}: {found['count']} x {what}\n    {found['message'].strip().splitlines()[-1][:200]}\n    "
-                          f"{found['repeat']}", highlight=False, markup=False, soft_wrap=True)
+            console.print(
+                f"{r.format}: {found['count']} x {what}\n    {found['message'].strip().splitlines()[-1][:200]}\n    "
+                f"{found['repeat']}",
+                highlight=False,
+                markup=False,
+                soft_wrap=True,
+            )
 
 
 def chosen(patterns: list[str]) -> list[Format]:
@@ -311,12 +375,16 @@ def chosen(patterns: list[str]) -> list[Format]:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("--formats", nargs="*", default=[], metavar="PATTERN", help="names of the table, with * and ?; default: all")
+    parser.add_argument(
+        "--formats", nargs="*", default=[], metavar="PATTERN", help="names of the table, with * and ?; default: all"
+    )
     parser.add_argument("--mutants", type=int, default=1000, help="per format")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, help="this one mutant, with its traceback")
     parser.add_argument("--cpu", type=int, default=Limits.cpu_s, help="processor seconds a mutant may take")
-    parser.add_argument("--memory", type=int, default=Limits.memory_mb, help="MB a mutant may take beyond the whole file")
+    parser.add_argument(
+        "--memory", type=int, default=Limits.memory_mb, help="MB a mutant may take beyond the whole file"
+    )
     parser.add_argument("--out", type=Path, help="folder for mutants that show a defect (emptied first)")
     parser.add_argument("--json", type=Path, help="file for the report")
     options = parser.parse_args(arguments)
@@ -329,11 +397,24 @@ def main(arguments: list[str] | None = None) -> int:
         if not fmt.available:
             print(f"{fmt.name}: left out, {fmt.needs} is not installed", file=sys.stderr)
             continue
-        report = fuzz(fmt, options.mutants, seed=options.seed, limits=Limits(options.cpu, memory_mb=options.memory), out=options.out, only=options.only)
-        print(f"{fmt.name}: {report.mutants} mutants, {report.defective} defects, {report.seconds:.0f} s", file=sys.stderr, flush=True)
+        report = fuzz(
+            fmt,
+            options.mutants,
+            seed=options.seed,
+            limits=Limits(options.cpu, memory_mb=options.memory),
+            out=options.out,
+            only=options.only,
+        )
+        print(
+            f"{fmt.name}: {report.mutants} mutants, {report.defective} defects, {report.seconds:.0f} s",
+            file=sys.stderr,
+            flush=True,
+        )
         reports.append(report)
         if options.json is not None:
-            options.json.write_text(json.dumps({"seed": options.seed, "reports": [asdict(r) for r in reports]}, indent=1) + "\n")
+            options.json.write_text(
+                json.dumps({"seed": options.seed, "reports": [asdict(r) for r in reports]}, indent=1) + "\n"
+            )
     if options.only is None:
         show(reports)
     return 1 if any(r.defective for r in reports) else 0

@@ -48,7 +48,12 @@ def _events(n: int = 400):
 
     rng = np.random.default_rng(5)
     t = np.sort(rng.integers(1000, 60_000, n))
-    return Events(rng.integers(0, WIDTH, n).astype(np.uint16), rng.integers(0, HEIGHT, n).astype(np.uint16), t, rng.integers(0, 2, n).astype(np.uint8))
+    return Events(
+        rng.integers(0, WIDTH, n).astype(np.uint16),
+        rng.integers(0, HEIGHT, n).astype(np.uint16),
+        t,
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
 
 
 def _write_events(name: str, **options) -> Callable[[Path], list[str]]:
@@ -57,6 +62,7 @@ def _write_events(name: str, **options) -> Callable[[Path], list[str]]:
 
         write_events(folder / name, _events(), HEIGHT, WIDTH, **options)
         return [name]
+
     return make
 
 
@@ -98,10 +104,20 @@ def _as_stored(folder: Path, name: str) -> dict[str, np.ndarray] | None:
     if path.suffix in (".npz", ".npy"):
         data = np.load(path, allow_pickle=False)
         t = np.asarray(data["t"])
-        return {"x": data["x"], "y": data["y"], "t": np.rint(t.astype(float) * 1e6) if t.dtype.kind == "f" else t, "p": (data["p"] > 0) * 1}
+        return {
+            "x": data["x"],
+            "y": data["y"],
+            "t": np.rint(t.astype(float) * 1e6) if t.dtype.kind == "f" else t,
+            "p": (data["p"] > 0) * 1,
+        }
     if path.suffix in (".txt", ".csv"):
         lines = [line for line in path.read_bytes().split(b"\n") if line.strip() and line.strip()[:1] not in b"#%"]
-        events = [f for line in lines if (len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit()) or f[0][:1] in b"."]
+        events = [
+            f
+            for line in lines
+            if (len(f := line.replace(b",", b" ").split()) == 4 and f[0].lstrip(b"+-")[:1].isdigit())
+            or f[0][:1] in b"."
+        ]
         return {"x": np.array([float(f[1]) for f in events])}
     return None
 
@@ -129,6 +145,7 @@ def _judge_events(name: str) -> Callable[[Path], str | None]:
             if any(int(a) != b for a, b in zip(getattr(e, k).tolist(), column.tolist())):
                 return f"column {k} is not that of the file"
         return None
+
     return judge
 
 
@@ -146,11 +163,18 @@ def _make_flow_png(scale: float) -> Callable[[Path], list[str]]:
 
         write_flow_png(folder / "f.png", *_flow(), scale=scale)
         return ["f.png"]
+
     return make
 
 
 def _sound_flow(flow: np.ndarray, valid: np.ndarray, limit: float = np.inf) -> str | None:
-    if flow.ndim != 3 or flow.shape[2] != 2 or valid.shape != flow.shape[:2] or valid.dtype != bool or flow.dtype != np.float32:
+    if (
+        flow.ndim != 3
+        or flow.shape[2] != 2
+        or valid.shape != flow.shape[:2]
+        or valid.dtype != bool
+        or flow.dtype != np.float32
+    ):
         return f"flow {flow.dtype} {flow.shape}, valid {valid.dtype} {valid.shape}"
     if not np.isfinite(flow[valid]).all() or np.abs(flow[valid]).max(initial=0) > limit:
         return "a valid flow that is NaN, infinite or out of range"
@@ -162,6 +186,7 @@ def _judge_flow_png(scale: float, limit: float) -> Callable[[Path], str | None]:
         from blinkgl.io.flow_png import read_flow_png
 
         return _sound_flow(*read_flow_png(folder / "f.png", scale=scale), limit)
+
     return judge
 
 
@@ -193,6 +218,7 @@ def _judge_flow_npy(folder: Path) -> str | None:
         read_truth(folder / "f.npy", *flow.shape[:2])
     except Exception as error:
         from blinkgl.errors import BlinkGLError
+
         if not isinstance(error, BlinkGLError):  # three channels are no truth
             raise
     return _sound_flow(flow, valid)
@@ -202,11 +228,18 @@ def _picture(dtype=np.uint8, channels: int = 3) -> np.ndarray:
     rng = np.random.default_rng(1)
     small = rng.integers(0, 256, (3, 4, channels))
     image = np.kron(small, np.ones((8, 8, 1), int))
-    return (image * 257).astype(np.uint16) if dtype == np.uint16 else (image / 255).astype(np.float32) if dtype == np.float32 else image.astype(np.uint8)
+    return (
+        (image * 257).astype(np.uint16)
+        if dtype == np.uint16
+        else (image / 255).astype(np.float32)
+        if dtype == np.float32
+        else image.astype(np.uint8)
+    )
 
 
 def _make_frames(ending: str, dtype=np.uint8) -> Callable[[Path], list[str]]:
     """A folder of two frames and their times."""
+
     def make(folder: Path) -> list[str]:
         import cv2
 
@@ -226,6 +259,7 @@ def _make_frames(ending: str, dtype=np.uint8) -> Callable[[Path], list[str]]:
             names.append(name)
         (folder / "frames/timestamps.txt").write_text("0\n10000\n")
         return names
+
     return make
 
 
@@ -236,8 +270,26 @@ def _write_exr(path: Path, image: np.ndarray) -> None:
     import imageio_ffmpeg
 
     from blinkgl.io.pfm import encode_pfm
-    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", "-f", "image2pipe", "-c:v", "pfm", "-i", "-", "-pix_fmt", "gbrpf32le", str(path)],
-                   input=encode_pfm(image), check=True)
+
+    subprocess.run(
+        [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-loglevel",
+            "error",
+            "-y",
+            "-f",
+            "image2pipe",
+            "-c:v",
+            "pfm",
+            "-i",
+            "-",
+            "-pix_fmt",
+            "gbrpf32le",
+            str(path),
+        ],
+        input=encode_pfm(image),
+        check=True,
+    )
 
 
 def _judge_frames(name: str = "frames", fps: float | None = None) -> Callable[[Path], str | None]:
@@ -255,6 +307,7 @@ def _judge_frames(name: str = "frames", fps: float | None = None) -> Callable[[P
                 return "times do not increase"
             last = t_ns
         return None
+
     return judge
 
 
@@ -271,6 +324,7 @@ def _make_array_frames(ending: str) -> Callable[[Path], list[str]]:
         else:
             np.savez_compressed(folder / "f.npz", frames=frames, timestamps=np.array([0.0, 0.01]))
         return [f"f{ending}"]
+
     return make
 
 
@@ -295,7 +349,11 @@ def _make_labels(folder: Path) -> list[str]:
 def _judge_labels(folder: Path) -> str | None:
     from blinkgl.io import images
 
-    found = images.read_image(folder / "ids.png"), images.read_mask(folder / "mask.png"), images.read_npy(folder / "depth.npy")
+    found = (
+        images.read_image(folder / "ids.png"),
+        images.read_mask(folder / "mask.png"),
+        images.read_npy(folder / "depth.npy"),
+    )
     return "objects" if any(a.dtype.hasobject for a in found) else None
 
 
@@ -324,6 +382,7 @@ def _make_mesh(ending: str) -> Callable[[Path], list[str]]:
             others = sorted(files)
             return ["a.obj"] if ending == ".obj" else others
         return [f"a{ending}"]
+
     return make
 
 
@@ -333,6 +392,7 @@ def _judge_asset(name: str) -> Callable[[Path], str | None]:
 
         asset = load_asset(folder / name, max_texture=256).normalised()
         return _sound_parts(asset.parts)
+
     return judge
 
 
@@ -353,7 +413,12 @@ def _sound_parts(parts) -> str | None:
 
 
 def _sound_texture(image: np.ndarray) -> str | None:
-    fine = image.ndim == 3 and image.shape[2] == 3 and image.size and (image.dtype == np.uint8 or (image.dtype == np.float32 and np.isfinite(image).all() and (image >= 0).all()))
+    fine = (
+        image.ndim == 3
+        and image.shape[2] == 3
+        and image.size
+        and (image.dtype == np.uint8 or (image.dtype == np.float32 and np.isfinite(image).all() and (image >= 0).all()))
+    )
     return None if fine else f"texture {image.dtype} {image.shape}"
 
 
@@ -362,29 +427,93 @@ def _gltf() -> tuple[dict[str, Any], bytes]:
     import cv2
 
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], "<f4")
-    pieces = [vertices.tobytes(), np.tile(np.array([0, 0, 1], "<f4"), (4, 1)).tobytes(), np.ascontiguousarray(vertices[:, :2]).tobytes(),
-              np.array([0, 1, 2, 2, 1, 3], "<u2").tobytes(), np.array([0, 0.1, 0.2], "<f4").tobytes(), np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]], "<f4").tobytes(),
-              np.array([[0, 0, 0, 1], [0, 0, 0.6, 0.8], [0, 0, 1, 0]], "<f4").tobytes(), cv2.imencode(".png", _picture())[1].tobytes()]
+    pieces = [
+        vertices.tobytes(),
+        np.tile(np.array([0, 0, 1], "<f4"), (4, 1)).tobytes(),
+        np.ascontiguousarray(vertices[:, :2]).tobytes(),
+        np.array([0, 1, 2, 2, 1, 3], "<u2").tobytes(),
+        np.array([0, 0.1, 0.2], "<f4").tobytes(),
+        np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]], "<f4").tobytes(),
+        np.array([[0, 0, 0, 1], [0, 0, 0.6, 0.8], [0, 0, 1, 0]], "<f4").tobytes(),
+        cv2.imencode(".png", _picture())[1].tobytes(),
+    ]
     data, views = b"", []
     for piece in pieces:
         data += b"\0" * (-len(data) % 4)
         views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(piece)})
         data += piece
-    kinds = [(5126, 4, "VEC3"), (5126, 4, "VEC3"), (5126, 4, "VEC2"), (5123, 6, "SCALAR"), (5126, 3, "SCALAR"), (5126, 3, "VEC3"), (5126, 3, "VEC4")]
+    kinds = [
+        (5126, 4, "VEC3"),
+        (5126, 4, "VEC3"),
+        (5126, 4, "VEC2"),
+        (5123, 6, "SCALAR"),
+        (5126, 3, "SCALAR"),
+        (5126, 3, "VEC3"),
+        (5126, 3, "VEC4"),
+    ]
     tree = {
-        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 2]}],
-        "nodes": [{"name": "a", "translation": [0, 0, -3], "rotation": [0, 0, 0, 1], "scale": [1, 2, 1], "children": [1]},
-                  {"name": "b", "mesh": 0}, {"name": "eye", "camera": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 1]}],
-        "cameras": [{"type": "perspective", "name": "c", "perspective": {"yfov": 0.8, "znear": 0.1, "aspectRatio": 1.3}}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2}, "indices": 3, "material": 0, "mode": 4}]}],
-        "materials": [{"name": "m", "doubleSided": True, "emissiveFactor": [0, 0, 0], "alphaMode": "OPAQUE",
-                       "pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 0.2, 1], "metallicFactor": 0,
-                                                "baseColorTexture": {"index": 0, "extensions": {"KHR_texture_transform": {"offset": [0.1, 0], "scale": [2, 2], "rotation": 0.1}}}}}],
-        "textures": [{"source": 0, "sampler": 0}], "samplers": [{"wrapS": 10497, "wrapT": 33071}], "images": [{"bufferView": 7, "mimeType": "image/png"}],
-        "animations": [{"name": "go", "samplers": [{"input": 4, "output": 5, "interpolation": "LINEAR"}, {"input": 4, "output": 6, "interpolation": "STEP"}],
-                        "channels": [{"sampler": 0, "target": {"node": 0, "path": "translation"}}, {"sampler": 1, "target": {"node": 0, "path": "rotation"}}]}],
-        "accessors": [{"bufferView": i, "componentType": c, "count": n, "type": t} for i, (c, n, t) in enumerate(kinds)],
-        "bufferViews": views, "buffers": [{"byteLength": len(data)}], "extensionsUsed": ["KHR_texture_transform"]}
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0, 2]}],
+        "nodes": [
+            {"name": "a", "translation": [0, 0, -3], "rotation": [0, 0, 0, 1], "scale": [1, 2, 1], "children": [1]},
+            {"name": "b", "mesh": 0},
+            {"name": "eye", "camera": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 1]},
+        ],
+        "cameras": [
+            {"type": "perspective", "name": "c", "perspective": {"yfov": 0.8, "znear": 0.1, "aspectRatio": 1.3}}
+        ],
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0, "NORMAL": 1, "TEXCOORD_0": 2},
+                        "indices": 3,
+                        "material": 0,
+                        "mode": 4,
+                    }
+                ]
+            }
+        ],
+        "materials": [
+            {
+                "name": "m",
+                "doubleSided": True,
+                "emissiveFactor": [0, 0, 0],
+                "alphaMode": "OPAQUE",
+                "pbrMetallicRoughness": {
+                    "baseColorFactor": [1, 0.5, 0.2, 1],
+                    "metallicFactor": 0,
+                    "baseColorTexture": {
+                        "index": 0,
+                        "extensions": {"KHR_texture_transform": {"offset": [0.1, 0], "scale": [2, 2], "rotation": 0.1}},
+                    },
+                },
+            }
+        ],
+        "textures": [{"source": 0, "sampler": 0}],
+        "samplers": [{"wrapS": 10497, "wrapT": 33071}],
+        "images": [{"bufferView": 7, "mimeType": "image/png"}],
+        "animations": [
+            {
+                "name": "go",
+                "samplers": [
+                    {"input": 4, "output": 5, "interpolation": "LINEAR"},
+                    {"input": 4, "output": 6, "interpolation": "STEP"},
+                ],
+                "channels": [
+                    {"sampler": 0, "target": {"node": 0, "path": "translation"}},
+                    {"sampler": 1, "target": {"node": 0, "path": "rotation"}},
+                ],
+            }
+        ],
+        "accessors": [
+            {"bufferView": i, "componentType": c, "count": n, "type": t} for i, (c, n, t) in enumerate(kinds)
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(data)}],
+        "extensionsUsed": ["KHR_texture_transform"],
+    }
     return tree, data
 
 
@@ -407,13 +536,18 @@ def _make_glb(folder: Path) -> list[str]:
     text = json.dumps(tree).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
-    (folder / "a.glb").write_bytes(struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(data), len(text), 0x4E4F534A) + text
-                                   + struct.pack("<II", len(data), 0x004E4942) + data)
+    (folder / "a.glb").write_bytes(
+        struct.pack("<IIIII", 0x46546C67, 2, 28 + len(text) + len(data), len(text), 0x4E4F534A)
+        + text
+        + struct.pack("<II", len(data), 0x004E4942)
+        + data
+    )
     return ["a.glb"]
 
 
 def _judge_scene(name: str) -> Callable[[Path], str | None]:
     """As an object of a pool, and as a whole scene with its camera and animation."""
+
     def judge(folder: Path) -> str | None:
         from blinkgl.camera import PinHole
         from blinkgl.errors import BlinkGLError
@@ -433,6 +567,7 @@ def _judge_scene(name: str) -> Callable[[Path], str | None]:
         if not (np.isfinite([camera.fx, camera.fy, camera.near]).all() and camera.fx > 0 and camera.near > 0):
             return f"camera fx {camera.fx}, near {camera.near}"
         return problem or next((p for o in scene.objects if (p := _sound_parts(o.parts))), None)
+
     return judge
 
 
@@ -443,6 +578,7 @@ def _make_texture(ending: str, dtype=np.uint8) -> Callable[[Path], list[str]]:
         if not cv2.imwrite(str(folder / f"t{ending}"), _picture(dtype)):
             raise RuntimeError(f"OpenCV cannot write {ending}")
         return [f"t{ending}"]
+
     return make
 
 
@@ -451,18 +587,36 @@ def _judge_texture(name: str) -> Callable[[Path], str | None]:
         from blinkgl.scene.surfaces.images import load_image
 
         return _sound_texture(load_image(folder / name, 256))
+
     return judge
 
 
 # ---- data sets and configurations ------------------------------------------------------------------------------------
 
 _RECIPE = {
-    "seed": 11, "camera": {"width": WIDTH, "height": HEIGHT, "fov": 60}, "time": {"duration": 0.1, "label_rate": 20},
-    "timeline": {"kind": "uniform", "fps": 300}, "labels": {"flow": ["forward"], "images": False}, "preview": {"enabled": False},
-    "scene": {"kind": "random", "objects": {"count": 3, "size": {"uniform": [0.3, 0.6]}}, "pool": {"primitives": ["cuboid"], "urdfs": False},
-              "textures": {"procedural": ["checks"], "photographs": False}},
-    "groups": {"a": {"output": {"name": "a", "sequences": 1, "split": "train"}, "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.15, 0.25]}}},
-               "b": {"enabled": False, "output": {"name": "b", "sequences": 1}, "events": {"emulator": {"choice": ["v2e", "esim"]}}}},
+    "seed": 11,
+    "camera": {"width": WIDTH, "height": HEIGHT, "fov": 60},
+    "time": {"duration": 0.1, "label_rate": 20},
+    "timeline": {"kind": "uniform", "fps": 300},
+    "labels": {"flow": ["forward"], "images": False},
+    "preview": {"enabled": False},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 3, "size": {"uniform": [0.3, 0.6]}},
+        "pool": {"primitives": ["cuboid"], "urdfs": False},
+        "textures": {"procedural": ["checks"], "photographs": False},
+    },
+    "groups": {
+        "a": {
+            "output": {"name": "a", "sequences": 1, "split": "train"},
+            "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.15, 0.25]}},
+        },
+        "b": {
+            "enabled": False,
+            "output": {"name": "b", "sequences": 1},
+            "events": {"emulator": {"choice": ["v2e", "esim"]}},
+        },
+    },
 }
 
 
@@ -487,7 +641,17 @@ def _make_data_set(folder: Path) -> None:
             writer.label("flow_forward", k, Flow(flow, valid), t, t + 20_000)
             writer.label("depth", k, flow[..., 0] + 9, t)
         writer.poses(T_world_cam=np.tile(np.eye(4), (2, 1, 1)))
-        writer.info.update(blinkgl="0", seed=11, sequence=0, split="train", labels=2, duration_us=60_000, emulator="esim", frames=30, group="a")
+        writer.info.update(
+            blinkgl="0",
+            seed=11,
+            sequence=0,
+            split="train",
+            labels=2,
+            duration_us=60_000,
+            emulator="esim",
+            frames=30,
+            group="a",
+        )
         writer.t_end_us = 60_000
     write_index(out)
     run = RunFolder(out)
@@ -498,15 +662,22 @@ def _make_data_set(folder: Path) -> None:
 def _make_record(*names: str) -> Callable[[Path], list[str]]:
     def make(folder: Path) -> list[str]:
         _make_data_set(folder)
-        found = [p.relative_to(folder).as_posix() for name in names for p in sorted((folder / "out").rglob(name)) if p.is_file()]
+        found = [
+            p.relative_to(folder).as_posix()
+            for name in names
+            for p in sorted((folder / "out").rglob(name))
+            if p.is_file()
+        ]
         if not found:
             raise RuntimeError(f"no {names} in the data set")
         return found
+
     return make
 
 
 def _judge_data_set(must_notice: bool) -> Callable[[Path], str | None]:
     """``must_notice``: the files are checksummed, so every change has to be reported."""
+
     def judge(folder: Path) -> str | None:
         from blinkgl.dataset.verify import verify_dataset
 
@@ -517,6 +688,7 @@ def _judge_data_set(must_notice: bool) -> Callable[[Path], str | None]:
         if must_notice and not lines and not (folder / MARK).exists():
             return "a file was altered and verify reports nothing"
         return None
+
     return judge
 
 
@@ -531,7 +703,11 @@ def _sound_samples(source) -> str | None:
     for k in range(min(len(source), 3)):
         s = source[k]
         for w in (s.old, s.new):
-            if len(w) and (w.x.max() >= s.width or w.y.max() >= s.height or w.x.min() < 0 or w.y.min() < 0) and w.x.dtype.kind == "u":
+            if (
+                len(w)
+                and (w.x.max() >= s.width or w.y.max() >= s.height or w.x.min() < 0 or w.y.min() < 0)
+                and w.x.dtype.kind == "u"
+            ):
                 return "an event outside the sensor"
             if len(w) and ((np.diff(w.t) < 0).any() or w.t[0] < w.t0 or w.t[-1] >= w.t1):
                 return "events out of order or outside their window"
@@ -552,7 +728,9 @@ def _make_dsec_set(folder: Path) -> list[str]:
     with DsecEventWriter(left / "events.h5", HEIGHT, WIDTH) as writer:
         writer.append(_events())
     write_rectify_map(left / "rectify_map.h5", identity_rectify_map(HEIGHT, WIDTH))
-    (flow.parent / "forward_timestamps.txt").write_text("# from_timestamp_us, to_timestamp_us\n20000, 40000\n40000, 60000\n")
+    (flow.parent / "forward_timestamps.txt").write_text(
+        "# from_timestamp_us, to_timestamp_us\n20000, 40000\n40000, 60000\n"
+    )
     for k in range(2):
         write_flow_png(flow / f"{k:06d}.png", *_flow())
     return ["thun/events/left/rectify_map.h5", "thun/events/left/events.h5"]
@@ -582,7 +760,9 @@ def _make_mvsec_set(folder: Path) -> list[str]:
         file["davis/left/image_raw_event_inds"] = np.searchsorted(table[:, 2], stamps)
     flow = np.ones((4, 260, 346), np.float32)
     flow[:, :20, :20] = 0
-    np.savez_compressed(folder / "a_gt_flow_dist.npz", timestamps=t0 + np.arange(4) * 0.02, x_flow_dist=flow, y_flow_dist=-flow)
+    np.savez_compressed(
+        folder / "a_gt_flow_dist.npz", timestamps=t0 + np.arange(4) * 0.02, x_flow_dist=flow, y_flow_dist=-flow
+    )
     return ["a_data.hdf5"]
 
 
@@ -617,9 +797,21 @@ def _judge_yaml(folder: Path) -> str | None:
 def _make_explicit(folder: Path) -> list[str]:
     from blinkgl.config.reader import to_yaml
 
-    tree = {"camera": {"width": 32, "height": 24, "fov": 60}, "time": {"duration": 0.1, "label_rate": 20},
-            "scene": {"kind": "explicit", "meshes": {"a": {"primitive": "cuboid"}}, "objects": [{"mesh": "a", "position": [0, 0, 0], "euler": [0, 10, 0]}],
-                      "camera": {"keyframes": [{"time": 0.0, "position": [0, -3, 0], "look_at": [0, 0, 0]}, {"time": 0.1, "position": [0.1, -3, 0]}]}}}
+    tree = {
+        "camera": {"width": 32, "height": 24, "fov": 60},
+        "time": {"duration": 0.1, "label_rate": 20},
+        "scene": {
+            "kind": "explicit",
+            "meshes": {"a": {"primitive": "cuboid"}},
+            "objects": [{"mesh": "a", "position": [0, 0, 0], "euler": [0, 10, 0]}],
+            "camera": {
+                "keyframes": [
+                    {"time": 0.0, "position": [0, -3, 0], "look_at": [0, 0, 0]},
+                    {"time": 0.1, "position": [0.1, -3, 0]},
+                ]
+            },
+        },
+    }
     (folder / "r.yaml").write_text(to_yaml(tree))
     return ["r.yaml"]
 
@@ -637,7 +829,9 @@ def _judge_explicit(folder: Path) -> str | None:
 
 
 def _make_emulator_yaml(folder: Path) -> list[str]:
-    (folder / "e.yaml").write_text("emulator: v2e\npreset: noisy\ncontrast_threshold: 0.25\nthreshold_sigma: 0.03\nrefractory_us: 100\n")
+    (folder / "e.yaml").write_text(
+        "emulator: v2e\npreset: noisy\ncontrast_threshold: 0.25\nthreshold_sigma: 0.03\nrefractory_us: 100\n"
+    )
     return ["e.yaml"]
 
 
@@ -673,21 +867,37 @@ def _judge_checkpoint(folder: Path) -> str | None:
     from eflow.checkpoint import load_model
 
     model = load_model(folder)
-    return None if all(torch.isfinite(p).all() for p in model.state_dict().values() if p.is_floating_point()) else "weights that are NaN or infinite"
+    return (
+        None
+        if all(torch.isfinite(p).all() for p in model.state_dict().values() if p.is_floating_point())
+        else "weights that are NaN or infinite"
+    )
 
 
 def _judge_checkpoint_state(folder: Path) -> str | None:
     from eflow.checkpoint import find_checkpoint, read_state
 
     state = read_state(find_checkpoint(folder).folder)
-    return None if isinstance(state["step"], int) and not isinstance(state["step"], bool) and state["step"] >= 0 else f"step {state['step']!r}"
+    return (
+        None
+        if isinstance(state["step"], int) and not isinstance(state["step"], bool) and state["step"] >= 0
+        else f"step {state['step']!r}"
+    )
 
 
 def _make_train_yaml(folder: Path) -> list[str]:
     from blinkgl.config.reader import to_yaml
 
-    (folder / "t.yaml").write_text(to_yaml({"seed": 0, "model": {"name": "eraft", "iterations": 3}, "data": {"crop": [64, 64], "train": [{"path": "x", "weight": 1.0}]},
-                                                   "optim": {"steps": 10}}))
+    (folder / "t.yaml").write_text(
+        to_yaml(
+            {
+                "seed": 0,
+                "model": {"name": "eraft", "iterations": 3},
+                "data": {"crop": [64, 64], "train": [{"path": "x", "weight": 1.0}]},
+                "optim": {"steps": 10},
+            }
+        )
+    )
     return ["t.yaml"]
 
 
@@ -713,8 +923,18 @@ FORMATS: tuple[Format, ...] = (
     Format("events mvsec", _make_mvsec, _judge_events("e.hdf5"), _H5),
     Format("events npz", _write_events("e.npz"), _judge_events("e.npz"), _NPZ),
     Format("events npy", _write_events("e.npy"), _judge_events("e.npy"), _NPY),
-    Format("events evt2", _write_events("e.raw", format="evt2"), _judge_events("e.raw"), (*m.BLIND, m.token, *[m.fields(m.words_layout(4))] * 5)),
-    Format("events evt3", _write_events("e.raw"), _judge_events("e.raw"), (*m.BLIND, m.token, *[m.fields(m.words_layout(2))] * 5)),
+    Format(
+        "events evt2",
+        _write_events("e.raw", format="evt2"),
+        _judge_events("e.raw"),
+        (*m.BLIND, m.token, *[m.fields(m.words_layout(4))] * 5),
+    ),
+    Format(
+        "events evt3",
+        _write_events("e.raw"),
+        _judge_events("e.raw"),
+        (*m.BLIND, m.token, *[m.fields(m.words_layout(2))] * 5),
+    ),
     Format("events aedat4", _write_events("e.aedat4"), _judge_events("e.aedat4"), m.BLIND, "dv_processing"),
     Format("flow png dsec", _make_flow_png(128.0), _judge_flow_png(128.0, 256), _PNG),
     Format("flow png kitti", _make_flow_png(64.0), _judge_flow_png(64.0, 512), _PNG),
@@ -724,7 +944,12 @@ FORMATS: tuple[Format, ...] = (
     Format("frames png", _make_frames(".png"), _judge_frames(), _PNG),
     Format("frames png 16", _make_frames(".png", np.uint16), _judge_frames(), _PNG),
     Format("frames jpg", _make_frames(".jpg"), _judge_frames()),
-    Format("frames bmp", _make_frames(".bmp"), _judge_frames(), (*m.BLIND, *[m.fixed((10, "<I"), (14, "<I"), (18, "<I"), (22, "<I"), (28, "<H"), (30, "<I"), (46, "<I"))] * 4)),
+    Format(
+        "frames bmp",
+        _make_frames(".bmp"),
+        _judge_frames(),
+        (*m.BLIND, *[m.fixed((10, "<I"), (14, "<I"), (18, "<I"), (22, "<I"), (28, "<H"), (30, "<I"), (46, "<I"))] * 4),
+    ),
     Format("frames tiff", _make_frames(".tiff", np.uint16), _judge_frames()),
     Format("frames webp", _make_frames(".webp"), _judge_frames()),
     Format("frames ppm", _make_frames(".ppm"), _judge_frames(), (*m.BLIND, m.token)),
@@ -742,25 +967,47 @@ FORMATS: tuple[Format, ...] = (
     Format("mesh stl", _make_mesh(".stl"), _judge_asset("a.stl"), (*m.BLIND, *[m.fixed((80, "<I"))] * 3)),
     Format("scene gltf", _make_gltf, _judge_scene("a.gltf"), (*m.TEXT, *[m.json_tree] * 12)),
     Format("scene gltf buffer", _make_gltf_buffer, _judge_scene("a.gltf")),
-    Format("scene glb", _make_glb, _judge_scene("a.glb"), (*m.BLIND, *[m.fixed((4, "<I"), (8, "<I"), (12, "<I"), (16, "<I"))] * 3, *[m.glb_tree] * 8)),
+    Format(
+        "scene glb",
+        _make_glb,
+        _judge_scene("a.glb"),
+        (*m.BLIND, *[m.fixed((4, "<I"), (8, "<I"), (12, "<I"), (16, "<I"))] * 3, *[m.glb_tree] * 8),
+    ),
     Format("texture png", _make_texture(".png"), _judge_texture("t.png"), _PNG),
     Format("texture jpg", _make_texture(".jpg"), _judge_texture("t.jpg")),
     Format("texture hdr", _make_texture(".hdr", np.float32), _judge_texture("t.hdr"), (*m.BLIND, m.token)),
     Format("texture tiff", _make_texture(".tiff"), _judge_texture("t.tiff")),
-    Format("dataset payload", _make_record("events.h5", "*.png", "*.npy", "poses.npz", "*_timestamps.txt", "config.yaml"), _judge_data_set(True)),
+    Format(
+        "dataset payload",
+        _make_record("events.h5", "*.png", "*.npy", "poses.npz", "*_timestamps.txt", "config.yaml"),
+        _judge_data_set(True),
+    ),
     Format("dataset manifest", _make_record("manifest.json"), _judge_data_set(False), (*m.TEXT, *[m.json_tree] * 12)),
     Format("dataset index", _make_record("index.jsonl"), _judge_data_set(False), (*m.TEXT, *[m.json_lines] * 12)),
     Format("dataset run.json", _make_record("run.json"), _judge_data_set(False), (*m.TEXT, *[m.json_tree] * 12)),
     Format("dataset recipe", _make_record("recipe.yaml"), _judge_data_set(False), (*m.TEXT, *[m.yaml_tree] * 8)),
-    Format("loader blinkgl", _make_record("events.h5", "*.png", "*_timestamps.txt", "index.jsonl"), _judge_loader, (*m.BLIND, m.token)),
+    Format(
+        "loader blinkgl",
+        _make_record("events.h5", "*.png", "*_timestamps.txt", "index.jsonl"),
+        _judge_loader,
+        (*m.BLIND, m.token),
+    ),
     Format("loader dsec", _make_dsec_set, _judge_dsec_set, _H5, "torch"),
     Format("loader dsec times", _make_times, _judge_dsec_set, m.TEXT, "torch"),
     Format("loader mvsec", _make_mvsec_set, _judge_mvsec_set, _H5, "torch"),
-    Format("loader mvsec truth", _make_mvsec_truth, _judge_mvsec_set, (*m.BLIND, *[m.fields(m.zip_layout)] * 4), "torch"),
+    Format(
+        "loader mvsec truth", _make_mvsec_truth, _judge_mvsec_set, (*m.BLIND, *[m.fields(m.zip_layout)] * 4), "torch"
+    ),
     Format("yaml recipe", _make_yaml, _judge_yaml, (*m.TEXT, *[m.yaml_tree] * 12)),
     Format("yaml explicit scene", _make_explicit, _judge_explicit, (*m.TEXT, *[m.yaml_tree] * 12)),
     Format("yaml emulator", _make_emulator_yaml, _judge_emulator_yaml, (*m.TEXT, *[m.yaml_tree] * 6)),
     Format("yaml training", _make_train_yaml, _judge_train_yaml, (*m.TEXT, *[m.yaml_tree] * 12), "torch"),
-    Format("checkpoint weights", _make_checkpoint, _judge_checkpoint, (*m.BLIND, m.fixed((0, "<Q")), *[m.safetensors_tree] * 6, m.safetensors_values), "torch"),
+    Format(
+        "checkpoint weights",
+        _make_checkpoint,
+        _judge_checkpoint,
+        (*m.BLIND, m.fixed((0, "<Q")), *[m.safetensors_tree] * 6, m.safetensors_values),
+        "torch",
+    ),
     Format("checkpoint state", _make_checkpoint_state, _judge_checkpoint_state, (*m.TEXT, *[m.json_tree] * 8), "torch"),
 )

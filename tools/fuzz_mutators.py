@@ -24,12 +24,97 @@ Mutator = Callable[[np.random.Generator, bytes], bytes]
 Layout = Callable[[bytes], list[tuple[int, str]]]
 """Where a format keeps counts, sizes and offsets: (byte, struct format)."""
 
-_INTEGERS = (0, 1, 2, 3, 7, 100, 127, 128, 255, 256, 4096, 32767, 32768, 65535, 65536, 60000, 10**6, 10**9, 2**31 - 1, 2**31, 2**32 - 1,
-             2**53, 2**62, 2**63 - 1, 2**63, 2**64 - 1, -1, -2, -32768, -(2**31), -(2**63))
-_FLOATS = (float("nan"), float("inf"), float("-inf"), -1.0, 0.0, -0.0, 1e-320, 1e30, -1e30, 3e38, 1e308, 0.5, 1e9, 2.0**31, 2.0**63)
-_TOKENS = (b"-1", b"0", b"nan", b"inf", b"-inf", b"1e999", b"-1e999", b"1e-999", b"99999999999999999999", b"65536", b"70000", b"4294967296", b"--", b"",
-           b"1.5", b"0x10", b"true", b"null", "²".encode(), "٣".encode(), b"1_000", b"+", b".", b"e", b"\"", b"{}", b"[]", b"9" * 5000, b"0." + b"0" * 400 + b"1", b"a" * 300,
-           b"\x00", b"\xff\xfe", b"#", b"%", b"../../../etc/passwd", b"/etc/passwd", b"!!python/object/apply:os.system", b"&a", b"*a")
+_INTEGERS = (
+    0,
+    1,
+    2,
+    3,
+    7,
+    100,
+    127,
+    128,
+    255,
+    256,
+    4096,
+    32767,
+    32768,
+    65535,
+    65536,
+    60000,
+    10**6,
+    10**9,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**53,
+    2**62,
+    2**63 - 1,
+    2**63,
+    2**64 - 1,
+    -1,
+    -2,
+    -32768,
+    -(2**31),
+    -(2**63),
+)
+_FLOATS = (
+    float("nan"),
+    float("inf"),
+    float("-inf"),
+    -1.0,
+    0.0,
+    -0.0,
+    1e-320,
+    1e30,
+    -1e30,
+    3e38,
+    1e308,
+    0.5,
+    1e9,
+    2.0**31,
+    2.0**63,
+)
+_TOKENS = (
+    b"-1",
+    b"0",
+    b"nan",
+    b"inf",
+    b"-inf",
+    b"1e999",
+    b"-1e999",
+    b"1e-999",
+    b"99999999999999999999",
+    b"65536",
+    b"70000",
+    b"4294967296",
+    b"--",
+    b"",
+    b"1.5",
+    b"0x10",
+    b"true",
+    b"null",
+    "²".encode(),
+    "٣".encode(),
+    b"1_000",
+    b"+",
+    b".",
+    b"e",
+    b'"',
+    b"{}",
+    b"[]",
+    b"9" * 5000,
+    b"0." + b"0" * 400 + b"1",
+    b"a" * 300,
+    b"\x00",
+    b"\xff\xfe",
+    b"#",
+    b"%",
+    b"../../../etc/passwd",
+    b"/etc/passwd",
+    b"!!python/object/apply:os.system",
+    b"&a",
+    b"*a",
+)
 
 
 def _at(rng: np.random.Generator, data: bytes, width: int = 1) -> int:
@@ -39,7 +124,7 @@ def _at(rng: np.random.Generator, data: bytes, width: int = 1) -> int:
 
 
 def _put(data: bytes, at: int, new: bytes) -> bytes:
-    return data[:at] + new + data[at + len(new):]
+    return data[:at] + new + data[at + len(new) :]
 
 
 def flip_bits(rng, data):
@@ -51,23 +136,27 @@ def flip_bits(rng, data):
 
 
 def truncate(rng, data):
-    return data[:_at(rng, data)] if rng.random() < 0.7 else data[:max(len(data) - int(rng.integers(1, 20)), 0)]
+    return data[: _at(rng, data)] if rng.random() < 0.7 else data[: max(len(data) - int(rng.integers(1, 20)), 0)]
 
 
 def extend(rng, data):
-    return data + (rng.bytes(int(rng.choice([1, 4, 64, 5000]))) if rng.random() < 0.5 else data[-int(rng.integers(1, 200)):])
+    return data + (
+        rng.bytes(int(rng.choice([1, 4, 64, 5000]))) if rng.random() < 0.5 else data[-int(rng.integers(1, 200)) :]
+    )
 
 
 def overwrite(rng, data):
     n = int(rng.choice([1, 2, 4, 16, 256]))
-    return _put(data, _at(rng, data, n), [b"\0" * n, b"\xff" * n, rng.bytes(n)][int(rng.integers(3))])[:len(data)]
+    return _put(data, _at(rng, data, n), [b"\0" * n, b"\xff" * n, rng.bytes(n)][int(rng.integers(3))])[: len(data)]
 
 
 def move_block(rng, data):
     a, b = sorted((_at(rng, data), _at(rng, data)))
     b = min(b, a + int(rng.choice([1, 8, 64, 4096])))
     to = _at(rng, data)
-    return [data[:a] + data[b:], data[:b] + data[a:b] + data[b:], data[:to] + data[a:b] + data[to:]][int(rng.integers(3))]
+    return [data[:a] + data[b:], data[:b] + data[a:b] + data[b:], data[:to] + data[a:b] + data[to:]][
+        int(rng.integers(3))
+    ]
 
 
 def integer(rng, data):
@@ -89,9 +178,20 @@ def _field(rng, data, at, fmt):
     if fmt[-1] in "fd":
         with np.errstate(over="ignore"):
             value = rng.choice(_FLOATS)
-            return _put(data, at, np.array(value, ("<" if fmt[0] == "<" else ">") + ("f4" if fmt[-1] == "f" else "f8")).tobytes())
+            return _put(
+                data,
+                at,
+                np.array(value, ("<" if fmt[0] == "<" else ">") + ("f4" if fmt[-1] == "f" else "f8")).tobytes(),
+            )
     old = struct.unpack_from(fmt, data, at)[0]
-    value = [int(_INTEGERS[int(rng.integers(len(_INTEGERS)))]), old + 1, old - 1, old * 2, old // 2, old + int(rng.integers(-300, 300))][int(rng.integers(6)) if rng.random() < 0.6 else 0]
+    value = [
+        int(_INTEGERS[int(rng.integers(len(_INTEGERS)))]),
+        old + 1,
+        old - 1,
+        old * 2,
+        old // 2,
+        old + int(rng.integers(-300, 300)),
+    ][int(rng.integers(6)) if rng.random() < 0.6 else 0]
     return _put(data, at, (value % (1 << 8 * size)).to_bytes(size, "little" if fmt[0] == "<" else "big"))
 
 
@@ -101,7 +201,7 @@ def token(rng, data):
     if not found:
         return overwrite(rng, data)
     m = found[int(rng.integers(len(found)))]
-    return data[:m.start()] + _TOKENS[int(rng.integers(len(_TOKENS)))] + data[m.end():]
+    return data[: m.start()] + _TOKENS[int(rng.integers(len(_TOKENS)))] + data[m.end() :]
 
 
 def word(rng, data):
@@ -111,26 +211,55 @@ def word(rng, data):
         return overwrite(rng, data)
     m, other = (found[int(rng.integers(len(found)))] for _ in range(2))
     new = [b"", m[0] * 2, m[0] * 1000, other[0], _TOKENS[int(rng.integers(len(_TOKENS)))]][int(rng.integers(5))]
-    return data[:m.start()] + new + data[m.end():]
+    return data[: m.start()] + new + data[m.end() :]
 
 
 def other_kind(rng, data):
     """The beginning of a file of quite another kind, or nothing."""
-    heads = (b"", b"\x89PNG\r\n\x1a\n", b"PK\x03\x04", b"\x89HDF\r\n\x1a\n", b"glTF\x02\0\0\0", b"\x93NUMPY\x01\0", b"% evt 3.0\n% end\n", b"#!AER-DAT4.0\r\n", b"{\"a\": 1}",
-             b"solid\n", b"ply\n", b"#?RADIANCE\n", b"PF\n4 4\n-1\n", b"\x80\x05\x95", b"the quick brown fox\n", b"\0" * 100)
+    heads = (
+        b"",
+        b"\x89PNG\r\n\x1a\n",
+        b"PK\x03\x04",
+        b"\x89HDF\r\n\x1a\n",
+        b"glTF\x02\0\0\0",
+        b"\x93NUMPY\x01\0",
+        b"% evt 3.0\n% end\n",
+        b"#!AER-DAT4.0\r\n",
+        b'{"a": 1}',
+        b"solid\n",
+        b"ply\n",
+        b"#?RADIANCE\n",
+        b"PF\n4 4\n-1\n",
+        b"\x80\x05\x95",
+        b"the quick brown fox\n",
+        b"\0" * 100,
+    )
     head = heads[int(rng.integers(len(heads)))]
-    return head + (data[len(head):] if rng.random() < 0.5 else b"")
+    return head + (data[len(head) :] if rng.random() < 0.5 else b"")
 
 
-BLIND: tuple[Mutator, ...] = (flip_bits, flip_bits, truncate, extend, overwrite, move_block, integer, integer, floating, other_kind)
+BLIND: tuple[Mutator, ...] = (
+    flip_bits,
+    flip_bits,
+    truncate,
+    extend,
+    overwrite,
+    move_block,
+    integer,
+    integer,
+    floating,
+    other_kind,
+)
 TEXT: tuple[Mutator, ...] = (flip_bits, truncate, move_block, token, token, token, word, word, other_kind)
 
 
 def fields(layout: Layout) -> Mutator:
     """Damages one of the numbers that ``layout`` finds."""
+
     def mutate(rng, data):
         places = layout(data)
         return _field(rng, data, *places[int(rng.integers(len(places)))]) if places else overwrite(rng, data)
+
     return mutate
 
 
@@ -143,8 +272,42 @@ def fixed(*places: tuple[int, str]) -> Mutator:
 
 
 def _leaf(rng) -> Any:
-    return [None, True, -1, 0, 1, 5, 0.5, 1e308, -1e308, float("nan"), float("inf"), 10**9, 2**63, 2**64, 10**400, "", "a", "nan", "a" * 5000, "\0", "../..", "²", [], {}, [[]],
-            [1, 2, 3], {"a": {}}, [None] * 4, ["a"] * 3, [1e308] * 3, [0] * 3, [0] * 4, [float("nan")] * 3, _nested(rng)][int(rng.integers(34))]
+    return [
+        None,
+        True,
+        -1,
+        0,
+        1,
+        5,
+        0.5,
+        1e308,
+        -1e308,
+        float("nan"),
+        float("inf"),
+        10**9,
+        2**63,
+        2**64,
+        10**400,
+        "",
+        "a",
+        "nan",
+        "a" * 5000,
+        "\0",
+        "../..",
+        "²",
+        [],
+        {},
+        [[]],
+        [1, 2, 3],
+        {"a": {}},
+        [None] * 4,
+        ["a"] * 3,
+        [1e308] * 3,
+        [0] * 3,
+        [0] * 4,
+        [float("nan")] * 3,
+        _nested(rng),
+    ][int(rng.integers(34))]
 
 
 def _nested(rng) -> Any:
@@ -159,7 +322,7 @@ def tree(rng, value: Any) -> Any:
     places: list[tuple[Any, Any]] = []
 
     def walk(node):
-        for key in (list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()):
+        for key in list(node) if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ():
             places.append((node, key))
             walk(node[key])
 
@@ -208,22 +371,22 @@ def yaml_tree(rng, data):
 def glb_tree(rng, data):
     """The JSON of a GLB, lengths right again."""
     length = struct.unpack_from("<I", data, 12)[0]
-    text = _dump(tree(rng, json.loads(data[20:20 + length])))
+    text = _dump(tree(rng, json.loads(data[20 : 20 + length])))
     text += b" " * (-len(text) % 4)
-    rest = data[20 + length:]
+    rest = data[20 + length :]
     return struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
 
 
 def safetensors_tree(rng, data):
     """The header of a safetensors file, its length right again; now and then the metadata inside."""
     length = struct.unpack_from("<Q", data)[0]
-    header = json.loads(data[8:8 + length])
+    header = json.loads(data[8 : 8 + length])
     if rng.random() < 0.4 and "model" in header.get("__metadata__", {}):
         header["__metadata__"]["model"] = _dump(tree(rng, json.loads(header["__metadata__"]["model"]))).decode()
     else:
         header = tree(rng, header)
     text = _dump(header)
-    return struct.pack("<Q", len(text)) + text + data[8 + length:]
+    return struct.pack("<Q", len(text)) + text + data[8 + length :]
 
 
 def safetensors_values(rng, data):
@@ -241,7 +404,7 @@ def png_chunks(rng, data):
     chunks, at = [], 8
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
-        chunks.append((kind, data[at + 8:at + 8 + length]))
+        chunks.append((kind, data[at + 8 : at + 8 + length]))
         at += 12 + length
     k = int(rng.integers(len(chunks)))
     kind, body = chunks[k]
@@ -249,19 +412,25 @@ def png_chunks(rng, data):
     if how == 0:
         kind, body = chunks[0]
         k = 0
-        body = _field(rng, body, *[(0, ">I"), (4, ">I"), (8, "<B"), (9, "<B"), (10, "<B"), (11, "<B"), (12, "<B")][int(rng.integers(7))])
+        body = _field(
+            rng,
+            body,
+            *[(0, ">I"), (4, ">I"), (8, "<B"), (9, "<B"), (10, "<B"), (11, "<B"), (12, "<B")][int(rng.integers(7))],
+        )
     elif how == 1 and body:
         body = flip_bits(rng, body)
     elif how == 2:
-        body = body[:int(rng.integers(0, len(body) + 1))]
+        body = body[: int(rng.integers(0, len(body) + 1))]
     elif how == 3 and kind == b"IDAT":
-        body = zlib.compress(zlib.decompress(body)[:int(rng.integers(0, 200))])
+        body = zlib.compress(zlib.decompress(body)[: int(rng.integers(0, 200))])
     elif how == 4:
         kind = bytes(rng.choice(list(b"IHDRPLTEtRNSacTLfdAT"), 4).astype(np.uint8))
     chunks[k] = (kind, body)
     if how == 5:
         chunks.insert(int(rng.integers(len(chunks))), chunks[k]) if rng.random() < 0.5 else chunks.pop(k)
-    return data[:8] + b"".join(struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks)
+    return data[:8] + b"".join(
+        struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks
+    )
 
 
 # ---- NumPy -----------------------------------------------------------------------------------------------------------
@@ -272,15 +441,43 @@ def npy_header(rng, data):
     start = 10 + struct.unpack_from("<H", data, 8)[0]
     old = ast.literal_eval(data[10:start].decode())
     n = [0, 1, 5, -1, 10**5, 10**9, 10**12, 2**63 - 1, 2**64][int(rng.integers(9))]
-    shape = [(n,), (n, *old["shape"][1:]), (*old["shape"], n), (), old["shape"][::-1], (n, n, n), (2,) * 40][int(rng.integers(7))]
-    descr = ["<f8", "<i4", "|O", "|b1", "<c16", "<U5", "|S3", "|V7", "<M8[us]", ">f4", "<f2", "|u1", [("t", "<f8"), ("x", "<i8"), ("y", "<f4"), ("p", "|b1")],
-             [("t", "<i8"), ("x", "<u2", (3,)), ("y", "<u2"), ("p", "|u1")], "nonsense", 5][int(rng.integers(16))]
-    new = {**old, **[{"shape": shape}, {"descr": descr}, {"fortran_order": True}, {"shape": shape, "descr": descr}, {"extra": 1}][int(rng.integers(5))]}
+    shape = [(n,), (n, *old["shape"][1:]), (*old["shape"], n), (), old["shape"][::-1], (n, n, n), (2,) * 40][
+        int(rng.integers(7))
+    ]
+    descr = [
+        "<f8",
+        "<i4",
+        "|O",
+        "|b1",
+        "<c16",
+        "<U5",
+        "|S3",
+        "|V7",
+        "<M8[us]",
+        ">f4",
+        "<f2",
+        "|u1",
+        [("t", "<f8"), ("x", "<i8"), ("y", "<f4"), ("p", "|b1")],
+        [("t", "<i8"), ("x", "<u2", (3,)), ("y", "<u2"), ("p", "|u1")],
+        "nonsense",
+        5,
+    ][int(rng.integers(16))]
+    new = {
+        **old,
+        **[{"shape": shape}, {"descr": descr}, {"fortran_order": True}, {"shape": shape, "descr": descr}, {"extra": 1}][
+            int(rng.integers(5))
+        ],
+    }
     if rng.random() < 0.3:  # a body of the length that the header claims
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             try:
-                count = int(np.prod([float(v) for v in new["shape"]])) * np.dtype([tuple(f) for f in new["descr"]] if isinstance(new["descr"], list) else new["descr"]).itemsize
+                count = (
+                    int(np.prod([float(v) for v in new["shape"]]))
+                    * np.dtype(
+                        [tuple(f) for f in new["descr"]] if isinstance(new["descr"], list) else new["descr"]
+                    ).itemsize
+                )
                 data = data[:start] + (data[start:] * 50)[:count] if 0 < count < 10**6 else data
             except (TypeError, ValueError, OverflowError):
                 pass
@@ -321,7 +518,19 @@ def values(rng, a: np.ndarray) -> np.ndarray:
         if how == 0 and a.dtype.names is None:
             return a.astype(str(rng.choice(["f8", "f4", "i8", "i2", "u1", "u8", "?", "c8", "S4", "U3", "O"])))
         if how == 1:
-            return [a[:-1], a[:0], np.concatenate([a, a]) if a.ndim else np.stack([a, a]), a[None], a[..., None], np.asarray(5), a.T][int(rng.integers(7))] if a.ndim else np.zeros(3)
+            return (
+                [
+                    a[:-1],
+                    a[:0],
+                    np.concatenate([a, a]) if a.ndim else np.stack([a, a]),
+                    a[None],
+                    a[..., None],
+                    np.asarray(5),
+                    a.T,
+                ][int(rng.integers(7))]
+                if a.ndim
+                else np.zeros(3)
+            )
         if how == 2:
             return a[::-1] if a.ndim else a - 1
         if how == 3:
@@ -343,16 +552,23 @@ def values_in(rng, a: np.ndarray) -> np.ndarray:
         if len(flat):
             with np.errstate(all="ignore"):
                 value = rng.choice(_FLOATS) if a.dtype.kind == "f" else _INTEGERS[int(rng.integers(len(_INTEGERS)))]
-                flat[int(rng.integers(len(flat)))] = np.array(value % 2**63 if a.dtype.kind in "iu" else value).astype(a.dtype)
+                flat[int(rng.integers(len(flat)))] = np.array(value % 2**63 if a.dtype.kind in "iu" else value).astype(
+                    a.dtype
+                )
     return a
 
 
 def zip_layout(data):
     """Sizes, offsets and methods of a zip's headers."""
     places = []
-    for magic, found in ((b"PK\x03\x04", ((4, "<H"), (6, "<H"), (8, "<H"), (14, "<I"), (18, "<I"), (22, "<I"), (26, "<H"), (28, "<H"))),
-                         (b"PK\x01\x02", ((8, "<H"), (10, "<H"), (16, "<I"), (20, "<I"), (24, "<I"), (28, "<H"), (30, "<H"), (42, "<I"))),
-                         (b"PK\x05\x06", ((8, "<H"), (10, "<H"), (12, "<I"), (16, "<I"), (20, "<H")))):
+    for magic, found in (
+        (b"PK\x03\x04", ((4, "<H"), (6, "<H"), (8, "<H"), (14, "<I"), (18, "<I"), (22, "<I"), (26, "<H"), (28, "<H"))),
+        (
+            b"PK\x01\x02",
+            ((8, "<H"), (10, "<H"), (16, "<I"), (20, "<I"), (24, "<I"), (28, "<H"), (30, "<H"), (42, "<I")),
+        ),
+        (b"PK\x05\x06", ((8, "<H"), (10, "<H"), (12, "<I"), (16, "<I"), (20, "<H"))),
+    ):
         at = data.find(magic)
         while at >= 0:
             places += [(at + o, f) for o, f in found]
@@ -365,8 +581,10 @@ def zip_layout(data):
 
 def hdf5_layout(data):
     """Every eight bytes that may be an offset, size or count of the file's own structures."""
-    words = np.frombuffer(data[:len(data) // 8 * 8], "<u8")
-    return [(int(i) * 8, "<Q") for i in np.flatnonzero((words > 0) & (words <= 4 * len(data)) | (words == 2**64 - 1))[:4000]]
+    words = np.frombuffer(data[: len(data) // 8 * 8], "<u8")
+    return [
+        (int(i) * 8, "<Q") for i in np.flatnonzero((words > 0) & (words <= 4 * len(data)) | (words == 2**64 - 1))[:4000]
+    ]
 
 
 def hdf5_objects(rng, data):
@@ -381,7 +599,9 @@ def hdf5_objects(rng, data):
         name = str(rng.choice(names))
         if file.attrs and rng.random() < 0.15:
             key = str(rng.choice(list(file.attrs)))
-            file.attrs[key] = [0, -1, 2**40, 1.5, "a", [1, 2], np.nan, h5py.Empty("i8"), 65537, 1][int(rng.integers(10))]
+            file.attrs[key] = [0, -1, 2**40, 1.5, "a", [1, 2], np.nan, h5py.Empty("i8"), 65537, 1][
+                int(rng.integers(10))
+            ]
             return _closed(file, stream)
         old = file[name][()] if file[name].size < 10**6 else np.zeros(3)
         del file[name]
@@ -393,14 +613,22 @@ def hdf5_objects(rng, data):
         elif how == 2:
             file[name] = h5py.ExternalLink("/etc/passwd" if rng.random() < 0.5 else "other.h5", "/x")
         elif how == 3:
-            file.create_dataset(name, np.shape(old), np.asarray(old).dtype, external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)])
+            file.create_dataset(
+                name, np.shape(old), np.asarray(old).dtype, external=[("/etc/passwd", 0, h5py.h5f.UNLIMITED)]
+            )
         elif how == 4:
             layout = h5py.VirtualLayout(np.shape(old) or (1,), np.asarray(old).dtype)
             layout[...] = h5py.VirtualSource("/etc/passwd", "x", np.shape(old) or (1,))
             file.create_virtual_dataset(name, layout)
         elif how == 5:
             n = int(rng.choice([10**6, 10**9, 10**15]))
-            file.create_dataset(name, (n, *np.shape(old)[1:]), np.asarray(old).dtype, chunks=(min(n, 10**5), *np.shape(old)[1:]), compression="gzip")
+            file.create_dataset(
+                name,
+                (n, *np.shape(old)[1:]),
+                np.asarray(old).dtype,
+                chunks=(min(n, 10**5), *np.shape(old)[1:]),
+                compression="gzip",
+            )
         elif how == 6:
             file[name] = h5py.Empty("i8")
         elif how == 7:
@@ -421,13 +649,19 @@ def _closed(file, stream: io.BytesIO) -> bytes:
 
 def box_layout(data):
     """Sizes of an MP4's boxes, and the words after them."""
-    return [(m.start() - 4 + o, ">I") for m in re.finditer(rb"moov|mdat|trak|mdia|minf|stbl|stsd|stts|stsz|stco|stsc|mvhd|tkhd|mdhd|avc1|ftyp", data)
-            if m.start() >= 4 for o in (0, 8, 12, 16, 20, 24)]
+    return [
+        (m.start() - 4 + o, ">I")
+        for m in re.finditer(rb"moov|mdat|trak|mdia|minf|stbl|stsd|stts|stsz|stco|stsc|mvhd|tkhd|mdhd|avc1|ftyp", data)
+        if m.start() >= 4
+        for o in (0, 8, 12, 16, 20, 24)
+    ]
 
 
 def words_layout(width: int, start: bytes = b"% end\n") -> Layout:
     """Words of ``width`` bytes after a header that ends with ``start``."""
+
     def layout(data):
         begin = data.find(start) + len(start)
         return [(i, {2: "<H", 4: "<I"}[width]) for i in range(begin, len(data) - width, width)]
+
     return layout

@@ -29,8 +29,12 @@ HEAD = """\
 
 def error_classes(trees: dict[str, ast.Module]) -> set[str]:
     """Names of BlinkGLError and everything that inherits from it, however far."""
-    parents = {node.name: {base.id for base in node.bases if isinstance(base, ast.Name)}
-               for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    parents = {
+        node.name: {base.id for base in node.bases if isinstance(base, ast.Name)}
+        for tree in trees.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ClassDef)
+    }
     found = {"BlinkGLError"}
     while more := {name for name, bases in parents.items() if bases & found} - found:
         found |= more
@@ -44,7 +48,9 @@ def template(node: ast.expr | None) -> str:
     if isinstance(node, ast.Constant):
         return str(node.value)
     if isinstance(node, ast.JoinedStr):
-        return "".join(str(v.value) if isinstance(v, ast.Constant) else "{" + _short(v.value) + "}" for v in node.values)
+        return "".join(
+            str(v.value) if isinstance(v, ast.Constant) else "{" + _short(v.value) + "}" for v in node.values
+        )
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
         return template(node.left) + template(node.right)
     if isinstance(node, ast.IfExp):
@@ -58,7 +64,13 @@ def _short(node: ast.expr) -> str:
 
 
 def _called(node: ast.Call) -> str:
-    return node.func.id if isinstance(node.func, ast.Name) else node.func.attr if isinstance(node.func, ast.Attribute) else ""
+    return (
+        node.func.id
+        if isinstance(node.func, ast.Name)
+        else node.func.attr
+        if isinstance(node.func, ast.Attribute)
+        else ""
+    )
 
 
 def _sentence(call: ast.Call, problem: ast.expr | None) -> str:
@@ -84,14 +96,24 @@ def _functions(tree: ast.Module) -> Iterator[tuple[ast.FunctionDef, list[str]]]:
 @cache
 def sentences() -> dict[str, list[str]]:
     """Module -> its sentences, each once, in the order of the source."""
-    trees = {p.relative_to(ROOT).as_posix(): ast.parse(p.read_text()) for package in PACKAGES for p in sorted((ROOT / package).rglob("*.py"))}
+    trees = {
+        p.relative_to(ROOT).as_posix(): ast.parse(p.read_text())
+        for package in PACKAGES
+        for p in sorted((ROOT / package).rglob("*.py"))
+    }
     classes = error_classes(trees)
     # Helpers that are given their sentence: name -> which argument it is.
     helpers: dict[str, tuple[int, str]] = {}
     for tree in trees.values():
         for function, parameters in _functions(tree):
             for node in ast.walk(function):
-                if isinstance(node, ast.Call) and _called(node) in classes and node.args and isinstance(node.args[0], ast.Name) and node.args[0].id in parameters:
+                if (
+                    isinstance(node, ast.Call)
+                    and _called(node) in classes
+                    and node.args
+                    and isinstance(node.args[0], ast.Name)
+                    and node.args[0].id in parameters
+                ):
                     skip = 1 if parameters[0] in ("self", "cls") else 0
                     helpers[function.name] = (parameters.index(node.args[0].id) - skip, node.args[0].id)
     found: dict[str, list[str]] = {}
@@ -100,15 +122,29 @@ def sentences() -> dict[str, list[str]]:
         for node in ast.walk(tree):
             if isinstance(node, ast.Call):
                 name = _called(node)
-                if name in classes and node.args and not (isinstance(node.args[0], ast.Name) and path != "blinkgl/errors.py"):
+                if (
+                    name in classes
+                    and node.args
+                    and not (isinstance(node.args[0], ast.Name) and path != "blinkgl/errors.py")
+                ):
                     lines.append((node.lineno, _sentence(node, node.args[0])))
                 elif name in helpers:
                     index, keyword = helpers[name]
-                    problem = node.args[index] if 0 <= index < len(node.args) else next((k.value for k in node.keywords if k.arg == keyword), None)
+                    problem = (
+                        node.args[index]
+                        if 0 <= index < len(node.args)
+                        else next((k.value for k in node.keywords if k.arg == keyword), None)
+                    )
                     if problem is not None and not isinstance(problem, ast.Name):
                         lines.append((node.lineno, _sentence(node, problem)))
-            elif isinstance(node, ast.Raise) and path.split("/")[1] in ("config", "config.py") and isinstance(node.exc, ast.Call):
-                if _called(node.exc) in ("ValueError", "PydanticCustomError") and node.exc.args:  # pydantic turns these into a ConfigError
+            elif (
+                isinstance(node, ast.Raise)
+                and path.split("/")[1] in ("config", "config.py")
+                and isinstance(node.exc, ast.Call)
+            ):
+                if (
+                    _called(node.exc) in ("ValueError", "PydanticCustomError") and node.exc.args
+                ):  # pydantic turns these into a ConfigError
                     lines.append((node.lineno, template(node.exc.args[-1])))
         if lines:
             found[path] = list(dict.fromkeys(line for _, line in sorted(lines)))
@@ -116,7 +152,9 @@ def sentences() -> dict[str, list[str]]:
 
 
 def text() -> str:
-    return HEAD + "".join(f"\n[{path}]\n" + "".join(f"{line}\n" for line in lines) for path, lines in sentences().items())
+    return HEAD + "".join(
+        f"\n[{path}]\n" + "".join(f"{line}\n" for line in lines) for path, lines in sentences().items()
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -54,8 +54,21 @@ ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("render", "timeline", "events", "scene", "io", "dataset", "sequence", "camera", "labels", "recordings")
 MAP = ROOT / ".scratch" / "mutate"
 EQUIVALENT = ROOT / "tools" / "mutants_equivalent.txt"
-SHARED_CODE = ("blinkgl", "eflow", "shaders", "configs", "tools", "tests", "setup.cfg", "README.md", "docs", "Makefile", "constraints.txt", "pyproject.toml",
-               "examples")
+SHARED_CODE = (
+    "blinkgl",
+    "eflow",
+    "shaders",
+    "configs",
+    "tools",
+    "tests",
+    "setup.cfg",
+    "README.md",
+    "docs",
+    "Makefile",
+    "constraints.txt",
+    "pyproject.toml",
+    "examples",
+)
 DEBUGGERS = "shaders/include/lookup.glsl"
 """the include that only the shader debugger asks for"""
 MOST_TESTS, MOST_S = 300, 120.0
@@ -63,22 +76,92 @@ MOST_TESTS, MOST_S = 300, 120.0
 MEMORY = 6 << 30
 """bytes: a mutant that never stops collecting must not take the machine with it"""
 
-PRELOADED = ("numpy", "numba", "scipy.interpolate", "scipy.ndimage", "scipy.spatial.transform", "scipy.optimize", "scipy.special", "cv2", "h5py",
-             "hdf5plugin", "pydantic", "yaml", "typer", "rich.console", "rich.table", "rich.progress", "PIL.Image", "imageio.v3", "moderngl", "trimesh",
-             "networkx", "fcl", "fast_simplification", "pytest", "_pytest.doctest", "hypothesis", "hypothesis.strategies", "hypothesis.extra.numpy",
-             "concurrent.futures.process", "multiprocessing.pool", "http.server", "urllib.request", "sqlite3", "unittest.mock", "tarfile")
+PRELOADED = (
+    "numpy",
+    "numba",
+    "scipy.interpolate",
+    "scipy.ndimage",
+    "scipy.spatial.transform",
+    "scipy.optimize",
+    "scipy.special",
+    "cv2",
+    "h5py",
+    "hdf5plugin",
+    "pydantic",
+    "yaml",
+    "typer",
+    "rich.console",
+    "rich.table",
+    "rich.progress",
+    "PIL.Image",
+    "imageio.v3",
+    "moderngl",
+    "trimesh",
+    "networkx",
+    "fcl",
+    "fast_simplification",
+    "pytest",
+    "_pytest.doctest",
+    "hypothesis",
+    "hypothesis.strategies",
+    "hypothesis.extra.numpy",
+    "concurrent.futures.process",
+    "multiprocessing.pool",
+    "http.server",
+    "urllib.request",
+    "sqlite3",
+    "unittest.mock",
+    "tarfile",
+)
 """what the server imports before it forks; none of them starts a thread or opens a display when it is imported"""
 
 COMPILED = re.compile(r"\b(njit|jit|vectorize|register_jitable|overload|intrinsic)\b")
 """in a decorator: the function is compiled, alone or into the kernels that call it"""
 
-ARITHMETIC = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*", ast.FloorDiv: "*", ast.Mod: "*", ast.Pow: "*", ast.MatMult: None,
-              ast.BitAnd: "|", ast.BitOr: "&", ast.BitXor: "|", ast.LShift: ">>", ast.RShift: "<<"}
-COMPARISON = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not", ast.IsNot: "is",
-              ast.In: "not in", ast.NotIn: "in"}
+ARITHMETIC = {
+    ast.Add: "-",
+    ast.Sub: "+",
+    ast.Mult: "/",
+    ast.Div: "*",
+    ast.FloorDiv: "*",
+    ast.Mod: "*",
+    ast.Pow: "*",
+    ast.MatMult: None,
+    ast.BitAnd: "|",
+    ast.BitOr: "&",
+    ast.BitXor: "|",
+    ast.LShift: ">>",
+    ast.RShift: "<<",
+}
+COMPARISON = {
+    ast.Lt: "<=",
+    ast.LtE: "<",
+    ast.Gt: ">=",
+    ast.GtE: ">",
+    ast.Eq: "!=",
+    ast.NotEq: "==",
+    ast.Is: "is not",
+    ast.IsNot: "is",
+    ast.In: "not in",
+    ast.NotIn: "in",
+}
 REVERSED = {ast.Lt: ">", ast.LtE: ">", ast.Gt: "<", ast.GtE: "<"}
-NAMES = {"min": "max", "max": "min", "floor": "ceil", "ceil": "floor", "any": "all", "all": "any", "minimum": "maximum", "maximum": "minimum",
-         "sin": "cos", "cos": "sin", "argmin": "argmax", "argmax": "argmin", "zeros": "ones", "ones": "zeros"}
+NAMES = {
+    "min": "max",
+    "max": "min",
+    "floor": "ceil",
+    "ceil": "floor",
+    "any": "all",
+    "all": "any",
+    "minimum": "maximum",
+    "maximum": "minimum",
+    "sin": "cos",
+    "cos": "sin",
+    "argmin": "argmax",
+    "argmax": "argmin",
+    "zeros": "ones",
+    "ones": "zeros",
+}
 
 
 @dataclass(frozen=True)
@@ -124,7 +207,9 @@ class _Finder(ast.NodeVisitor):
 
     def add(self, start: int, end: int, after: str, operator: str) -> None:
         line = self.source.count("\n", 0, start) + 1
-        mutant = Mutant(self.path, line, start - self.starts[line - 1] + 1, self.source[start:end], after, operator, self.compiled)
+        mutant = Mutant(
+            self.path, line, start - self.starts[line - 1] + 1, self.source[start:end], after, operator, self.compiled
+        )
         first, last = self.statement
         try:
             ast.parse(self.source[first:start] + after + self.source[end:last])
@@ -156,7 +241,9 @@ class _Finder(ast.NodeVisitor):
         self.compiled = outer
 
     def visit_AnnAssign(self, node) -> None:
-        if node.value is not None and not (isinstance(node.value, ast.Call) and getattr(node.value.func, "id", "") in ("Field", "field")):
+        if node.value is not None and not (
+            isinstance(node.value, ast.Call) and getattr(node.value.func, "id", "") in ("Field", "field")
+        ):
             self.visit(node.value)
 
     def visit_Expr(self, node) -> None:
@@ -179,7 +266,9 @@ class _Finder(ast.NodeVisitor):
 
     def visit_BinOp(self, node) -> None:
         symbol = ARITHMETIC.get(type(node.op))
-        literal = lambda n: isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
+        literal = lambda n: (
+            isinstance(n, ast.JoinedStr) or (isinstance(n, ast.Constant) and isinstance(n.value, (str, bytes)))
+        )
         if symbol and not literal(node.left) and not literal(node.right):
             self.between(node.left, node.right, symbol, "arithmetic")
         self.generic_visit(node)
@@ -238,15 +327,27 @@ class _Finder(ast.NodeVisitor):
         self.visit(node.value)
 
     def visit_keyword(self, node) -> None:
-        if node.arg not in ("description", "accepted", "where", "value"):  # what an error says is golden text, tested as such
+        if node.arg not in (
+            "description",
+            "accepted",
+            "where",
+            "value",
+        ):  # what an error says is golden text, tested as such
             self.visit(node.value)
 
 
 GLSL = (
     (re.compile(r"(?<=[\w)\]]) ([-+*/]) (?=[\w(-])"), {"+": "-", "-": "+", "*": "/", "/": "*"}, "arithmetic"),
-    (re.compile(r"(?<=[\w)\]]) (<=|>=|<|>|==|!=|&&|\|\|) (?=[\w(-])"),
-     {"<": ">", ">": "<", "<=": ">", ">=": "<", "==": "!=", "!=": "==", "&&": "||", "||": "&&"}, "comparison"),
-    (re.compile(r"\b(min|max|dFdx|dFdy)(?=\()"), {"min": "max", "max": "min", "dFdx": "dFdy", "dFdy": "dFdx"}, "function"),
+    (
+        re.compile(r"(?<=[\w)\]]) (<=|>=|<|>|==|!=|&&|\|\|) (?=[\w(-])"),
+        {"<": ">", ">": "<", "<=": ">", ">=": "<", "==": "!=", "!=": "==", "&&": "||", "||": "&&"},
+        "comparison",
+    ),
+    (
+        re.compile(r"\b(min|max|dFdx|dFdy)(?=\()"),
+        {"min": "max", "max": "min", "dFdx": "dFdy", "dFdy": "dFdx"},
+        "function",
+    ),
     (re.compile(r"(?<![\w.])(\d+\.\d+)(?![\w.])"), None, "constant"),
     (re.compile(r"(?<=[=(,] )(-)(?=[a-z(])"), {"-": ""}, "negation left out"),
 )
@@ -282,7 +383,12 @@ def drawn(count: int, seed: int) -> list[Mutant]:
     """``count`` mutants, the same number from every room, at most one of a line."""
     dice, chosen = random.Random(seed), []
     for k, room in enumerate(ROOMS):
-        everything = [m for path in modules(room) if path != "shaders/debug.glsl" for m in mutants_of(path, (ROOT / path).read_text())]
+        everything = [
+            m
+            for path in modules(room)
+            if path != "shaders/debug.glsl"
+            for m in mutants_of(path, (ROOT / path).read_text())
+        ]
         dice.shuffle(everything)
         lines, few = set(), count // len(ROOMS) + (k < count % len(ROOMS))
         for mutant in everything:
@@ -309,9 +415,26 @@ def make_map(jobs: str, tests: list[str]) -> None:
     elif json.loads((MAP / "sources.json").read_text()) != sources:
         raise SystemExit("the source has changed since --map: make the whole map again")
     environment = {**os.environ, "COVERAGE_FILE": str(MAP / "coverage.db")}
-    status = subprocess.run([sys.executable, "-m", "pytest", "-q", "-n", jobs, "--dist", "worksteal", "--cov=blinkgl", "--cov-context=test",
-                             "--cov-report=term:skip-covered", f"--junitxml={MAP / f'durations{len(known) if tests else 0}.xml'}",
-                             *(["--cov-append"] if tests else []), *tests], cwd=ROOT, env=environment).returncode
+    status = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-q",
+            "-n",
+            jobs,
+            "--dist",
+            "worksteal",
+            "--cov=blinkgl",
+            "--cov-context=test",
+            "--cov-report=term:skip-covered",
+            f"--junitxml={MAP / f'durations{len(known) if tests else 0}.xml'}",
+            *(["--cov-append"] if tests else []),
+            *tests,
+        ],
+        cwd=ROOT,
+        env=environment,
+    ).returncode
     if status not in (0, 1):
         raise SystemExit("the suite cannot be run")
     if status:
@@ -342,7 +465,11 @@ class Kernels:
     def __init__(self, folder: Path):
         self.folder = folder
         self.files = [p for p in (folder / "blinkgl").rglob("*.py") if "__pycache__" not in p.parts]
-        self.holders = {p.relative_to(folder).as_posix() for p in self.files if re.search(rf"^\s*@.*{COMPILED.pattern}", p.read_text(), re.M)}
+        self.holders = {
+            p.relative_to(folder).as_posix()
+            for p in self.files
+            if re.search(rf"^\s*@.*{COMPILED.pattern}", p.read_text(), re.M)
+        }
         self.imports = {p.relative_to(folder).as_posix(): self._imported(p) for p in self.files}
         self.early = _called_at_import(folder)
 
@@ -356,7 +483,11 @@ class Kernels:
             else:
                 continue
             for name in names:
-                found |= {p for p in (name.replace(".", "/") + ".py", name.replace(".", "/") + "/__init__.py") if (self.folder / p).exists()}
+                found |= {
+                    p
+                    for p in (name.replace(".", "/") + ".py", name.replace(".", "/") + "/__init__.py")
+                    if (self.folder / p).exists()
+                }
         return found
 
     def users(self, path: str) -> set[str]:
@@ -374,7 +505,12 @@ class Kernels:
         if not mutant.path.endswith(".py"):
             return set()
         tree = ast.parse((self.folder / mutant.path).read_text())
-        around = [n for n in ast.walk(tree) if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef)) and n.body[0].lineno <= mutant.line <= n.end_lineno]
+        around = [
+            n
+            for n in ast.walk(tree)
+            if isinstance(n, (ast.FunctionDef, ast.AsyncFunctionDef))
+            and n.body[0].lineno <= mutant.line <= n.end_lineno
+        ]
         if around and not mutant.compiled and not self.early & {n.name for n in around}:
             return set()
         return self.users(mutant.path) & self.holders
@@ -394,8 +530,13 @@ def _remembered(mutant: Mutant) -> bool:
     """Whether the line is in a function whose results are kept: then only the first test
     that asked in a process ran it."""
     tree = ast.parse((ROOT / mutant.path).read_text())
-    return any(isinstance(node, ast.FunctionDef) and node.lineno <= mutant.line <= node.end_lineno and any("cache" in ast.unparse(d) for d in node.decorator_list)
-               for node in ast.walk(tree) if not COMPILED.search(" ".join(ast.unparse(d) for d in getattr(node, "decorator_list", ()))))
+    return any(
+        isinstance(node, ast.FunctionDef)
+        and node.lineno <= mutant.line <= node.end_lineno
+        and any("cache" in ast.unparse(d) for d in node.decorator_list)
+        for node in ast.walk(tree)
+        if not COMPILED.search(" ".join(ast.unparse(d) for d in getattr(node, "decorator_list", ())))
+    )
 
 
 class Reach:
@@ -415,7 +556,11 @@ class Reach:
             for case in ElementTree.parse(durations).iter("testcase"):
                 test = f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"
                 self.seconds[test] = float(case.get("time", 0))
-                if case.find("failure") is not None or case.find("error") is not None or case.find("skipped") is not None:
+                if (
+                    case.find("failure") is not None
+                    or case.find("error") is not None
+                    or case.find("skipped") is not None
+                ):
                     self.idle.add(test)
         self._lines: dict[str, dict[int, list[str]]] = {}
         self._anywhere: dict[str, set[str]] = {}
@@ -425,7 +570,10 @@ class Reach:
         if path not in self._lines:
             tests = {}  # one object for each name
             by_line = self.data.contexts_by_lineno(str(ROOT / path)).items()
-            self._lines[path] = {line: sorted({tests.setdefault(c, c) for c in (c.rsplit("|", 1)[0] for c in contexts)}) for line, contexts in by_line}
+            self._lines[path] = {
+                line: sorted({tests.setdefault(c, c) for c in (c.rsplit("|", 1)[0] for c in contexts)})
+                for line, contexts in by_line
+            }
             self._anywhere[path] = {c for contexts in self._lines[path].values() for c in contexts if c}
         return self._lines[path]
 
@@ -463,7 +611,16 @@ class Reach:
         for test in chosen:
             files[test.split("::")[0]].append(self.seconds.get(test, 1.0))
         pace = {file: sum(seconds) / len(seconds) for file, seconds in files.items()}
-        return sorted(chosen, key=lambda t: (self._distance(mutant, t), pace[t.split("::")[0]], t.split("::")[0], self.seconds.get(t, 1.0), t))
+        return sorted(
+            chosen,
+            key=lambda t: (
+                self._distance(mutant, t),
+                pace[t.split("::")[0]],
+                t.split("::")[0],
+                self.seconds.get(t, 1.0),
+                t,
+            ),
+        )
 
     @staticmethod
     def _distance(mutant: Mutant, test: str) -> int:
@@ -491,9 +648,21 @@ class Server:
     """A process that has imported what the tree needs and runs tests in children of its own (:func:`serve`)."""
 
     def __init__(self, folder: Path):
-        environment = {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "LP_NUM_THREADS": "0", "PYGLET_HEADLESS": "1"}
-        self.process = subprocess.Popen([sys.executable, str(ROOT / "tools" / "mutate.py"), "--serve"], cwd=folder, env=environment, text=True,
-                                        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        environment = {
+            **os.environ,
+            "PYTHONPATH": str(folder),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "LP_NUM_THREADS": "0",
+            "PYGLET_HEADLESS": "1",
+        }
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / "tools" / "mutate.py"), "--serve"],
+            cwd=folder,
+            env=environment,
+            text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
 
     def ask(self, order: dict) -> str:
         self.process.stdin.write(json.dumps(order) + "\n")
@@ -519,7 +688,9 @@ def serve() -> int:
             importlib.import_module(name)
     import numba
 
-    numba.njit("f8(f8)")(lambda x: x + 1.0)  # fills numba's tables of types, which it does when it compiles or loads the first kernel
+    numba.njit("f8(f8)")(
+        lambda x: x + 1.0
+    )  # fills numba's tables of types, which it does when it compiles or loads the first kernel
     taken = sorted(m for m in sys.modules if m.split(".")[0] in ("blinkgl", "eflow", "tests"))
     assert not taken, f"of the tree, before it is edited: {taken}"
     gc.collect()
@@ -541,7 +712,9 @@ def serve() -> int:
 
 def _awaited(child: int, limit_s: float) -> str:
     handle = os.pidfd_open(child)
-    ready = select.select([handle, sys.stdin], [], [], limit_s)[0]  # no order comes while one is carried out: readable is who gives them gone
+    ready = select.select([handle, sys.stdin], [], [], limit_s)[
+        0
+    ]  # no order comes while one is carried out: readable is who gives them gone
     in_time = handle in ready
     os.close(handle)
     with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -559,19 +732,25 @@ def _run_tests(order: dict) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for old, new in ((nothing, 0), (output, 1), (output, 2)):
         os.dup2(old, new)
-    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))  # not of address space, of which Ray maps more than it uses
+    resource.setrlimit(
+        resource.RLIMIT_DATA, (MEMORY, MEMORY)
+    )  # not of address space, of which Ray maps more than it uses
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]
     locator = caching._SourceFileBackedLocatorMixin  # noqa: SLF001 - there is no other way to a kernel's stamp
     original, stamp = order["original"], locator.get_source_stamp
     # An edit that no kernel contains leaves those of its file as they are, though the file is another.
-    locator.get_source_stamp = lambda self: bytes.fromhex(original[self._py_file]) if self._py_file in original else stamp(self)
+    locator.get_source_stamp = lambda self: (
+        bytes.fromhex(original[self._py_file]) if self._py_file in original else stamp(self)
+    )
     sys.argv = ["pytest"]
     import pytest
 
-    status = pytest.main(["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *order["tests"]],
-                         plugins=[_Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"])])
+    status = pytest.main(
+        ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *order["tests"]],
+        plugins=[_Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"])],
+    )
     sys.stdout.flush()
     sys.stderr.flush()
     return int(status)
@@ -613,21 +792,41 @@ class Copy:
         self.kernels = Kernels(folder)
         self.server = Server(folder)
 
-    def run(self, tests: dict[str, float], spare_s: float, stale: set[str] = frozenset(), original: dict[str, str] | None = None) -> tuple[str, str]:
+    def run(
+        self,
+        tests: dict[str, float],
+        spare_s: float,
+        stale: set[str] = frozenset(),
+        original: dict[str, str] | None = None,
+    ) -> tuple[str, str]:
         """("passed" | "failed" | "time", the test that failed, "" where the process died). ``tests``: with the seconds
         that each took. ``original``: digests of the sources of files that were edited outside of kernels."""
         failed = self.folder / "output.failed"
         failed.unlink(missing_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
             self.kernels.cache(stale, Path(scratch))
-            outcome = self.server.ask({"tests": list(tests), "seconds": tests, "spare_s": spare_s, "limit_s": 10 * spare_s + 4 * sum(tests.values()),
-                                       "kernels": scratch, "original": original or {}, "output": str(self.folder / "output.txt")})
+            outcome = self.server.ask(
+                {
+                    "tests": list(tests),
+                    "seconds": tests,
+                    "spare_s": spare_s,
+                    "limit_s": 10 * spare_s + 4 * sum(tests.values()),
+                    "kernels": scratch,
+                    "original": original or {},
+                    "output": str(self.folder / "output.txt"),
+                }
+            )
         return outcome, failed.read_text() if outcome == "failed" and failed.exists() else ""
 
     def leave_out_what_is_gone(self, reach: Reach) -> None:
         """Tests of the map that cannot be collected any more have no say."""
-        listing = subprocess.run([sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"], cwd=self.folder, text=True,
-                                 env={**os.environ, "PYTHONPATH": str(self.folder)}, stdout=subprocess.PIPE).stdout
+        listing = subprocess.run(
+            [sys.executable, "-m", "pytest", "--collect-only", "-q", "-p", "no:cacheprovider"],
+            cwd=self.folder,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(self.folder)},
+            stdout=subprocess.PIPE,
+        ).stdout
         self.unfit |= set(reach.seconds) - set(listing.splitlines())
 
     sound: ClassVar[set[str]] = set()
@@ -659,23 +858,33 @@ class Copy:
             return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
         if outcome == "failed" and not failed and self.run(tests, 60)[0] != "passed":
             return {**result, "outcome": "broken"}  # the process died, and does so without the mutant
-        return {**result, "outcome": "survived" if outcome == "passed" else outcome, "by": failed,
-                "seconds": round(time.monotonic() - started, 1)}
+        return {
+            **result,
+            "outcome": "survived" if outcome == "passed" else outcome,
+            "by": failed,
+            "seconds": round(time.monotonic() - started, 1),
+        }
 
 
 def equivalent() -> dict[str, str]:
     """Keys of mutants that change nothing, with the reason."""
     if not EQUIVALENT.exists():
         return {}
-    entries = [line.rsplit("  # ", 1) for line in EQUIVALENT.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    entries = [
+        line.rsplit("  # ", 1)
+        for line in EQUIVALENT.read_text().splitlines()
+        if line.strip() and not line.startswith("#")
+    ]
     return {entry[0].strip(): entry[1].strip() for entry in entries}
 
 
 def key_of(mutant: Mutant, source: str) -> str:
     """A mutant's name by the text of its line instead of the line's number, which moves."""
     line = source.splitlines()[mutant.line - 1]
-    return (f"{mutant.path} | {line.strip()} | {mutant.column - (len(line) - len(line.lstrip()))}: {mutant.before} -> "
-            f"{mutant.after or '(nothing)'}")
+    return (
+        f"{mutant.path} | {line.strip()} | {mutant.column - (len(line) - len(line.lstrip()))}: {mutant.before} -> "
+        f"{mutant.after or '(nothing)'}"
+    )
 
 
 def excuses(mutants: list[Mutant]) -> dict[str, str]:
@@ -686,7 +895,10 @@ def excuses(mutants: list[Mutant]) -> dict[str, str]:
 
 
 def judged(mutants: list[Mutant], reach: Reach, jobs: int) -> Iterator[dict]:
-    with tempfile.TemporaryDirectory(prefix="blinkgl-mutants-") as scratch, concurrent.futures.ThreadPoolExecutor(jobs) as pool:
+    with (
+        tempfile.TemporaryDirectory(prefix="blinkgl-mutants-") as scratch,
+        concurrent.futures.ThreadPoolExecutor(jobs) as pool,
+    ):
         idle = [Copy(_made(Path(scratch) / f"copy{k}")) for k in range(jobs)]
         idle[0].leave_out_what_is_gone(reach)
 
@@ -698,7 +910,9 @@ def judged(mutants: list[Mutant], reach: Reach, jobs: int) -> Iterator[dict]:
                 idle.append(copy)
 
         try:
-            yield from (future.result() for future in concurrent.futures.as_completed([pool.submit(one, m) for m in mutants]))
+            yield from (
+                future.result() for future in concurrent.futures.as_completed([pool.submit(one, m) for m in mutants])
+            )
         finally:
             pool.shutdown(cancel_futures=True)
             for copy in idle:
@@ -712,7 +926,12 @@ def _made(folder: Path) -> Path:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--map", nargs="*", metavar="TEST", help="run the suite, or more tests of the same source, under coverage (needs pytest-cov) and stop")
+    parser.add_argument(
+        "--map",
+        nargs="*",
+        metavar="TEST",
+        help="run the suite, or more tests of the same source, under coverage (needs pytest-cov) and stop",
+    )
     parser.add_argument("--count", type=int, default=200, help=f"mutants drawn, over {', '.join(ROOMS)}")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2, help="mutants side by side")
@@ -728,7 +947,10 @@ def main(arguments: list[str] | None = None) -> int:
         make_map(str(options.jobs), options.map)
         return 0
     if options.show:
-        print(*(f"{m.name}  [{m.operator}]" for m in mutants_of(options.show, (ROOT / options.show).read_text())), sep="\n")
+        print(
+            *(f"{m.name}  [{m.operator}]" for m in mutants_of(options.show, (ROOT / options.show).read_text())),
+            sep="\n",
+        )
         return 0
     if options.only:
         path, _, line = options.only.partition(":")
@@ -743,15 +965,26 @@ def main(arguments: list[str] | None = None) -> int:
     known = {r["name"] for r in results}
     for result in judged([m for m in mutants if m not in excused and m.name not in known], Reach(), options.jobs):
         results.append(result)
-        print(f"[{len(results)}/{len(mutants) - len(excused)}] {result['outcome']:9} {result['name']}  {result['by']}", flush=True)
+        print(
+            f"[{len(results)}/{len(mutants) - len(excused)}] {result['outcome']:9} {result['name']}  {result['by']}",
+            flush=True,
+        )
         if options.out:
             options.out.write_text(json.dumps(results, indent=1))
     survivors = [r for r in results if r["outcome"] in ("survived", "no test")]
     results = [r for r in results if r["outcome"] != "broken"]
     share = 1 - len(survivors) / max(len(results), 1)
-    print(f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as "
-          "equivalent")
-    print(*(f"survived: {r['name']}  ({r['outcome']}, {r['tests']} tests)" for r in sorted(survivors, key=lambda r: r["name"])), sep="\n")
+    print(
+        f"\n{len(results) - len(survivors)} of {len(results)} killed ({share:.1%}), {len(excused)} left out as "
+        "equivalent"
+    )
+    print(
+        *(
+            f"survived: {r['name']}  ({r['outcome']}, {r['tests']} tests)"
+            for r in sorted(survivors, key=lambda r: r["name"])
+        ),
+        sep="\n",
+    )
     print(*(f"equivalent: {m.name}  ({reasons[m.name]})" for m in excused), sep="\n")
     return 0 if share >= options.at_least else 1
 

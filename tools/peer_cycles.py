@@ -51,8 +51,10 @@ from blinkgl.scene.types import Material, Scene
 
 ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 WORKER = Path(__file__).with_name("cycles_worker.py")
-REMEDY = ("run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter "
-          f"in {ENVIRONMENT} (or install it here)")
+REMEDY = (
+    "run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter "
+    f"in {ENVIRONMENT} (or install it here)"
+)
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
 CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -71,14 +73,25 @@ class CyclesSettings:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        for name, low, high in (("samples", 1, 2**24), ("seed", 0, 2**31 - 1), ("bounces", 0, 1024), ("threads", 0, 1024)):
+        for name, low, high in (
+            ("samples", 1, 2**24),
+            ("seed", 0, 2**31 - 1),
+            ("bounces", 0, 1024),
+            ("threads", 0, 1024),
+        ):
             if not low <= getattr(self, name) <= high:
-                raise ConfigError("out of range", where=f"cycles.{name}", value=getattr(self, name), accepted=f"{low} to {high}")
+                raise ConfigError(
+                    "out of range", where=f"cycles.{name}", value=getattr(self, name), accepted=f"{low} to {high}"
+                )
         if self.engine not in ("cycles", "eevee"):
             raise ConfigError("unknown engine", where="cycles.engine", value=self.engine, accepted="cycles or eevee")
         if self.bounces and not self.shadows:
-            raise ConfigError("light that passes through everything cannot bounce", where="cycles.bounces", value=self.bounces,
-                              accepted="0 with shadows=False")
+            raise ConfigError(
+                "light that passes through everything cannot bounce",
+                where="cycles.bounces",
+                value=self.bounces,
+                accepted="0 with shadows=False",
+            )
 
 
 @dataclass
@@ -120,18 +133,24 @@ def require() -> None:
         raise BlinkGLError(missing)
 
 
-def frames(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
+def frames(
+    scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None
+) -> Iterator[np.ndarray]:
     """Linear luminance at each time, (H, W) float32, Rec. 709 luma of :func:`colours`; see there."""
     for colour in colours(scene, times_ns, settings, cost):
         yield (colour @ LUMA).astype(np.float32)
 
 
-def source(scene: Scene, settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Callable[[Iterable[int]], Iterator[np.ndarray]]:
+def source(
+    scene: Scene, settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None
+) -> Callable[[Iterable[int]], Iterator[np.ndarray]]:
     """:func:`frames` of one scene as a function of the times: a ``blinkgl.trade.reference.FrameSource``."""
     return lambda times_ns: frames(scene, times_ns, settings, cost)
 
 
-def colours(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None) -> Iterator[np.ndarray]:
+def colours(
+    scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None
+) -> Iterator[np.ndarray]:
     """Linear radiance at each time, (H, W, 3) float32, in the order of times_ns, each as soon as it is rendered.
 
     One Blender process serves the iterator and ends with it, also when it is abandoned. Raises BlinkGLError (one line)
@@ -144,9 +163,19 @@ def colours(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = Cy
         folder = Path(name)
         export(scene, times_ns, settings, folder)
         # What this process set for its own OpenGL and its own libraries is not for Blender.
-        environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "LP_NUM_THREADS", "OMP_NUM_THREADS")}
-        blender = subprocess.Popen([interpreter(), str(WORKER), name], env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                                   stderr=log, text=True)
+        environment = {
+            key: value
+            for key, value in os.environ.items()
+            if key not in ("PYTHONPATH", "LP_NUM_THREADS", "OMP_NUM_THREADS")
+        }
+        blender = subprocess.Popen(
+            [interpreter(), str(WORKER), name],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            text=True,
+        )
         try:
             yield from _answers(blender, folder, log, len(times_ns), cost)
         finally:
@@ -176,7 +205,9 @@ def _answers(blender, folder: Path, log, count: int, cost: Cost) -> Iterator[np.
     if status or done < count:
         log.seek(0)
         words = log.read().decode("utf-8", "replace").strip().splitlines() or ["no message"]
-        raise BlinkGLError(f"Blender stopped after {done} of {count} frames (status {status}): {words[-1]}", where=interpreter())
+        raise BlinkGLError(
+            f"Blender stopped after {done} of {count} frames (status {status}): {words[-1]}", where=interpreter()
+        )
 
 
 # ------------------------------------------------------------------------------------------------------------ export
@@ -224,10 +255,19 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     arrays["camera_poses"] = poses(scene.camera_path) @ CV_FROM_BLENDER
     light = scene.light
     job = {
-        "size": [camera.width, camera.height], "blender_camera": blender_camera(camera), "near": float(camera.near),
-        "background": float(scene.background), "frames": len(times_ns), "settings": asdict(settings),
-        "light": {"sun_direction": [float(s) for s in light.sun_direction], "sun": float(light.sun), "sky": float(light.sky)},
-        "materials": paints, "bodies": bodies,
+        "size": [camera.width, camera.height],
+        "blender_camera": blender_camera(camera),
+        "near": float(camera.near),
+        "background": float(scene.background),
+        "frames": len(times_ns),
+        "settings": asdict(settings),
+        "light": {
+            "sun_direction": [float(s) for s in light.sun_direction],
+            "sun": float(light.sun),
+            "sky": float(light.sky),
+        },
+        "materials": paints,
+        "bodies": bodies,
     }
     np.savez(folder / "job.npz", **arrays)
     (folder / "job.json").write_text(json.dumps(job))
@@ -243,8 +283,11 @@ def blender_camera(camera: PinHole) -> dict[str, float | str]:
     """
     sensor, tall = 36.0, camera.fx / camera.fy
     return {
-        "sensor_fit": "HORIZONTAL", "sensor_width": sensor, "lens": sensor * camera.fx / camera.width,
-        "pixel_aspect_x": max(1.0, 1.0 / tall), "pixel_aspect_y": max(1.0, tall),  # Blender takes nothing below 1
+        "sensor_fit": "HORIZONTAL",
+        "sensor_width": sensor,
+        "lens": sensor * camera.fx / camera.width,
+        "pixel_aspect_x": max(1.0, 1.0 / tall),
+        "pixel_aspect_y": max(1.0, tall),  # Blender takes nothing below 1
         "shift_x": ((camera.width - 1) / 2 - camera.cx) / camera.width,
         "shift_y": (camera.cy - (camera.height - 1) / 2) * tall / camera.width,
     }
@@ -263,7 +306,12 @@ def _paint(material: Material, culled: bool, textures: _Numbered, arrays: dict) 
         index, new = textures.number(id(material.texture))
         if new:
             arrays[f"texture{index}"] = linear_image(material.texture.image)
-    return {"texture": index, "base_color": [float(c) for c in material.base_color], "unlit": material.unlit, "culled": culled}
+    return {
+        "texture": index,
+        "base_color": [float(c) for c in material.base_color],
+        "unlit": material.unlit,
+        "culled": culled,
+    }
 
 
 def _blender_uvs(uvs: np.ndarray, uv_scale: tuple[float, float]) -> np.ndarray:

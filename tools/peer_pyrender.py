@@ -49,7 +49,11 @@ _GL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along -z with y up
 def available() -> str:
     """'' when pyrender can be used, else what is missing and the command that mends it."""
     missing = [name for name in ("pyrender", "OpenGL") if importlib.util.find_spec(name) is None]
-    return f"{' and '.join(missing)} not installed: run {install(*missing).replace(' OpenGL', ' PyOpenGL')}" if missing else ""
+    return (
+        f"{' and '.join(missing)} not installed: run {install(*missing).replace(' OpenGL', ' PyOpenGL')}"
+        if missing
+        else ""
+    )
 
 
 def render(scene: Scene, times_ns, near: float | None = None) -> dict[str, np.ndarray]:

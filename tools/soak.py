@@ -50,8 +50,16 @@ from blinkgl.scene.geometry import primitives
 LOCAL = ("kill-worker", "hang", "kill-driver", "sigterm", "sigint", "disk-full", "corrupt-asset")
 RAY = ("ray-worker", "ray-node")
 MAX_RESUMES = 12
-TINY = ["camera.width=64", "camera.height=48", "time.duration=0.1", "time.label_rate=20", "preview.enabled=false", "scene.textures.photographs=false",
-        "scene.textures.max_size=64", "scene.pool.urdfs=false"]
+TINY = [
+    "camera.width=64",
+    "camera.height=48",
+    "time.duration=0.1",
+    "time.label_rate=20",
+    "preview.enabled=false",
+    "scene.textures.photographs=false",
+    "scene.textures.max_size=64",
+    "scene.pool.urdfs=false",
+]
 
 
 class Soak:
@@ -68,7 +76,17 @@ class Soak:
 
     def command(self, out: Path, *more: object) -> list[str]:
         sets = [word for option in self.overrides for word in ("--set", option)]
-        return [sys.executable, "-m", "blinkgl.cli", "generate", str(self.recipe), "--out", str(out), *sets, *map(str, more)]
+        return [
+            sys.executable,
+            "-m",
+            "blinkgl.cli",
+            "generate",
+            str(self.recipe),
+            "--out",
+            str(out),
+            *sets,
+            *map(str, more),
+        ]
 
     def start(self, out: Path, *more: object) -> subprocess.Popen:
         return subprocess.Popen(self.command(out, *more), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -95,7 +113,12 @@ class Soak:
     def resume(self, out: Path) -> int:
         """As often as it takes; how often."""
         for count in range(1, MAX_RESUMES + 1):
-            if subprocess.run(self.command(out, "--workers", self.workers, "--resume", "--quiet"), capture_output=True).returncode == 0:
+            if (
+                subprocess.run(
+                    self.command(out, "--workers", self.workers, "--resume", "--quiet"), capture_output=True
+                ).returncode
+                == 0
+            ):
                 return count
         raise SystemExit(f"not whole after {MAX_RESUMES} resumes: {out}")
 
@@ -137,6 +160,7 @@ def _signalled(number: int) -> Fault:
                 raise SystemExit(f"workers outlive their driver: {workers}")
             time.sleep(0.05)
         return f"{'at work' if busy else 'too late'}, {soak.whole(out)} whole, status {driver.returncode}"
+
     return fault
 
 
@@ -158,7 +182,11 @@ def corrupt_asset(soak: Soak, out: Path) -> str:
     for path in good:
         path.write_bytes(b"v 0 0 0\nf 1 2 3\n")
     driver.communicate()
-    failed = json.loads((out / RUN_FOLDER / "failed.json").read_text()) if (out / RUN_FOLDER / "failed.json").is_file() else {}
+    failed = (
+        json.loads((out / RUN_FOLDER / "failed.json").read_text())
+        if (out / RUN_FOLDER / "failed.json").is_file()
+        else {}
+    )
     refused = subprocess.run(soak.command(out, "--resume", "--quiet"), capture_output=True, text=True)
     if refused.returncode != 2 or "pools are not those" not in refused.stderr:
         raise SystemExit(f"changed pools were not refused: {refused.stderr}")
@@ -169,17 +197,33 @@ def corrupt_asset(soak: Soak, out: Path) -> str:
 
 def ray_fault(soak: Soak, out: Path, *, node: bool) -> str:
     """In a process of its own: Ray and its cluster must be gone before the next fault."""
-    arguments = json.dumps({"recipe": str(soak.recipe), "overrides": soak.overrides, "out": str(out), "node": node, "skip": soak.dice.randint(2, 6)})
-    done = subprocess.run([sys.executable, "-m", "blinkgl.tools.soak", "--ray-child", arguments], capture_output=True, text=True)
+    arguments = json.dumps(
+        {
+            "recipe": str(soak.recipe),
+            "overrides": soak.overrides,
+            "out": str(out),
+            "node": node,
+            "skip": soak.dice.randint(2, 6),
+        }
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "blinkgl.tools.soak", "--ray-child", arguments], capture_output=True, text=True
+    )
     if done.returncode:
         raise SystemExit(f"the Ray run failed: {done.stderr[-2000:]}")
     return done.stdout.strip().splitlines()[-1]
 
 
 FAULTS: dict[str, Fault] = {
-    "kill-worker": kill_worker, "hang": hang, "kill-driver": _signalled(signal.SIGKILL), "sigterm": _signalled(signal.SIGTERM),
-    "sigint": _signalled(signal.SIGINT), "disk-full": disk_full, "corrupt-asset": corrupt_asset,
-    "ray-worker": lambda soak, out: ray_fault(soak, out, node=False), "ray-node": lambda soak, out: ray_fault(soak, out, node=True),
+    "kill-worker": kill_worker,
+    "hang": hang,
+    "kill-driver": _signalled(signal.SIGKILL),
+    "sigterm": _signalled(signal.SIGTERM),
+    "sigint": _signalled(signal.SIGINT),
+    "disk-full": disk_full,
+    "corrupt-asset": corrupt_asset,
+    "ray-worker": lambda soak, out: ray_fault(soak, out, node=False),
+    "ray-node": lambda soak, out: ray_fault(soak, out, node=True),
 }
 
 
@@ -245,14 +289,19 @@ def make_meshes(folder: Path) -> Path:
     folder.mkdir(parents=True)
     for k in range(12):
         mesh = primitives.torus(radius=0.4, tube=0.04 + 0.01 * k, segments=24, tube_segments=12)
-        lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces]
+        lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices] + [
+            f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces
+        ]
         (folder / f"ring{k}.obj").write_text("\n".join(lines) + "\n")
     return folder
 
 
 def tree(out: Path) -> dict[str, str]:
-    return {p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-            for p in sorted(out.rglob("*")) if p.is_file() and p.relative_to(out).parts[0] != RUN_FOLDER}
+    return {
+        p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(out.rglob("*"))
+        if p.is_file() and p.relative_to(out).parts[0] != RUN_FOLDER
+    }
 
 
 def workers_of(pid: int) -> list[int]:
@@ -276,7 +325,11 @@ def alive(pid: int) -> bool:
 def output_folder(soak: Soak, fault: str) -> Iterator[Path | None]:
     """None: this machine does not let us."""
     folder = Path(tempfile.mkdtemp(dir=soak.scratch))
-    mounted = fault == "disk-full" and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], capture_output=True).returncode == 0
+    mounted = (
+        fault == "disk-full"
+        and subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], capture_output=True).returncode
+        == 0
+    )
     try:
         yield None if fault == "disk-full" and not mounted else folder / "out"
     finally:
@@ -306,38 +359,80 @@ def main() -> None:
     console, results = Console(), []
     console.print(machine_line(), highlight=False)
     with tempfile.TemporaryDirectory(prefix="blinkgl-soak-") as scratch:
-        soak = Soak(Path(arguments.recipe), (TINY if arguments.tiny else []) + arguments.overrides, arguments.workers, Path(scratch).resolve(), random.Random(arguments.seed))
+        soak = Soak(
+            Path(arguments.recipe),
+            (TINY if arguments.tiny else []) + arguments.overrides,
+            arguments.workers,
+            Path(scratch).resolve(),
+            random.Random(arguments.seed),
+        )
         reference = Path(scratch) / "reference"
         started = time.monotonic()
         subprocess.run(soak.command(reference, "--quiet"), check=True)
         elapsed = time.monotonic() - started
         expected = tree(reference)
         soak.reference_bytes = sum(p.stat().st_size for p in reference.rglob("*") if p.is_file())
-        costs = [json.loads(line)["total_s"] for line in (reference / RUN_FOLDER / "costs.jsonl").read_text().splitlines()]
+        costs = [
+            json.loads(line)["total_s"] for line in (reference / RUN_FOLDER / "costs.jsonl").read_text().splitlines()
+        ]
         soak.limit_s, soak.pace_s = max(10.0, 8 * max(costs)), sum(costs) / len(costs)
-        console.print(f"reference: {len(soak.tasks)} sequences, {soak.reference_bytes / 1e6:.1f} MB, {elapsed:.0f} s; time "
-                      f"limit {soak.limit_s:.0f} s", highlight=False)
+        console.print(
+            f"reference: {len(soak.tasks)} sequences, {soak.reference_bytes / 1e6:.1f} MB, {elapsed:.0f} s; time "
+            f"limit {soak.limit_s:.0f} s",
+            highlight=False,
+        )
         for round_number in range(arguments.rounds):
             for fault in faults:
                 with output_folder(soak, fault) as out:
                     if out is None:
-                        results.append({"round": round_number, "fault": fault, "what": "skipped: not allowed to mount", "ok": None})
+                        results.append(
+                            {"round": round_number, "fault": fault, "what": "skipped: not allowed to mount", "ok": None}
+                        )
                         continue
                     started = time.monotonic()
                     what = strike(soak, fault, out)
                     resumes = soak.resume(out)
-                    verified = subprocess.run([sys.executable, "-m", "blinkgl.cli", "verify", str(out), "--deep", "--sample", "2", "--seed", str(round_number)],
-                                              capture_output=True, text=True)
+                    verified = subprocess.run(
+                        [
+                            sys.executable,
+                            "-m",
+                            "blinkgl.cli",
+                            "verify",
+                            str(out),
+                            "--deep",
+                            "--sample",
+                            "2",
+                            "--seed",
+                            str(round_number),
+                        ],
+                        capture_output=True,
+                        text=True,
+                    )
                     same = tree(out) == expected
                     struck = ", ".join(map(str, soak.struck))
-                    results.append({"round": round_number, "fault": fault, "struck at": f"{struck} of {len(soak.tasks)}" if struck else "",
-                                    "what": what, "resumes": resumes, "identical": same,
-                                    "verified": verified.returncode == 0, "seconds": round(time.monotonic() - started, 1),
-                                    "ok": same and verified.returncode == 0})
+                    results.append(
+                        {
+                            "round": round_number,
+                            "fault": fault,
+                            "struck at": f"{struck} of {len(soak.tasks)}" if struck else "",
+                            "what": what,
+                            "resumes": resumes,
+                            "identical": same,
+                            "verified": verified.returncode == 0,
+                            "seconds": round(time.monotonic() - started, 1),
+                            "ok": same and verified.returncode == 0,
+                        }
+                    )
                     console.print(f"{results[-1]}", highlight=False, soft_wrap=True)
     table = Table("fault", "round", "whole when struck", "what happened", "resumes", "identical", "verify --deep", "s")
     for r in results:
-        table.add_row(r["fault"], str(r["round"]), r.get("struck at", ""), r["what"], *(str(r.get(k, "")) for k in ("resumes", "identical", "verified", "seconds")))
+        table.add_row(
+            r["fault"],
+            str(r["round"]),
+            r.get("struck at", ""),
+            r["what"],
+            *(str(r.get(k, "")) for k in ("resumes", "identical", "verified", "seconds")),
+        )
     console.print(table)
     if arguments.json:
         Path(arguments.json).write_text(json.dumps({"machine": machine_line(), "results": results}, indent=1) + "\n")

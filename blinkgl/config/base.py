@@ -83,16 +83,26 @@ class Config(BaseModel):
 
     presets : values that the key ``preset`` of a model gives to those of its other keys that are not given."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,))
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True, ignored_types=(Rule,)
+    )
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     rules: ClassVar[tuple[Rule, ...]] = ()
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        found = {name: value for base in reversed(cls.__mro__) for name, value in vars(base).items() if isinstance(value, Rule)}
+        found = {
+            name: value
+            for base in reversed(cls.__mro__)
+            for name, value in vars(base).items()
+            if isinstance(value, Rule)
+        }
         cls.rules = tuple(found.values())
         decorators = cls.__pydantic_decorators__
-        others = {*decorators.model_validators, *decorators.field_validators, *decorators.validators} - {"_fill_preset", "_keep_rules"}
+        others = {*decorators.model_validators, *decorators.field_validators, *decorators.validators} - {
+            "_fill_preset",
+            "_keep_rules",
+        }
         if others:
             raise TypeError(f"{cls.__name__}.{others.pop()}: say by @rule which keys it reads")
         for name, one in found.items():
@@ -206,7 +216,7 @@ class Growing(Config):
         if name in cls.model_fields or not name.isidentifier() or name.startswith("_") or hasattr(BaseModel, name):
             raise TypeError(f"'{name}' " + ("is a key already" if name in cls.model_fields else "cannot be a key"))
         fields = {**cls.model_fields, name: FieldInfo.from_annotated_attribute(annotation, info)}
-        later = list(cls.model_fields)[list(cls.model_fields).index(before):] if before in cls.model_fields else []
+        later = list(cls.model_fields)[list(cls.model_fields).index(before) :] if before in cls.model_fields else []
         cls._regrown({key: fields[key] for key in (*(key for key in fields if key not in later), *later)})
 
     @classmethod
@@ -288,7 +298,11 @@ def _limits_below(annotation: Any, step: str | int) -> FieldInfo | None:
     if typing.get_origin(annotation) not in (tuple, list) or not str(step).isdigit() or not arguments:
         return None
     entry = arguments[min(int(step), len(arguments) - 1) if arguments[-1] is not Ellipsis else 0]
-    return next((a for a in typing.get_args(entry)[1:] if isinstance(a, FieldInfo)), None) if typing.get_origin(entry) is Annotated else None
+    return (
+        next((a for a in typing.get_args(entry)[1:] if isinstance(a, FieldInfo)), None)
+        if typing.get_origin(entry) is Annotated
+        else None
+    )
 
 
 def _fits(annotation: Any, path: Iterable[str]) -> bool:
@@ -343,16 +357,32 @@ def validate_field(model: type[Config], name: str, value: Any) -> Any:
 
 
 PROBLEMS = {
-    "model_type": "not a table of keys", "model_attributes_type": "not a table of keys", "dict_type": "not a table of keys",
+    "model_type": "not a table of keys",
+    "model_attributes_type": "not a table of keys",
+    "dict_type": "not a table of keys",
     "invalid_key": "a key is not text",
-    "tuple_type": "not a list", "too_long": "too many entries", "too_short": "too few entries",
-    "int_type": "not a whole number", "int_parsing": "not a whole number", "int_from_float": "not a whole number",
+    "tuple_type": "not a list",
+    "too_long": "too many entries",
+    "too_short": "too few entries",
+    "int_type": "not a whole number",
+    "int_parsing": "not a whole number",
+    "int_from_float": "not a whole number",
     "int_parsing_size": "too many digits",
-    "float_type": "not a number", "float_parsing": "not a number", "finite_number": "not a finite number",
-    "bool_type": "not true or false", "bool_parsing": "not true or false",
-    "string_type": "not text", "string_unicode": "not text", "string_too_short": "too short", "string_too_long": "too long",
-    "literal_error": "unknown choice", "none_required": "not null",
-    "greater_than": "too small", "greater_than_equal": "too small", "less_than": "too large", "less_than_equal": "too large",
+    "float_type": "not a number",
+    "float_parsing": "not a number",
+    "finite_number": "not a finite number",
+    "bool_type": "not true or false",
+    "bool_parsing": "not true or false",
+    "string_type": "not text",
+    "string_unicode": "not text",
+    "string_too_short": "too short",
+    "string_too_long": "too long",
+    "literal_error": "unknown choice",
+    "none_required": "not null",
+    "greater_than": "too small",
+    "greater_than_equal": "too small",
+    "less_than": "too large",
+    "less_than_equal": "too large",
     "multiple_of": "not a multiple",
 }
 """What pydantic's types of error are in plain words; `missing`, `extra_forbidden`, `value_error` and the tags of unions
@@ -372,13 +402,21 @@ def _translate(model: type[BaseModel], error: ValidationError, where: str, start
         tags = [tag_of(a) for a in annotations if is_model(a)]
         key = context.get("discriminator", "kind").strip("'")
         got = first["input"].get(key, ...) if isinstance(first["input"], dict) else first["input"]
-        return ConfigError("missing choice" if got is ... else "unknown choice", where=f"{dotted}.{key}", value=got,
-                           accepted="one of " + ", ".join(f"'{tag[1]}'" for tag in tags if tag))
+        return ConfigError(
+            "missing choice" if got is ... else "unknown choice",
+            where=f"{dotted}.{key}",
+            value=got,
+            accepted="one of " + ", ".join(f"'{tag[1]}'" for tag in tags if tag),
+        )
     if kind == "missing":
         short = path and path[-1].isdigit() and not owners
         problem, value = ("too few entries", first["input"]) if short else ("is required", ...)
-        return ConfigError(problem, where=_dotted(where, *path[:-1]) if short else dotted, value=value,
-                           accepted=None if short else describe(annotations, info))
+        return ConfigError(
+            problem,
+            where=_dotted(where, *path[:-1]) if short else dotted,
+            value=value,
+            accepted=None if short else describe(annotations, info),
+        )
     refused = context.get("error")
     if isinstance(refused, Refused):
         there = _dotted(where, *path, refused.where) or "config"
@@ -406,7 +444,9 @@ def _nearest(model: type[BaseModel], path: list[str], owners: list[type[BaseMode
     return "one of: " + ", ".join(known) + also
 
 
-def _locate(model: type[BaseModel], loc: tuple, kind: str) -> tuple[list[str], list[type[BaseModel]], list[Any], FieldInfo | None]:
+def _locate(
+    model: type[BaseModel], loc: tuple, kind: str
+) -> tuple[list[str], list[type[BaseModel]], list[Any], FieldInfo | None]:
     """Config path of a pydantic location without the labels that pydantic inserts for members of unions; the models
     that may own its last key; the annotations that are accepted there; and the field that they are of."""
     path: list[str] = []
@@ -419,7 +459,11 @@ def _locate(model: type[BaseModel], loc: tuple, kind: str) -> tuple[list[str], l
         if inner:
             path.append(str(step))
             owners = [m for m in models if step in m.model_fields]
-            info = owners[0].model_fields[step] if owners else next(filter(None, (_limits_below(a, step) for a in here)), None)
+            info = (
+                owners[0].model_fields[step]
+                if owners
+                else next(filter(None, (_limits_below(a, step) for a in here)), None)
+            )
             here = inner
             continue
         tagged = [m for m in models if step in (tag_of(m) or ())[1:]]
@@ -472,10 +516,18 @@ _NUMBER_WORDS = {2: "two", 3: "three", 4: "four"}
 
 def _limits(info: FieldInfo | None) -> str:
     said = []
-    for kind, attribute, words in ((annotated_types.Gt, "gt", "greater than"), (annotated_types.Ge, "ge", "at least"),
-                                   (annotated_types.Lt, "lt", "less than"), (annotated_types.Le, "le", "at most"),
-                                   (annotated_types.MultipleOf, "multiple_of", "a multiple of")):
-        said += [f"{words} {_plain(getattr(m, attribute))}" for m in (info.metadata if info is not None else ()) if isinstance(m, kind)]
+    for kind, attribute, words in (
+        (annotated_types.Gt, "gt", "greater than"),
+        (annotated_types.Ge, "ge", "at least"),
+        (annotated_types.Lt, "lt", "less than"),
+        (annotated_types.Le, "le", "at most"),
+        (annotated_types.MultipleOf, "multiple_of", "a multiple of"),
+    ):
+        said += [
+            f"{words} {_plain(getattr(m, attribute))}"
+            for m in (info.metadata if info is not None else ())
+            if isinstance(m, kind)
+        ]
     text = " and ".join(said)
     return re.sub(r"^ at least (\S+) and at most (\S+)$", r" from \1 to \2", f" {text}") if said else ""
 

@@ -44,7 +44,9 @@ class Fill:
         """``tree`` over the fill's values. Raises TypeError where those are not the declared ones."""
         given = self.values(*(_said(tree, key.split(".")) for key in self.reads))
         for path in _leaves(given, ()):
-            if not any(_related(path, tuple(key.split(".")), True) and len(path) >= len(key.split(".")) for key in self.writes):
+            if not any(
+                _related(path, tuple(key.split(".")), True) and len(path) >= len(key.split(".")) for key in self.writes
+            ):
                 raise TypeError(f"a fill of {self.writes} wrote {'.'.join(path)}")
         return _lay(given, tree)
 
@@ -101,7 +103,9 @@ def corners(model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Ite
         group = _together([(site, is_leaf(model, site))], model, every, fills)
         yield from combinations(tree, group, between=site)
     done: list[frozenset[Path]] = []
-    for group in sorted({_together(keys, model, every, fills) for keys in _looked_at(model, every)}, key=len, reverse=True):
+    for group in sorted(
+        {_together(keys, model, every, fills) for keys in _looked_at(model, every)}, key=len, reverse=True
+    ):
         if not any(group <= other for other in done):
             done.append(group)
             yield from combinations(tree, group)
@@ -119,8 +123,12 @@ def combinations(tree: Any, group: frozenset[Path], between: Path | None = None)
     all others. ``between``: the one of which a value inside the range is an option, too."""
     number = _count(tree, (), group)
     if number > MOST:
-        raise ConfigError("too many distributions are looked at together", where=", ".join(sorted(".".join(p) for p in group))[:200],
-                          value=f"{number} combinations", accepted=f"at most {MOST}; draw fewer of them")
+        raise ConfigError(
+            "too many distributions are looked at together",
+            where=", ".join(sorted(".".join(p) for p in group))[:200],
+            value=f"{number} combinations",
+            accepted=f"at most {MOST}; draw fewer of them",
+        )
     yield from _expand(tree, (), group, between)
 
 
@@ -176,7 +184,9 @@ def _related(site: Path, key: Path, deep: bool) -> bool:
     return (deep or len(site) <= len(key)) and all(s == k or k == "*" for s, k in zip(site, key))
 
 
-def _together(keys: list[tuple[Path, bool]], model: type[Config], every: list[Path], fills: tuple[Fill, ...]) -> frozenset[Path]:
+def _together(
+    keys: list[tuple[Path, bool]], model: type[Config], every: list[Path], fills: tuple[Fill, ...]
+) -> frozenset[Path]:
     """The distributions that decide the values of ``keys`` (path, whether with all below
     it), directly or by what those hang on."""
     wanted = dict.fromkeys(keys)
@@ -200,7 +210,11 @@ def _hangs_on(model: type[Config], key: Path) -> Iterator[Path]:
     here: list[Any] = [model]
     for depth, step in enumerate((*key, None)):
         models = [a for a in here if is_model(a)]
-        tags = {name for name in ("kind", "emulator") for m in models if name in m.model_fields} if len(models) > 1 else set()
+        tags = (
+            {name for name in ("kind", "emulator") for m in models if name in m.model_fields}
+            if len(models) > 1
+            else set()
+        )
         for name in sorted(tags | ({"preset"} if any(m.presets for m in models) else set())):
             yield (*key[:depth], name)
         if step is not None:
@@ -256,6 +270,6 @@ def _looked_at(model: type[Config], every: list[Path]) -> Iterator[list[tuple[Pa
 
 def _bound(place: Path, site: Path) -> Path:
     """``place`` with its "*" replaced by where ``site`` is, if it is there."""
-    if len(site) >= len(place) and _related(site[:len(place)], place, False):
-        return site[:len(place)]
+    if len(site) >= len(place) and _related(site[: len(place)], place, False):
+        return site[: len(place)]
     return place

@@ -96,12 +96,20 @@ def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
         except ValueError:
             ok = False
         if not ok:
-            raise ConfigError("not a table of weights", where=where, value=spec,
-                              accepted="{value: weight, …} with weights >= 0 and a positive sum")
+            raise ConfigError(
+                "not a table of weights",
+                where=where,
+                value=spec,
+                accepted="{value: weight, …} with weights >= 0 and a positive sum",
+            )
         return
     if kind == "shares":
         try:
-            ok = isinstance(spec, list) and spec and all(set(part) == {"share", "value"} and _number(part["share"]) >= 0 for part in spec)
+            ok = (
+                isinstance(spec, list)
+                and spec
+                and all(set(part) == {"share", "value"} and _number(part["share"]) >= 0 for part in spec)
+            )
         except (TypeError, ValueError):
             ok = False
         if not ok:
@@ -115,11 +123,15 @@ def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
     except (TypeError, ValueError):
         raise ConfigError("not a range", where=where, value=spec, accepted="[low, high], two finite numbers") from None
     if not math.isfinite(high - low) or (kind == "integer" and max(abs(low), abs(high)) >= 2**63):
-        raise ConfigError("the range is too wide", where=where, value=spec, accepted="ends whose difference is a number")
+        raise ConfigError(
+            "the range is too wide", where=where, value=spec, accepted="ends whose difference is a number"
+        )
     if low > high:
         raise ConfigError("the range is empty", where=where, value=spec, accepted="low <= high")
     if kind == "log_uniform" and low <= 0:
-        raise ConfigError("a logarithmic range needs positive ends", where=where, value=spec, accepted="0 < low <= high")
+        raise ConfigError(
+            "a logarithmic range needs positive ends", where=where, value=spec, accepted="0 < low <= high"
+        )
     if kind == "integer" and not (low.is_integer() and high.is_integer()):
         raise ConfigError("not whole numbers", where=where, value=spec, accepted="[low, high], two integers")
 
@@ -140,7 +152,9 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     if kind == "integer":
         return int(rng.integers(int(low), int(high), endpoint=True))
     if kind == "log_uniform":
-        return min(max(float(math.exp(rng.uniform(math.log(low), math.log(high)))), low), high)  # exp(log(b)) may be above b
+        return min(
+            max(float(math.exp(rng.uniform(math.log(low), math.log(high)))), low), high
+        )  # exp(log(b)) may be above b
     return float(rng.uniform(low, high))
 
 

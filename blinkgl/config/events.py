@@ -17,10 +17,15 @@ from blinkgl.config.base import Family, Members, Refused, rule
 if TYPE_CHECKING:
     from blinkgl.config.sensor import SensorConfig
 
-_MAX_EVENTS = Field(2**25, ge=1_000, le=2**31 - 1, description="Most events one step may emit, shared out equally among blocks "
-                    "of 1024 pixels (a block may always emit one per pixel). Where more could fire, each pixel of the block "
-                    "is cut to the same number; levels still move, the cut events are counted in `emulator.saturated`. "
-                    "2^25 events need about 1 GB while they are sorted.")
+_MAX_EVENTS = Field(
+    2**25,
+    ge=1_000,
+    le=2**31 - 1,
+    description="Most events one step may emit, shared out equally among blocks "
+    "of 1024 pixels (a block may always emit one per pixel). Where more could fire, each pixel of the block "
+    "is cut to the same number; levels still move, the cut events are counted in `emulator.saturated`. "
+    "2^25 events need about 1 GB while they are sorted.",
+)
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
@@ -51,8 +56,12 @@ def followers(reconstruction: str) -> list[str]:
 
 
 def _pixel(sensor: SensorConfig) -> dict[str, Any]:
-    return dict(contrast_threshold=sensor.contrast_threshold, contrast_threshold_off=sensor.contrast_threshold_off,
-                threshold_sigma=sensor.threshold_sigma, refractory_us=sensor.refractory_us)
+    return dict(
+        contrast_threshold=sensor.contrast_threshold,
+        contrast_threshold_off=sensor.contrast_threshold_off,
+        threshold_sigma=sensor.threshold_sigma,
+        refractory_us=sensor.refractory_us,
+    )
 
 
 class EsimConfig(EmulatorConfig):
@@ -60,19 +69,41 @@ class EsimConfig(EmulatorConfig):
 
     reconstructions = ("linear", "pchip", "hermite")
     emulator: Literal["esim"] = "esim"
-    contrast_threshold: float = Field(0.2, **_THRESHOLD, description="C+, change of ln(intensity) per ON event. "
-                                      "BlinkSim draws 0.18-0.25 per sequence.")
-    contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="C-, for OFF events; default: equal to "
-                                                 "contrast_threshold.")
-    threshold_sigma: float = Field(0.021, ge=0, le=5, description="Standard deviation of C+ and C- over the pixels, in ln "
-                                   "units (rpg_esim's default 0.021), drawn once per pixel; each threshold stays >= 0.01 "
-                                   "(or >= half of a smaller nominal one).")
-    threshold_jitter: float = Field(0.0, ge=0, le=5, description="Standard deviation of the threshold from event to event, "
-                                    "in ln units, drawn once per event.")
-    log_eps: float = Field(1e-3, ge=1e-9, le=1e6, description="Added to the intensity before the logarithm, in the units "
-                           "of the intensity (rpg_esim's default 1e-3 for intensities in [0, 1]).")
-    refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time of a pixel after an event, microseconds; a level "
-                                 "passed in it is lost, as in rpg_esim.")
+    contrast_threshold: float = Field(
+        0.2,
+        **_THRESHOLD,
+        description="C+, change of ln(intensity) per ON event. BlinkSim draws 0.18-0.25 per sequence.",
+    )
+    contrast_threshold_off: float | None = Field(
+        None, **_THRESHOLD, description="C-, for OFF events; default: equal to contrast_threshold."
+    )
+    threshold_sigma: float = Field(
+        0.021,
+        ge=0,
+        le=5,
+        description="Standard deviation of C+ and C- over the pixels, in ln "
+        "units (rpg_esim's default 0.021), drawn once per pixel; each threshold stays >= 0.01 "
+        "(or >= half of a smaller nominal one).",
+    )
+    threshold_jitter: float = Field(
+        0.0,
+        ge=0,
+        le=5,
+        description="Standard deviation of the threshold from event to event, in ln units, drawn once per event.",
+    )
+    log_eps: float = Field(
+        1e-3,
+        ge=1e-9,
+        le=1e6,
+        description="Added to the intensity before the logarithm, in the units "
+        "of the intensity (rpg_esim's default 1e-3 for intensities in [0, 1]).",
+    )
+    refractory_us: float = Field(
+        0.0,
+        ge=0,
+        le=1e9,
+        description="Dead time of a pixel after an event, microseconds; a level passed in it is lost, as in rpg_esim.",
+    )
     max_events_per_step: int = _MAX_EVENTS
 
     @classmethod
@@ -82,10 +113,24 @@ class EsimConfig(EmulatorConfig):
 
 V2E_PRESETS = {
     # v2e's `--dvs_params clean` and `noisy` (emulator.py, set_dvs_params).
-    "clean": dict(threshold_sigma=0.02, cutoff_hz=0.0, leak_rate_hz=0.0, leak_jitter=0.0, leak_cov_decades=0.0,
-                  shot_noise_rate_hz=0.0, refractory_us=0.0),
-    "noisy": dict(threshold_sigma=0.05, cutoff_hz=30.0, leak_rate_hz=0.1, leak_jitter=0.1, leak_cov_decades=0.1,
-                  shot_noise_rate_hz=5.0, refractory_us=500.0),
+    "clean": dict(
+        threshold_sigma=0.02,
+        cutoff_hz=0.0,
+        leak_rate_hz=0.0,
+        leak_jitter=0.0,
+        leak_cov_decades=0.0,
+        shot_noise_rate_hz=0.0,
+        refractory_us=0.0,
+    ),
+    "noisy": dict(
+        threshold_sigma=0.05,
+        cutoff_hz=30.0,
+        leak_rate_hz=0.1,
+        leak_jitter=0.1,
+        leak_cov_decades=0.1,
+        shot_noise_rate_hz=5.0,
+        refractory_us=500.0,
+    ),
 }
 
 
@@ -95,25 +140,56 @@ class V2eConfig(EmulatorConfig):
     reconstructions = ("linear",)
     presets = V2E_PRESETS
     emulator: Literal["v2e"] = "v2e"
-    preset: Literal["default", "clean", "noisy"] = Field("default", description="v2e's command-line defaults, or its `clean` "
-                                                         "and `noisy` parameter sets.")
+    preset: Literal["default", "clean", "noisy"] = Field(
+        "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
+    )
     contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units (v2e: 0.2).")
     contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="OFF threshold; default: equal.")
-    threshold_sigma: float = Field(0.03, ge=0, le=5, description="Spread of the thresholds over the pixels, ln units (v2e: "
-                                   "0.03); each threshold stays >= 0.01.")
-    full_scale: float = Field(255.0, gt=0, le=1e9, description="Digital number of luminance 1.0: v2e's lin-log joint (20) "
-                              "and its 275 are on the 8-bit scale.")
-    cutoff_hz: float = Field(300.0, ge=0, le=1e7, description="Photoreceptor cut-off at full scale, Hz (v2e: 300), scaled by "
-                             "(I + 20)/275; 0: infinite bandwidth.")
+    threshold_sigma: float = Field(
+        0.03,
+        ge=0,
+        le=5,
+        description="Spread of the thresholds over the pixels, ln units (v2e: 0.03); each threshold stays >= 0.01.",
+    )
+    full_scale: float = Field(
+        255.0,
+        gt=0,
+        le=1e9,
+        description="Digital number of luminance 1.0: v2e's lin-log joint (20) and its 275 are on the 8-bit scale.",
+    )
+    cutoff_hz: float = Field(
+        300.0,
+        ge=0,
+        le=1e7,
+        description="Photoreceptor cut-off at full scale, Hz (v2e: 300), scaled by "
+        "(I + 20)/275; 0: infinite bandwidth.",
+    )
     leak_rate_hz: float = Field(0.01, ge=0, le=1e4, description="Leak events per second and pixel, ON (v2e: 0.01).")
-    leak_jitter: float = Field(0.1, ge=0, le=1, description="Relative standard deviation of the interval between two leak "
-                               "events of a pixel (v2e: leak_jitter_fraction 0.1).")
-    leak_cov_decades: float = Field(0.1, ge=0, le=3, description="Spread of the leak rate over the pixels, decades (v2e: "
-                                    "noise_rate_cov_decades 0.1).")
-    shot_noise_rate_hz: float = Field(0.001, ge=0, le=1e4, description="Noise events per second and pixel in the dark, ON and "
-                                      "OFF together (v2e: 0.001); at full scale a quarter of it.")
-    photoreceptor_noise: bool = Field(False, description="Make the noise events by low-passed noise before the comparator, "
-                                      "at the rate shot_noise_rate_hz, instead of drawing events; needs cutoff_hz > 0.")
+    leak_jitter: float = Field(
+        0.1,
+        ge=0,
+        le=1,
+        description="Relative standard deviation of the interval between two leak "
+        "events of a pixel (v2e: leak_jitter_fraction 0.1).",
+    )
+    leak_cov_decades: float = Field(
+        0.1,
+        ge=0,
+        le=3,
+        description="Spread of the leak rate over the pixels, decades (v2e: noise_rate_cov_decades 0.1).",
+    )
+    shot_noise_rate_hz: float = Field(
+        0.001,
+        ge=0,
+        le=1e4,
+        description="Noise events per second and pixel in the dark, ON and "
+        "OFF together (v2e: 0.001); at full scale a quarter of it.",
+    )
+    photoreceptor_noise: bool = Field(
+        False,
+        description="Make the noise events by low-passed noise before the comparator, "
+        "at the rate shot_noise_rate_hz, instead of drawing events; needs cutoff_hz > 0.",
+    )
     refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
@@ -126,8 +202,12 @@ class V2eConfig(EmulatorConfig):
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
-        return {**_pixel(sensor), "cutoff_hz": sensor.cutoff_hz, "leak_rate_hz": sensor.leak_rate_hz,
-                "shot_noise_rate_hz": sensor.shot_noise_rate_hz}
+        return {
+            **_pixel(sensor),
+            "cutoff_hz": sensor.cutoff_hz,
+            "leak_rate_hz": sensor.leak_rate_hz,
+            "shot_noise_rate_hz": sensor.shot_noise_rate_hz,
+        }
 
 
 VOLTMETER_PRESETS = {
@@ -143,17 +223,26 @@ class VoltmeterConfig(EmulatorConfig):
     reconstructions = ("linear",)
     presets = VOLTMETER_PRESETS
     emulator: Literal["voltmeter"] = "voltmeter"
-    preset: Literal["DVS346", "DVS240"] = Field("DVS346", description="Camera whose calibrated k1...k6 are the defaults.")
-    k1: float = Field(5.265, gt=0, le=100, description="Gain: thresholds per unit of d ln(L + k2); the contrast threshold is "
-                      "about 1/k1.")
+    preset: Literal["DVS346", "DVS240"] = Field(
+        "DVS346", description="Camera whose calibrated k1...k6 are the defaults."
+    )
+    k1: float = Field(
+        5.265,
+        gt=0,
+        le=100,
+        description="Gain: thresholds per unit of d ln(L + k2); the contrast threshold is about 1/k1.",
+    )
     k2: float = Field(20.0, gt=0, le=1e4, description="Dark-current offset, digital numbers.")
     k3: float = Field(1e-4, ge=0, le=1, description="Photon shot noise, sqrt(DN) per sqrt(us).")
     k4: float = Field(1e-7, ge=-1, le=1, description="Leak by temperature (junction leakage), thresholds per us.")
     k5: float = Field(5e-9, ge=-1, le=1, description="Leak by parasitic photocurrent, thresholds per us and DN.")
     k6: float = Field(1e-5, ge=0, le=1, description="Noise of the circuit, thresholds per sqrt(us).")
-    full_scale: float = Field(255.0, gt=0, le=1e9, description="Digital number of luminance 1.0 (the constants are on the "
-                              "8-bit scale).")
-    refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time after an event, microseconds (the paper has none).")
+    full_scale: float = Field(
+        255.0, gt=0, le=1e9, description="Digital number of luminance 1.0 (the constants are on the 8-bit scale)."
+    )
+    refractory_us: float = Field(
+        0.0, ge=0, le=1e9, description="Dead time after an event, microseconds (the paper has none)."
+    )
     max_events_per_step: int = _MAX_EVENTS
 
     @classmethod

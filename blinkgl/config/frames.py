@@ -17,16 +17,29 @@ MAX_SPAN_S = (2**32 - 1) * 1e-6
 class FramesConfig(Config):
     """Frames of a folder through the event emulator; a flow file per pair of frames becomes the label."""
 
-    folders: Paths = Field((), description="folders of one sequence each, or patterns such as `/data/tartanair/*/*/P0*`; sequence n takes "
-                           "the n-th in alphabetical order")
+    folders: Paths = Field(
+        (),
+        description="folders of one sequence each, or patterns such as `/data/tartanair/*/*/P0*`; sequence n takes "
+        "the n-th in alphabetical order",
+    )
     images: str = Field("image_left", description="sub-folder of the images, or '.'")
-    flow: str | None = Field("flow", description="sub-folder of the optical flow, one file per pair of frames in their order: .npy "
-                             "(H, W, 2 or 3), .flo or DSEC .png; null: none")
-    fps: float = Field(10.0, ge=0.001, le=1e6, description="frames per second that the frames are taken to have, Hz; flow labels come at this rate")
+    flow: str | None = Field(
+        "flow",
+        description="sub-folder of the optical flow, one file per pair of frames in their order: .npy "
+        "(H, W, 2 or 3), .flo or DSEC .png; null: none",
+    )
+    fps: float = Field(
+        10.0,
+        ge=0.001,
+        le=1e6,
+        description="frames per second that the frames are taken to have, Hz; flow labels come at this rate",
+    )
     first: int = Field(0, ge=0, description="frames left out at the beginning")
     count: int | None = Field(None, ge=3, description="frames used; null: all")
     gamma: Literal["srgb", "linear"] = Field("srgb", description="transfer curve of the images")
-    interpolate: Literal["linear", "cubic", "motion"] = Field("motion", description="between frames: as `blinkgl simulate --interpolate`")
+    interpolate: Literal["linear", "cubic", "motion"] = Field(
+        "motion", description="between frames: as `blinkgl simulate --interpolate`"
+    )
     max_px: float = Field(1.0, gt=0, le=1e3, description="motion: largest displacement per step, px")
     factor: int = Field(4, ge=1, le=1000, description="cubic: steps per given frame")
 
@@ -38,5 +51,10 @@ class FramesConfig(Config):
 def check_span(frames: int, fps: float) -> None:
     """Refuses ``frames`` frames at ``fps`` that are longer than one event file can hold."""
     if (frames - 1) / fps > MAX_SPAN_S:
-        raise Refused(f"{frames} frames at this rate last {(frames - 1) / fps:.6g} s, more than the {MAX_SPAN_S:.1f} s that an "
-                      "event file can hold", where="fps", value=fps, accepted=f"at least {(frames - 1) / MAX_SPAN_S:.4g}, or fewer frames")
+        raise Refused(
+            f"{frames} frames at this rate last {(frames - 1) / fps:.6g} s, more than the {MAX_SPAN_S:.1f} s that an "
+            "event file can hold",
+            where="fps",
+            value=fps,
+            accepted=f"at least {(frames - 1) / MAX_SPAN_S:.4g}, or fewer frames",
+        )

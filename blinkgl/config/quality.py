@@ -21,7 +21,10 @@ def load_quality(name: str) -> dict[str, Any]:
 
 @lru_cache
 def _shipped(name: str) -> dict[str, Any]:
-    return parse_yaml((resources.files("blinkgl.configs") / "quality" / f"{name}.yaml").read_text(encoding="utf-8"), f"quality/{name}.yaml")
+    return parse_yaml(
+        (resources.files("blinkgl.configs") / "quality" / f"{name}.yaml").read_text(encoding="utf-8"),
+        f"quality/{name}.yaml",
+    )
 
 
 def fill_quality(quality: Any, kind: Any, emulator: Any, frames: Any) -> dict[str, Any]:

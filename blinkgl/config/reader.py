@@ -29,6 +29,7 @@ MAX_DIGITS = 100
 # libyaml's parser hands out events one by one, without recursion; the composing that counts is Python's either way.
 _Events: Any = getattr(yaml, "cyaml", None) and yaml.cyaml.CParser
 if not _Events:
+
     class _Events(yaml.reader.Reader, yaml.scanner.Scanner, yaml.parser.Parser):  # type: ignore[no-redef]
         def __init__(self, stream: str):
             yaml.reader.Reader.__init__(self, stream)
@@ -41,7 +42,9 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
 
     yaml_constructors: dict = {}  # noqa: RUF012 - as PyYAML declares it
     yaml_implicit_resolvers: dict = {  # noqa: RUF012
-        first: [(tag, regexp) for tag, regexp in known if not tag.endswith(":timestamp")] for first, known in Resolver.yaml_implicit_resolvers.items()}
+        first: [(tag, regexp) for tag, regexp in known if not tag.endswith(":timestamp")]
+        for first, known in Resolver.yaml_implicit_resolvers.items()
+    }
 
     def __init__(self, text: str):
         _Events.__init__(self, text)
@@ -59,14 +62,18 @@ class _Loader(Composer, _Events, SafeConstructor, Resolver):
             known = self.anchors.get(event.anchor)
             if known is not None:
                 if id(known) not in self._sizes:
-                    raise ComposerError(None, None, f"alias '{event.anchor}' is inside what it stands for", event.start_mark)
+                    raise ComposerError(
+                        None, None, f"alias '{event.anchor}' is inside what it stands for", event.start_mark
+                    )
                 self._count(self._sizes[id(known)], event)
             return super().compose_node(parent, index)
         event = self.peek_event()
         self._count(1, event)
         self._depth += 1
         if self._depth > MAX_DEPTH:
-            raise ComposerError(None, None, f"more than {MAX_DEPTH} tables and lists inside one another", event.start_mark)
+            raise ComposerError(
+                None, None, f"more than {MAX_DEPTH} tables and lists inside one another", event.start_mark
+            )
         node = super().compose_node(parent, index)
         self._depth -= 1
         self._sizes[id(node)] = self._values - before
@@ -158,14 +165,20 @@ def read_yaml(path: str | Path) -> Any:
         if path.exists() and not path.is_file():
             raise ConfigError("cannot be read: not a regular file", where=where, accepted="a YAML file")
         if path.stat().st_size > MAX_BYTES:
-            raise ConfigError("file is too large for a configuration", where=where, accepted=f"at most {MAX_BYTES} bytes")
+            raise ConfigError(
+                "file is too large for a configuration", where=where, accepted=f"at most {MAX_BYTES} bytes"
+            )
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError("no such file", where=where, accepted="a YAML file") from None
     except OSError as error:
-        raise ConfigError(f"cannot be read: {(error.strerror or str(error)).lower()}", where=where, accepted="a YAML file") from None
+        raise ConfigError(
+            f"cannot be read: {(error.strerror or str(error)).lower()}", where=where, accepted="a YAML file"
+        ) from None
     except ValueError:  # bytes that are no UTF-8, or a NUL in the name
-        raise ConfigError("cannot be read: not text in UTF-8", where=where, accepted="a YAML text file in UTF-8") from None
+        raise ConfigError(
+            "cannot be read: not text in UTF-8", where=where, accepted="a YAML text file in UTF-8"
+        ) from None
     return parse_yaml(text, where)
 
 

@@ -86,15 +86,20 @@ def all_groups(template: RunTemplate) -> tuple[Group, ...]:
         try:
             made.append(_group(name, tree, template, enabled))
         except ConfigError as error:
-            raise ConfigError(f"in group '{name}': {error.problem}", where=error.where, value=error.value,
-                              accepted=error.accepted) from None
+            raise ConfigError(
+                f"in group '{name}': {error.problem}", where=error.where, value=error.value, accepted=error.accepted
+            ) from None
     folders: dict[tuple[str, str], str] = {}
     for group in made:
         output = group.template.tree["output"]
         folder = (output.get("split", "train"), output["name"])
         if folder in folders:
-            raise ConfigError(f"writes the same folders as group '{folders[folder]}'", where=f"groups.{group.name}.output",
-                              value="/".join(folder), accepted="another name or split")
+            raise ConfigError(
+                f"writes the same folders as group '{folders[folder]}'",
+                where=f"groups.{group.name}.output",
+                value="/".join(folder),
+                accepted="another name or split",
+            )
         folders[folder] = group.name
     return tuple(made)
 
@@ -113,7 +118,9 @@ def derived_seed(seed: int, name: str) -> int:
 def merge(common: Any, own: Any) -> Any:
     """``own`` laid over ``common``: tables key by key; anything else, a distribution, or a table of another kind
     (``kind: explicit`` over ``kind: random``) replaces what was there."""
-    both = isinstance(common, dict) and isinstance(own, dict) and not is_distribution(common) and not is_distribution(own)
+    both = (
+        isinstance(common, dict) and isinstance(own, dict) and not is_distribution(common) and not is_distribution(own)
+    )
     if not both or any(tag in own and own[tag] != common.get(tag) for tag in _TAGS):
         return copy.deepcopy(own)
     return {**copy.deepcopy(common), **{key: merge(common.get(key), value) for key, value in own.items()}}
@@ -121,7 +128,10 @@ def merge(common: Any, own: Any) -> Any:
 
 def _plain(node: Any) -> Any:
     if isinstance(node, dict):
-        return [["table"], *sorted(([repr(key), _plain(value)] for key, value in node.items()), key=lambda pair: pair[0])]
+        return [
+            ["table"],
+            *sorted(([repr(key), _plain(value)] for key, value in node.items()), key=lambda pair: pair[0]),
+        ]
     if isinstance(node, list):
         return [_plain(value) for value in node]
     return repr(node)

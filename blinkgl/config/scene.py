@@ -40,9 +40,13 @@ def _as_list(value: Any) -> Any:
 def _one_of(words: tuple, kinds: tuple[str, ...] = ()):
     """Refuses what is neither one of ``words`` nor a list of ``kinds``: pydantic would name
     the union's first member only."""
+
     def check(value: Any) -> Any:
         listed = isinstance(value, (list, tuple)) and kinds
-        if not (any(value is w or (isinstance(w, str) and value == w) for w in words) or (listed and all(v in kinds for v in value))):
+        if not (
+            any(value is w or (isinstance(w, str) and value == w) for w in words)
+            or (listed and all(v in kinds for v in value))
+        ):
             said = ", ".join(str(w).lower() for w in words)
             raise ValueError(f"must be {said}" + (" or a list of " + ", ".join(kinds) if kinds else ""))
         return value
@@ -53,7 +57,11 @@ def _one_of(words: tuple, kinds: tuple[str, ...] = ()):
 def _number_or_three(value: Any) -> Any:
     items = value if isinstance(value, (list, tuple)) else [value]
     try:
-        ok = len(items) in ((3,) if items is value else (1,)) and not any(isinstance(v, bool) for v in items) and [float(v) for v in items]
+        ok = (
+            len(items) in ((3,) if items is value else (1,))
+            and not any(isinstance(v, bool) for v in items)
+            and [float(v) for v in items]
+        )
     except (TypeError, ValueError):
         ok = False
     if not ok:
@@ -86,26 +94,37 @@ class ObjectsConfig(Config):
 
     count: int = Field(20, ge=0, le=1000, description="number of objects")
     size: PositiveRange = Field((0.4, 2.2), description="diameter of an object's bounding sphere, m; log-uniform")
-    distance: PositiveRange = Field((2.0, 20.0), description="distance from the camera's first position, m; log-uniform")
+    distance: PositiveRange = Field(
+        (2.0, 20.0), description="distance from the camera's first position, m; log-uniform"
+    )
     flying: Fraction = Field(0.5, description="fraction that flies; the others rest on the ground")
-    in_view: Fraction = Field(0.85, description="fraction placed in the camera's first field of view; the others anywhere around it")
+    in_view: Fraction = Field(
+        0.85, description="fraction placed in the camera's first field of view; the others anywhere around it"
+    )
     tint: Fraction = Field(0.3, description="strength of the random colour factor on each object's texture")
-    texture_scale: PositiveRange = Field((0.7, 2.0), description="texture repeats over an object's texture coordinates; log-uniform")
+    texture_scale: PositiveRange = Field(
+        (0.7, 2.0), description="texture repeats over an object's texture coordinates; log-uniform"
+    )
 
 
 class PoolConfig(Config):
     """Where the random world's objects come from."""
 
     primitives: Annotated[Literal["all"] | tuple[PrimitiveKind, ...], _one_of(("all",), PRIMITIVE_KINDS)] = Field(
-        "all", description="'all' or a list of kinds; [] for none")
+        "all", description="'all' or a list of kinds; [] for none"
+    )
     variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
     folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
-    up: Literal["auto", "y", "z"] = Field("auto",
-                                          description="the axis of the folders' files that points up; auto: y for glb and gltf, "
-                                          "z for obj, ply, stl. Resting objects stand on it")
+    up: Literal["auto", "y", "z"] = Field(
+        "auto",
+        description="the axis of the folders' files that points up; auto: y for glb and gltf, "
+        "z for obj, ply, stl. Resting objects stand on it",
+    )
     urdfs: Annotated[Literal["auto"] | bool, _one_of(("auto", True, False))] = Field(
-        False, description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that the same YAML "
-        "gives other scenes there")
+        False,
+        description="pybullet's random_urdfs; auto uses them when the wheel is installed, so that the same YAML "
+        "gives other scenes there",
+    )
     max_faces: int = Field(50_000, ge=1, le=50_000_000, description="a mesh with more triangles is refused")
     max_file_mb: float = Field(512.0, gt=0, description="a larger mesh file is refused unread")
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
@@ -117,12 +136,15 @@ class TexturesConfig(Config):
     """Where the random world's textures come from."""
 
     procedural: Annotated[bool | tuple[TextureKind, ...], _one_of((True, False), TEXTURE_KINDS)] = Field(
-        True, description="true, false or a list of kinds")
+        True, description="true, false or a list of kinds"
+    )
     variants: int = Field(40, ge=1, le=100_000, description="textures of each procedural kind")
     photographs: bool = Field(True, description="the photographs bundled with scikit-image")
     folders: Paths = Field((), description="folders searched recursively for images (also .hdr)")
     max_size: int = Field(512, ge=8, le=8192, description="longer image sides are reduced to this, px")
-    test_fraction: Fraction = Field(0.1, description="fraction of textures kept for split 'test', chosen by content hash")
+    test_fraction: Fraction = Field(
+        0.1, description="fraction of textures kept for split 'test', chosen by content hash"
+    )
     bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unreadable image and draws another")
 
 
@@ -131,11 +153,15 @@ class SkyConfig(Config):
 
     kind: Literal["box"] = "box"
     size: float = Field(100.0, gt=0, le=1e6, description="edge length, m")
-    subdivisions: int = Field(4, ge=1, le=256, description="cells per edge; 1 costs a third of the flow's precision, more than 4 gains none")
+    subdivisions: int = Field(
+        4, ge=1, le=256, description="cells per edge; 1 costs a third of the flow's precision, more than 4 gains none"
+    )
     repeat: PositiveRange = Field((1.0, 3.0), description="texture repeats per face; log-uniform")
     per_face: bool = Field(True, description="a texture of its own on each face, or one on all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
-    panoramas: Paths = Field((), description="equirectangular images or folders of them (jpg, png, hdr) used instead of the texture pool")
+    panoramas: Paths = Field(
+        (), description="equirectangular images or folders of them (jpg, png, hdr) used instead of the texture pool"
+    )
 
 
 class GroundConfig(Config):
@@ -169,10 +195,15 @@ class LightConfig(Config):
 
     sun: float = Field(0.9, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
     sky: float = Field(0.6, ge=0, le=1e9, description="strength of the sky")
-    sun_elevation: float | None = Field(None, ge=-90, le=90, description="degrees above the horizon; null: random in [25, 80] "
-                                        "(60 where nothing is random)")
-    sun_azimuth: float | None = Field(None, ge=-360, le=360, description="degrees from +x towards +y; null: random "
-                                      "(40 where nothing is random)")
+    sun_elevation: float | None = Field(
+        None,
+        ge=-90,
+        le=90,
+        description="degrees above the horizon; null: random in [25, 80] (60 where nothing is random)",
+    )
+    sun_azimuth: float | None = Field(
+        None, ge=-360, le=360, description="degrees from +x towards +y; null: random (40 where nothing is random)"
+    )
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
     def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
@@ -192,12 +223,15 @@ class RandomSceneConfig(Config):
     region: RegionConfig = RegionConfig()
     sky: SkyConfig | None = Field(SkyConfig(), description="null: none, the background is seen")
     ground: GroundConfig | None = Field(GroundConfig(), description="null: none; then every object flies")
-    walls: Annotated[WallsConfig, BeforeValidator(lambda v: WallsConfig(count=4 * v) if isinstance(v, bool) else v)] = Field(
-        WallsConfig(), description="true: four walls")
+    walls: Annotated[WallsConfig, BeforeValidator(lambda v: WallsConfig(count=4 * v) if isinstance(v, bool) else v)] = (
+        Field(WallsConfig(), description="true: four walls")
+    )
     light: LightConfig = LightConfig()
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
-    camera_clearance: float = Field(0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m")
+    camera_clearance: float = Field(
+        0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m"
+    )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
 
     @rule("region.width", "region.height", "objects.size", "sky.size")
@@ -209,7 +243,9 @@ class RandomSceneConfig(Config):
     @rule("region.camera_height", "region.height")
     def _camera_below_the_ceiling(camera_heights: tuple[float, float], height: float):
         if camera_heights[0] >= height:
-            raise Refused(f"must begin below region.height {height:g}", where="region.camera_height", value=list(camera_heights))
+            raise Refused(
+                f"must begin below region.height {height:g}", where="region.camera_height", value=list(camera_heights)
+            )
 
     @rule("objects.size", "region.height")
     def _objects_below_the_ceiling(sizes: tuple[float, float], height: float):
@@ -221,9 +257,13 @@ class PoseConfig(Config):
     """Position, and at most one way to say the orientation."""
 
     position: Position = Field((0.0, 0.0, 0.0), description="m")
-    quaternion: tuple[float, float, float, float] | None = Field(None, description="[w, x, y, z], need not be normalised")
+    quaternion: tuple[float, float, float, float] | None = Field(
+        None, description="[w, x, y, z], need not be normalised"
+    )
     euler: Vector3 | None = Field(None, description="degrees about the fixed x, y, z axes, applied in this order")
-    look_at: Position | None = Field(None, description="point that the camera's z axis, or an object's x axis, is turned to")
+    look_at: Position | None = Field(
+        None, description="point that the camera's z axis, or an object's x axis, is turned to"
+    )
 
     @rule("quaternion", "euler", "look_at")
     def _one_orientation(quaternion, euler, look_at):
@@ -245,7 +285,9 @@ class PoseConfig(Config):
 class KeyframeConfig(PoseConfig):
     """A pose at a time."""
 
-    time: float = Field(ge=-1e7, le=1e7, description="s on the sequence's clock (the first label is at time.start + 1 / label_rate)")
+    time: float = Field(
+        ge=-1e7, le=1e7, description="s on the sequence's clock (the first label is at time.start + 1 / label_rate)"
+    )
 
 
 class KeyedMotionConfig(PoseConfig):
@@ -254,7 +296,9 @@ class KeyedMotionConfig(PoseConfig):
     step; whole turns need key frames in between."""
 
     keyframes: tuple[KeyframeConfig, ...] = Field((), description="two or more poses with increasing times")
-    interpolation: Literal["spline", "linear"] = Field("spline", description="between key frames: C2 spline, or straight lines and slerp")
+    interpolation: Literal["spline", "linear"] = Field(
+        "spline", description="between key frames: C2 spline, or straight lines and slerp"
+    )
 
     @rule("keyframes.*.time")
     def _in_order(times: tuple[float, ...]):
@@ -262,7 +306,11 @@ class KeyedMotionConfig(PoseConfig):
             raise Refused("one key frame is no motion; give two or more, or a fixed pose", where="keyframes")
         for k, (before, after) in enumerate(itertools.pairwise(times)):
             if after - before < 1e-6:
-                raise Refused("the key frames' times must increase by at least 1e-6 s", where=f"keyframes.{k + 1}.time", value=after)
+                raise Refused(
+                    "the key frames' times must increase by at least 1e-6 s",
+                    where=f"keyframes.{k + 1}.time",
+                    value=after,
+                )
 
     @rule("#keyframes", "position", "quaternion", "euler", "look_at")
     def _pose_or_keyframes(keyframes, position, *orientation):
@@ -278,8 +326,10 @@ class KeyedMotionConfig(PoseConfig):
                 continue
             steps = [abs(v - u) for u, v in zip(eulers[k] or (0, 0, 0), eulers[k + 1] or (0, 0, 0))]
             if max(steps) >= 180:
-                raise Refused(f"euler changes by {max(steps):g} degrees about {'xyz'[steps.index(max(steps))]} from key frame "
-                              f"{k} to {k + 1}; it must be less than 180 (add key frames in between)")
+                raise Refused(
+                    f"euler changes by {max(steps):g} degrees about {'xyz'[steps.index(max(steps))]} from key frame "
+                    f"{k} to {k + 1}; it must be less than 180 (add key frames in between)"
+                )
 
 
 class MeshConfig(Config):
@@ -287,14 +337,19 @@ class MeshConfig(Config):
 
     primitive: Literal[PrimitiveKind, "grid"] | None = Field(None, description="kind of primitive")
     parameters: dict[str, Annotated[int | float | Vector3, BeforeValidator(_number_or_three)]] = Field(
-        {}, description="the primitive's sizes and numbers of faces: see [primitives](#primitives)")
+        {}, description="the primitive's sizes and numbers of faces: see [primitives](#primitives)"
+    )
     file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
-    up: Literal["auto", "y", "z"] = Field("auto",
-                                          description="the file's axis that points up, which becomes the world's z: with y, the file's "
-                                          "(x, y, z) is drawn at (x, -z, y). auto: y for glb and gltf, as their standard says; z (the file's own "
-                                          "coordinates) for obj, ply, stl")
+    up: Literal["auto", "y", "z"] = Field(
+        "auto",
+        description="the file's axis that points up, which becomes the world's z: with y, the file's "
+        "(x, y, z) is drawn at (x, -z, y). auto: y for glb and gltf, as their standard says; z (the file's own "
+        "coordinates) for obj, ply, stl",
+    )
     project_uvs: bool = Field(False, description="replace the file's texture coordinates by a box projection")
-    uv_size: float = Field(1.0, gt=0, description="edge of one repeat of projected texture coordinates, in the mesh's units")
+    uv_size: float = Field(
+        1.0, gt=0, description="edge of one repeat of projected texture coordinates, in the mesh's units"
+    )
 
     @rule("primitive", "file")
     def _one(primitive, file):
@@ -318,7 +373,9 @@ class MaterialConfig(Config):
     texture: str | None = Field(None, description="image file, sRGB, or .hdr, linear")
     procedural: TextureKind | None = Field(None, description="kind of procedural texture")
     seed: int = Field(0, ge=0, description="which procedural texture of that kind")
-    photograph: str | None = Field(None, description="name of a photograph bundled with scikit-image, such as astronaut")
+    photograph: str | None = Field(
+        None, description="name of a photograph bundled with scikit-image, such as astronaut"
+    )
     max_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
     color: tuple[Radiance, Radiance, Radiance] = Field((1.0, 1.0, 1.0), description="linear factor")
     uv_scale: tuple[Repeats, Repeats] = Field((1.0, 1.0), description="texture repeats per unit of texture coordinate")
@@ -339,15 +396,22 @@ class ObjectConfig(KeyedMotionConfig):
     mesh: str = Field(description="a name under scene.meshes")
     material: str | None = Field(None, description="a name under scene.materials; null: the file's own materials")
     scale: Annotated[float | Vector3, BeforeValidator(_number_or_three), AfterValidator(_greater_than_zero)] = Field(
-        1.0, description="factor on the mesh, one or per axis")
-    category: Literal["object", "ground", "wall", "sky"] = Field("object", description="what it is: collisions and drawing order")
+        1.0, description="factor on the mesh, one or per axis"
+    )
+    category: Literal["object", "ground", "wall", "sky"] = Field(
+        "object", description="what it is: collisions and drawing order"
+    )
 
 
 def _known(used, known, key: str, table: str, at=None) -> None:
     for number, name in zip(at if at is not None else range(len(used)), used):
         if name not in known:
-            raise Refused(f"no such name under {table}", where=f"objects.{number}.{key}", value=name,
-                          accepted="one of: " + ", ".join(known) if known else f"a name under {table}")
+            raise Refused(
+                f"no such name under {table}",
+                where=f"objects.{number}.{key}",
+                value=name,
+                accepted="one of: " + ", ".join(known) if known else f"a name under {table}",
+            )
 
 
 def object_names(names: Iterable[str | None], meshes: Iterable[str]) -> list[str]:
@@ -369,7 +433,9 @@ class ExplicitSceneConfig(Config):
     meshes: dict[str, MeshConfig] = Field({}, description="by name")
     materials: dict[str, MaterialConfig] = Field({}, description="by name")
     objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="at least one")
-    collisions: bool = Field(False, description="true: find collisions along the trajectories and stop what collides there")
+    collisions: bool = Field(
+        False, description="true: find collisions along the trajectories and stop what collides there"
+    )
     camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
@@ -385,7 +451,13 @@ class ExplicitSceneConfig(Config):
 
     @rule("objects.*.material", "#materials")
     def _materials_are_known(used, known):
-        _known([name for name in used if name is not None], known, "material", "scene.materials", at=[k for k, n in enumerate(used) if n is not None])
+        _known(
+            [name for name in used if name is not None],
+            known,
+            "material",
+            "scene.materials",
+            at=[k for k, n in enumerate(used) if n is not None],
+        )
 
 
 class FileSceneConfig(Config):
@@ -396,8 +468,12 @@ class FileSceneConfig(Config):
     kind: Literal["file"]
     path: str = Field(description="gltf or glb file")
     camera: str | int | None = Field(None, description="name or index of the file's camera; null: the first")
-    pose: KeyedMotionConfig | None = Field(None, description="camera motion used instead of the file's camera (z-up world)")
-    intrinsics: Literal["config", "file"] = Field("config", description="focal length from the YAML's camera or from the file's (yfov)")
+    pose: KeyedMotionConfig | None = Field(
+        None, description="camera motion used instead of the file's camera (z-up world)"
+    )
+    intrinsics: Literal["config", "file"] = Field(
+        "config", description="focal length from the YAML's camera or from the file's (yfov)"
+    )
     animation: str | int | None = Field(0, description="name or index of the animation played; null: none")
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")

@@ -46,7 +46,9 @@ class CameraConfig(Config):
     height: int = Field(260, ge=1, le=16384, description="rows, px")
     fov: float | None = Field(None, gt=0.01, lt=179.9, description="horizontal field of view, degrees; default 60")
     focal: float | None = Field(None, ge=1e-3, le=1e9, description="focal length, px (fx = fy)")
-    cx: float | None = Field(None, ge=-1e6, le=1e6, description="principal point x, px; default the image centre, (width - 1) / 2")
+    cx: float | None = Field(
+        None, ge=-1e6, le=1e6, description="principal point x, px; default the image centre, (width - 1) / 2"
+    )
     cy: float | None = Field(None, ge=-1e6, le=1e6, description="principal point y, px; default (height - 1) / 2")
     near: float = Field(0.05, ge=1e-9, le=1e9, description="near plane: nothing nearer is drawn, world units")
 
@@ -68,8 +70,19 @@ class CameraConfig(Config):
         """The keys of a camera that sees the same with ``factor`` times the pixels in x and y,
         as near as whole pixels come to it."""
         said = {key: (value + 0.5) * factor - 0.5 for key in ("cx", "cy") if (value := getattr(self, key)) is not None}
-        said |= {"focal": self.focal * factor} if self.focal is not None else {"fov": self.fov} if self.fov is not None else {}
-        return {"width": max(1, round(self.width * factor)), "height": max(1, round(self.height * factor)), "near": self.near, **said}
+        said |= (
+            {"focal": self.focal * factor}
+            if self.focal is not None
+            else {"fov": self.fov}
+            if self.fov is not None
+            else {}
+        )
+        return {
+            "width": max(1, round(self.width * factor)),
+            "height": max(1, round(self.height * factor)),
+            "near": self.near,
+            **said,
+        }
 
 
 def camera_radius(camera: CameraModel, clearance: float) -> float:
@@ -82,8 +95,13 @@ class TimeConfig(Config):
     """Labels at ``label_rate`` over ``duration`` seconds; the simulation starts one label interval earlier
     (pre-roll), so that every label has a full window of events before and after it."""
 
-    duration: float = Field(1.0, gt=0, le=86400 * 2, description="labelled time, s; with a label interval before and one after at most 71.6 minutes, which is "
-                            "what an event file can hold")
+    duration: float = Field(
+        1.0,
+        gt=0,
+        le=86400 * 2,
+        description="labelled time, s; with a label interval before and one after at most 71.6 minutes, which is "
+        "what an event file can hold",
+    )
     label_rate: float = Field(10.0, gt=0, le=1e5, description="labels (flow, images) per second, Hz")
     start: float = Field(0.0, ge=0, le=1e7, description="clock at the start of the pre-roll, s")
 
@@ -92,11 +110,20 @@ class TimeConfig(Config):
         if duration * rate < 1 - 1e-9:
             raise Refused("duration * label_rate must be at least 1 label")
         if duration * rate > MAX_LABELS:
-            raise Refused(f"{duration * rate:.0f} labels", where="label_rate", value=rate, accepted=f"duration * label_rate of at most {MAX_LABELS}")
+            raise Refused(
+                f"{duration * rate:.0f} labels",
+                where="label_rate",
+                value=rate,
+                accepted=f"duration * label_rate of at most {MAX_LABELS}",
+            )
         if span_s(duration, rate) > MAX_SPAN_S:
-            raise Refused(f"with one label interval before and one after, {span_s(duration, rate):.6g} s are more than the "
-                          f"{MAX_SPAN_S:.1f} s (71.6 minutes) that an event file can hold", where="duration", value=duration,
-                          accepted="a shorter one, or more sequences")
+            raise Refused(
+                f"with one label interval before and one after, {span_s(duration, rate):.6g} s are more than the "
+                f"{MAX_SPAN_S:.1f} s (71.6 minutes) that an event file can hold",
+                where="duration",
+                value=duration,
+                accepted="a shorter one, or more sequences",
+            )
 
     @property
     def interval_ns(self) -> int:
@@ -137,12 +164,22 @@ ImageAntialiasing = Literal["none", "msaa4", "ssaa2", "ssaa4"]
 class RenderConfig(Config):
     """How a frame is drawn."""
 
-    antialiasing: Antialiasing = Field("none", description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel), taps4 textures (4 lookups a "
-                                                           "pixel); ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. "
-                                                           "Costs: docs/results.md")
+    antialiasing: Antialiasing = Field(
+        "none",
+        description="event frames: msaa4 filters silhouettes (4 coverage samples a pixel), taps4 textures (4 lookups a "
+        "pixel); ssaa2 and ssaa4 draw 2 x 2 and 4 x 4 finer and average everything. Labels are never filtered. "
+        "Costs: docs/results.md",
+    )
     image_antialiasing: ImageAntialiasing = Field("ssaa2", description="the same for the colour images at label times")
-    anisotropy: float = Field(1.0, ge=1, le=16, description="texture anisotropy, 1 is off (halves the rate on software GL)")
-    mip_bias: float = Field(0.0, ge=-8, le=8, description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more")
+    anisotropy: float = Field(
+        1.0, ge=1, le=16, description="texture anisotropy, 1 is off (halves the rate on software GL)"
+    )
+    mip_bias: float = Field(
+        0.0,
+        ge=-8,
+        le=8,
+        description="added to the mip level that is looked up, log2: -1 is sharper by 2, and aliases more",
+    )
     lod: LodConfig = Field(LodConfig(), description="level of detail of meshes")
 
 
@@ -156,7 +193,11 @@ class PreviewConfig(Config):
 
 def _file_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}", name):
-        raise Refused("not a name for folders", value=name, accepted="a letter or digit, then letters, digits, '_', '-' and '.', at most 100")
+        raise Refused(
+            "not a name for folders",
+            value=name,
+            accepted="a letter or digit, then letters, digits, '_', '-' and '.', at most 100",
+        )
     return name
 
 
@@ -164,9 +205,13 @@ class OutputConfig(Config):
     """Where sequences go below the output folder: `OUT/SPLIT/NAME_000000`, …"""
 
     name: Annotated[str, AfterValidator(_file_name)] = Field("sequence", description="name of the sequences")
-    split: Literal["train", "test"] = Field("train", description="which side of the object and texture pools; disjoint by content")
+    split: Literal["train", "test"] = Field(
+        "train", description="which side of the object and texture pools; disjoint by content"
+    )
     sequences: int = Field(1, ge=1, le=10_000_000, description="how many (--num overrides)")
-    first_index: int = Field(0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone")
+    first_index: int = Field(
+        0, ge=0, le=10_000_000, description="number of the first; sequence n depends on the seed and n alone"
+    )
 
 
 def _sensor(name: str) -> str:
@@ -182,17 +227,28 @@ class SequenceConfig(Config):
     output: OutputConfig = Field(OutputConfig(), description="where sequences go")
     camera: CameraConfig = Field(CameraConfig(), description="resolution and intrinsics")
     time: TimeConfig = Field(TimeConfig(), description="duration and label rate")
-    quality: Quality | None = Field(None, description="fast, balanced, accurate or reference: gives timeline and render the values of a measured "
-                                    "point of speed against accuracy (docs/trade.md); what is said beside it wins")
+    quality: Quality | None = Field(
+        None,
+        description="fast, balanced, accurate or reference: gives timeline and render the values of a measured "
+        "point of speed against accuracy (docs/trade.md); what is said beside it wins",
+    )
     timeline: TimelineConfig = Field(DisplacementTimeline(), description="when event frames are drawn")
     scene: SceneConfig = Field(RandomSceneConfig(), description="what is in front of the camera and how it moves")
-    frames: FramesConfig | None = Field(None, description="recorded frames to convert; then nothing is rendered, and `camera`, `time`, "
-                                        "`timeline`, `scene` and `render` have no meaning")
+    frames: FramesConfig | None = Field(
+        None,
+        description="recorded frames to convert; then nothing is rendered, and `camera`, `time`, "
+        "`timeline`, `scene` and `render` have no meaning",
+    )
     render: RenderConfig = Field(RenderConfig(), description="how a frame is drawn")
-    sensor: Annotated[str, AfterValidator(_sensor)] | None = Field(None, description="davis240c, davis346, dvxplorer, gen31_vga or imx636: gives camera.width and height, events and "
-                               "readout the camera's values; what is said beside it wins")
+    sensor: Annotated[str, AfterValidator(_sensor)] | None = Field(
+        None,
+        description="davis240c, davis346, dvxplorer, gen31_vga or imx636: gives camera.width and height, events and "
+        "readout the camera's values; what is said beside it wins",
+    )
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
-    readout: ReadoutConfig | None = Field(None, description="the sensor's bus: events above its rate are late, then lost; null: no limit")
+    readout: ReadoutConfig | None = Field(
+        None, description="the sensor's bus: events above its rate are late, then lost; null: no limit"
+    )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
@@ -202,19 +258,34 @@ class SequenceConfig(Config):
         able = followers(path)
         if emulator not in able and not frames:
             own = EmulatorConfig.members.models[emulator].reconstructions
-            raise Refused(f"{emulator} follows straight lines alone" if own == ("linear",) else f"{emulator} cannot follow this path",
-                          where="timeline.reconstruction", value=path, accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}")
+            raise Refused(
+                f"{emulator} follows straight lines alone"
+                if own == ("linear",)
+                else f"{emulator} cannot follow this path",
+                where="timeline.reconstruction",
+                value=path,
+                accepted=f"{', '.join(own)}, or events.emulator: {' or '.join(able)}",
+            )
 
     @rule("time.duration", "time.label_rate", "readout.events_per_second", "readout.row_ns", "readout.queue_events")
     def _late_events_fit(duration: float, label_rate: float, rate: float | None, row_ns: float, queue: int):
         if rate is not None and span_s(duration, label_rate) + 1e-6 * drain_us(rate, row_ns, queue) > MAX_SPAN_S:
-            raise Refused("events that wait for the read-out would leave it after the end of the file", where="time.duration", value=duration,
-                          accepted=f"at most {MAX_SPAN_S - 1 / label_rate - 1e-6 * drain_us(rate, row_ns, queue):.6g}")
+            raise Refused(
+                "events that wait for the read-out would leave it after the end of the file",
+                where="time.duration",
+                value=duration,
+                accepted=f"at most {MAX_SPAN_S - 1 / label_rate - 1e-6 * drain_us(rate, row_ns, queue):.6g}",
+            )
 
     @rule("time.start", "?readout")
     def _picoseconds_fit(start: float, readout: bool):
         if readout and start > 8e6:
-            raise Refused("too late for the read-out, which counts picoseconds", where="time.start", value=start, accepted="at most 8000000")
+            raise Refused(
+                "too late for the read-out, which counts picoseconds",
+                where="time.start",
+                value=start,
+                accepted="at most 8000000",
+            )
 
     @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
     def _room_for_the_camera(kind, height, clearance, camera):
@@ -222,9 +293,13 @@ class SequenceConfig(Config):
             return
         least = camera_radius(camera.model, clearance)
         if least > height:
-            raise Refused("the region is too low for a camera that keeps this far from everything", where="scene.region.height", value=height,
-                          accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
-                                   "plane's corners: camera.near and camera.fov)")
+            raise Refused(
+                "the region is too low for a camera that keeps this far from everything",
+                where="scene.region.height",
+                value=height,
+                accepted=f"at least {least:.4g} m (scene.camera_clearance, or the distance of the near "
+                "plane's corners: camera.near and camera.fov)",
+            )
 
 
 FILLS = (
@@ -264,10 +339,17 @@ class RunTemplate:
 
             return [group.template.check() for group in all_groups(self)][0]
         if is_distribution(self.tree):
-            raise ConfigError("the whole file cannot be drawn", where=next(iter(self.tree)), accepted="distributions of single keys")
+            raise ConfigError(
+                "the whole file cannot be drawn", where=next(iter(self.tree)), accepted="distributions of single keys"
+            )
         for key in _OF_THE_RUN:
             if key in self.tree and sites(self.tree[key]):
-                raise ConfigError("belongs to the whole run and cannot be drawn", where=key, value=self.tree[key], accepted="plain values")
+                raise ConfigError(
+                    "belongs to the whole run and cannot be drawn",
+                    where=key,
+                    value=self.tree[key],
+                    accepted="plain values",
+                )
         first = None
         for tree in corners(SequenceConfig, self.tree, FILLS):
             config = _validated(tree)
@@ -317,11 +399,17 @@ def apply_overrides(tree: dict[str, Any], overrides: Sequence[str]) -> dict[str,
             last = depth == len(keys) - 1
             if isinstance(node, list):
                 if not key.isdigit() or int(key) >= len(node):
-                    raise ConfigError("no such list entry", where="--set " + ".".join(keys[: depth + 1]), value=key,
-                                      accepted=f"0 … {len(node) - 1}")
+                    raise ConfigError(
+                        "no such list entry",
+                        where="--set " + ".".join(keys[: depth + 1]),
+                        value=key,
+                        accepted=f"0 … {len(node) - 1}",
+                    )
                 key = int(key)
             elif not isinstance(node, dict):
-                raise ConfigError("is a plain value and has no keys", where="--set " + ".".join(keys[:depth]), value=node)
+                raise ConfigError(
+                    "is a plain value and has no keys", where="--set " + ".".join(keys[:depth]), value=node
+                )
             if last:
                 node[key] = value
             elif isinstance(node, dict):

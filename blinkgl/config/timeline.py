@@ -12,23 +12,37 @@ from blinkgl.config.events import followers
 
 class _Timeline(Config):
     reconstruction: Literal["linear", "pchip", "hermite"] = Field(
-        "linear", description="log intensity between two frames. linear: straight lines. pchip: monotone cubics over the "
-                              "neighbouring frames, free of rendering. hermite: monotone cubics with dL/dt from the "
-                              "shader, which makes frames dearer and fewer enough. The cubics are for `events.emulator: "
-                              f"{' or '.join(followers('pchip'))}`")
+        "linear",
+        description="log intensity between two frames. linear: straight lines. pchip: monotone cubics over the "
+        "neighbouring frames, free of rendering. hermite: monotone cubics with dL/dt from the "
+        "shader, which makes frames dearer and fewer enough. The cubics are for `events.emulator: "
+        f"{' or '.join(followers('pchip'))}`",
+    )
 
 
 class UniformTimeline(_Timeline):
     """Event frames at a fixed rate."""
 
     kind: Literal["uniform"] = "uniform"
-    fps: float = Field(300.0, ge=0.001, le=1e9, description="frames per second, Hz; emulators take frames at most 17 minutes apart")
+    fps: float = Field(
+        300.0, ge=0.001, le=1e9, description="frames per second, Hz; emulators take frames at most 17 minutes apart"
+    )
 
 
 class _AdaptiveTimeline(_Timeline):
-    sample_every: int = Field(4, ge=1, le=64, description="the small picture that decides the step looks at every n-th pixel in x and y; 1 at all of them")
+    sample_every: int = Field(
+        4,
+        ge=1,
+        le=64,
+        description="the small picture that decides the step looks at every n-th pixel in x and y; 1 at all of them",
+    )
     min_step_us: float = Field(200.0, ge=0.001, description="the step is never shorter, µs")
-    max_step_us: float = Field(20000.0, ge=0.001, le=1e9, description="the step is never longer, µs; emulators take frames at most 17 minutes apart")
+    max_step_us: float = Field(
+        20000.0,
+        ge=0.001,
+        le=1e9,
+        description="the step is never longer, µs; emulators take frames at most 17 minutes apart",
+    )
 
     @rule("min_step_us", "max_step_us")
     def _ordered(least, most):
@@ -41,9 +55,18 @@ class DisplacementTimeline(_AdaptiveTimeline):
     the speeds at both ends of the step."""
 
     kind: Literal["displacement"] = "displacement"
-    max_px: float = Field(0.5, gt=0, le=1e4, description="displacement between two frames, px, that the percentile keeps to")
-    percentile: float = Field(100.0, gt=0, le=100, description="of the speeds of the pixels that move; 100 bounds every sampled pixel")
-    max_px_peak: float | None = Field(None, gt=0, le=1e4, description="what the fastest sampled pixel keeps to besides, px; for a percentile below 100")
+    max_px: float = Field(
+        0.5, gt=0, le=1e4, description="displacement between two frames, px, that the percentile keeps to"
+    )
+    percentile: float = Field(
+        100.0, gt=0, le=100, description="of the speeds of the pixels that move; 100 bounds every sampled pixel"
+    )
+    max_px_peak: float | None = Field(
+        None,
+        gt=0,
+        le=1e4,
+        description="what the fastest sampled pixel keeps to besides, px; for a percentile below 100",
+    )
 
 
 class BrightnessTimeline(_AdaptiveTimeline):
@@ -51,8 +74,12 @@ class BrightnessTimeline(_AdaptiveTimeline):
     |dL/dt| from the shader at both ends of the step."""
 
     kind: Literal["brightness"] = "brightness"
-    max_fraction_of_threshold: float = Field(1.0, gt=0, le=100, description="change between two frames, in smallest nominal contrast thresholds")
-    percentile: float = Field(95.0, gt=0, le=100, description="of |dL/dt| over the pixels that change; 100 bounds every sampled pixel")
+    max_fraction_of_threshold: float = Field(
+        1.0, gt=0, le=100, description="change between two frames, in smallest nominal contrast thresholds"
+    )
+    percentile: float = Field(
+        95.0, gt=0, le=100, description="of |dL/dt| over the pixels that change; 100 bounds every sampled pixel"
+    )
 
 
 class BudgetTimeline(_AdaptiveTimeline):
@@ -60,8 +87,12 @@ class BudgetTimeline(_AdaptiveTimeline):
     measured while frames are drawn, and the achieved estimate goes into the manifest."""
 
     kind: Literal["budget"] = "budget"
-    max_time_error_us: float | None = Field(None, gt=0, le=1e9, description="error of event times, µs; give this or max_time_error_px")
-    max_time_error_px: float | None = Field(None, gt=0, le=1e4, description="the same times the image speed: how far an edge is from where it should be, px")
+    max_time_error_us: float | None = Field(
+        None, gt=0, le=1e9, description="error of event times, µs; give this or max_time_error_px"
+    )
+    max_time_error_px: float | None = Field(
+        None, gt=0, le=1e4, description="the same times the image speed: how far an edge is from where it should be, px"
+    )
     percentile: float = Field(75.0, gt=0, le=99.9, description="of the events' errors, which keeps to the budget")
 
     @rule("max_time_error_us", "max_time_error_px")
@@ -70,4 +101,6 @@ class BudgetTimeline(_AdaptiveTimeline):
             raise Refused("give max_time_error_us or max_time_error_px, one of the two")
 
 
-TimelineConfig = one_of("kind", UniformTimeline, DisplacementTimeline, BrightnessTimeline, BudgetTimeline, default="displacement")
+TimelineConfig = one_of(
+    "kind", UniformTimeline, DisplacementTimeline, BrightnessTimeline, BudgetTimeline, default="displacement"
+)

@@ -1,11 +1,11 @@
 """Settings of random motion: ``scene.camera_motion`` and ``scene.object_motion``.
 
-    object_motion:
-      waypoints: 6
-      speed: [0.2, 1.5]            # mean speed; each object draws its own from the range
-      rotation_rate: [20, 120]     # mean turn, deg/s
-      smoothness: 0.5
-    camera_motion: {kind: static}
+object_motion:
+  waypoints: 6
+  speed: [0.2, 1.5]            # mean speed; each object draws its own from the range
+  rotation_rate: [20, 120]     # mean turn, deg/s
+  smoothness: 0.5
+camera_motion: {kind: static}
 """
 
 from __future__ import annotations
@@ -38,14 +38,21 @@ RateRange = Annotated[tuple[_Rate, _Rate], BeforeValidator(_as_pair), AfterValid
 class MotionConfig(Config):
     """Motion of one body through random way-points; ranges are drawn anew for each body."""
 
-    kind: Literal["spline", "static"] = Field("spline", description="spline: through random way-points; static: stands still")
+    kind: Literal["spline", "static"] = Field(
+        "spline", description="spline: through random way-points; static: stands still"
+    )
     waypoints: int = Field(6, ge=2, le=1000, description="way-points over the sequence (about: see rotation_rate)")
-    speed: SpeedRange = Field((0.2, 1.5), description="mean speed of the body's origin, world units/s: a number or [low, high]")
+    speed: SpeedRange = Field(
+        (0.2, 1.5), description="mean speed of the body's origin, world units/s: a number or [low, high]"
+    )
     rotation_rate: RateRange = Field(
-        (20.0, 120.0), description="mean angular rate, deg/s: a number or [low, high]; key frames are added where two "
-        "way-points would be more than 115 degrees apart")
+        (20.0, 120.0),
+        description="mean angular rate, deg/s: a number or [low, high]; key frames are added where two "
+        "way-points would be more than 115 degrees apart",
+    )
     smoothness: float = Field(
-        0.5, ge=0, le=1, description="0: each leg starts in a fresh random direction, 1: it keeps the last one's")
+        0.5, ge=0, le=1, description="0: each leg starts in a fresh random direction, 1: it keeps the last one's"
+    )
 
 
 class ObjectMotion(MotionConfig):
@@ -57,9 +64,17 @@ class ObjectMotion(MotionConfig):
 class CameraMotion(MotionConfig):
     """Motion of the camera: as an object's, but it keeps looking roughly at the scene's centre."""
 
-    speed: SpeedRange = Field((0.3, 1.5), description="mean speed of the camera centre, world units/s: a number or [low, high]")
-    rotation_rate: RateRange = Field((10.0, 60.0), description="mean angular rate without shake, deg/s: a number or [low, high]")
-    view_cone: float = Field(20.0, ge=1, le=180, description="largest angle at the way-points between viewing direction and target, deg")
+    speed: SpeedRange = Field(
+        (0.3, 1.5), description="mean speed of the camera centre, world units/s: a number or [low, high]"
+    )
+    rotation_rate: RateRange = Field(
+        (10.0, 60.0), description="mean angular rate without shake, deg/s: a number or [low, high]"
+    )
+    view_cone: float = Field(
+        20.0, ge=1, le=180, description="largest angle at the way-points between viewing direction and target, deg"
+    )
     roll: float = Field(20.0, ge=0, le=180, description="largest roll of the horizon at the way-points, deg")
-    shake: float = Field(0.0, ge=0, le=30, description="hand shake on top: standard deviation of the rotation about each axis, deg")
+    shake: float = Field(
+        0.0, ge=0, le=30, description="hand shake on top: standard deviation of the rotation about each axis, deg"
+    )
     shake_rate: float = Field(8.0, gt=0, le=200, description="shake impulses per second")

@@ -41,20 +41,24 @@ class RayCluster:
 
     def __init__(self, workers: int | None = None, *, address: str | None = None, gpus: float = 0.0):
         # Ray reads these when it is imported and started; they are taken back when the run is over.
-        self._own_variables = [name for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO") if name not in os.environ]
+        self._own_variables = [
+            name for name in ("RAY_USAGE_STATS_ENABLED", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO") if name not in os.environ
+        ]
         os.environ.update(dict.fromkeys(self._own_variables, "0"))
         try:
             import ray
         except ImportError:
             self._restore_environment()
-            raise ConfigError("Ray is not installed", where="--executor", value="ray", accepted=f"run {install('ray')}") from None
+            raise ConfigError(
+                "Ray is not installed", where="--executor", value="ray", accepted=f"run {install('ray')}"
+            ) from None
         self._ray, self._workers, self._address, self._gpus = ray, workers, address, gpus
         self.listener: Callable[[Message], None] = lambda message: None
         self._ours = False
-        self._tasks: dict[Any, int] = {}    # object reference -> task
+        self._tasks: dict[Any, int] = {}  # object reference -> task
         self._reasons: dict[int, str] = {}  # task -> why it was killed
         self._board = None
-        self._folder: str | None = None     # of a cluster of ours
+        self._folder: str | None = None  # of a cluster of ours
 
     def open(self, job: Job) -> list[Message]:
         ray = self._ray
@@ -145,32 +149,61 @@ class RayCluster:
             raise
         except Exception as error:  # noqa: BLE001 - Ray raises ConnectionError, RuntimeError, ValueError, grpc's own
             text = " ".join(str(error).split())[:200]
-            what = "Ray's or Python's version differs from the cluster's" if "ersion mismatch" in text else "cannot connect to Ray"
-            raise ConfigError(f"{what}: {text}", where="--address", value=address if address != "local" else "a local cluster",
-                              accepted="a running Ray of the same version") from None
+            what = (
+                "Ray's or Python's version differs from the cluster's"
+                if "ersion mismatch" in text
+                else "cannot connect to Ray"
+            )
+            raise ConfigError(
+                f"{what}: {text}",
+                where="--address",
+                value=address if address != "local" else "a local cluster",
+                accepted="a running Ray of the same version",
+            ) from None
         self._ours = True
 
     def _start_own(self) -> None:
         """A cluster on 127.0.0.1 alone, with its files where no other user of the machine can read or write them."""
         before = set(listening(os.getpid()))  # a notebook's kernel listens, too
-        self._folder = tempfile.mkdtemp(prefix="ray-", dir=_short_folder())  # 0700; Ray opens its own folder in it to everybody
+        self._folder = tempfile.mkdtemp(
+            prefix="ray-", dir=_short_folder()
+        )  # 0700; Ray opens its own folder in it to everybody
         with _loopback_only():
-            self._ray.init(address="local", include_dashboard=False, num_cpus=self._workers or len(os.sched_getaffinity(0)),
-                           log_to_driver=False, logging_level="ERROR", configure_logging=True, _temp_dir=f"{self._folder}/r")
+            self._ray.init(
+                address="local",
+                include_dashboard=False,
+                num_cpus=self._workers or len(os.sched_getaffinity(0)),
+                log_to_driver=False,
+                logging_level="ERROR",
+                configure_logging=True,
+                _temp_dir=f"{self._folder}/r",
+            )
         if exposed := [s for s in listening(os.getpid()) if s not in before and not s.loopback]:
             self._ours = True
             self.close()
-            raise ConfigError(f"Ray {self._ray.__version__} listens to other machines: {', '.join(map(str, exposed))}", where="--executor",
-                              value="ray", accepted="Ray 2.60, which can be told not to; or a cluster of your own and its --address")
+            raise ConfigError(
+                f"Ray {self._ray.__version__} listens to other machines: {', '.join(map(str, exposed))}",
+                where="--executor",
+                value="ray",
+                accepted="Ray 2.60, which can be told not to; or a cluster of your own and its --address",
+            )
 
     def _ask(self, node: dict[str, Any]) -> Message:
         ray, name = self._ray, node.get("NodeManagerHostname") or node["NodeID"]
-        ask = ray.remote(_hello).options(num_cpus=1, num_gpus=self._gpus, max_retries=0, scheduling_strategy=self._affinity(node["NodeID"], soft=False))
+        ask = ray.remote(_hello).options(
+            num_cpus=1,
+            num_gpus=self._gpus,
+            max_retries=0,
+            scheduling_strategy=self._affinity(node["NodeID"], soft=False),
+        )
         try:
             hello = ray.get(ask.remote(self._job), timeout=_HELLO_S)
         except Exception as error:  # noqa: BLE001
-            raise ConfigError(f"node {name} cannot work: {_first_line(error)}", where="--executor",
-                              accepted="this version of BlinkGL, and the GPUs asked for, on every node") from None
+            raise ConfigError(
+                f"node {name} cannot work: {_first_line(error)}",
+                where="--executor",
+                accepted="this version of BlinkGL, and the GPUs asked for, on every node",
+            ) from None
         if hello["kind"] == "refused":
             raise BlinkGLError(f"node {name}: {hello['error']}")
         return hello
@@ -197,7 +230,11 @@ class RayCluster:
         except exceptions.WorkerCrashedError:
             return _failure(task, reason or "the worker was ended")
         except exceptions.RayError as error:
-            return _failure(task, reason or _first_line(error), lost=reason is None and "node" in str(error).lower() and "died" in str(error).lower())
+            return _failure(
+                task,
+                reason or _first_line(error),
+                lost=reason is None and "node" in str(error).lower() and "died" in str(error).lower(),
+            )
 
     def _news(self) -> list[Message]:
         try:
@@ -263,8 +300,11 @@ def _work(job: dict[str, Any], task: int, attempt: int, expected: tuple[dict[str
         if _maker is None or _maker.job.to_dict() != job:
             _, hello = _open(job)
             if different := environment_differences(hello["environment"], expected[0]):
-                return {"kind": "refused", "error": f"a worker on {socket.gethostname()} differs from the run's first in version or hardware: "
-                                                    f"{different}"}
+                return {
+                    "kind": "refused",
+                    "error": f"a worker on {socket.gethostname()} differs from the run's first in version or hardware: "
+                    f"{different}",
+                }
             if hello["assets"] != expected[1]:
                 return {"kind": "refused", "error": f"node {socket.gethostname()} sees other meshes or textures"}
     except BlinkGLError as error:
@@ -286,11 +326,18 @@ def _reachable(address: str) -> None:
     """ConfigError at once, where Ray itself would try for half a minute."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if not host or not port.isdigit():
-        raise ConfigError("not an address", where="--address", value=address, accepted="host:port, ray://host:port or auto")
+        raise ConfigError(
+            "not an address", where="--address", value=address, accepted="host:port, ray://host:port or auto"
+        )
     try:
         socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
     except OSError as error:
-        raise ConfigError(f"cannot be reached: {error.strerror or error}", where="--address", value=address, accepted="a running Ray cluster") from None
+        raise ConfigError(
+            f"cannot be reached: {error.strerror or error}",
+            where="--address",
+            value=address,
+            accepted="a running Ray cluster",
+        ) from None
 
 
 @contextlib.contextmanager

@@ -30,7 +30,7 @@ from blinkgl.gl.context import egl_devices
 
 _SILENT_S = 60.0
 """A worker says every second that it lives; after so long without a word it is mentioned."""
-_START_S = 600.0    # compiling every kernel for the first time on a slow machine
+_START_S = 600.0  # compiling every kernel for the first time on a slow machine
 _STOP_S = 20.0
 _BAD_STARTS = 3
 
@@ -115,8 +115,9 @@ class Local:
         while len(hellos) < self._wanted:
             hellos += [m for m in self.poll(1.0) if m["kind"] == "hello"]
             if time.monotonic() > deadline:
-                raise StartError(f"workers did not start within {_START_S:.0f} s", where="--workers",
-                                   accepted=f"see {self._log(0)}")
+                raise StartError(
+                    f"workers did not start within {_START_S:.0f} s", where="--workers", accepted=f"see {self._log(0)}"
+                )
         return hellos
 
     def free(self) -> int:
@@ -179,13 +180,21 @@ class Local:
         self._processes.remove(process)
         status = process.popen.wait()
         process.close()
-        how = process.reason or (f"the worker was ended by {signal.Signals(-status).name}" if status < 0 else f"the worker ended with status {status}")
+        how = process.reason or (
+            f"the worker was ended by {signal.Signals(-status).name}"
+            if status < 0
+            else f"the worker ended with status {status}"
+        )
         if not process.ready:
             self._bad_starts += 1
             if self._bad_starts >= _BAD_STARTS:
                 raise StartError(f"workers cannot start: {how}", where="--workers", accepted=f"see {process.log}")
         self._start(process.slot)
-        return [] if process.task is None else [{"kind": "failed", "task": process.task, "error": how, "final": False, "stop": False}]
+        return (
+            []
+            if process.task is None
+            else [{"kind": "failed", "task": process.task, "error": how, "final": False, "stop": False}]
+        )
 
     def _log(self, slot: int) -> Path:
         return Path(self._job.out) / RUN_FOLDER / "logs" / f"worker-{slot}.log"
@@ -206,8 +215,15 @@ class _Process:
         except OSError:
             output = open(os.devnull, "ab")  # noqa: SIM115
         with output:
-            self.popen = subprocess.Popen([sys.executable, "-m", "blinkgl.dataset.worker", str(write_end)], stdin=subprocess.PIPE,
-                                          stdout=output, stderr=output, pass_fds=(write_end,), env=environment, start_new_session=True)
+            self.popen = subprocess.Popen(
+                [sys.executable, "-m", "blinkgl.dataset.worker", str(write_end)],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=output,
+                pass_fds=(write_end,),
+                env=environment,
+                start_new_session=True,
+            )
         os.close(write_end)
 
     def send(self, order: dict) -> None:
@@ -230,9 +246,13 @@ class _Process:
         if self.task is None or self._mentioned or quiet < _SILENT_S:
             return None
         self._mentioned = True
-        return {"kind": "silent", "task": self.task, "pid": self.popen.pid,
-                "error": f"worker {self.slot} (pid {self.popen.pid}) {_condition(self.popen.pid)}: no word from it for "
-                         f"{quiet:.0f} s; waiting for it, until --time-limit or its end"}
+        return {
+            "kind": "silent",
+            "task": self.task,
+            "pid": self.popen.pid,
+            "error": f"worker {self.slot} (pid {self.popen.pid}) {_condition(self.popen.pid)}: no word from it for "
+            f"{quiet:.0f} s; waiting for it, until --time-limit or its end",
+        }
 
     def stop(self) -> None:
         if self.popen.poll() is None:
@@ -251,7 +271,7 @@ class _Process:
 
 
 def _condition(pid: int) -> str:
-    """"is stopped", "waits for a disk or a driver" or "hangs": the kernel's view of a process that says nothing."""
+    """ "is stopped", "waits for a disk or a driver" or "hangs": the kernel's view of a process that says nothing."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except (OSError, IndexError):

@@ -82,12 +82,17 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
     files, flows, masks = probe.files, probe.flows, probe.masks
     duration = (len(files) - 1) / frames.fps
     result = Explanation(machine=platform.processor() or platform.machine(), seconds=0.0)
-    between = {"linear": "no frames in between", "cubic": f"{frames.factor - 1} frames in between, monotone cubics",
-               "motion": f"at most {frames.max_px:g} px per step, dense-flow warp"}[frames.interpolate]
+    between = {
+        "linear": "no frames in between",
+        "cubic": f"{frames.factor - 1} frames in between, monotone cubics",
+        "motion": f"at most {frames.max_px:g} px per step, dense-flow warp",
+    }[frames.interpolate]
     result.scene = {
-        "frames": f"{len(files)} of {probe.folder}, {probe.width}x{probe.height}, {frames.fps:g} Hz: {duration:.6g} s", "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
+        "frames": f"{len(files)} of {probe.folder}, {probe.width}x{probe.height}, {frames.fps:g} Hz: {duration:.6g} s",
+        "images": f"{files[0].name} … {files[-1].name}, {frames.gamma}",
         "flow": f"{len(flows)} files, {len(masks)} masks of occluded pixels" if flows else "none: no flow labels",
-        "not used": "camera, time, timeline, scene and render: nothing is rendered"}
+        "not used": "camera, time, timeline, scene and render: nothing is rendered",
+    }
     count = min(PROBES, len(files)) - 1
     until_ns, started, steps = round(count * 1e9 / frames.fps), time.perf_counter(), 0
     for chunk in probe.chunks():
@@ -96,14 +101,28 @@ def _explain_frames(config: SequenceConfig, index: int, base: Path) -> Explanati
             break
     each, rate = (time.perf_counter() - started) / count, probe.events / (1e-9 * until_ns)
     result.frames = 1 + round((steps - 1) * (len(files) - 1) / count)
-    result.passes.append(Pass("frames and event kernel", f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
-                              (config.events.emulator,), 0, result.frames, each * (len(files) - 1)))
+    result.passes.append(
+        Pass(
+            "frames and event kernel",
+            f"{between}; {config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
+            (config.events.emulator,),
+            0,
+            result.frames,
+            each * (len(files) - 1),
+        )
+    )
     request = asked_for(config.labels)
-    for name, on, why in (("images", "images" in request, "labels.images: false"),
-                          ("forward flow", flows and "flow_forward" in request, "frames.flow: null, or not in labels.flow"),
-                          ("occlusion masks", masks and "occlusion_forward" in request, "no mask files, labels.occlusion: false, or no forward flow"),
-                          ("preview", config.preview.enabled, "preview.enabled: false"),
-                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
+    for name, on, why in (
+        ("images", "images" in request, "labels.images: false"),
+        ("forward flow", flows and "flow_forward" in request, "frames.flow: null, or not in labels.flow"),
+        (
+            "occlusion masks",
+            masks and "occlusion_forward" in request,
+            "no mask files, labels.occlusion: false, or no forward flow",
+        ),
+        ("preview", config.preview.enabled, "preview.enabled: false"),
+        ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
+    ):
         if not on:
             result.left_out.append((name, why))
     brought = {LABELS[name].heading for name in RECORDED}
@@ -119,14 +138,20 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
     parts = [p for o in scene.objects for p in o.parts]
     textures = {id(p.material.texture): p.material.texture for p in parts if p.material.texture is not None}
     pixels = sum(t.image.shape[0] * t.image.shape[1] for t in textures.values())
-    kinds = {category: sum(o.category == category for o in scene.objects) for category in ("object", "ground", "wall", "sky")}
+    kinds = {
+        category: sum(o.category == category for o in scene.objects) for category in ("object", "ground", "wall", "sky")
+    }
     lit = sum(not p.material.unlit for p in parts)
     return {
-        "bodies": ", ".join(f"{n} {k}{'s' if n > 1 and k != 'sky' else ''}" for k, n in kinds.items() if n) + f"; {moving} move",
+        "bodies": ", ".join(f"{n} {k}{'s' if n > 1 and k != 'sky' else ''}" for k, n in kinds.items() if n)
+        + f"; {moving} move",
         "camera": f"{scene.camera.summary}, " + ("still" if scene.camera_path.is_static else "moving"),
-        "triangles": f"{renderer.triangles:,}" + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
+        "triangles": f"{renderer.triangles:,}"
+        + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
-        "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit" if lit else "none: every surface is unlit",
+        "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit"
+        if lit
+        else "none: every surface is unlit",
         "notes": "; ".join(scene.log) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
@@ -140,7 +165,9 @@ def _timed(run, times) -> float:
     return (time.perf_counter() - started) / len(times)
 
 
-def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, gl: GLContext, result: Explanation) -> None:
+def _passes(
+    config: SequenceConfig, index: int, scene: Scene, renderer: Renderer, gl: GLContext, result: Explanation
+) -> None:
     t0, t1 = scene.t0_ns, scene.t1_ns
     duration = (t1 - t0) * 1e-9
     pixels = renderer.width * renderer.height
@@ -148,8 +175,15 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     labels = config.time.label_count
 
     def variants(name: str) -> tuple[str, ...]:
-        return tuple(sorted({"+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
-                             for program, defines in gl.shaders.compiled if program == name}))
+        return tuple(
+            sorted(
+                {
+                    "+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
+                    for program, defines in gl.shaders.compiled
+                    if program == name
+                }
+            )
+        )
 
     timeline, rejected = config.timeline, 1.0
     rates = timeline.reconstruction == "hermite"
@@ -165,36 +199,88 @@ def _passes(config: SequenceConfig, index: int, scene: Scene, renderer: Renderer
     if timeline.kind == "uniform":
         result.frames = math.ceil(duration * timeline.fps - 1e-6) + 1  # one at the end, whatever the rate
     else:
-        steps = np.clip([1 / max(probe.timeline.pace(t), 1e-12) for t in times], timeline.min_step_us * 1e-6, timeline.max_step_us * 1e-6)
+        steps = np.clip(
+            [1 / max(probe.timeline.pace(t), 1e-12) for t in times],
+            timeline.min_step_us * 1e-6,
+            timeline.max_step_us * 1e-6,
+        )
         result.frames = int(duration * np.mean(1 / steps)) + 1
         rejected = 1.1  # a step is cut again now and then
-    result.passes.append(Pass("event frames" + (" with rates" if rates else ""), f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
-                              variants("luminance.glsl"), pixels * fine * ((8 if rates else 4) + DEPTH_BYTES), result.frames,
-                              event_s * result.frames))
+    result.passes.append(
+        Pass(
+            "event frames" + (" with rates" if rates else ""),
+            f"timeline: {timeline.kind}, {timeline.reconstruction} in between",
+            variants("luminance.glsl"),
+            pixels * fine * ((8 if rates else 4) + DEPTH_BYTES),
+            result.frames,
+            event_s * result.frames,
+        )
+    )
     if timeline.kind != "uniform":
         small_s, count = _timed(probe.timeline.pace, times), int(result.frames * rejected)
         name = "brightness" if timeline.kind == "brightness" else "velocity"
-        result.passes.append(Pass(name, f"decides the step; every {timeline.sample_every}. pixel", (name,),
-                                  pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES), count, small_s * count))
+        result.passes.append(
+            Pass(
+                name,
+                f"decides the step; every {timeline.sample_every}. pixel",
+                (name,),
+                pixels // timeline.sample_every**2 * (8 + DEPTH_BYTES),
+                count,
+                small_s * count,
+            )
+        )
     if "images" in asked_for(config.labels):
-        result.passes.append(Pass("colour", f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
-                                  ("colour",), pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES), labels + 1,
-                                  _timed(lambda t: renderer.colour(t).read(), times[:3]) * (labels + 1)))
+        result.passes.append(
+            Pass(
+                "colour",
+                f"images at {config.time.label_rate:g} Hz, anti-aliasing {config.render.image_antialiasing}",
+                ("colour",),
+                pixels * samples_of(config.render.image_antialiasing).stored * (16 + DEPTH_BYTES),
+                labels + 1,
+                _timed(lambda t: renderer.colour(t).read(), times[:3]) * (labels + 1),
+            )
+        )
     request = asked_for(config.labels)
     request = request.without(*(name for name in request if LABELS[name].anti_aliased))
     if request:
         interval = config.time.interval_ns
         each = _timed(lambda t: renderer.labels(t, request, t + interval, t - interval), config.time.label_times_ns[:3])
-        result.passes.append(Pass("labels", ", ".join(request), ("geometry",),
-                                  pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES), labels, each * labels))
+        result.passes.append(
+            Pass(
+                "labels",
+                ", ".join(request),
+                ("geometry",),
+                pixels * (sum(BUFFERS[LABELS[name].buffer].bytes for name in request.buffers) + DEPTH_BYTES),
+                labels,
+                each * labels,
+            )
+        )
     if config.preview.enabled:
         pictures = int(duration * config.preview.rate) + 1
-        each = _timed(lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times[:3])
-        result.passes.append(Pass("preview", f"{config.preview.rate:g} pictures per simulated second", ("colour", "velocity"),
-                                  pixels * (16 + 8 + DEPTH_BYTES), pictures, each * pictures))
+        each = _timed(
+            lambda t: (renderer.colour(t, antialiasing="none").read(), renderer.velocity(t).read()), times[:3]
+        )
+        result.passes.append(
+            Pass(
+                "preview",
+                f"{config.preview.rate:g} pictures per simulated second",
+                ("colour", "velocity"),
+                pixels * (16 + 8 + DEPTH_BYTES),
+                pictures,
+                each * pictures,
+            )
+        )
     each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - t0), 1e-9)
-    result.passes.append(Pass("event kernel", f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
-                              (config.events.emulator,), 0, result.frames, each * result.frames))
+    result.passes.append(
+        Pass(
+            "event kernel",
+            f"{config.events.emulator}; about {rate / 1e6:.1f} M events per simulated second",
+            (config.events.emulator,),
+            0,
+            result.frames,
+            each * result.frames,
+        )
+    )
 
 
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
@@ -202,18 +288,30 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     request = asked_for(config.labels)
     there = {LABELS[name].heading for name in request}
     labels = {label.heading: label.off or f"labels.{label.name}: false" for label in LABELS.values()}
-    for name, on, key in (*((heading, heading in there, why) for heading, why in labels.items()), ("preview", config.preview.enabled, "preview.enabled: false"),
-                          ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)")):
+    for name, on, key in (
+        *((heading, heading in there, why) for heading, why in labels.items()),
+        ("preview", config.preview.enabled, "preview.enabled: false"),
+        ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
+    ):
         if not on:
             add(name, key)
     if config.render.antialiasing == "none":
-        add("anti-aliasing of event frames", "render.antialiasing: none (mip-maps filter textures; edges are not filtered)")
+        add(
+            "anti-aliasing of event frames",
+            "render.antialiasing: none (mip-maps filter textures; edges are not filtered)",
+        )
     elif config.render.antialiasing == "msaa4":
-        add("super-sampling of event frames", "render.antialiasing: msaa4 (edges are filtered; textures by mip-maps alone)")
+        add(
+            "super-sampling of event frames",
+            "render.antialiasing: msaa4 (edges are filtered; textures by mip-maps alone)",
+        )
     if not config.render.lod.enabled:
         add("level of detail", "render.lod.enabled: false (every mesh as it is)")
     if config.render.antialiasing == "taps4":
-        add("anti-aliasing of silhouettes", "render.antialiasing: taps4 (textures are super-sampled; edges are not filtered)")
+        add(
+            "anti-aliasing of silhouettes",
+            "render.antialiasing: taps4 (textures are super-sampled; edges are not filtered)",
+        )
     if config.render.anisotropy == 1:
         add("anisotropic filtering", "render.anisotropy: 1")
     if all(p.material.unlit for o in scene.objects for p in o.parts):

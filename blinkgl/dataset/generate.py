@@ -23,8 +23,9 @@ from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate_seque
 from blinkgl.sequence.clock import StageClock
 
 
-def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
-                 progress: Progress | None = None) -> Iterator[SequenceReport]:
+def generate_run(
+    template: RunTemplate, out: str | Path, num: int | None = None, progress: Progress | None = None
+) -> Iterator[SequenceReport]:
     """Generates ``num`` (default: the configuration's ``output.sequences``) sequences below ``out``, in order, in this
     process, yielding a report after each. The first error ends it;
     :mod:`blinkgl.dataset.run` is the loop that does not give up.
@@ -45,8 +46,15 @@ def generate_run(template: RunTemplate, out: str | Path, num: int | None = None,
             yield generate_sequence(config, task.index, out, gl, base=template.base, progress=progress)
 
 
-def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: GLContext | None, *, base: Path = Path("."),
-                      progress: Progress | None = None) -> SequenceReport:
+def generate_sequence(
+    config: SequenceConfig,
+    index: int,
+    out: str | Path,
+    gl: GLContext | None,
+    *,
+    base: Path = Path("."),
+    progress: Progress | None = None,
+) -> SequenceReport:
     """Generates one sequence directory, whole or not at all: what happens in the sequence, written down.
 
     gl : context to draw with; not looked at (None) for a sequence that is converted from frames.
@@ -54,9 +62,17 @@ def generate_sequence(config: SequenceConfig, index: int, out: str | Path, gl: G
     Raises BlinkGLError for anything the user or the machine caused."""
     report = SequenceReport(index, Path(out) / sequence_name(config.output, index))
     with (
-        simulate_sequence(config, index, gl, base=base, pictures_hz=config.preview.rate if config.preview.enabled else None) as sequence,
-        SequenceWriter(report.path, sequence.height, sequence.width, config_yaml=config_yaml(sequence.config, index),
-                       t_offset_us=sequence.t0_ns // 1000, labels=config.labels) as writer,
+        simulate_sequence(
+            config, index, gl, base=base, pictures_hz=config.preview.rate if config.preview.enabled else None
+        ) as sequence,
+        SequenceWriter(
+            report.path,
+            sequence.height,
+            sequence.width,
+            config_yaml=config_yaml(sequence.config, index),
+            t_offset_us=sequence.t0_ns // 1000,
+            labels=config.labels,
+        ) as writer,
     ):
         clock, span_ns = sequence.clock, sequence.t1_ns - sequence.t0_ns
         with PreviewRecorder(config.preview, sequence, writer) as preview:
@@ -110,7 +126,8 @@ def manifest_info(sequence: Simulation) -> dict:
         "emulator": config.events.emulator,
         "frames": sequence.frames,
         "labels": sequence.labels,
-        "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,  # between whole microseconds, as every time in the files
+        "duration_us": sequence.t1_ns // 1000
+        - sequence.t0_ns // 1000,  # between whole microseconds, as every time in the files
         **losses(*sequence.losses),
         **sequence.facts(),
     }

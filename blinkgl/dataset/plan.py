@@ -166,8 +166,12 @@ class Plan:
                 _check_group(group, self.counts[group.name], hashes)
             except ConfigError as error:
                 if group.name:
-                    raise ConfigError(f"in group '{group.name}': {error.problem}", where=error.where, value=error.value,
-                                      accepted=error.accepted) from None
+                    raise ConfigError(
+                        f"in group '{group.name}': {error.problem}",
+                        where=error.where,
+                        value=error.value,
+                        accepted=error.accepted,
+                    ) from None
                 raise
         return hashes
 
@@ -179,20 +183,37 @@ class Plan:
 def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
     base = group.template.base
     # What check_assets looks at, and which folders there are.
-    for config in group.template.corners_of("frames", "scene.kind", "scene.pool", "scene.textures", "scene.sky", "scene.objects.count",
-                                            "scene.meshes", "scene.materials", "scene.path"):
+    for config in group.template.corners_of(
+        "frames",
+        "scene.kind",
+        "scene.pool",
+        "scene.textures",
+        "scene.sky",
+        "scene.objects.count",
+        "scene.meshes",
+        "scene.materials",
+        "scene.path",
+    ):
         if config.frames is not None:
             folders = matching_folders(config.frames, base)
             last = group.first + count - 1
             if len(folders) > 1 and last >= len(folders):
-                raise ConfigError(f"{len(folders)} folders are too few for sequence {last}", where="frames.folders",
-                                  value=list(config.frames.folders), accepted=f"at least {last + 1} folders, or fewer output.sequences")
+                raise ConfigError(
+                    f"{len(folders)} folders are too few for sequence {last}",
+                    where="frames.folders",
+                    value=list(config.frames.folders),
+                    accepted=f"at least {last + 1} folders, or fewer output.sequences",
+                )
             for folder in folders:
-                with suppress(AssetError):  # one bad folder is set aside alone; frames too far apart are the recipe's fault
+                with suppress(
+                    AssetError
+                ):  # one bad folder is set aside alone; frames too far apart are the recipe's fault
                     used_images(config.frames, folder)
                 for path in sorted(folder.rglob("*")):
                     if path.is_file():
-                        hashes[f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"] = f"{path.stat().st_size} bytes"
+                        hashes[f"frames/{folder.name}/{path.relative_to(folder).as_posix()}"] = (
+                            f"{path.stat().st_size} bytes"
+                        )
             continue
         check_assets(config.scene, base, config.output.split)
         _hash_scene_files(config.scene, base, hashes)
@@ -205,10 +226,14 @@ def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:
 
     if isinstance(scene, RandomSceneConfig):
         for pool in pools(scene, base):
-            hashes.update({f"{entry.source}/{entry.name}": entry.source_hash for entry in pool.entries if entry.file is not None})
+            hashes.update(
+                {f"{entry.source}/{entry.name}": entry.source_hash for entry in pool.entries if entry.file is not None}
+            )
         for name in scene.sky.panoramas if scene.sky else ():
             path = resolve(name, base)
-            for found in files_below(path, "scene.sky.panoramas", name, IMAGE_SUFFIXES, "images") if path.is_dir() else [path]:
+            for found in (
+                files_below(path, "scene.sky.panoramas", name, IMAGE_SUFFIXES, "images") if path.is_dir() else [path]
+            ):
                 hashes[f"{name}/{found.name}"] = content_hash(found.read_bytes())
     elif isinstance(scene, ExplicitSceneConfig):
         for used in [*(m.file for m in scene.meshes.values()), *(m.texture for m in scene.materials.values())]:
@@ -233,4 +258,6 @@ def check_output(out: str | Path) -> None:
         raise OutputError("is a file", where=str(out), accepted="a folder")
     for name in SPLITS:
         if (out / name).is_symlink():
-            raise OutputError("is a symbolic link", where=str(out / name), accepted="a folder (--out itself may be a link)")
+            raise OutputError(
+                "is a symbolic link", where=str(out / name), accepted="a folder (--out itself may be a link)"
+            )

@@ -21,8 +21,15 @@ class PreviewRecorder:
         self._interval_s = np.float32(sequence.config.time.interval_ns * 1e-9)
         self._video: PreviewWriter | None = None
         if rate is not None:
-            self._video = PreviewWriter(writer.path("preview.mp4"), sequence.height, sequence.width, t0_us=sequence.t0_ns // 1000,
-                                        flow=sequence.config.frames is None, rate_hz=rate, fps=rate / config.slowdown)
+            self._video = PreviewWriter(
+                writer.path("preview.mp4"),
+                sequence.height,
+                sequence.width,
+                t0_us=sequence.t0_ns // 1000,
+                flow=sequence.config.frames is None,
+                rate_hz=rate,
+                fps=rate / config.slowdown,
+            )
 
     def add_events(self, events: Events) -> None:
         """Every chunk, in order."""

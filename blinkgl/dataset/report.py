@@ -44,12 +44,21 @@ class SequenceReport:
 
     def count(self, sequence: Simulation) -> None:
         """What there is of it so far."""
-        self.frames, self.events, self.labels, self.seconds = sequence.frames, sequence.events, sequence.labels, sequence.seconds
+        self.frames, self.events, self.labels, self.seconds = (
+            sequence.frames,
+            sequence.events,
+            sequence.labels,
+            sequence.seconds,
+        )
 
 
 def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
     """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
-    return {"events_cut_by_max_events_per_step": saturated, "events_lost_in_readout": dropped, "events_late_in_readout": late}
+    return {
+        "events_cut_by_max_events_per_step": saturated,
+        "events_lost_in_readout": dropped,
+        "events_late_in_readout": late,
+    }
 
 
 @dataclass
@@ -86,10 +95,17 @@ class Totals:
         """Totals of a run: counts, wall seconds per stage, and the rates the table shows."""
         stages = {name: self.seconds.get(name, 0.0) for name in STAGES}
         stages["other"] = max(0.0, self.total_s - sum(stages.values()))
-        return {"sequences": self.count, "frames": self.frames, "events": self.events,
-                "labels": self.labels, "simulated_s": self.simulated_s, "total_s": self.total_s,
-                "seconds_per_simulated_second": self.total_s / self.simulated_s, "events_per_second": self.events / self.total_s,
-                **{f"{name}_s": seconds for name, seconds in stages.items()}}
+        return {
+            "sequences": self.count,
+            "frames": self.frames,
+            "events": self.events,
+            "labels": self.labels,
+            "simulated_s": self.simulated_s,
+            "total_s": self.total_s,
+            "seconds_per_simulated_second": self.total_s / self.simulated_s,
+            "events_per_second": self.events / self.total_s,
+            **{f"{name}_s": seconds for name, seconds in stages.items()},
+        }
 
 
 def config_yaml(config: SequenceConfig, index: int) -> str:
@@ -98,6 +114,7 @@ def config_yaml(config: SequenceConfig, index: int) -> str:
     tree["output"].update(first_index=index, sequences=1)
     if tree.get("frames") is None:
         tree.pop("frames", None)
-    return (f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
-            "# Relative paths start from the folder of the run's own configuration file.\n"
-            + to_yaml(tree))
+    return (
+        f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
+        "# Relative paths start from the folder of the run's own configuration file.\n" + to_yaml(tree)
+    )

@@ -56,8 +56,17 @@ class Listener(Protocol):
     def end(self, outcome: Outcome) -> None: ...
 
 
-def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | None = None, *, num: int | None = None, resume: bool = False,
-                mixed: bool = False, time_limit_s: float = 0.0, listener: Listener | None = None) -> Outcome:
+def run_dataset(
+    template: RunTemplate,
+    out: str | Path,
+    executor: Executor | None = None,
+    *,
+    num: int | None = None,
+    resume: bool = False,
+    mixed: bool = False,
+    time_limit_s: float = 0.0,
+    listener: Listener | None = None,
+) -> Outcome:
     """Makes every sequence of ``template`` below ``out`` that is not whole yet.
 
     executor : default :class:`~blinkgl.dataset.executor.Inline`.
@@ -110,7 +119,9 @@ def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | Non
             elif folder.in_place:
                 folder.sweep(plan)
                 with contextlib.suppress(OutputError):  # on a full disk the first error is the one to hear of
-                    if folder.read("run.json") is None:  # deleted under us; without it nobody could tell whose run this is
+                    if (
+                        folder.read("run.json") is None
+                    ):  # deleted under us; without it nobody could tell whose run this is
                         folder.begin(plan, assets, folder.environment, num)
                 folder.write_failures(outcome.set_aside, plan)
                 with contextlib.suppress(OutputError):
@@ -120,7 +131,11 @@ def run_dataset(template: RunTemplate, out: str | Path, executor: Executor | Non
         if outcome.set_aside and not (outcome.made or outcome.found):
             folder.forget(plan, keep_logs=outcome.surprises > 0)
             reason = next(iter(outcome.set_aside.values()))
-            raise BlinkGLError(reason if outcome.planned == 1 else f"{reason} (all {outcome.planned} sequences failed, this is the first's reason)")
+            raise BlinkGLError(
+                reason
+                if outcome.planned == 1
+                else f"{reason} (all {outcome.planned} sequences failed, this is the first's reason)"
+            )
     return outcome
 
 
@@ -132,8 +147,11 @@ def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
         if state is None:  # an empty folder
             continue
         if not resume:
-            raise OutputError("output folder exists", where=str(folder.out / task.name),
-                              accepted="a new folder name, or --resume to make only what is missing")
+            raise OutputError(
+                "output folder exists",
+                where=str(folder.out / task.name),
+                accepted="a new folder name, or --resume to make only what is missing",
+            )
         if state == "":
             outcome.found += 1
         else:
@@ -141,7 +159,9 @@ def _found(plan: Plan, folder: RunFolder, resume: bool) -> Outcome:
     return outcome
 
 
-def _loop(plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, time_limit_s: float, listener: Listener | None) -> None:
+def _loop(
+    plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, time_limit_s: float, listener: Listener | None
+) -> None:
     running: dict[int, tuple[int, float]] = {}  # task -> attempt, since when
     # What is there was looked at before; damaged things have been put away by now.
     fresh = ((number, 1) for number, task in enumerate(plan.tasks) if not folder.occupied(task.name))
@@ -182,8 +202,11 @@ def _loop(plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, t
                 if folder.state(task.name) == "":  # the worker died between the rename and the message
                     outcome.found += 1
                 elif message["stop"]:
-                    raise OutputError(f"{message['error']}; the run has stopped with {outcome.found + len(outcome.made)} of "
-                                      f"{outcome.planned} sequences whole", accepted="run again with --resume when that is mended")
+                    raise OutputError(
+                        f"{message['error']}; the run has stopped with {outcome.found + len(outcome.made)} of "
+                        f"{outcome.planned} sequences whole",
+                        accepted="run again with --resume when that is mended",
+                    )
                 elif message.get("lost"):  # no fault of the sequence's: a whole machine went
                     again.append((number, attempt))
                 elif attempt >= ATTEMPTS or message["final"]:
@@ -203,10 +226,17 @@ def _loop(plan: Plan, executor: Executor, folder: RunFolder, outcome: Outcome, t
 def _agree(hello: Message, environment: dict[str, str], assets: str | None) -> None:
     """Workers that differ in anything that decides the bytes must not work on one data set."""
     if different := environment_differences(hello["environment"], environment):
-        raise ConfigError(f"workers differ in version or hardware: {different}", where="--executor",
-                          accepted="the same installation on all of them")
+        raise ConfigError(
+            f"workers differ in version or hardware: {different}",
+            where="--executor",
+            accepted="the same installation on all of them",
+        )
     if assets is not None and hello["assets"] != assets:
-        raise ConfigError("a worker sees other meshes or textures than the driver", where="--executor", accepted="the same files on all machines")
+        raise ConfigError(
+            "a worker sees other meshes or textures than the driver",
+            where="--executor",
+            accepted="the same files on all machines",
+        )
 
 
 @contextlib.contextmanager

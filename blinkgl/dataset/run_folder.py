@@ -80,7 +80,9 @@ class RunFolder:
         self.out, self.path = out, out / RUN_FOLDER
         self.begun = False
         self.environment: dict[str, str] = {}
-        self._foreign: dict[Path, tuple[tuple[int, ...], float]] = {}  # temporary of another machine -> its state, seen since
+        self._foreign: dict[
+            Path, tuple[tuple[int, ...], float]
+        ] = {}  # temporary of another machine -> its state, seen since
 
     # ---- may this run go on here? ---------------------------------------------------------------------------------
 
@@ -91,23 +93,36 @@ class RunFolder:
             return
         if known.get("groups") != plan.identity:
             ours, theirs = plan.identity, known.get("groups") or {}
-            names = sorted(n or "the configuration" for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n))
-            raise OutputError(f"holds the run of another recipe (different: {', '.join(names)})", where=str(self.out),
-                              accepted="another --out, or --mixed to add to it all the same")
+            names = sorted(
+                n or "the configuration" for n in ours.keys() | theirs.keys() if ours.get(n) != theirs.get(n)
+            )
+            raise OutputError(
+                f"holds the run of another recipe (different: {', '.join(names)})",
+                where=str(self.out),
+                accepted="another --out, or --mixed to add to it all the same",
+            )
         before = self.read("assets.json")
         if before is not None and before != assets:
             changed = sorted(n for n in before.keys() | assets.keys() if before.get(n) != assets.get(n))
             how = ["changed" if n in before and n in assets else "gone" if n in before else "new" for n in changed]
             said = ", ".join(f"{n} ({h})" for n, h in list(zip(changed, how))[:3]) + (" …" if len(changed) > 3 else "")
-            raise OutputError(f"the pools are not those the run began with: {said}", where=str(self.out),
-                              accepted="the same files, or --mixed to go on with these")
+            raise OutputError(
+                f"the pools are not those the run began with: {said}",
+                where=str(self.out),
+                accepted="the same files, or --mixed to go on with these",
+            )
 
     def check_environment(self, environment: dict[str, str], mixed: bool) -> None:
         """OutputError when the run began with other versions or another OpenGL, unless ``mixed``."""
         known = (self.read("run.json") or {}).get("environment") or {}
-        if not mixed and (different := [f"{k} {known[k]}, now {v}" for k, v in environment.items() if k in known and known[k] != v]):
-            raise OutputError("the run began with another installation: " + "; ".join(different), where=str(self.out),
-                              accepted="the same, or --mixed to go on with this one (bytes may differ)")
+        if not mixed and (
+            different := [f"{k} {known[k]}, now {v}" for k, v in environment.items() if k in known and known[k] != v]
+        ):
+            raise OutputError(
+                "the run began with another installation: " + "; ".join(different),
+                where=str(self.out),
+                accepted="the same, or --mixed to go on with this one (bytes may differ)",
+            )
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -117,7 +132,9 @@ class RunFolder:
         self._handle = self._lock()
         try:
             if self.path.is_symlink():
-                raise OutputError("is a symbolic link", where=str(self.path), accepted="a folder (--out itself may be a link)")
+                raise OutputError(
+                    "is a symbolic link", where=str(self.path), accepted="a folder (--out itself may be a link)"
+                )
             self._fresh = not self.path.exists()
             self._logs = set(self._worker_logs())
             yield
@@ -144,8 +161,11 @@ class RunFolder:
                 try:
                     fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
-                    raise OutputError("another run is at work in this folder", where=str(self.out),
-                                      accepted="another --out, or --resume when it is over") from None
+                    raise OutputError(
+                        "another run is at work in this folder",
+                        where=str(self.out),
+                        accepted="another --out, or --resume when it is over",
+                    ) from None
                 except OSError:  # a file system without locks
                     pass
                 if _same(self.out, handle):
@@ -153,15 +173,20 @@ class RunFolder:
             except BaseException:
                 os.close(handle)
                 raise
-            os.close(handle)  # another run was refused, and took the folder away, between our opening and our locking it
+            os.close(
+                handle
+            )  # another run was refused, and took the folder away, between our opening and our locking it
             self._make()
 
     def check_in_place(self) -> None:
         """OutputError when the folder that was locked is no longer the one at ``out``:
         deleted, moved or replaced under the run."""
         if not _same(self.out, self._handle):
-            raise OutputError("was deleted, moved or replaced while the run was at work in it", where=str(self.out),
-                              accepted="a folder that stays where it is")
+            raise OutputError(
+                "was deleted, moved or replaced while the run was at work in it",
+                where=str(self.out),
+                accepted="a folder that stays where it is",
+            )
 
     @property
     def in_place(self) -> bool:
@@ -239,8 +264,18 @@ class RunFolder:
         later = known.get("mixed", [])
         if (known["environment"], known["groups"]) != (environment, plan.identity):
             later = [*later, {"environment": environment, "groups": plan.identity}]
-        self._write("run.json", {"format": FORMAT, "format_version": 1, "groups": known["groups"], "environment": known["environment"],
-                                 "mixed": later, "base": str(plan.template.base.resolve()), "num": num})
+        self._write(
+            "run.json",
+            {
+                "format": FORMAT,
+                "format_version": 1,
+                "groups": known["groups"],
+                "environment": known["environment"],
+                "mixed": later,
+                "base": str(plan.template.base.resolve()),
+                "num": num,
+            },
+        )
         self._write("assets.json", assets)
         with atomic_file(self.path / "recipe.yaml") as path, output_errors(path):
             path.write_text(plan.recipe_text(), encoding="utf-8")
@@ -259,8 +294,16 @@ class RunFolder:
                 folder.rmdir()
 
     def add_cost(self, task: Task, message: Message, attempt: int) -> None:
-        line = {"name": task.name, "group": task.group, **{k: v for k, v in message["report"].items() if k not in ("path", "index")},
-                "bytes": message["bytes"], "cpu_s": message["cpu_s"], "peak_rss_kib": message["peak_rss_kib"], "attempts": attempt, "when": time.time()}
+        line = {
+            "name": task.name,
+            "group": task.group,
+            **{k: v for k, v in message["report"].items() if k not in ("path", "index")},
+            "bytes": message["bytes"],
+            "cpu_s": message["cpu_s"],
+            "peak_rss_kib": message["peak_rss_kib"],
+            "attempts": attempt,
+            "when": time.time(),
+        }
         with contextlib.suppress(OSError), open(self.path / "costs.jsonl", "a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
 
@@ -295,8 +338,11 @@ class RunFolder:
             return None
         except (AssetError, ValueError) as error:
             problem = error.problem if isinstance(error, AssetError) else error
-            raise OutputError(f"the run's record is damaged: {problem}", where=str(path), accepted="a readable file; without it the run "
-                              "cannot be told from another recipe's") from error
+            raise OutputError(
+                f"the run's record is damaged: {problem}",
+                where=str(path),
+                accepted="a readable file; without it the run cannot be told from another recipe's",
+            ) from error
 
     def _write(self, name: str, data: dict[str, Any]) -> None:
         with atomic_file(self.path / name) as path, output_errors(path):

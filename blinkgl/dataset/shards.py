@@ -34,7 +34,9 @@ _FLOW = LABELS["flow_forward"]
 """What makes a sample: without it there is none."""
 
 
-def export_shards(root: str | Path, out: str | Path, *, shard_bytes: int = 512_000_000, seed: int = 0) -> dict[str, list[int]]:
+def export_shards(
+    root: str | Path, out: str | Path, *, shard_bytes: int = 512_000_000, seed: int = 0
+) -> dict[str, list[int]]:
     """Writes ``<out>/<split>-000000.tar`` …, each whole or not at all; returns the samples per shard of each split.
 
     Labels are put in a random order (``seed``) over all sequences of a split, since shards are read in one go.
@@ -47,7 +49,11 @@ def export_shards(root: str | Path, out: str | Path, *, shard_bytes: int = 512_0
     labels: dict[str, list[tuple[Path, int]]] = {}
     for folder in sequence_folders(root):
         if problems := verify_sequence(folder, checksums=False):
-            raise AssetError(f"damaged sequence: {problems[0]}", where=str(folder), accepted="a data set that 'blinkgl verify' passes")
+            raise AssetError(
+                f"damaged sequence: {problems[0]}",
+                where=str(folder),
+                accepted="a data set that 'blinkgl verify' passes",
+            )
         manifest = read_manifest(folder)
         count = sum(map(_FLOW.forms[0].holds, manifest["files"]))
         labels.setdefault(str(manifest.get("split", "all")), []).extend((folder, k) for k in range(count))
@@ -69,7 +75,9 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
             with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
                 while pending is not None and (counts[-1] == 0 or shard.offset < shard_bytes):
                     for name, data in sample(*pending):
-                        member = tarfile.TarInfo(name)  # owner, mode and time stay at their defaults: the same bytes on every day
+                        member = tarfile.TarInfo(
+                            name
+                        )  # owner, mode and time stay at their defaults: the same bytes on every day
                         member.size = len(data)
                         shard.addfile(member, io.BytesIO(data))
                     counts[-1] += 1
@@ -83,14 +91,24 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     lines = [line for line in (folder / _FLOW.stamps).read_text().splitlines() if not line.startswith("#")]
     start, end = (int(v) for v in lines[k].split(","))
     manifest = read_manifest(folder)
-    about: dict[str, Any] = {"sequence": folder.name, "label": k, "from_us": start, "to_us": end, "height": manifest["height"],
-                             "width": manifest["width"], "emulator": manifest.get("emulator"), "seed": manifest.get("seed")}
+    about: dict[str, Any] = {
+        "sequence": folder.name,
+        "label": k,
+        "from_us": start,
+        "to_us": end,
+        "height": manifest["height"],
+        "width": manifest["width"],
+        "emulator": manifest.get("emulator"),
+        "seed": manifest.get("seed"),
+    }
     with DsecEventReader(folder / "events.h5") as reader:
         windows = {"old": reader.slice(2 * start - end, start), "new": reader.slice(start, end)}
     yield f"{key}.json", json.dumps(about, sort_keys=True).encode()
     for name, events in windows.items():
         yield f"{key}.{name}.npz", _npz(events)
-    for label in sorted((label for label in LABELS.values() if label.shard), key=lambda label: (label is not _FLOW, label.shard)):
+    for label in sorted(
+        (label for label in LABELS.values() if label.shard), key=lambda label: (label is not _FLOW, label.shard)
+    ):
         if (path := folder / label.forms[0].file(k)).is_file():
             yield f"{key}.{label.shard}", path.read_bytes()
 

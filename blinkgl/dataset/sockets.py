@@ -78,7 +78,7 @@ def descendants(pid: int) -> list[int]:
 
 
 def _address(text: str) -> str:
-    """"0100007F" -> "127.0.0.1": the kernel prints words of four bytes in its own byte
+    """ "0100007F" -> "127.0.0.1": the kernel prints words of four bytes in its own byte
     order, which is little-endian here."""
-    data = b"".join(bytes.fromhex(text[k:k + 8])[::-1] for k in range(0, len(text), 8))
+    data = b"".join(bytes.fromhex(text[k : k + 8])[::-1] for k in range(0, len(text), 8))
     return str(ipaddress.ip_address(data))

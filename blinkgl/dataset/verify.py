@@ -37,7 +37,19 @@ _REQUIRED = {"duration_us": int, "seed": int, "sequence": int, "split": str, "la
 _AT_TOP = {INDEX, "report.html"}
 _MOST_MISSING = 1000
 """Missing sequences that get a line each; the others are counted."""
-_SAME_ANYWHERE = ("split", "seed", "sequence", "emulator", "labels", "duration_us", "t_offset_us", "height", "width", "objects", "source")
+_SAME_ANYWHERE = (
+    "split",
+    "seed",
+    "sequence",
+    "emulator",
+    "labels",
+    "duration_us",
+    "t_offset_us",
+    "height",
+    "width",
+    "objects",
+    "source",
+)
 """Of a manifest: what no renderer and no library has a say in."""
 
 
@@ -72,8 +84,14 @@ class _Known:
     config: SequenceConfig
 
 
-def verify_dataset(root: str | Path, *, deep: int = 0, seed: int = 0, base: str | Path | None = None,
-                   progress: Callable[[int, str], None] | None = None) -> Verification:
+def verify_dataset(
+    root: str | Path,
+    *,
+    deep: int = 0,
+    seed: int = 0,
+    base: str | Path | None = None,
+    progress: Callable[[int, str], None] | None = None,
+) -> Verification:
     """Every sequence below ``root``, and what lies between them.
 
     deep : so many sequences, drawn with ``seed``, are generated again and compared bit by bit.
@@ -129,14 +147,20 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
         if problems := verify_sequence(folder):
             return problems
         manifest = read_manifest(folder)
-        if missing := [f"{MANIFEST}: '{key}' is missing or no {kind.__name__}" for key, kind in _REQUIRED.items() if manifest.get(key) is None]:
+        if missing := [
+            f"{MANIFEST}: '{key}' is missing or no {kind.__name__}"
+            for key, kind in _REQUIRED.items()
+            if manifest.get(key) is None
+        ]:
             return missing
         if "config.yaml" not in manifest["files"]:
             return ["config.yaml: missing"]
         config = load_run(folder / "config.yaml").sequence(manifest["sequence"])
         if problems := _bound(name, manifest, config):
             return problems
-        problems = _guarded(lambda: check_events(folder / "events.h5", manifest)) if "events.h5" in manifest["files"] else []
+        problems = (
+            _guarded(lambda: check_events(folder / "events.h5", manifest)) if "events.h5" in manifest["files"] else []
+        )
         problems = [line if line.startswith("events.h5") else f"events.h5: {line}" for line in problems]
         problems += _guarded(lambda: _check_labels(folder, manifest))
         if not problems:
@@ -151,12 +175,26 @@ def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[
     sequence, and is there what it asks for?"""
     index, output = manifest["sequence"], config.output
     path = sequence_name(output, index)
-    said = [("split", output.split), ("seed", config.seed), ("sequence", output.first_index), ("emulator", config.events.emulator)]
+    said = [
+        ("split", output.split),
+        ("seed", config.seed),
+        ("sequence", output.first_index),
+        ("emulator", config.events.emulator),
+    ]
     if config.frames is None:
         t0, t1 = config.time.t0_ns // 1000, config.time.t1_ns // 1000
-        said += [("height", config.camera.height), ("width", config.camera.width), ("t_offset_us", t0), ("duration_us", t1 - t0),
-                 ("labels", config.time.label_count)]
-    problems = [f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}" for key, value in said if manifest.get(key) != value]
+        said += [
+            ("height", config.camera.height),
+            ("width", config.camera.width),
+            ("t_offset_us", t0),
+            ("duration_us", t1 - t0),
+            ("labels", config.time.label_count),
+        ]
+    problems = [
+        f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}"
+        for key, value in said
+        if manifest.get(key) != value
+    ]
     if name != "." and name != (path if "/" in name else path.split("/")[1]):
         problems.append(f"the folder is called {shown(name)}, but holds {path}")
     if config.frames is None and not problems:
@@ -200,9 +238,11 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
         expected = np.zeros(len(ms_to_idx), np.int64)
         marks = np.arange(len(ms_to_idx), dtype=np.int64) * 1000
         for begin in range(0, manifest["events"], _BLOCK):
-            x, y, t, p = (columns[k][begin:begin + _BLOCK].astype(np.int64) for k in "xytp")
+            x, y, t, p = (columns[k][begin : begin + _BLOCK].astype(np.int64) for k in "xytp")
             if (np.diff(t) < 0).any() or t[0] < last:
-                problems.append(f"events.h5: times decrease after event {begin + int(np.argmax(np.diff(t, prepend=last) < 0))}")
+                problems.append(
+                    f"events.h5: times decrease after event {begin + int(np.argmax(np.diff(t, prepend=last) < 0))}"
+                )
                 break
             last = int(t[-1])
             if x.max() >= manifest["width"] or y.max() >= manifest["height"] or min(x.min(), y.min()) < 0:
@@ -216,7 +256,9 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
             if manifest["events"] and last > end:
                 problems.append(f"events.h5: last event at {last} µs, the sequence ends at {end} µs")
             if (wrong := np.flatnonzero(ms_to_idx != expected)).size:
-                problems.append(f"events.h5: ms_to_idx[{wrong[0]}] is {ms_to_idx[wrong[0]]}, expected {expected[wrong[0]]}")
+                problems.append(
+                    f"events.h5: ms_to_idx[{wrong[0]}] is {ms_to_idx[wrong[0]]}, expected {expected[wrong[0]]}"
+                )
     return problems
 
 
@@ -235,10 +277,18 @@ def _check_labels(folder: Path, manifest: dict[str, Any]) -> list[str]:
 
 def _check_times(folder: Path, manifest: dict[str, Any], label: Label, files: list[str]) -> list[str]:
     problems = []
-    where, begin, end = label.forms[0].folder, manifest["t_offset_us"], manifest["t_offset_us"] + manifest["duration_us"]
+    where, begin, end = (
+        label.forms[0].folder,
+        manifest["t_offset_us"],
+        manifest["t_offset_us"] + manifest["duration_us"],
+    )
     count = manifest["labels"]
     if label.stamps is None or label.stamps not in manifest["files"]:
-        return [] if len(files) == count + label.at_last else [f"{where}: {len(files)} files, manifest says {count} labels"]
+        return (
+            []
+            if len(files) == count + label.at_last
+            else [f"{where}: {len(files)} files, manifest says {count} labels"]
+        )
     lines = [line for line in (folder / label.stamps).read_text().splitlines() if line and not line.startswith("#")]
     if label.towards is None:
         times = [int(line) for line in lines]
@@ -250,7 +300,9 @@ def _check_times(folder: Path, manifest: dict[str, Any], label: Label, files: li
         pairs = [tuple(int(v) for v in line.split(",")) for line in lines]
         if not len(files) == len(pairs) == count:
             problems.append(f"{where}: {len(files)} files, {len(pairs)} time stamps, manifest says {count} labels")
-        if any(not begin <= t <= end for pair in pairs for t in pair) or any((b > a) != (label.towards == "forward") for a, b in pairs):
+        if any(not begin <= t <= end for pair in pairs for t in pair) or any(
+            (b > a) != (label.towards == "forward") for a, b in pairs
+        ):
             problems.append(f"{label.stamps}: an interval leaves the sequence or runs the wrong way")
     return problems
 
@@ -313,22 +365,38 @@ def _twins(known: dict[str, _Known], result: Verification) -> dict[str, list[str
     for name, one in known.items():
         files, config = one.manifest["files"], one.config
         random_scene = config.frames is None and config.scene.kind == "random"
-        looked = [f for f, tells in (("events.h5", one.manifest["events"] > 0), ("poses.npz", random_scene)) if tells and f in files]
+        looked = [
+            f
+            for f, tells in (("events.h5", one.manifest["events"] > 0), ("poses.npz", random_scene))
+            if tells and f in files
+        ]
         for file in looked:
             other = seen.setdefault((file, files[file]["sha256"]), name)
             if other == name:
                 continue
             numbers = [(known[n].config.seed, known[n].manifest["sequence"]) for n in (name, other)]
             if numbers[0] != numbers[1] and (random_scene or _noisy(config)):
-                problems.setdefault(name, []).append(f"{file}: the same as in {shown(other)}, a sequence of another draw")
+                problems.setdefault(name, []).append(
+                    f"{file}: the same as in {shown(other)}, a sequence of another draw"
+                )
             elif file == "events.h5":
-                result.notes.append(f"{shown(name)}: the same events as {shown(other)}, as their configurations have it")
+                result.notes.append(
+                    f"{shown(name)}: the same events as {shown(other)}, as their configurations have it"
+                )
     return problems
 
 
 def _noisy(config: SequenceConfig) -> bool:
     """Whether two seeds give two pixel arrays."""
-    drawn = ("threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6")
+    drawn = (
+        "threshold_sigma",
+        "threshold_jitter",
+        "leak_rate_hz",
+        "shot_noise_rate_hz",
+        "hot_pixel_fraction",
+        "k3",
+        "k6",
+    )
     return any(getattr(config.events, key, 0) > 0 for key in drawn)
 
 
@@ -347,13 +415,22 @@ def _against_run(root: Path, folders: list[Path], known: dict[str, _Known], resu
         if task.name not in here:
             missing += 1
             if missing <= _MOST_MISSING:
-                result.add(task.name, [f"set aside: {shown(failed[task.name])}" if task.name in failed else "missing: the recipe asks for it"])
+                result.add(
+                    task.name,
+                    [
+                        f"set aside: {shown(failed[task.name])}"
+                        if task.name in failed
+                        else "missing: the recipe asks for it"
+                    ],
+                )
     if missing > _MOST_MISSING:
         problems.append(f"and {missing - _MOST_MISSING} more sequences that the recipe asks for are missing")
     if record.get("mixed"):
         result.notes.append("the run went on with --mixed: configurations and OpenGL were not compared with its record")
         return problems
-    groups = {f"{g.template.tree.get('output', {}).get('split', 'train')}/{_called(g.template)}": g for g in plan.groups}
+    groups = {
+        f"{g.template.tree.get('output', {}).get('split', 'train')}/{_called(g.template)}": g for g in plan.groups
+    }
     environment = record.get("environment", {})
     for name, one in known.items():
         group = groups.get(re.sub(r"_\d{6,}$", "", name))
@@ -363,15 +440,24 @@ def _against_run(root: Path, folders: list[Path], known: dict[str, _Known], resu
         drawn = group.template.sequence(one.manifest["sequence"])
         if where := _first_difference(_comparable(one.config), _comparable(drawn)):
             result.add(name, [f"config.yaml: the recipe draws another value for {where}"])
-        result.add(name, [f"{MANIFEST}: made with {key} {shown(value)}, the run's record says {shown(environment[key])}"
-                          for key, value in _made_with(one.manifest).items() if environment.get(key, value) != value])
+        result.add(
+            name,
+            [
+                f"{MANIFEST}: made with {key} {shown(value)}, the run's record says {shown(environment[key])}"
+                for key, value in _made_with(one.manifest).items()
+                if environment.get(key, value) != value
+            ],
+        )
     return problems
 
 
 def _made_with(manifest: dict[str, Any]) -> dict[str, str]:
     """Versions and OpenGL, under the names that the run's record has for them."""
     gl = manifest.get("opengl") or {}
-    return {**(manifest.get("versions") or {}), **({"opengl": f"{gl.get('renderer')}, {gl.get('version')}"} if gl else {})}
+    return {
+        **(manifest.get("versions") or {}),
+        **({"opengl": f"{gl.get('renderer')}, {gl.get('version')}"} if gl else {}),
+    }
 
 
 def _called(template: RunTemplate) -> str:
@@ -454,7 +540,9 @@ def _compared(name: str, one: _Known, made: Path, result: Verification) -> list[
     if not (apart := _apart(one.manifest, manifest)):
         return [f"made again, {line}" for line in lines]
     result.in_part.append(name)
-    problems = [f"made again, {MANIFEST}: {key} differs" for key in _SAME_ANYWHERE if one.manifest.get(key) != manifest.get(key)]
+    problems = [
+        f"made again, {MANIFEST}: {key} differs" for key in _SAME_ANYWHERE if one.manifest.get(key) != manifest.get(key)
+    ]
     problems += [f"made again, {line}" for line in lines if line.endswith("only in one of them")]
     depend = []
     for file in sorted(set(one.manifest["files"]) & set(manifest["files"])):
@@ -463,8 +551,11 @@ def _compared(name: str, one: _Known, made: Path, result: Verification) -> list[
                 depend.append(file)
             else:
                 problems.append(f"made again, {file}: differs by more than a renderer can")
-    result.notes.append(f"{shown(name)}: {apart}; of {len(depend)} files that may depend on it the bytes were not compared: "
-                        + ", ".join(depend[:4]) + (" …" if len(depend) > 4 else ""))
+    result.notes.append(
+        f"{shown(name)}: {apart}; of {len(depend)} files that may depend on it the bytes were not compared: "
+        + ", ".join(depend[:4])
+        + (" …" if len(depend) > 4 else "")
+    )
     return problems
 
 
@@ -472,7 +563,9 @@ def _apart(one: dict[str, Any], other: dict[str, Any]) -> str:
     """What may make the bytes of two machines differ; "" where nothing does."""
     mine, here = ({"BlinkGL": manifest.get("blinkgl"), **_made_with(manifest)} for manifest in (one, other))
     different = [k for k in mine.keys() | here.keys() if mine.get(k) != here.get(k)]
-    return "; ".join(f"made with {k} {shown(mine.get(k))}, this machine has {shown(here.get(k))}" for k in sorted(different))
+    return "; ".join(
+        f"made with {k} {shown(mine.get(k))}, this machine has {shown(here.get(k))}" for k in sorted(different)
+    )
 
 
 def _agrees(file: str, one: Path, other: Path) -> bool:
@@ -487,8 +580,14 @@ def _agrees(file: str, one: Path, other: Path) -> bool:
     if file == "poses.npz":
         with np.load(a, allow_pickle=False) as p, np.load(b, allow_pickle=False) as q:
             return set(p.files) == set(q.files) and all(
-                p[k].shape == q[k].shape and (np.allclose(p[k], q[k], rtol=1e-9, atol=1e-9) if p[k].dtype.kind == "f" else np.array_equal(p[k], q[k]))
-                for k in p.files)
+                p[k].shape == q[k].shape
+                and (
+                    np.allclose(p[k], q[k], rtol=1e-9, atol=1e-9)
+                    if p[k].dtype.kind == "f"
+                    else np.array_equal(p[k], q[k])
+                )
+                for k in p.files
+            )
     for label in LABELS.values():
         if label.forms[0].holds(file):
             return label.agrees(label.forms[0].read(a), label.forms[0].read(b))
@@ -499,4 +598,8 @@ def differences(a: Path, b: Path) -> list[str]:
     """Files in which two folders differ, one line each."""
     names = [{p.relative_to(f).as_posix() for p in f.rglob("*") if p.is_file()} for f in (a, b)]
     lines = [f"{shown(name)}: only in one of them" for name in sorted(names[0] ^ names[1])]
-    return lines + [f"{shown(name)}: differs" for name in sorted(names[0] & names[1]) if (a / name).read_bytes() != (b / name).read_bytes()]
+    return lines + [
+        f"{shown(name)}: differs"
+        for name in sorted(names[0] & names[1])
+        if (a / name).read_bytes() != (b / name).read_bytes()
+    ]

@@ -86,7 +86,9 @@ class Maker:
         rendered = [config.gl for config in rendered if config.frames is None]
         if rendered:
             if any(gl != rendered[0] for gl in rendered):
-                raise ConfigError("the groups ask for different OpenGL", where="gl", accepted="one gl section at the top level")
+                raise ConfigError(
+                    "the groups ask for different OpenGL", where="gl", accepted="one gl section at the top level"
+                )
             self.gl = create_context(rendered[0].backend, rendered[0].device if self.device is None else self.device)
         return {"kind": "hello", "pid": os.getpid(), "environment": environment(self.gl), "assets": digest(assets)}
 
@@ -102,27 +104,55 @@ class Maker:
             nonlocal last
             if (now := time.monotonic()) - last > _NEWS_EVERY_S:
                 last = now
-                tell({"kind": "progress", "task": number, "frames": report.frames, "events": report.events, "fraction": fraction,
-                      "seconds": dict(report.seconds), "omissions": list(report.omissions)})
+                tell(
+                    {
+                        "kind": "progress",
+                        "task": number,
+                        "frames": report.frames,
+                        "events": report.events,
+                        "fraction": fraction,
+                        "seconds": dict(report.seconds),
+                        "omissions": list(report.omissions),
+                    }
+                )
 
         try:
             config = self.plan.config(task)
-            report = generate_sequence(config, task.index, self.job.out, self.gl, base=Path(self.job.base), progress=progress)
+            report = generate_sequence(
+                config, task.index, self.job.out, self.gl, base=Path(self.job.base), progress=progress
+            )
         except (KeyboardInterrupt, SystemExit):
             log.write("interrupted")
             raise
         except Exception as error:  # noqa: BLE001 - whatever it is, the other sequences go on
-            line = str(error) if isinstance(error, BlinkGLError) else f"{type(error).__name__}: {' '.join(str(error).split())}"
+            line = (
+                str(error)
+                if isinstance(error, BlinkGLError)
+                else f"{type(error).__name__}: {' '.join(str(error).split())}"
+            )
             log.write("failed: " + line)
             log.write(traceback.format_exc())
-            return {"kind": "failed", "task": number, "error": line, "expected": isinstance(error, BlinkGLError),
-                    "final": not may_pass(error), "stop": _disk_is_full(error)}
+            return {
+                "kind": "failed",
+                "task": number,
+                "error": line,
+                "expected": isinstance(error, BlinkGLError),
+                "final": not may_pass(error),
+                "stop": _disk_is_full(error),
+            }
         size = sum(p.stat().st_size for p in report.path.rglob("*") if p.is_file())
-        log.write(f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} "
-                  f"labels, {size} bytes; "
-                  + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items()))
-        return {"kind": "done", "task": number, "bytes": size, "cpu_s": time.process_time() - cpu, "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
-                "report": {**asdict(report), "path": str(report.path)}}
+        log.write(
+            f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} "
+            f"labels, {size} bytes; " + ", ".join(f"{k} {v:.2f} s" for k, v in report.seconds.items())
+        )
+        return {
+            "kind": "done",
+            "task": number,
+            "bytes": size,
+            "cpu_s": time.process_time() - cpu,
+            "peak_rss_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+            "report": {**asdict(report), "path": str(report.path)},
+        }
 
     def __enter__(self) -> Maker:
         return self
@@ -144,13 +174,19 @@ def environment(gl: GLContext | None) -> dict[str, str]:
     import numpy
     import scipy
 
-    return {"blinkgl": f"{__version__} ({_source_hash()})", "python": platform.python_version(), "machine": platform.machine(), "numpy": numpy.__version__,
-            "scipy": scipy.__version__, "numba": numba.__version__,
-            "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used"}
+    return {
+        "blinkgl": f"{__version__} ({_source_hash()})",
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "numpy": numpy.__version__,
+        "scipy": scipy.__version__,
+        "numba": numba.__version__,
+        "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used",
+    }
 
 
 def environment_differences(one: dict[str, str], other: dict[str, str]) -> str:
-    """"numpy 2.4 and 2.3; …", empty when they agree."""
+    """ "numpy 2.4 and 2.3; …", empty when they agree."""
     return "; ".join(f"{key} {one.get(key)} and {value}" for key, value in other.items() if one.get(key) != value)
 
 

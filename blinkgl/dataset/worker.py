@@ -36,7 +36,7 @@ def main() -> int:
         try:
             with one_at_a_time:
                 while data:  # not a buffered file: a thread in the middle of one at exit is a fatal error of Python's
-                    data = data[os.write(channel, data):]
+                    data = data[os.write(channel, data) :]
         except OSError:  # nobody listens any more
             raise KeyboardInterrupt from None
 

@@ -43,8 +43,15 @@ class EventCamera:
     emulator : the :class:`Emulator` itself.   Raises EventDataError: size, or a path that
                                                the emulator cannot follow."""
 
-    def __init__(self, config: EmulatorConfig, readout: ReadoutConfig | None, height: int, width: int, seed: int,
-                 reconstruction: str = "linear"):
+    def __init__(
+        self,
+        config: EmulatorConfig,
+        readout: ReadoutConfig | None,
+        height: int,
+        width: int,
+        seed: int,
+        reconstruction: str = "linear",
+    ):
         self.emulator = make_emulator(config, height, width, seed, reconstruction)
         self._readout = None if readout is None else Readout(readout)
 
@@ -93,8 +100,11 @@ class EventCamera:
         return self._readout.step(events, self.done_ns // 1000)
 
 
-def emulate(frames: Iterable[EventFrame], camera: EventCamera,
-            clock: Callable[[str], AbstractContextManager] = lambda _: nullcontext()) -> Iterator[tuple[int, Events]]:
+def emulate(
+    frames: Iterable[EventFrame],
+    camera: EventCamera,
+    clock: Callable[[str], AbstractContextManager] = lambda _: nullcontext(),
+) -> Iterator[tuple[int, Events]]:
     """(t_ns, events) frame by frame: all events before t_ns's microsecond that have not been given before.
 
     The loop asks for a frame, takes its events and gives them away before it asks for the next.

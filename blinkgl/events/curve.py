@@ -61,7 +61,9 @@ def slope_at_end(near: float, far: float, near_ns: float, far_ns: float) -> floa
 
 
 @register_jitable
-def end_slopes(older: float, before: float, now: float, newer: float, dt_ns: float, older_ns: float, newer_ns: float) -> tuple[float, float]:
+def end_slopes(
+    older: float, before: float, now: float, newer: float, dt_ns: float, older_ns: float, newer_ns: float
+) -> tuple[float, float]:
     """(alpha, beta) of an interval from the log intensities of four frames; older_ns or
     newer_ns 0: there is no such frame."""
     change = np.float64(now - before)

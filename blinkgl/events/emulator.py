@@ -84,11 +84,17 @@ class Emulator(ABC):
 
     def __init__(self, height: int, width: int, seed: int, reconstruction: str = "linear"):
         if reconstruction not in self.Config.reconstructions:
-            raise EventDataError(f"{type(self).__name__} cannot follow this path between frames", where="timeline.reconstruction",
-                                 value=reconstruction, accepted=", ".join(self.Config.reconstructions))
+            raise EventDataError(
+                f"{type(self).__name__} cannot follow this path between frames",
+                where="timeline.reconstruction",
+                value=reconstruction,
+                accepted=", ".join(self.Config.reconstructions),
+            )
         self.reconstruction = reconstruction
         if not (1 <= height < MAX_SIDE and 1 <= width < MAX_SIDE and height * width < 2**31):
-            raise EventDataError("frame size out of range", value=(height, width), accepted=f"1 to {MAX_SIDE - 1} rows and columns")
+            raise EventDataError(
+                "frame size out of range", value=(height, width), accepted=f"1 to {MAX_SIDE - 1} rows and columns"
+            )
         self.height, self.width = int(height), int(width)
         self.seed = np.uint64(int(seed) & (2**64 - 1))
         self.t_ns: int | None = None
@@ -107,7 +113,9 @@ class Emulator(ABC):
         """Linear luminance of each uint8 value, (256,) float32; the default is k / 255. An sRGB video wants the
         sRGB curve here: 8-bit input then costs a table look-up and no conversion."""
         table = np.ascontiguousarray(table, np.float32)
-        if table.shape != (256,) or not (np.isfinite(table).all() and table.min() >= 0 and table.max() <= LOG_MAX_INPUT):
+        if table.shape != (256,) or not (
+            np.isfinite(table).all() and table.min() >= 0 and table.max() <= LOG_MAX_INPUT
+        ):
             raise EventDataError("decode table must hold 256 finite values >= 0", value=table.shape)
         self._decode = table
         self._tables_changed()
@@ -130,7 +138,9 @@ class Emulator(ABC):
         """Time up to which events have been returned; None before the first frame."""
         return self.t_ns
 
-    def step(self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None, rate: np.ndarray | None = None) -> Events:
+    def step(
+        self, luminance: np.ndarray, t_ns: int, rows: tuple[int, int] | None = None, rate: np.ndarray | None = None
+    ) -> Events:
         """Events since the last frame; see the class.
 
         rows : the caller's word that rows outside [y0, y1) are the same as in the frame before (None: any may differ)
@@ -145,7 +155,9 @@ class Emulator(ABC):
         whole = (0, self.height)
         here = whole if rows is None or self.t_ns is None else (max(0, rows[0]), min(self.height, rows[1]))
         first, stop = here
-        if self.needs_rate:  # where there was a rate in the frame before there is none now: slopes are part of the state
+        if (
+            self.needs_rate
+        ):  # where there was a rate in the frame before there is none now: slopes are part of the state
             before = self._rows_before or whole
             if before[0] < before[1]:
                 first, stop = (min(first, before[0]), max(stop, before[1])) if first < stop else before
@@ -159,18 +171,30 @@ class Emulator(ABC):
     def _checked_frame(self, luminance: np.ndarray) -> np.ndarray:
         frame = np.asarray(luminance)
         if frame.shape != (self.height, self.width):
-            raise EventDataError("frame size changed", where=f"frame {self.frames}", value=frame.shape,
-                                 accepted=f"({self.height}, {self.width})")
+            raise EventDataError(
+                "frame size changed",
+                where=f"frame {self.frames}",
+                value=frame.shape,
+                accepted=f"({self.height}, {self.width})",
+            )
         if frame.dtype != np.uint8 and frame.dtype != np.float32:
-            raise EventDataError("unsupported frame type", where=f"frame {self.frames}", value=str(frame.dtype),
-                                 accepted="float32 linear luminance or uint8")
+            raise EventDataError(
+                "unsupported frame type",
+                where=f"frame {self.frames}",
+                value=str(frame.dtype),
+                accepted="float32 linear luminance or uint8",
+            )
         return _flat(frame)
 
     def _checked_rate(self, rate: np.ndarray | None) -> np.ndarray:
         shape, dtype = (None, None) if rate is None else (np.shape(rate), np.asarray(rate).dtype)
         if rate is None or shape != (self.height, self.width) or dtype != np.float32:
-            raise EventDataError("hermite wants the rate of change of every pixel", where=f"frame {self.frames}", value=(shape, str(dtype)),
-                                 accepted=f"({self.height}, {self.width}) float32")
+            raise EventDataError(
+                "hermite wants the rate of change of every pixel",
+                where=f"frame {self.frames}",
+                value=(shape, str(dtype)),
+                accepted=f"({self.height}, {self.width}) float32",
+            )
         return _flat(rate)
 
     def flush(self) -> Events:
@@ -182,13 +206,23 @@ class Emulator(ABC):
         try:
             t_ns = int(t_ns)
         except (TypeError, ValueError, OverflowError):
-            raise EventDataError("not a time stamp", where=f"frame {self.frames}", value=t_ns, accepted="whole nanoseconds") from None
+            raise EventDataError(
+                "not a time stamp", where=f"frame {self.frames}", value=t_ns, accepted="whole nanoseconds"
+            ) from None
         if self.t_ns is not None and t_ns <= self.t_ns:
-            raise EventDataError("time stamps must increase", where=f"frame {self.frames}", value=f"{t_ns} ns",
-                                 accepted=f"more than {self.t_ns} ns")
+            raise EventDataError(
+                "time stamps must increase",
+                where=f"frame {self.frames}",
+                value=f"{t_ns} ns",
+                accepted=f"more than {self.t_ns} ns",
+            )
         if abs(t_ns) >= 2**61 or (self.t_ns is not None and t_ns - self.t_ns > MAX_INTERVAL_NS):
-            raise EventDataError("time stamp out of range", where=f"frame {self.frames}", value=f"{t_ns} ns",
-                                 accepted="at most 17 minutes between two frames")
+            raise EventDataError(
+                "time stamp out of range",
+                where=f"frame {self.frames}",
+                value=f"{t_ns} ns",
+                accepted="at most 17 minutes between two frames",
+            )
         return t_ns
 
     def _check_intensity(self, frame: np.ndarray) -> None:
@@ -199,8 +233,12 @@ class Emulator(ABC):
         bad = np.flatnonzero(~((frame >= 0) & (frame <= LOG_MAX_INPUT)))  # -0.0 is not bad
         if bad.size:
             y, x = divmod(int(bad[0]), self.width)
-            error = EventDataError(f"intensity at pixel x={x}, y={y} cannot be used", where=f"frame {self.frames}",
-                                   value=float(frame[bad[0]]), accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}")
+            error = EventDataError(
+                f"intensity at pixel x={x}, y={y} cannot be used",
+                where=f"frame {self.frames}",
+                value=float(frame[bad[0]]),
+                accepted=f"a finite value from 0 to {LOG_MAX_INPUT:.3g}",
+            )
             error.pixel = (x, y)
             raise error
 
@@ -253,11 +291,15 @@ class Emulator(ABC):
         """Restore :meth:`state_dict`'s result into an emulator built with the same size, config and seed."""
         wanted = {name for name in self._state if getattr(self, name) is not None} | {"clock", "shape"}
         if set(state) != wanted or tuple(state["shape"]) != (self.height, self.width):
-            raise EventDataError("saved state is of another emulator", value=sorted(state), accepted=", ".join(sorted(wanted)))
+            raise EventDataError(
+                "saved state is of another emulator", value=sorted(state), accepted=", ".join(sorted(wanted))
+            )
         for name in wanted - {"clock", "shape"}:
             mine, theirs = getattr(self, name), np.asarray(state[name])
             if theirs.dtype != mine.dtype or theirs.shape != mine.shape:
-                raise EventDataError("saved state is of another emulator", where=name, value=(theirs.dtype, theirs.shape))
+                raise EventDataError(
+                    "saved state is of another emulator", where=name, value=(theirs.dtype, theirs.shape)
+                )
             mine[...] = theirs
         started, t_ns, self.frames, self.saturated = (int(v) for v in state["clock"])
         self.t_ns, self._rows_before = t_ns if started else None, None

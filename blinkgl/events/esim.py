@@ -129,7 +129,10 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
         polarity = np.int64(level >= above)
         gap = max(level - above, below - level)  # how far the signal ends beyond the level being passed
         pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity  # the word of packing.py but for its time
-        step_on, step_off = v.on_all, v.off_all  # the pixel's own thresholds; ``up`` and ``down`` are those now in force, with jitter
+        step_on, step_off = (
+            v.on_all,
+            v.off_all,
+        )  # the pixel's own thresholds; ``up`` and ``down`` are those now in force, with jitter
         if p.on.size:
             step_on, step_off = np.int64(p.on[i]), np.int64(p.off[i])
         up, down = step_on, step_off
@@ -144,7 +147,9 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
             else:
                 older = np.int64(curve.older[i]) if curve.older_ns > 0.0 else before
                 newer = np.int64(curve.newer[i]) if curve.newer_ns > 0.0 else level
-                alpha, beta = end_slopes(older, before, level, newer, np.float64(v.dt_ns), curve.older_ns, curve.newer_ns)
+                alpha, beta = end_slopes(
+                    older, before, level, newer, np.float64(v.dt_ns), curve.older_ns, curve.newer_ns
+                )
         # One turn per level passed. All are of one polarity, since neither a line nor a monotone cubic turns back.
         while gap >= 0:
             if curve is None:
@@ -152,7 +157,9 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
             else:
                 s = curve_time((whole - gap) / whole, alpha, beta, s)
                 after_ns = start_ns + np.int64(s * v.dt_ns)
-            alive = True  # out of the refractory period; if not, the event is lost, but the reference moves all the same
+            alive = (
+                True  # out of the refractory period; if not, the event is lost, but the reference moves all the same
+            )
             if p.last_ns.size:
                 alive = v.base_us * 1000 + after_ns - p.last_ns[i] >= v.refractory_ns
                 if alive:
@@ -203,7 +210,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
-            if filled + count * cap > packed.size:  # no room for the worst case; nothing of this block has been touched: the caller
+            if (
+                filled + count * cap > packed.size
+            ):  # no room for the worst case; nothing of this block has been touched: the caller
                 return block, filled, cut  # makes room and comes back to it
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, None, None)
             cut += cut_here
@@ -215,14 +224,18 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
     b = take_part(taken, start)
     while b >= 0:
-        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v)
+        block, filled, cut = _band(
+            progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v
+        )
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
 
 
 @numba.njit(**JIT)
-def _band_curve(first_block, stop_block, share, packed, filled, frame, codes, table, rate, decode, log_now, curve, p, v):
+def _band_curve(
+    first_block, stop_block, share, packed, filled, frame, codes, table, rate, decode, log_now, curve, p, v
+):
     """Band kernel for cubics. With slopes (``rate`` given, per second): the interval up to ``frame``. Without: the
     interval up to ``log_now``; the frame that lies after it only goes into ``curve.newer``."""
     cut, pixels = 0, p.log.size
@@ -270,8 +283,22 @@ def _band_curve(first_block, stop_block, share, packed, filled, frame, codes, ta
 def _bands_curve(taken, start, edges, progress, share, packed, frame, codes, table, rate, decode, log_now, curve, p, v):
     b = take_part(taken, start)
     while b >= 0:
-        block, filled, cut = _band_curve(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, rate,
-                                         decode, log_now, curve, p, v)
+        block, filled, cut = _band_curve(
+            progress[b, 0],
+            edges[b + 1],
+            share,
+            packed[b],
+            progress[b, 1],
+            frame,
+            codes,
+            table,
+            rate,
+            decode,
+            log_now,
+            curve,
+            p,
+            v,
+        )
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
@@ -282,7 +309,9 @@ def to_q25(value: float | np.ndarray) -> np.ndarray:
     return np.floor(np.asarray(value, np.float64) * Q_ONE + 0.5).astype(np.int64)
 
 
-def draw_thresholds(height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64) -> tuple[np.ndarray, np.ndarray]:
+def draw_thresholds(
+    height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64
+) -> tuple[np.ndarray, np.ndarray]:
     """Per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 10.
 
     For nominal thresholds under 0.02 the floor is half the nominal one.
@@ -306,13 +335,24 @@ class Esim(Emulator):
 
     @classmethod
     def noiseless(cls, config: EsimConfig) -> EsimConfig:
-        return EsimConfig(contrast_threshold=config.contrast_threshold, contrast_threshold_off=config.contrast_threshold_off,
-                          threshold_sigma=config.threshold_sigma)
+        return EsimConfig(
+            contrast_threshold=config.contrast_threshold,
+            contrast_threshold_off=config.contrast_threshold_off,
+            threshold_sigma=config.threshold_sigma,
+        )
 
-    def __init__(self, height: int, width: int, config: EsimConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
+    def __init__(
+        self, height: int, width: int, config: EsimConfig | None = None, seed: int = 0, reconstruction: str = "linear"
+    ):
         super().__init__(height, width, seed, reconstruction)
-        self._state = ("_upper", "_lower", "_fired", "_last_ns", *(("_ring", "_ring_ns", "_ring_rows", "_passed") if self.lags else ("_log",)),
-                       *(("_slope",) if self.needs_rate else ()))
+        self._state = (
+            "_upper",
+            "_lower",
+            "_fired",
+            "_last_ns",
+            *(("_ring", "_ring_ns", "_ring_rows", "_passed") if self.lags else ("_log",)),
+            *(("_slope",) if self.needs_rate else ()),
+        )
         self.config = config = config or EsimConfig()
         pixels = self.height * self.width
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
@@ -320,8 +360,10 @@ class Esim(Emulator):
         self._on = self._off = np.empty(0, np.int32)
         smallest = min(self._on_all, self._off_all)
         if config.threshold_sigma:
-            self._on, self._off = (to_q25(c).astype(np.int32) for c in
-                                   draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed))
+            self._on, self._off = (
+                to_q25(c).astype(np.int32)
+                for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
+            )
             smallest = int(min(self._on.min(), self._off.min()))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))
         if config.threshold_jitter:
@@ -334,7 +376,11 @@ class Esim(Emulator):
         if self.lags:
             # The last four frames, frame k in row k mod 4: their logs, times, and the pixels [first, stop) in which
             # each differs from the one before it.
-            self._ring, self._ring_ns, self._ring_rows = np.zeros((4, pixels), np.int32), np.zeros(4, np.int64), np.zeros((4, 2), np.int64)
+            self._ring, self._ring_ns, self._ring_rows = (
+                np.zeros((4, pixels), np.int32),
+                np.zeros(4, np.int64),
+                np.zeros((4, 2), np.int64),
+            )
             self._passed = np.zeros(1, np.int64)  # number of the frame up to which events have been returned
         else:
             self._log = np.zeros(pixels, np.int32)
@@ -372,8 +418,12 @@ class Esim(Emulator):
         base_us = self.t_ns // 1000
         if self.needs_rate:
             curve = Curve(NO_LOG, NO_LOG, 0.0, 0.0)
-            return self._run(_bands_curve, (*source, rate, self._decode, NO_LOG, curve, levels, interval), base_us,
-                             t_ns // 1000 - base_us)
+            return self._run(
+                _bands_curve,
+                (*source, rate, self._decode, NO_LOG, curve, levels, interval),
+                base_us,
+                t_ns // 1000 - base_us,
+            )
         return self._run(_bands, (*source, levels, interval), base_us, t_ns // 1000 - base_us)
 
     def _advance_late(self, source: tuple, t_ns: int) -> Events:
@@ -382,10 +432,15 @@ class Esim(Emulator):
         if self._passed[0] < k - 1:
             self._ring_ns[k % 4] = t_ns
             return self._pass_interval(k - 1, source)
-        log, first, stop = self._ring[k % 4], *self._stale(k)  # the interval before is done: only the first frame, and after flush
+        log, first, stop = (
+            self._ring[k % 4],
+            *self._stale(k),
+        )  # the interval before is done: only the first frame, and after flush
         frame, codes, table = (a[first:stop] if j < 2 else a for j, a in enumerate(source))
         if first < stop:
-            lookup_block(codes, table, log[first:stop]) if codes.size else log_block(frame, np.float32(self.config.log_eps), log[first:stop])
+            lookup_block(codes, table, log[first:stop]) if codes.size else log_block(
+                frame, np.float32(self.config.log_eps), log[first:stop]
+            )
         self._ring_ns[k % 4] = t_ns
         return Events.empty()
 
@@ -399,16 +454,27 @@ class Esim(Emulator):
     def _pass_interval(self, k: int, source: tuple | None) -> Events:
         """Events between frames k - 1 and k; ``source`` is frame k + 1, None when there is none yet."""
         ring, ns = (lambda j: self._ring[j % 4]), (lambda j: int(self._ring_ns[j % 4]))
-        curve = Curve(ring(k - 2) if k >= 2 else NO_LOG, ring(k + 1) if source else NO_LOG,
-                      float(ns(k - 1) - ns(k - 2)) if k >= 2 else 0.0, float(ns(k + 1) - ns(k)) if source else 0.0)
+        curve = Curve(
+            ring(k - 2) if k >= 2 else NO_LOG,
+            ring(k + 1) if source else NO_LOG,
+            float(ns(k - 1) - ns(k - 2)) if k >= 2 else 0.0,
+            float(ns(k + 1) - ns(k)) if source else 0.0,
+        )
         if source:
             self._changed = self._stale(k + 1)
         else:
             self._changed = tuple(self._ring_rows[k % 4].tolist())
         self._passed[0] = k
         base_us = ns(k - 1) // 1000
-        arguments = (*(source or (NO_FRAME, NO_CODES, self._table)), NO_FRAME, self._decode, ring(k), curve,
-                     self._levels(ring(k - 1)), self._interval(ns(k - 1), ns(k)))
+        arguments = (
+            *(source or (NO_FRAME, NO_CODES, self._table)),
+            NO_FRAME,
+            self._decode,
+            ring(k),
+            curve,
+            self._levels(ring(k - 1)),
+            self._interval(ns(k - 1), ns(k)),
+        )
         return self._run(_bands_curve, arguments, base_us, ns(k) // 1000 - base_us)
 
     @property
@@ -425,7 +491,19 @@ class Esim(Emulator):
 
     def _interval(self, t0_ns: int, t1_ns: int) -> Interval:
         dt_ns = t1_ns - t0_ns
-        return Interval(t0_ns, dt_ns, t0_ns // 1000, np.float32(self.config.log_eps), self._on_all, self._off_all,
-                        self.config.threshold_jitter * Q_ONE, self._floor_on, self._floor_off, self._refractory_ns,
-                        self._inverse_threshold, dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
-                        self.seed, self.width)
+        return Interval(
+            t0_ns,
+            dt_ns,
+            t0_ns // 1000,
+            np.float32(self.config.log_eps),
+            self._on_all,
+            self._off_all,
+            self.config.threshold_jitter * Q_ONE,
+            self._floor_on,
+            self._floor_off,
+            self._refractory_ns,
+            self._inverse_threshold,
+            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
+            self.seed,
+            self.width,
+        )

@@ -137,13 +137,22 @@ class PackedBuffer:
             self._histogram = np.empty(parts << digit_bits, np.int64)
         histogram = self._histogram[: parts << digit_bits].reshape(parts, 1 << digit_bits)
         mask, edges = (1 << digit_bits) - 1, total * np.arange(parts + 1) // parts
-        source, starts, first_row = self._rows.reshape(-1), self._rows.shape[1] * np.arange(len(counts)), _even_split(counts, parts)
+        source, starts, first_row = (
+            self._rows.reshape(-1),
+            self._rows.shape[1] * np.arange(len(counts)),
+            _even_split(counts, parts),
+        )
         for k, low in enumerate(range(0, bits, digit_bits)):
             target, shift = self._sorted[k % 2], T_SHIFT + low
             run(_count_parts, parts, (source, starts, counts, first_row, shift, mask, histogram), threads)
             _histograms_to_offsets(histogram)
             run(_scatter_parts, parts, (source, starts, counts, first_row, shift, mask, histogram, target), threads)
-            source, starts, counts, first_row = target, edges[:-1], np.diff(edges), np.arange(parts + 1)  # contiguous from now on
+            source, starts, counts, first_row = (
+                target,
+                edges[:-1],
+                np.diff(edges),
+                np.arange(parts + 1),
+            )  # contiguous from now on
         x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
         t, p = np.empty(total, np.int64), np.empty(total, np.uint8)
         run(_unpack_parts, parts, (source, edges, base_us, x, y, t, p), threads)

@@ -84,7 +84,9 @@ class Readout:
     def _serve(self, events: Events) -> Events:
         """Those that find a place, with the times at which they leave."""
         if max(abs(int(events.t[0])), abs(int(events.t[-1]))) > 2**43:
-            raise EventDataError("event time too large for the read-out model", value=int(events.t[-1]), accepted="at most 100 days")
+            raise EventDataError(
+                "event time too large for the read-out model", value=int(events.t[-1]), accepted="at most 100 days"
+            )
         keep, out_us = np.empty(len(events), np.int64), np.empty(len(events), np.int64)
         kept = _serve(events.t, events.y, self._event_ps, self._row_ps, self._waiting, self._state, keep, out_us)
         self.dropped += len(events) - kept
@@ -92,8 +94,12 @@ class Readout:
         return Events(events.x[keep], events.y[keep], out_us[:kept].copy(), events.p[keep])
 
     def state_dict(self) -> dict[str, np.ndarray]:
-        return {"waiting": self._waiting.copy(), "state": self._state.copy(), "dropped": np.array([self.dropped], np.int64),
-                **{f"on_bus_{k}": getattr(self._on_bus, k).copy() for k in "xytp"}}
+        return {
+            "waiting": self._waiting.copy(),
+            "state": self._state.copy(),
+            "dropped": np.array([self.dropped], np.int64),
+            **{f"on_bus_{k}": getattr(self._on_bus, k).copy() for k in "xytp"},
+        }
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
         columns = [f"on_bus_{k}" for k in "xytp"]

@@ -37,15 +37,22 @@ class ReferenceEsim:
     float64, from Hermite's basis functions and by bisection."""
 
     def __init__(self, height: int, width: int, config: EsimConfig, seed: int = 0, reconstruction: str = "linear"):
-        self.shape, self.config, self.seed, self.reconstruction = (height, width), config, np.uint64(seed), reconstruction
+        self.shape, self.config, self.seed, self.reconstruction = (
+            (height, width),
+            config,
+            np.uint64(seed),
+            reconstruction,
+        )
         self.levels, self.times, self.slopes, self.passed = [], [], [], 0
         q = lambda c: math.floor(c * Q_ONE + 0.5)
         nominal = [config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold]
         floor = [min(0.01, c / 2) for c in nominal]
         pixels = pixel_counters(height, width)
         spread = normal2(self.seed, pixels, np.uint64(Stream.THRESHOLD), np.uint64(0))
-        self.threshold = [[q(min(max(c + config.threshold_sigma * n, f), 10.0)) for n in normals]
-                          for c, f, normals in zip(nominal, floor, spread)]
+        self.threshold = [
+            [q(min(max(c + config.threshold_sigma * n, f), 10.0)) for n in normals]
+            for c, f, normals in zip(nominal, floor, spread)
+        ]
         if config.threshold_sigma == 0:
             self.threshold = [[q(c)] * (height * width) for c in nominal]
         self.floor = [q(f) for f in floor]
@@ -56,8 +63,12 @@ class ReferenceEsim:
         """(C-, C+) of pixel i for its next event."""
         on, off = self.threshold[0][i], self.threshold[1][i]
         if self.config.threshold_jitter:
-            draws = normal2(self.seed, np.array([i], np.uint64), np.uint64(Stream.JITTER),
-                            np.array([self.events_so_far[i]], np.uint64))
+            draws = normal2(
+                self.seed,
+                np.array([i], np.uint64),
+                np.uint64(Stream.JITTER),
+                np.array([self.events_so_far[i]], np.uint64),
+            )
             scale = self.config.threshold_jitter * Q_ONE
             on, off = (max(f, c + math.floor(scale * n[0] + 0.5)) for f, c, n in zip(self.floor, (on, off), draws))
         return off, on
@@ -83,7 +94,12 @@ class ReferenceEsim:
         while self.passed < last:
             self.passed += 1
             for i in range(len(self.reference)):
-                rows += self.pixel(i, self.levels[self.passed - 1][i], self.levels[self.passed][i], *self.times[self.passed - 1 : self.passed + 1])
+                rows += self.pixel(
+                    i,
+                    self.levels[self.passed - 1][i],
+                    self.levels[self.passed][i],
+                    *self.times[self.passed - 1 : self.passed + 1],
+                )
         return sorted_events(rows)
 
     def end_slopes(self, i: int) -> tuple[float, float]:
@@ -145,8 +161,10 @@ class ReferenceV2e:
         self.pixels = height * width
         nominal = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
         normals = normal2(self.seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
-        self.on, self.off = (np.clip(c + config.threshold_sigma * n, min(0.01, c / 2), 10.0).astype(np.float32)
-                             for c, n in zip(nominal, normals))
+        self.on, self.off = (
+            np.clip(c + config.threshold_sigma * n, min(0.01, c / 2), 10.0).astype(np.float32)
+            for c, n in zip(nominal, normals)
+        )
         self.leak = v2e.draw_leaks(height, width, config, self.on, self.seed)
         if not self.leak.size:
             self.leak = np.zeros(self.pixels, np.float32)
@@ -178,7 +196,9 @@ class ReferenceV2e:
         rows = []
         if self.t_ns is None:
             self.t_ns = self.epoch = t_ns
-            phase = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))[0]
+            phase = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))[
+                0
+            ]
             reference = x - phase.astype(np.float32) * self.on if self.leaks else x
             self.upper, self.lower = reference + self.on, reference - self.off
             lag = np.zeros(self.pixels, np.float32)
@@ -230,14 +250,21 @@ class ReferenceV2e:
     def photoreceptor_noise(self, intensity: np.ndarray, kappa: np.float32, dt_s: float) -> np.ndarray:
         """The noise at the interval's end, ln units."""
         f, c = np.float32, self.config
-        pairs = normal2(self.seed, np.arange((self.pixels + 1) // 2, dtype=np.uint64), np.uint64(Stream.NOISE), np.uint64(self.frame))
+        pairs = normal2(
+            self.seed,
+            np.arange((self.pixels + 1) // 2, dtype=np.uint64),
+            np.uint64(Stream.NOISE),
+            np.uint64(self.frame),
+        )
         normals = np.stack(pairs, axis=1).ravel()[: self.pixels].astype(f)
         k = kappa * (f(0.5) * (self.intensity + intensity) + f(20))
         sizes = noise_table(c.shot_noise_rate_hz, dt_s, c.contrast_threshold)
         below, part = v2e.noise_place(k)
         return v2e.next_noise(self.hum, k, sizes[below] + part * (sizes[below + 1] - sizes[below]), normals)
 
-    def pixel(self, i: int, x: int, lag: float, intensity: float, kappa: float, t_ns: int, noise: float, hum: float) -> list[tuple[int, int, int, int]]:
+    def pixel(
+        self, i: int, x: int, lag: float, intensity: float, kappa: float, t_ns: int, noise: float, hum: float
+    ) -> list[tuple[int, int, int, int]]:
         f = np.float64
         dt_ns, (y, column) = t_ns - self.t_ns, divmod(i, self.width)
         since = (self.t_ns - self.epoch) * 1e-9, (t_ns - self.epoch) * 1e-9
@@ -321,8 +348,17 @@ class ReferenceVoltmeter:
         rows = []
         if self.t_ns is not None:
             dt = (t_ns - self.t_ns) * 1e-3
-            drift, noise = voltmeter.drift_and_noise(self.intensity, intensity, f(c.k1), f(c.k2), f(c.k3), f(c.k4 * dt),
-                                                     f(c.k5 * dt), f(c.k6), f(np.sqrt(dt)))
+            drift, noise = voltmeter.drift_and_noise(
+                self.intensity,
+                intensity,
+                f(c.k1),
+                f(c.k2),
+                f(c.k3),
+                f(c.k4 * dt),
+                f(c.k5 * dt),
+                f(c.k6),
+                f(np.sqrt(dt)),
+            )
             v_end = voltmeter.move(self.v, drift)
             near = voltmeter.near_threshold(self.v, v_end, noise)
             for i in range(len(self.v)):

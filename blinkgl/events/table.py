@@ -25,8 +25,15 @@ from blinkgl.events.response import Response
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """By ``Config``'s key ``emulator``."""
-_SOME_SENSOR = SensorConfig(name="some", width=4, height=3, pixel_pitch_um=10, contrast_threshold=0.2, refractory_us=10,
-                            readout=ReadoutConfig(events_per_second=1e6))
+_SOME_SENSOR = SensorConfig(
+    name="some",
+    width=4,
+    height=3,
+    pixel_pitch_um=10,
+    contrast_threshold=0.2,
+    refractory_us=10,
+    readout=ReadoutConfig(events_per_second=1e6),
+)
 
 
 def register(emulator: type[Emulator]) -> type[Emulator]:
@@ -56,7 +63,9 @@ def emulator_of(config: EmulatorConfig) -> type[Emulator]:
     raise TypeError(f"no emulator for {type(config).__name__}")
 
 
-def make_emulator(config: EmulatorConfig, height: int, width: int, seed: int = 0, reconstruction: str = "linear") -> Emulator:
+def make_emulator(
+    config: EmulatorConfig, height: int, width: int, seed: int = 0, reconstruction: str = "linear"
+) -> Emulator:
     """The emulator a config asks for; ``reconstruction``: its path between frames, see :class:`Emulator`."""
     return emulator_of(config)(height, width, config, seed, reconstruction)
 
@@ -79,18 +88,28 @@ def _checked(emulator: Any) -> str:
 
     model = getattr(emulator, "Config", None)
     unless(model is not None, "Config", "is missing")
-    unless(isinstance(model, type) and issubclass(model, EmulatorConfig) and model is not EmulatorConfig, "Config",
-           f"is {model!r} and not an EmulatorConfig of its own")
+    unless(
+        isinstance(model, type) and issubclass(model, EmulatorConfig) and model is not EmulatorConfig,
+        "Config",
+        f"is {model!r} and not an EmulatorConfig of its own",
+    )
     unless("emulator" in model.model_fields, "Config.emulator", "is missing")
     kind = model.model_fields["emulator"].default
-    unless(tag_of(model) == ("emulator", kind), "Config.emulator", 'is not of the form `emulator: Literal["name"] = "name"`')
+    unless(
+        tag_of(model) == ("emulator", kind),
+        "Config.emulator",
+        'is not of the form `emulator: Literal["name"] = "name"`',
+    )
     name = f"'{kind}'"
     required = [key for key, info in model.model_fields.items() if info.is_required()]
     unless(not required, "Config", f"has keys without a default: {', '.join(required)}")
     paths = getattr(model, "reconstructions", None)
     unless(paths is not None, "Config.reconstructions", "is missing")
-    unless(isinstance(paths, tuple) and "linear" in paths and set(paths) <= {"linear", "pchip", "hermite"}, "Config.reconstructions",
-           f"is {paths!r} and not a tuple of 'linear' and, where it can, 'pchip' and 'hermite'")
+    unless(
+        isinstance(paths, tuple) and "linear" in paths and set(paths) <= {"linear", "pchip", "hermite"},
+        "Config.reconstructions",
+        f"is {paths!r} and not a tuple of 'linear' and, where it can, 'pchip' and 'hermite'",
+    )
     for part in sorted(model.__abstractmethods__):
         unless(False, f"Config.{part}", "is missing")
     values = result("Config.from_sensor", model.from_sensor, _SOME_SENSOR)

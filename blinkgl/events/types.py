@@ -28,10 +28,20 @@ class Events:
     def __post_init__(self) -> None:
         for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.uint8)):
             column = getattr(self, name)
-            if not isinstance(column, np.ndarray) or column.dtype != dtype or column.ndim != 1 or len(column) != len(self.t):
+            if (
+                not isinstance(column, np.ndarray)
+                or column.dtype != dtype
+                or column.ndim != 1
+                or len(column) != len(self.t)
+            ):
                 got = f"{column.dtype} {column.shape}" if isinstance(column, np.ndarray) else column
                 many = f" of {len(self.t)}" if isinstance(self.t, np.ndarray) and self.t.ndim == 1 else ""
-                raise EventDataError("not a column of events", where=f"Events.{name}", value=got, accepted=f"a one-dimensional {np.dtype(dtype)} array{many}")
+                raise EventDataError(
+                    "not a column of events",
+                    where=f"Events.{name}",
+                    value=got,
+                    accepted=f"a one-dimensional {np.dtype(dtype)} array{many}",
+                )
 
     def __len__(self) -> int:
         return len(self.t)
@@ -55,5 +65,7 @@ class Events:
     def split(self, t_us: int) -> tuple[Events, Events]:
         """Those before t_us, and the rest; views, no copy."""
         cut = int(np.searchsorted(self.t, t_us, side="left"))
-        return (Events(self.x[:cut], self.y[:cut], self.t[:cut], self.p[:cut]),
-                Events(self.x[cut:], self.y[cut:], self.t[cut:], self.p[cut:]))
+        return (
+            Events(self.x[:cut], self.y[:cut], self.t[:cut], self.p[:cut]),
+            Events(self.x[cut:], self.y[cut:], self.t[cut:], self.p[cut:]),
+        )

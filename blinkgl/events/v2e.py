@@ -183,7 +183,9 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
             i = first + offset
             after = max(t_ns - v.t0_ns, 0)
             intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
-            u, _ = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)  # odd: shot_draw has the even numbers
+            u, _ = uniform2(
+                v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1
+            )  # odd: shot_draw has the even numbers
             if u * DARKEST < shot_factor(intensity):
                 if count == keys.size:
                     return -1, t_ns, index  # the caller doubles ``keys`` and begins the block anew: draws know no state
@@ -244,7 +246,9 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
         up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
         on, off = np.float64(constants[j, 0]), np.float64(constants[j, 1])
         s, now_ns, dead = 0.0, np.int64(0), False
-        if p.release.size and up == -np.inf:  # in its dead time, which ends where the comparator takes its new reference
+        if (
+            p.release.size and up == -np.inf
+        ):  # in its dead time, which ends where the comparator takes its new reference
             if p.release[i] > end_ns:
                 dead = True
             else:
@@ -264,7 +268,11 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                 fires, polarity, target = True, np.int64(1), up
             elif end <= down:
                 fires, target = True, down
-            event_s, event_ns, reference = 2.0, np.int64(0), target  # a crossing leaves the reference at the level that it met
+            event_s, event_ns, reference = (
+                2.0,
+                np.int64(0),
+                target,
+            )  # a crossing leaves the reference at the level that it met
             if fires:
                 event_s = crossing_fraction(s, target, polarity, c, rise, fall, k, end)
                 event_ns = np.int64(event_s * dt_ns)
@@ -300,7 +308,9 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                     dead = True
                     break
                 s = now_ns / dt_ns
-            if from_noise or p.release.size:  # noise, and the end of a dead time, leave the reference wherever the signal is
+            if (
+                from_noise or p.release.size
+            ):  # noise, and the end of a dead time, leave the reference wherever the signal is
                 reference = signal_at(s, c, rise, fall, k)
             up, down = reference + on, reference - off
         if dead:  # both levels are passed, whatever comes: the pixel is looked at until it is released
@@ -380,8 +390,19 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         if p.leak.size:
             _add_scaled_block(p.leak[s:e], since, z[:n])
         if p.noise.size:
-            _noise_block(p.noise[s:e], p.intensity[s:e], intensity[:n], kappa, p.noise_sizes, v.seed, v.step, s, normals,
-                         noise[:n], z[:n])
+            _noise_block(
+                p.noise[s:e],
+                p.intensity[s:e],
+                intensity[:n],
+                kappa,
+                p.noise_sizes,
+                v.seed,
+                v.step,
+                s,
+                normals,
+                noise[:n],
+                z[:n],
+            )
         farthest = _flag_block(z[:n], p.upper[s:e], p.lower[s:e], flags)
         shots, clock_ns, clock_index = 0, np.int64(0), np.int64(0)
         if p.clock_ns.size:
@@ -394,7 +415,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
         if farthest >= _ZERO or shots:
             count = compact_flags(flags, scratch, s, active)
             # As many events a pixel as levels fit between the first one and the farthest, rounded up, and its noise.
-            cap = min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
+            cap = (
+                min(np.int64(max(min(farthest, _FARTHEST), _ZERO) * v.inverse_threshold) + 2, v.bound_per_pixel) + shots
+            )
             if count * cap > share:
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:  # no room for the worst case; nothing of this block has been touched
@@ -422,8 +445,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, x
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, x_table, p, v):
     b = take_part(taken, start)
     while b >= 0:
-        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, x_table,
-                                   p, v)
+        block, filled, cut = _band(
+            progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, x_table, p, v
+        )
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
@@ -436,27 +460,47 @@ class V2e(Emulator):
     or shot noise asks for it, 8 with the dead time. Constants: 16 bytes per pixel, 8 more with shot noise."""
 
     Config = V2eConfig
-    _state = ("_intensity", "_x", "_lag", "_noise", "_upper", "_lower", "_leak", "_release", "_clock_ns",
-              "_clock_index", "_epoch_ns", "_brightest")
+    _state = (
+        "_intensity",
+        "_x",
+        "_lag",
+        "_noise",
+        "_upper",
+        "_lower",
+        "_leak",
+        "_release",
+        "_clock_ns",
+        "_clock_index",
+        "_epoch_ns",
+        "_brightest",
+    )
 
     @classmethod
     def response(cls, config: V2eConfig) -> Response:
         """lin-log: linear up to 20 digital numbers."""
-        return Response(smallest_threshold(config), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale)
+        return Response(
+            smallest_threshold(config), 1.0, 0.0, 20.0 / config.full_scale, np.log(20.0) / 20.0 * config.full_scale
+        )
 
     @classmethod
     def noiseless(cls, config: V2eConfig) -> EsimConfig:
-        return EsimConfig(contrast_threshold=config.contrast_threshold, contrast_threshold_off=config.contrast_threshold_off,
-                          threshold_sigma=config.threshold_sigma)
+        return EsimConfig(
+            contrast_threshold=config.contrast_threshold,
+            contrast_threshold_off=config.contrast_threshold_off,
+            threshold_sigma=config.threshold_sigma,
+        )
 
-    def __init__(self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
+    def __init__(
+        self, height: int, width: int, config: V2eConfig | None = None, seed: int = 0, reconstruction: str = "linear"
+    ):
         super().__init__(height, width, seed, reconstruction)
         self.config = config = config or V2eConfig()
         pixels = self.height * self.width
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
-        self._on, self._off = (c.astype(np.float32) for c in
-                               draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed))
+        self._on, self._off = (
+            c.astype(np.float32) for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
+        )
         self._x, self._upper, self._lower = (frame() for _ in range(3))
         self._intensity = frame(config.cutoff_hz > 0 or config.shot_noise_rate_hz > 0)
         noisy = config.photoreceptor_noise and config.shot_noise_rate_hz > 0
@@ -500,7 +544,9 @@ class V2e(Emulator):
             self._noise[...] = draw_start_noise(intensity, self.config, self.seed)
             reference = reference + self._noise
         if self._leak.size:  # else every pixel's first leak event would come at the same time
-            phase, _ = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))
+            phase, _ = uniform2(
+                self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0)
+            )
             reference = reference - phase.astype(np.float32) * self._on
         self._upper[...], self._lower[...] = reference + self._on, reference - self._off
         for block in range(len(self._clock_ns)):
@@ -513,25 +559,56 @@ class V2e(Emulator):
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         config, dt_ns = self.config, t_ns - self.t_ns
         if self._shot_unit * float(self._shot_table[:, -1:].sum()) * dt_ns > config.max_events_per_step:
-            raise EventDataError("more shot noise than max_events_per_step in one interval", where=f"frame {self.frames}",
-                                 value=f"{dt_ns} ns", accepted="a shorter interval or a lower shot_noise_rate_hz")
+            raise EventDataError(
+                "more shot noise than max_events_per_step in one interval",
+                where=f"frame {self.frames}",
+                value=f"{dt_ns} ns",
+                accepted="a shorter interval or a lower shot_noise_rate_hz",
+            )
         if self._noise.size and dt_ns != self._sizes_dt_ns:
             self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, config.contrast_threshold)
             self._sizes_dt_ns = dt_ns
-        pixels = Pixels(self._intensity, self._x, self._lag, self._noise, self._noise_sizes, self._upper,
-                        self._lower, self._constants,
-                        self._leak, self._release, self._clock_ns, self._clock_index, self._shot_table)
+        pixels = Pixels(
+            self._intensity,
+            self._x,
+            self._lag,
+            self._noise,
+            self._noise_sizes,
+            self._upper,
+            self._lower,
+            self._constants,
+            self._leak,
+            self._release,
+            self._clock_ns,
+            self._clock_index,
+            self._shot_table,
+        )
         base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0
         brightest = float(self._table.max() if frame.dtype == np.uint8 else frame.max() * self._scale)
         gentle = kappa * (max(brightest, self._brightest[0]) + 20.0) < 0.499
-        interval = Interval(self.t_ns, dt_ns, base_us, (self.t_ns - epoch) * 1e-9, (t_ns - epoch) * 1e-9, kappa, gentle,
-                            self._scale, self.seed, self.frames, self.width, self._refractory_ns, self._leak_jitter,
-                            self._shot_unit, self._inverse_threshold,
-                            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
+        interval = Interval(
+            self.t_ns,
+            dt_ns,
+            base_us,
+            (self.t_ns - epoch) * 1e-9,
+            (t_ns - epoch) * 1e-9,
+            kappa,
+            gentle,
+            self._scale,
+            self.seed,
+            self.frames,
+            self.width,
+            self._refractory_ns,
+            self._leak_jitter,
+            self._shot_unit,
+            self._inverse_threshold,
+            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
+        )
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
-        events = self._run(_bands, (*source, self._table, self._x_table, pixels, interval), base_us,
-                           t_ns // 1000 - base_us)
+        events = self._run(
+            _bands, (*source, self._table, self._x_table, pixels, interval), base_us, t_ns // 1000 - base_us
+        )
         self._brightest[0] = brightest
         if t_ns - epoch >= self._rebase_ns:
             gone = self._leak * np.float32((t_ns - epoch) * 1e-9)

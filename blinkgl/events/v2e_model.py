@@ -65,7 +65,9 @@ def relax(lag: float, before: float, now: float, intensity_before: float, intens
 
 
 @register_jitable
-def relax_gently(lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float) -> float:
+def relax_gently(
+    lag: float, before: float, now: float, intensity_before: float, intensity_now: float, kappa: float
+) -> float:
     """:func:`relax` where k < 1/2 everywhere: the same bits for half the work."""
     k = kappa * (_HALF * (intensity_before + intensity_now) + _JOINT)
     g = _gentle_growth(k)
@@ -95,7 +97,9 @@ def signal_at(s: float, c: float, rise: float, fall: float, k: float) -> float:
 
 
 @register_jitable
-def crossing_fraction(start: float, target: float, polarity: int, c: float, rise: float, fall: float, k: float, end: float) -> float:
+def crossing_fraction(
+    start: float, target: float, polarity: int, c: float, rise: float, fall: float, k: float, end: float
+) -> float:
     """Where in [start, 1] z(s) = target, given that z(1) = ``end`` has reached it.
 
     The inverse cubic Hermite interpolant of z, then Newton's method inside a shrinking bracket; the error is below

@@ -49,7 +49,9 @@ MAX_DRAWS = 2**19
 
 
 @register_jitable
-def drift_and_noise(before: float, now: float, k1: float, k2: float, k3: float, k4_dt: float, k5_dt: float, k6: float, root_dt: float) -> tuple[float, float]:
+def drift_and_noise(
+    before: float, now: float, k1: float, k2: float, k3: float, k4_dt: float, k5_dt: float, k6: float, root_dt: float
+) -> tuple[float, float]:
     """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
     room = mean + k2  # (L + k2): the gain of the logarithm
@@ -209,7 +211,9 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
             if not in_reach(voltage, mu * left_us, sigma * np.sqrt(left_us)):
                 voltage += mu * left_us
                 break
-            index = (np.uint64(v.step) << _U20) | np.uint64(2 * draw)  # two blocks a draw: (normal, uniform), then the side
+            index = (np.uint64(v.step) << _U20) | np.uint64(
+                2 * draw
+            )  # two blocks a draw: (normal, uniform), then the side
             normal, which = normal_and_uniform(v.seed, np.uint64(i), _DIFFUSION, index)
             chance = on_first(1.0 - voltage, 1.0 + voltage, mu, sigma)
             polarity = np.int64(chance)  # where it is certain, no number is drawn
@@ -218,7 +222,9 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
                 polarity = np.int64(side < chance)
             distance = 1.0 - voltage if polarity else 1.0 + voltage
             hit_us = t_us + hitting_time(distance, mu, sigma, normal, which)
-            if not hit_us <= dt_us:  # too late, or never (inf): no event, and V takes its drift along, as in the paper's algorithm
+            if (
+                not hit_us <= dt_us
+            ):  # too late, or never (inf): no event, and V takes its drift along, as in the paper's algorithm
                 voltage = max(min(voltage + mu * left_us, NEAREST), -NEAREST)
                 break
             draw += 1
@@ -261,7 +267,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
-            cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)  # far beyond what chance adds to the mean
+            cap = min(
+                np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel
+            )  # far beyond what chance adds to the mean
             if count * cap > share:
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:
@@ -277,7 +285,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
 def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p, v):
     b = take_part(taken, start)
     while b >= 0:
-        block, filled, cut = _band(progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v)
+        block, filled, cut = _band(
+            progress[b, 0], edges[b + 1], share, packed[b], progress[b, 1], frame, codes, table, p, v
+        )
         progress[b, 0], progress[b, 1] = block, filled
         progress[b, 2] += cut
         b = take_part(taken, start)
@@ -300,7 +310,14 @@ class DvsVoltmeter(Emulator):
     def noiseless(cls, config: VoltmeterConfig) -> EsimConfig:
         return EsimConfig(contrast_threshold=min(max(1 / config.k1, 0.001), 10))
 
-    def __init__(self, height: int, width: int, config: VoltmeterConfig | None = None, seed: int = 0, reconstruction: str = "linear"):
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        config: VoltmeterConfig | None = None,
+        seed: int = 0,
+        reconstruction: str = "linear",
+    ):
         super().__init__(height, width, seed, reconstruction)
         self.config = config = config or VoltmeterConfig()
         pixels = self.height * self.width
@@ -320,8 +337,22 @@ class DvsVoltmeter(Emulator):
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         c, dt_ns, base_us = self.config, t_ns - self.t_ns, self.t_ns // 1000
         pixels = Pixels(self._intensity, self._v, self._release)
-        interval = Interval(self.t_ns, dt_ns, base_us, c.k1, c.k2, c.k3, c.k4, c.k5, c.k6, self._scale, self.seed,
-                            self.width, self.frames, self._refractory_ns,
-                            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31)
+        interval = Interval(
+            self.t_ns,
+            dt_ns,
+            base_us,
+            c.k1,
+            c.k2,
+            c.k3,
+            c.k4,
+            c.k5,
+            c.k6,
+            self._scale,
+            self.seed,
+            self.width,
+            self.frames,
+            self._refractory_ns,
+            dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
+        )
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         return self._run(_bands, (*source, self._table, pixels, interval), base_us, t_ns // 1000 - base_us)

@@ -39,12 +39,23 @@ def path(value: Any, where: str) -> Path:
     return Path(value)
 
 
-def number(value: Any, where: str, *, least: float = -math.inf, most: float = math.inf, above: float = -math.inf) -> float:
+def number(
+    value: Any, where: str, *, least: float = -math.inf, most: float = math.inf, above: float = -math.inf
+) -> float:
     """A finite number in [least, most] and greater than ``above``. Raises ConfigError."""
-    bounds = [f"greater than {above:g}"] * (above > -math.inf) + [f"at least {least:g}"] * (least > -math.inf) + [f"at most {most:g}"] * (most < math.inf)
+    bounds = (
+        [f"greater than {above:g}"] * (above > -math.inf)
+        + [f"at least {least:g}"] * (least > -math.inf)
+        + [f"at most {most:g}"] * (most < math.inf)
+    )
     real = isinstance(value, (numbers.Real, np.number)) and not isinstance(value, bool) and math.isfinite(value)
     if not real or not least <= float(value) <= most or not float(value) > above:
-        raise ConfigError("out of range" if real else "not a finite number", where=where, value=value, accepted=" ".join(["a number", " and ".join(bounds)]).strip())
+        raise ConfigError(
+            "out of range" if real else "not a finite number",
+            where=where,
+            value=value,
+            accepted=" ".join(["a number", " and ".join(bounds)]).strip(),
+        )
     return float(value)
 
 

@@ -31,7 +31,9 @@ class Renderer:
     def __init__(self, source: Source, *, index: int = 0, quality: str | None = None):
         self.config = configured(source, quality=quality).sequence(check.whole(index, "index", 0, MAX_INDEX))
         if self.config.frames is not None:
-            raise ConfigError("nothing to draw: it converts recorded frames", where="source", accepted="use generate() or record()")
+            raise ConfigError(
+                "nothing to draw: it converts recorded frames", where="source", accepted="use generate() or record()"
+            )
         self.scene = scene_of(source, self.config, index)
         self.start_s, self.end_s = self.config.time.t0_ns * 1e-9, self.config.time.t1_ns * 1e-9
         with ExitStack() as stack:
@@ -57,22 +59,30 @@ class Renderer:
         """(H, W, 3) uint8 sRGB at t s."""
         return to_srgb8(self._renderer.colour(_ns(t, "t")).read())
 
-    def frame(self, t: float, labels: Sequence[str] = ("images",), *, to: float | None = None, back_to: float | None = None) -> LabelFrame:
+    def frame(
+        self, t: float, labels: Sequence[str] = ("images",), *, to: float | None = None, back_to: float | None = None
+    ) -> LabelFrame:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
         labels : as of :func:`record`.   to, back_to : s, where flow and flow_backward lead;
                                          default: one label interval on and back."""
         request = asked_for(LabelsConfig.model_validate(labels_tree(labels)))
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
-        return self._renderer.labels(t_ns, request, t_ns + interval if to is None else _ns(to, "to"),
-                                     t_ns - interval if back_to is None else _ns(back_to, "back_to"))
+        return self._renderer.labels(
+            t_ns,
+            request,
+            t_ns + interval if to is None else _ns(to, "to"),
+            t_ns - interval if back_to is None else _ns(back_to, "back_to"),
+        )
 
 
 def _ns(seconds: float, where: str) -> int:
     return math.floor(check.number(seconds, where, least=-_LATEST_S, most=_LATEST_S) * 1e9 + 0.5)
 
 
-def render_frame(source: Source, t: float, labels: Sequence[str] = ("images",), *, index: int = 0, to: float | None = None) -> LabelFrame:
+def render_frame(
+    source: Source, t: float, labels: Sequence[str] = ("images",), *, index: int = 0, to: float | None = None
+) -> LabelFrame:
     """One :class:`LabelFrame` at t s; for many, a :class:`Renderer` saves making OpenGL's context each time.
 
     labels : as of :func:`record`; images are ``.colour``, (H, W, 3) float32 linear, flow is

@@ -38,17 +38,39 @@ def read_events(path: str | os.PathLike) -> Events:
         return file.read()
 
 
-def write_events(path: str | os.PathLike, events: Events | Iterable[Events], height: int, width: int, *, format: str | None = None,
-                 t_offset_us: int = 0, time_unit: str = "s", overwrite: bool = True) -> int:
+def write_events(
+    path: str | os.PathLike,
+    events: Events | Iterable[Events],
+    height: int,
+    width: int,
+    *,
+    format: str | None = None,
+    t_offset_us: int = 0,
+    time_unit: str = "s",
+    overwrite: bool = True,
+) -> int:
     """Writes events, or chunks in order, of a sensor of height x width px; the file appears
     whole or not at all. Returns how many.
 
     path : its ending names the format, or ``format``: dsec, evt3, evt2, aedat4, text, csv,
     npz, npy.   t_offset_us : DSEC's, µs.
     time_unit : of text and CSV, "s" or "us". Raises OutputError, EventDataError, ConfigError."""
-    path, height, width = check.path(path, "path"), check.whole(height, "height", 1, _SIDE), check.whole(width, "width", 1, _SIDE)
+    path, height, width = (
+        check.path(path, "path"),
+        check.whole(height, "height", 1, _SIDE),
+        check.whole(width, "width", 1, _SIDE),
+    )
     offset = check.whole(t_offset_us, "t_offset_us", 0, 2**62)
-    return formats.write_events(path, _chunks(events), height, width, format=format, t_offset_us=offset, time_unit=time_unit, overwrite=overwrite)
+    return formats.write_events(
+        path,
+        _chunks(events),
+        height,
+        width,
+        format=format,
+        t_offset_us=offset,
+        time_unit=time_unit,
+        overwrite=overwrite,
+    )
 
 
 def _chunks(events: Any) -> Iterator[Events]:
@@ -64,8 +86,16 @@ def _chunks(events: Any) -> Iterator[Events]:
     return checked()
 
 
-def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str | None = None, size: tuple[int, int] | None = None,
-            zero_time: bool = False, time_unit: str = "s", overwrite: bool = True) -> int:
+def convert(
+    source: str | os.PathLike,
+    target: str | os.PathLike,
+    *,
+    format: str | None = None,
+    size: tuple[int, int] | None = None,
+    zero_time: bool = False,
+    time_unit: str = "s",
+    overwrite: bool = True,
+) -> int:
     """Copies events from one file format to another, in pieces. Returns how many events.
 
     size : (height, width), px, where ``source`` does not say.   format, time_unit : as of :func:`write_events`.
@@ -75,8 +105,15 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str
         if len(pair) != 2:
             raise ConfigError("not two numbers", where="size", value=size, accepted="(height, width)")
         size = (check.whole(pair[0], "size", 1, _SIDE), check.whole(pair[1], "size", 1, _SIDE))
-    return formats.convert(check.path(source, "source"), check.path(target, "target"), format=format, size=size, zero_time=bool(zero_time),
-                           time_unit=time_unit, overwrite=overwrite)[1]
+    return formats.convert(
+        check.path(source, "source"),
+        check.path(target, "target"),
+        format=format,
+        size=size,
+        zero_time=bool(zero_time),
+        time_unit=time_unit,
+        overwrite=overwrite,
+    )[1]
 
 
 def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
@@ -94,14 +131,25 @@ def write_flow(path: str | os.PathLike, flow: np.ndarray, valid: np.ndarray | No
     Returns how many valid pixels the format could not hold; they are stored as invalid. Raises
     OutputError, ConfigError."""
     field = check.array(flow, "flow", (None, None, 2), "an array (H, W, 2), px")
-    mask = np.ones(field.shape[:2], bool) if valid is None else check.array(valid, "valid", field.shape[:2], f"an array {field.shape[:2]} of bool")
+    mask = (
+        np.ones(field.shape[:2], bool)
+        if valid is None
+        else check.array(valid, "valid", field.shape[:2], f"an array {field.shape[:2]} of bool")
+    )
     if not field.size:
         raise ConfigError("no pixels", where="flow", value=field.shape, accepted="an array (H, W, 2), px")
     return flow_files.write_flow(check.path(path, "path"), field.astype(np.float32), mask.astype(bool))
 
 
-def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames: str | os.PathLike | None = None, fps: float | None = None,
-            interval_ms: float = 20.0, zero_time: bool = False) -> Comparison:
+def compare(
+    a: str | os.PathLike,
+    b: str | os.PathLike | None = None,
+    *,
+    frames: str | os.PathLike | None = None,
+    fps: float | None = None,
+    interval_ms: float = 20.0,
+    zero_time: bool = False,
+) -> Comparison:
     """How alike two event files are, over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
 
     b : event file; None: ``a`` is described.   frames : video or folder of images both are
@@ -110,13 +158,29 @@ def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames:
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
 
-    return comparison.compare(check.path(a, "a"), None if b is None else check.path(b, "b"), frames=None if frames is None else check.path(frames, "frames"),
-                              fps=_fps(fps), interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7), zero_time=bool(zero_time))
+    return comparison.compare(
+        check.path(a, "a"),
+        None if b is None else check.path(b, "b"),
+        frames=None if frames is None else check.path(frames, "frames"),
+        fps=_fps(fps),
+        interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
+        zero_time=bool(zero_time),
+    )
 
 
-def simulate(frames: Iterable, *, fps: float | None = None, emulator: EmulatorSettings = "esim", gamma: str | float | None = None,
-             interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0, sensor: str | None = None,
-             report: SimulationReport | None = None) -> Iterator[Events]:
+def simulate(
+    frames: Iterable,
+    *,
+    fps: float | None = None,
+    emulator: EmulatorSettings = "esim",
+    gamma: str | float | None = None,
+    interpolate: str = "linear",
+    factor: int = 4,
+    max_px: float = 1.0,
+    seed: int = 0,
+    sensor: str | None = None,
+    report: SimulationReport | None = None,
+) -> Iterator[Events]:
     """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
 
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
@@ -131,13 +195,32 @@ def simulate(frames: Iterable, *, fps: float | None = None, emulator: EmulatorSe
 
     if not isinstance(frames, Iterable):
         raise ConfigError("not frames", where="frames", value=frames, accepted="an iterable of arrays")
-    return simulation.frames_to_events(_frames(frames), fps=_fps(fps), gamma=gamma, interpolate=interpolate, report=report, **_options(emulator, sensor, factor, max_px, seed))
+    return simulation.frames_to_events(
+        _frames(frames),
+        fps=_fps(fps),
+        gamma=gamma,
+        interpolate=interpolate,
+        report=report,
+        **_options(emulator, sensor, factor, max_px, seed),
+    )
 
 
-def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None, emulator: EmulatorSettings = "esim",
-                  gamma: str | float | None = None, interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
-                  sensor: str | None = None, timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None,
-                  overwrite: bool = True) -> SimulationReport:
+def simulate_file(
+    source: str | os.PathLike,
+    target: str | os.PathLike,
+    *,
+    fps: float | None = None,
+    emulator: EmulatorSettings = "esim",
+    gamma: str | float | None = None,
+    interpolate: str = "linear",
+    factor: int = 4,
+    max_px: float = 1.0,
+    seed: int = 0,
+    sensor: str | None = None,
+    timestamps: str | os.PathLike | None = None,
+    preview: str | os.PathLike | None = None,
+    overwrite: bool = True,
+) -> SimulationReport:
     """A video, a folder of images or .npy frames (N, H, W[, 3]) to an event file, as
     ``blinkgl simulate``; files appear whole or not at all.
 
@@ -146,10 +229,17 @@ def simulate_file(source: str | os.PathLike, target: str | os.PathLike, *, fps: 
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 
-    return simulation.file_to_events(check.path(source, "source"), check.path(target, "target"), fps=_fps(fps), gamma=gamma, interpolate=interpolate,
-                                    timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
-                                    preview=None if preview is None else check.path(preview, "preview"), overwrite=overwrite,
-                                    **_options(emulator, sensor, factor, max_px, seed))
+    return simulation.file_to_events(
+        check.path(source, "source"),
+        check.path(target, "target"),
+        fps=_fps(fps),
+        gamma=gamma,
+        interpolate=interpolate,
+        timestamps=None if timestamps is None else check.path(timestamps, "timestamps"),
+        preview=None if preview is None else check.path(preview, "preview"),
+        overwrite=overwrite,
+        **_options(emulator, sensor, factor, max_px, seed),
+    )
 
 
 def _options(emulator: EmulatorSettings, sensor: str | None, factor: int, max_px: float, seed: int) -> dict[str, Any]:
@@ -160,8 +250,13 @@ def _options(emulator: EmulatorSettings, sensor: str | None, factor: int, max_px
     camera = None if sensor is None else load_sensor(sensor)
     if camera is not None:
         tree = {**camera.values(tree.get("emulator", "esim")), **tree}
-    return dict(emulator=simulation.emulator_config(tree), factor=check.whole(factor, "factor", 1, 1000), seed=check.seed(seed),
-                max_px=check.number(max_px, "max_px", above=0, most=1e4), readout=None if camera is None else camera.readout)
+    return dict(
+        emulator=simulation.emulator_config(tree),
+        factor=check.whole(factor, "factor", 1, 1000),
+        seed=check.seed(seed),
+        max_px=check.number(max_px, "max_px", above=0, most=1e4),
+        readout=None if camera is None else camera.readout,
+    )
 
 
 def _fps(fps: float | None) -> float | None:
@@ -177,5 +272,7 @@ def _frames(frames: Iterable) -> Iterator:
             if not 0 <= len(rest) <= 2 or (rest and int(rest[0]) != rest[0]):
                 raise ValueError
         except (TypeError, ValueError, OverflowError):
-            raise EventDataError("not a frame", where=f"frames[{k}]", value=item, accepted="an array, or (array, whole ns)") from None
+            raise EventDataError(
+                "not a frame", where=f"frames[{k}]", value=item, accepted="an array, or (array, whole ns)"
+            ) from None
         yield (array, *rest) if rest else array

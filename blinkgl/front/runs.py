@@ -56,9 +56,19 @@ def load(path: str | os.PathLike, overrides: Sequence[str] = (), *, seed: int | 
     return load_run(check.path(path, "path"), overrides, seed=None if seed is None else check.seed(seed))
 
 
-def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, workers: int = 1, resume: bool = False,
-             emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None, quality: str | None = None,
-             labels: Sequence[str] | None = None) -> Outcome:
+def generate(
+    source: Source,
+    out: str | os.PathLike,
+    *,
+    num: int | None = None,
+    workers: int = 1,
+    resume: bool = False,
+    emulator: EmulatorSettings | None = None,
+    sensor: str | None = None,
+    timeline: Timeline | None = None,
+    quality: str | None = None,
+    labels: Sequence[str] | None = None,
+) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
@@ -73,8 +83,12 @@ def generate(source: Source, out: str | os.PathLike, *, num: int | None = None, 
 
     template = configured(source, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
     if isinstance(source, Scene) and not source.on_disk:
-        raise ConfigError("the scene holds arrays, which the data set could not be made from again", where="source", value=source,
-                          accepted="meshes and images in files, or record()")
+        raise ConfigError(
+            "the scene holds arrays, which the data set could not be made from again",
+            where="source",
+            value=source,
+            accepted="meshes and images in files, or record()",
+        )
     num = None if num is None else check.whole(num, "num", 1, 10_000_000)
     executor = Inline() if check.whole(workers, "workers", 1, 1024) == 1 else Local(workers)
     template.check()
@@ -90,8 +104,15 @@ def verify(folder: str | os.PathLike, *, deep: int = 0, seed: int = 0) -> Verifi
     return verify_dataset(check.path(folder, "folder"), deep=check.whole(deep, "deep", 0, 2**31), seed=check.seed(seed))
 
 
-def configured(source: Source, *, emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None,
-               quality: str | None = None, labels: Sequence[str] | None = None) -> RunTemplate:
+def configured(
+    source: Source,
+    *,
+    emulator: EmulatorSettings | None = None,
+    sensor: str | None = None,
+    timeline: Timeline | None = None,
+    quality: str | None = None,
+    labels: Sequence[str] | None = None,
+) -> RunTemplate:
     """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load() gives")
     template = source.template() if isinstance(source, Scene) else source
@@ -122,8 +143,19 @@ def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
     from blinkgl.recordings.simulation import emulator_config
 
     if not isinstance(emulator, (str, Mapping, Config)):
-        raise ConfigError("not an emulator", where="emulator", value=emulator, accepted="a name, or a table such as {'emulator': 'v2e', 'cutoff_hz': 200}")
-    tree = emulator.model_dump() if isinstance(emulator, Config) else {"emulator": emulator} if isinstance(emulator, str) else check.plain(emulator)
+        raise ConfigError(
+            "not an emulator",
+            where="emulator",
+            value=emulator,
+            accepted="a name, or a table such as {'emulator': 'v2e', 'cutoff_hz': 200}",
+        )
+    tree = (
+        emulator.model_dump()
+        if isinstance(emulator, Config)
+        else {"emulator": emulator}
+        if isinstance(emulator, str)
+        else check.plain(emulator)
+    )
     emulator_config(tree)
     return tree
 

@@ -53,8 +53,9 @@ class _Piece:
         except ConfigError as error:
             first, *rest = (error.where or "config").split(".")
             at = [step for step in (renamed.get(first, first), *rest) if step not in ("", "config")]
-            raise ConfigError(error.problem, where=".".join([type(self).__name__, *at]), value=error.value,
-                              accepted=error.accepted) from None
+            raise ConfigError(
+                error.problem, where=".".join([type(self).__name__, *at]), value=error.value, accepted=error.accepted
+            ) from None
         return tree
 
     def __repr__(self) -> str:
@@ -69,9 +70,17 @@ class Pose(_Piece):
     rest a camera looks along +x with z up.
     Raises ConfigError."""
 
-    def __init__(self, position: Vector = (0.0, 0.0, 0.0), *, euler: Vector | None = None, quaternion: Vector | None = None,
-                 look_at: Vector | None = None):
-        self.tree = self._checked(PoseConfig, check.given(position=position, euler=euler, quaternion=quaternion, look_at=look_at))
+    def __init__(
+        self,
+        position: Vector = (0.0, 0.0, 0.0),
+        *,
+        euler: Vector | None = None,
+        quaternion: Vector | None = None,
+        look_at: Vector | None = None,
+    ):
+        self.tree = self._checked(
+            PoseConfig, check.given(position=position, euler=euler, quaternion=quaternion, look_at=look_at)
+        )
 
 
 def look_at(position: Vector, target: Vector) -> Pose:
@@ -96,7 +105,9 @@ class Keyframes(_Piece):
         frames = [{"time": check.plain(time), **poses[time].tree} for time in sorted(poses)]
         if not frames:
             raise ConfigError("too few entries", where="Keyframes.poses", value=poses, accepted="two or more poses")
-        self.tree = self._checked(KeyedMotionConfig, {"keyframes": frames, "interpolation": check.plain(interpolation)}, keyframes="poses")
+        self.tree = self._checked(
+            KeyedMotionConfig, {"keyframes": frames, "interpolation": check.plain(interpolation)}, keyframes="poses"
+        )
 
 
 def _motion(pose: Pose | Keyframes | Vector, where: str) -> dict[str, Any]:
@@ -116,9 +127,21 @@ class Camera(_Piece):
     pose : :class:`Pose`, :class:`Keyframes` or a position (3,); OpenCV axes (x right, y down, z forward).
     Raises ConfigError."""
 
-    def __init__(self, width: int = 346, height: int = 260, *, fov: float | None = None, focal: float | None = None, cx: float | None = None,
-                 cy: float | None = None, near: float = 0.05, pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0)):
-        self.tree = self._checked(CameraConfig, check.given(width=width, height=height, fov=fov, focal=focal, cx=cx, cy=cy, near=near))
+    def __init__(
+        self,
+        width: int = 346,
+        height: int = 260,
+        *,
+        fov: float | None = None,
+        focal: float | None = None,
+        cx: float | None = None,
+        cy: float | None = None,
+        near: float = 0.05,
+        pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
+    ):
+        self.tree = self._checked(
+            CameraConfig, check.given(width=width, height=height, fov=fov, focal=focal, cx=cx, cy=cy, near=near)
+        )
         self.motion = _motion(pose, "Camera.pose")
 
 
@@ -129,7 +152,15 @@ class Light(_Piece):
     40).   unlit : radiance = albedo everywhere.
     Raises ConfigError."""
 
-    def __init__(self, sun: float = 0.9, sky: float = 0.6, *, elevation: float | None = None, azimuth: float | None = None, unlit: bool = False):
+    def __init__(
+        self,
+        sun: float = 0.9,
+        sky: float = 0.6,
+        *,
+        elevation: float | None = None,
+        azimuth: float | None = None,
+        unlit: bool = False,
+    ):
         tree = check.given(sun=sun, sky=sky, sun_elevation=elevation, sun_azimuth=azimuth, unlit=unlit)
         self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
 
@@ -145,16 +176,35 @@ class Material(_Piece):
     unlit : radiance = albedo, whatever the light.   double_sided : draw back faces.
     Raises ConfigError; a missing file is found when the scene is built."""
 
-    def __init__(self, image: str | os.PathLike | np.ndarray | None = None, *, color: Vector = (1.0, 1.0, 1.0), procedural: str | None = None,
-                 seed: int = 0, photograph: str | None = None, uv_scale: Vector = (1.0, 1.0), max_size: int = 2048, unlit: bool = False,
-                 double_sided: bool = False):
+    def __init__(
+        self,
+        image: str | os.PathLike | np.ndarray | None = None,
+        *,
+        color: Vector = (1.0, 1.0, 1.0),
+        procedural: str | None = None,
+        seed: int = 0,
+        photograph: str | None = None,
+        uv_scale: Vector = (1.0, 1.0),
+        max_size: int = 2048,
+        unlit: bool = False,
+        double_sided: bool = False,
+    ):
         self.image: data.Texture | None = None
         if image is not None and not isinstance(image, (str, os.PathLike)):
             self.image, image = _texture(image), None
             if procedural is not None or photograph is not None:
                 raise ConfigError("only one of image, procedural, photograph may be given", where="Material.image")
-        tree = check.given(texture=image, procedural=procedural, seed=seed, photograph=photograph, max_size=max_size, color=color,
-                           uv_scale=uv_scale, unlit=unlit, double_sided=double_sided)
+        tree = check.given(
+            texture=image,
+            procedural=procedural,
+            seed=seed,
+            photograph=photograph,
+            max_size=max_size,
+            color=color,
+            uv_scale=uv_scale,
+            unlit=unlit,
+            double_sided=double_sided,
+        )
         self.tree = self._checked(MaterialConfig, tree, texture="image")
 
 
@@ -162,10 +212,14 @@ def _texture(image: Any) -> data.Texture:
     accepted = "a file, or an array (h, w, 3), uint8 sRGB or float linear light >= 0"
     pixels = check.array(image, "Material.image", (None, None, 3), accepted)
     if not pixels.size or max(pixels.shape) > 16384:
-        raise ConfigError("size out of range", where="Material.image", value=pixels.shape, accepted="1 to 16384 rows and columns")
+        raise ConfigError(
+            "size out of range", where="Material.image", value=pixels.shape, accepted="1 to 16384 rows and columns"
+        )
     if pixels.dtype != np.uint8:
         if pixels.dtype.kind != "f" or not (np.isfinite(pixels).all() and pixels.min() >= 0):
-            raise ConfigError("pixels cannot be used", where="Material.image", value=str(pixels.dtype), accepted=accepted)
+            raise ConfigError(
+                "pixels cannot be used", where="Material.image", value=str(pixels.dtype), accepted=accepted
+            )
         pixels = pixels.astype(np.float32)
     pixels = np.array(pixels, order="C")  # a copy: the scene is a value
     return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))
@@ -177,11 +231,21 @@ class _Body(_Piece):
     mesh: dict[str, Any]
     triangles: data.Mesh | None = None
 
-    def _placed(self, name: str | None, material: Material | None, pose: Pose | Keyframes | Vector, scale: float | Vector,
-                category: str) -> dict[str, Any]:
+    def _placed(
+        self,
+        name: str | None,
+        material: Material | None,
+        pose: Pose | Keyframes | Vector,
+        scale: float | Vector,
+        category: str,
+    ) -> dict[str, Any]:
         kind = type(self).__name__
         self.material = None if material is None else check.one_of(material, f"{kind}.material", Material, "a Material")
-        tree = {"mesh": "mesh", **check.given(name=name, scale=scale, category=category), **_motion(pose, f"{kind}.pose")}
+        tree = {
+            "mesh": "mesh",
+            **check.given(name=name, scale=scale, category=category),
+            **_motion(pose, f"{kind}.pose"),
+        }
         return self._checked(ObjectConfig, tree)
 
 
@@ -195,9 +259,17 @@ class Primitive(_Body):
     name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
     Raises ConfigError."""
 
-    def __init__(self, kind: str, *, material: Material | None = None, pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
-                 scale: float | Vector = 1.0, name: str | None = None, category: Literal["object", "ground", "wall", "sky"] = "object",
-                 **parameters: float | Vector):
+    def __init__(
+        self,
+        kind: str,
+        *,
+        material: Material | None = None,
+        pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
+        scale: float | Vector = 1.0,
+        name: str | None = None,
+        category: Literal["object", "ground", "wall", "sky"] = "object",
+        **parameters: float | Vector,
+    ):
         check.one_of(kind, "Primitive.kind", str, "the name of a shape")
         self.mesh = {"primitive": kind, "parameters": check.plain(parameters)}
         try:
@@ -205,7 +277,9 @@ class Primitive(_Body):
             primitive_mesh(validate(MeshConfig, self.mesh), "mesh")
         except ConfigError as error:
             _, said, key = (error.where or "").rpartition("parameters")
-            raise ConfigError(error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted) from None
+            raise ConfigError(
+                error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted
+            ) from None
         self.tree = self._placed(name, material if material is not None else Material(), pose, scale, category)
         self.tree.setdefault("name", kind)
 
@@ -220,10 +294,20 @@ class Mesh(_Body):
     category : as of :class:`Primitive`.
     Raises ConfigError; a missing or damaged file raises when the scene is built."""
 
-    def __init__(self, file: str | os.PathLike | None = None, *, vertices: ArrayLike | None = None, faces: ArrayLike | None = None,
-                 uvs: ArrayLike | None = None, up: Literal["auto", "y", "z"] = "auto", material: Material | None = None,
-                 pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0), scale: float | Vector = 1.0, name: str | None = None,
-                 category: Literal["object", "ground", "wall", "sky"] = "object"):
+    def __init__(
+        self,
+        file: str | os.PathLike | None = None,
+        *,
+        vertices: ArrayLike | None = None,
+        faces: ArrayLike | None = None,
+        uvs: ArrayLike | None = None,
+        up: Literal["auto", "y", "z"] = "auto",
+        material: Material | None = None,
+        pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
+        scale: float | Vector = 1.0,
+        name: str | None = None,
+        category: Literal["object", "ground", "wall", "sky"] = "object",
+    ):
         if (file is None) == (vertices is None) or (vertices is None) != (faces is None):
             raise ConfigError("give a file, or vertices and faces", where="Mesh.file", value=file)
         if file is not None:
@@ -240,9 +324,16 @@ def _triangles(vertices: ArrayLike, faces: ArrayLike, uvs: ArrayLike | None) -> 
     v = check.array(vertices, "Mesh.vertices", (None, 3), "an array (V, 3) of finite numbers, m").astype(np.float64)
     f = check.array(faces, "Mesh.faces", (None, 3), "an array (F, 3) of whole numbers below V")
     if not len(v) or not np.isfinite(v).all():
-        raise ConfigError("not finite, or none", where="Mesh.vertices", value=v.shape, accepted="an array (V, 3) of finite numbers, m")
+        raise ConfigError(
+            "not finite, or none", where="Mesh.vertices", value=v.shape, accepted="an array (V, 3) of finite numbers, m"
+        )
     if f.dtype.kind not in "iu" or not len(f) or f.min() < 0 or f.max() >= len(v):
-        raise ConfigError("not indices of vertices", where="Mesh.faces", value=f"{f.dtype} {f.shape}", accepted=f"whole numbers, 0 to {len(v) - 1}")
+        raise ConfigError(
+            "not indices of vertices",
+            where="Mesh.faces",
+            value=f"{f.dtype} {f.shape}",
+            accepted=f"whole numbers, 0 to {len(v) - 1}",
+        )
     t = None if uvs is None else check.array(uvs, "Mesh.uvs", (len(v), 2), f"an array ({len(v)}, 2)").astype(np.float32)
     digest = content_hash(v.tobytes(), f.astype(np.int64).tobytes(), b"" if t is None else t.tobytes())
     try:
@@ -261,17 +352,33 @@ class Scene(_Piece):
     collisions : stop what collides where it does.   seed : of the sensor's noise.
     Raises ConfigError."""
 
-    def __init__(self, camera: Camera | None = None, objects: Sequence[Primitive | Mesh] = (), *, light: Light | None = None,
-                 background: float = 0.2, duration: float = 1.0, label_rate: float = 10.0, start: float = 0.0, collisions: bool = False,
-                 seed: int = 0):
+    def __init__(
+        self,
+        camera: Camera | None = None,
+        objects: Sequence[Primitive | Mesh] = (),
+        *,
+        light: Light | None = None,
+        background: float = 0.2,
+        duration: float = 1.0,
+        label_rate: float = 10.0,
+        start: float = 0.0,
+        collisions: bool = False,
+        seed: int = 0,
+    ):
         self.camera = Camera() if camera is None else check.one_of(camera, "Scene.camera", Camera, "a Camera")
         self.light = Light() if light is None else check.one_of(light, "Scene.light", Light, "a Light")
         self.objects = tuple(check.one_of(objects, "Scene.objects", (list, tuple), "a list of Primitive and Mesh"))
         for k, body in enumerate(self.objects):
             check.one_of(body, f"Scene.objects[{k}]", _Body, "a Primitive or a Mesh")
         self._plain = {"background": check.plain(background), "collisions": check.plain(collisions)}
-        self._run = {"seed": check.plain(seed), "time": {"duration": check.plain(duration), "label_rate": check.plain(label_rate),
-                                                         "start": check.plain(start)}}
+        self._run = {
+            "seed": check.plain(seed),
+            "time": {
+                "duration": check.plain(duration),
+                "label_rate": check.plain(label_rate),
+                "start": check.plain(start),
+            },
+        }
         self._checked(SequenceConfig, self._run, time="")
         # A scene without bodies is refused where it is used: `scene + body` begins with one.
         named, meshes, materials = [], {}, {}
@@ -290,14 +397,28 @@ class Scene(_Piece):
                 if body.material.image is not None:
                     self._memory.textures[f"material{k}"] = body.material.image
             named.append(item)
-        self.tree = {"kind": "explicit", "meshes": meshes, "materials": materials, "objects": named, "camera": self.camera.motion,
-                     "light": self.light.tree, **self._plain}
+        self.tree = {
+            "kind": "explicit",
+            "meshes": meshes,
+            "materials": materials,
+            "objects": named,
+            "camera": self.camera.motion,
+            "light": self.light.tree,
+            **self._plain,
+        }
         if named:
             self._checked(ExplicitSceneConfig, self.tree)
 
     def __add__(self, body: Primitive | Mesh) -> Scene:
         check.one_of(body, "Scene + …", _Body, "a Primitive or a Mesh")
-        return Scene(self.camera, (*self.objects, body), light=self.light, seed=self._run["seed"], **self._plain, **self._run["time"])
+        return Scene(
+            self.camera,
+            (*self.objects, body),
+            light=self.light,
+            seed=self._run["seed"],
+            **self._plain,
+            **self._run["time"],
+        )
 
     def __repr__(self) -> str:
         return f"<Scene of {len(self.objects)} objects>"
@@ -306,7 +427,9 @@ class Scene(_Piece):
         """The scene as the run that a YAML file would be, relative paths from the working
         folder. Raises ConfigError: no objects."""
         if not self.objects:
-            raise ConfigError("a scene without objects", where="Scene.objects", accepted="at least one: scene + Primitive(…)")
+            raise ConfigError(
+                "a scene without objects", where="Scene.objects", accepted="at least one: scene + Primitive(…)"
+            )
         return RunTemplate({**self._run, "camera": self.camera.tree, "scene": self.tree}, Path.cwd())
 
     @property
@@ -316,4 +439,6 @@ class Scene(_Piece):
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """What the renderer draws. Raises ConfigError and AssetError: files."""
-        return explicit_scene(config.scene, config.camera.model, config.time.t0_ns, config.time.t1_ns, Path.cwd(), self._memory)
+        return explicit_scene(
+            config.scene, config.camera.model, config.time.t0_ns, config.time.t1_ns, Path.cwd(), self._memory
+        )

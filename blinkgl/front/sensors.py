@@ -21,14 +21,18 @@ _STEP = """
     Raises ConfigError and, from ``step``, EventDataError."""
 
 
-def _made(kind: str, height: int, width: int, seed: int, sensor: str | None, reconstruction: str, values: dict[str, Any]) -> Emulator:
+def _made(
+    kind: str, height: int, width: int, seed: int, sensor: str | None, reconstruction: str, values: dict[str, Any]
+) -> Emulator:
     height, width = check.whole(height, "height", 1, MAX_SIDE - 1), check.whole(width, "width", 1, MAX_SIDE - 1)
     defaults = load_sensor(sensor).values(kind) if sensor is not None else {}
     config = emulator_config({"emulator": kind, **defaults, **check.plain(values)})
     return make_emulator(config, height, width, check.seed(seed), reconstruction)
 
 
-def Esim(height: int, width: int, *, seed: int = 0, sensor: str | None = None, reconstruction: str = "linear", **values: Any) -> Emulator:
+def Esim(
+    height: int, width: int, *, seed: int = 0, sensor: str | None = None, reconstruction: str = "linear", **values: Any
+) -> Emulator:
     return _made("esim", height, width, seed, sensor, reconstruction, values)
 
 
@@ -40,9 +44,13 @@ def DvsVoltmeter(height: int, width: int, *, seed: int = 0, sensor: str | None =
     return _made("voltmeter", height, width, seed, sensor, "linear", values)
 
 
-Esim.__doc__ = "ESIM (Rebecq et al., CoRL 2018): an event at every crossing of a contrast threshold of the log intensity." + _STEP
+Esim.__doc__ = (
+    "ESIM (Rebecq et al., CoRL 2018): an event at every crossing of a contrast threshold of the log intensity." + _STEP
+)
 V2e.__doc__ = "V2E (Hu et al., CVPRW 2021): finite bandwidth, mismatch, leak, shot noise, refractory period." + _STEP
-DvsVoltmeter.__doc__ = "DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion with drift between two thresholds." + _STEP
+DvsVoltmeter.__doc__ = (
+    "DVS-Voltmeter (Lin et al., ECCV 2022): Brownian motion with drift between two thresholds." + _STEP
+)
 
 
 def load_sensor(name: str) -> SensorConfig:

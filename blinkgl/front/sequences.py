@@ -18,9 +18,18 @@ from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate as co
 from blinkgl.srgb import to_srgb8
 
 
-def simulate_sequence(source: Source, *, index: int = 0, emulator: EmulatorSettings | None = None, sensor: str | None = None,
-                      timeline: Timeline | None = None, quality: str | None = None, labels: Sequence[str] | None = None, events: bool = True,
-                      pictures_hz: float | None = None) -> Simulation:
+def simulate_sequence(
+    source: Source,
+    *,
+    index: int = 0,
+    emulator: EmulatorSettings | None = None,
+    sensor: str | None = None,
+    timeline: Timeline | None = None,
+    quality: str | None = None,
+    labels: Sequence[str] | None = None,
+    events: bool = True,
+    pictures_hz: float | None = None,
+) -> Simulation:
     """What happens in one sequence, in the order of time; nothing is written and nothing kept:
 
         for item in simulate_sequence(scene):
@@ -39,7 +48,9 @@ def simulate_sequence(source: Source, *, index: int = 0, emulator: EmulatorSetti
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
     ``labels``. Iterate over it once, or use it in ``with`` where it may never be. Raises ConfigError, AssetError,
     GLError and, as it goes, EventDataError."""
-    config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
+    config = _configured(
+        source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels
+    )
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
         pictures_hz = check.number(pictures_hz, "pictures_hz", above=0, most=1e4)
@@ -98,8 +109,16 @@ class Recording:
         return flows
 
 
-def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None = None, sensor: str | None = None, timeline: Timeline | None = None,
-           quality: str | None = None, labels: Sequence[str] | None = None) -> Recording:
+def record(
+    source: Source,
+    *,
+    index: int = 0,
+    emulator: EmulatorSettings | None = None,
+    sensor: str | None = None,
+    timeline: Timeline | None = None,
+    quality: str | None = None,
+    labels: Sequence[str] | None = None,
+) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 
     source : :class:`Scene` or what :func:`load` gave.   index : number of the sequence.
@@ -110,7 +129,9 @@ def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None 
     labels : names of labels, such as images, flow, flow_backward, occlusion, depth
     (docs/configuration.md has all); default: the source's.
     Raises ConfigError, AssetError, GLError, EventDataError."""
-    config = _configured(source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
+    config = _configured(
+        source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels
+    )
     images, frames, chunks, times = [], [], [], []
     with _simulation(source, config, index) as sequence:
         for item in sequence:
@@ -123,5 +144,13 @@ def record(source: Source, *, index: int = 0, emulator: EmulatorSettings | None 
                 frames.append(item.frame)
                 times.append(item.t_ns // 1000)
     t_us = np.array(times, np.int64)
-    return Recording(Events.concatenate(chunks), t_us[:-1], tuple(frames[:-1]), t_us, np.stack(images) if images else None, sequence.config,
-                     sequence.frames, sum(sequence.losses[:2]))
+    return Recording(
+        Events.concatenate(chunks),
+        t_us[:-1],
+        tuple(frames[:-1]),
+        t_us,
+        np.stack(images) if images else None,
+        sequence.config,
+        sequence.frames,
+        sum(sequence.losses[:2]),
+    )

@@ -9,4 +9,14 @@ from blinkgl.gl.context import GLContext, create_context, egl_devices
 from blinkgl.gl.framebuffer import FORMATS, Target
 from blinkgl.gl.shader import ShaderError, ShaderLoader, ShaderSource, expand
 
-__all__ = ["FORMATS", "GLContext", "ShaderError", "ShaderLoader", "ShaderSource", "Target", "create_context", "egl_devices", "expand"]
+__all__ = [
+    "FORMATS",
+    "GLContext",
+    "ShaderError",
+    "ShaderLoader",
+    "ShaderSource",
+    "Target",
+    "create_context",
+    "egl_devices",
+    "expand",
+]

@@ -30,8 +30,10 @@ _opened_by: int | None = None
 threads: it would wait for them for ever with its first triangle, also in a context of its own."""
 REQUIRED_VERSION = 430
 APT_PACKAGES = "libegl1 libgl1 libgl1-mesa-dri libosmesa6"
-REMEDY = (f"run 'sudo apt-get install -y --no-install-recommends {APT_PACKAGES}', or install the GPU's driver with its EGL "
-          "part")
+REMEDY = (
+    f"run 'sudo apt-get install -y --no-install-recommends {APT_PACKAGES}', or install the GPU's driver with its EGL "
+    "part"
+)
 DEVICE_VARIABLE = "GLCONTEXT_DEVICE_INDEX"
 
 _LOWER_LEFT, _ZERO_TO_ONE, _CLIP_DEPTH_MODE = 0x8CA1, 0x935F, 0x935D
@@ -82,7 +84,9 @@ class GLContext:
     def _set_clip_control(self) -> None:
         if self.ctx.version_code < 450 and "GL_ARB_clip_control" not in self.ctx.extensions:
             self.release()
-            raise _EGLUnavailable(f"{self.renderer}: neither OpenGL 4.5 nor GL_ARB_clip_control, needed for reversed-Z depth")
+            raise _EGLUnavailable(
+                f"{self.renderer}: neither OpenGL 4.5 nor GL_ARB_clip_control, needed for reversed-Z depth"
+            )
         self.function("glClipControl", None, ctypes.c_uint, ctypes.c_uint)(_LOWER_LEFT, _ZERO_TO_ONE)
         mode = ctypes.c_int(0)
         self.function("glGetIntegerv", None, ctypes.c_uint, ctypes.c_void_p)(_CLIP_DEPTH_MODE, ctypes.byref(mode))
@@ -102,8 +106,9 @@ class GLContext:
         _refuse_after_fork()
         return self.shaders.program(name, defines)
 
-    def framebuffer(self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True,
-                    samples: int = 0) -> Target:
+    def framebuffer(
+        self, width: int, height: int, colour: tuple[str, ...] = ("RGBA8",), depth: bool | str = True, samples: int = 0
+    ) -> Target:
         """A new render target; see :class:`~blinkgl.gl.framebuffer.Target`."""
         return Target(self, width, height, colour, depth, samples)
 
@@ -120,7 +125,9 @@ class GLContext:
             egl = _unbind_egl()
         self._raw.__enter__()  # glcontext does not look at what eglMakeCurrent answers
         if egl is not None and not egl.eglGetCurrentContext():
-            raise GLError("this context is in use by another thread", where=self.renderer, accepted="a context per thread")
+            raise GLError(
+                "this context is in use by another thread", where=self.renderer, accepted="a context per thread"
+            )
         _thread.current = weakref.ref(self)
 
     def resume(self) -> None:
@@ -190,8 +197,12 @@ def create_context(backend: str = "auto", device: int = 0) -> GLContext:
             except _EGLUnavailable as error:
                 attempts.append(f"EGL device {index}: {error}")
                 if error.no_such_device:
-                    raise GLError("no such EGL device", where="gl.device", value=index,
-                                  accepted="one of those `blinkgl doctor` lists") from None
+                    raise GLError(
+                        "no such EGL device",
+                        where="gl.device",
+                        value=index,
+                        accepted="one of those `blinkgl doctor` lists",
+                    ) from None
     if backend in ("auto", "osmesa"):
         try:
             return GLContext(OSMesaContext(4, 3), "osmesa", 0, tuple(attempts))
@@ -206,8 +217,11 @@ def _forked() -> bool:
 
 def _refuse_after_fork() -> None:
     if _forked():
-        raise GLError("this process was forked from one that had opened OpenGL, and would hang", where=f"process {os.getpid()}",
-                      accepted="use multiprocessing.get_context('spawn'), or fork before anything is drawn")
+        raise GLError(
+            "this process was forked from one that had opened OpenGL, and would hang",
+            where=f"process {os.getpid()}",
+            accepted="use multiprocessing.get_context('spawn'), or fork before anything is drawn",
+        )
 
 
 def _overridden(device: int) -> int:
@@ -215,7 +229,12 @@ def _overridden(device: int) -> int:
     if not text:
         return device
     if not text.isdigit():
-        raise GLError("not a device number", where=f"environment variable {DEVICE_VARIABLE}", value=text, accepted="an integer >= 0")
+        raise GLError(
+            "not a device number",
+            where=f"environment variable {DEVICE_VARIABLE}",
+            value=text,
+            accepted="an integer >= 0",
+        )
     return int(text)
 
 
@@ -229,7 +248,9 @@ def _egl(device: int) -> Any:
     # glcontext opens libGL beside libEGL, although EGL hands out every function: machines without X11 have no libGL.
     libgl = os.environ.get("GLCONTEXT_LINUX_LIBGL") or _loadable(_GL_LIBRARIES) or libegl
     try:
-        return egl.create_context(mode="standalone", libegl=libegl, libgl=libgl, glversion=REQUIRED_VERSION, device_index=device)
+        return egl.create_context(
+            mode="standalone", libegl=libegl, libgl=libgl, glversion=REQUIRED_VERSION, device_index=device
+        )
     except Exception as error:  # noqa: BLE001 - glcontext raises bare Exception
         message = _one_line(error)
         if "but found 0 devices" in message:

@@ -73,12 +73,22 @@ class Target:
     Raises GLError for unknown formats, sizes or samples beyond the driver's limit.
     """
 
-    def __init__(self, gl: GLContext, width: int, height: int, colour: Sequence[str], depth: bool | str = True, samples: int = 0):
+    def __init__(
+        self, gl: GLContext, width: int, height: int, colour: Sequence[str], depth: bool | str = True, samples: int = 0
+    ):
         limit = gl.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if not (1 <= width <= limit and 1 <= height <= limit):
-            raise GLError("render size is beyond this OpenGL's limit", value=f"{width}x{height}", accepted=f"1 to {limit} px a side")
+            raise GLError(
+                "render size is beyond this OpenGL's limit",
+                value=f"{width}x{height}",
+                accepted=f"1 to {limit} px a side",
+            )
         if len(colour) > gl.ctx.info["GL_MAX_DRAW_BUFFERS"]:
-            raise GLError("too many colour attachments", value=len(colour), accepted=f"at most {gl.ctx.info['GL_MAX_DRAW_BUFFERS']}")
+            raise GLError(
+                "too many colour attachments",
+                value=len(colour),
+                accepted=f"at most {gl.ctx.info['GL_MAX_DRAW_BUFFERS']}",
+            )
         unknown = [name for name in colour if name not in FORMATS]
         if unknown:
             raise GLError("unknown pixel format", value=unknown[0], accepted="one of " + ", ".join(FORMATS))
@@ -88,7 +98,9 @@ class Target:
             raise GLError("a multi-sampled target's depth cannot be a texture", accepted="True or False")
         self.gl, self.width, self.height, self.samples = gl, width, height, samples
         self.formats = tuple(FORMATS[name] for name in colour)
-        self.colour: tuple[moderngl.Texture | moderngl.Renderbuffer, ...] = tuple(self._texture(f) for f in self.formats)
+        self.colour: tuple[moderngl.Texture | moderngl.Renderbuffer, ...] = tuple(
+            self._texture(f) for f in self.formats
+        )
         self.depth = self._depth(depth)
         self.fbo = gl.ctx.framebuffer(list(self.colour), self.depth)
         self._bind = gl.function("glBindFramebuffer", None, ctypes.c_uint, ctypes.c_uint)
@@ -99,7 +111,9 @@ class Target:
 
     def _texture(self, pixel: PixelFormat) -> moderngl.Texture | moderngl.Renderbuffer:
         if self.samples:
-            return self.gl.ctx.renderbuffer((self.width, self.height), pixel.components, samples=self.samples, dtype=pixel.gl)
+            return self.gl.ctx.renderbuffer(
+                (self.width, self.height), pixel.components, samples=self.samples, dtype=pixel.gl
+            )
         texture = self.gl.ctx.texture((self.width, self.height), pixel.components, dtype=pixel.gl)
         texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         texture.repeat_x = texture.repeat_y = False
@@ -117,8 +131,9 @@ class Target:
             depth = gl.ctx.depth_texture(size)
             gl.function("glActiveTexture", None, uint)(_TEXTURE0 + gl.ctx.default_texture_unit)
             gl.function("glBindTexture", None, uint, uint)(_TEXTURE_2D, depth.glo)
-            gl.function("glTexImage2D", None, uint, integer, integer, integer, integer, integer, uint, uint, ctypes.c_void_p)(
-                _TEXTURE_2D, 0, _DEPTH_COMPONENT32F, *size, 0, _DEPTH_COMPONENT, _FLOAT, None)
+            gl.function(
+                "glTexImage2D", None, uint, integer, integer, integer, integer, integer, uint, uint, ctypes.c_void_p
+            )(_TEXTURE_2D, 0, _DEPTH_COMPONENT32F, *size, 0, _DEPTH_COMPONENT, _FLOAT, None)
             depth.compare_func = ""
             depth.filter = (moderngl.NEAREST, moderngl.NEAREST)
             depth.repeat_x = depth.repeat_y = False
@@ -127,7 +142,8 @@ class Target:
             depth = gl.ctx.depth_renderbuffer(size, samples=self.samples)
             gl.function("glBindRenderbuffer", None, uint, uint)(_RENDERBUFFER, depth.glo)
             gl.function("glRenderbufferStorageMultisample", None, uint, integer, uint, integer, integer)(
-                _RENDERBUFFER, self.samples, _DEPTH_COMPONENT32F, *size)
+                _RENDERBUFFER, self.samples, _DEPTH_COMPONENT32F, *size
+            )
             return depth
         raise GLError("unknown kind of depth", value=kind, accepted="True, False or 'texture'")
 
@@ -161,7 +177,9 @@ class Target:
         self._blit(*edges, *edges, _COLOR_BIT, _NEAREST)
         other.fbo.use()
 
-    def read(self, i: int = 0, out: np.ndarray | None = None, region: tuple[int, int, int, int] | None = None) -> np.ndarray:
+    def read(
+        self, i: int = 0, out: np.ndarray | None = None, region: tuple[int, int, int, int] | None = None
+    ) -> np.ndarray:
         """Attachment ``i``: (H, W) for one component, else (H, W, C); dtype of its format; row 0 is the top row.
 
         out    : written in place and returned when given (C-contiguous, that shape and

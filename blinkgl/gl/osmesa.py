@@ -29,8 +29,9 @@ class OSMesaContext:
     def __init__(self, major: int, minor: int):
         self._handle = None
         self._lib = _load_library()
-        attributes = (ctypes.c_int * 13)(_FORMAT, _RGBA, _DEPTH_BITS, 0, _STENCIL_BITS, 0,
-                                         _PROFILE, _CORE_PROFILE, _MAJOR, major, _MINOR, minor, 0)
+        attributes = (ctypes.c_int * 13)(
+            _FORMAT, _RGBA, _DEPTH_BITS, 0, _STENCIL_BITS, 0, _PROFILE, _CORE_PROFILE, _MAJOR, major, _MINOR, minor, 0
+        )
         self._handle = self._lib.OSMesaCreateContextAttribs(attributes, None)
         if not self._handle:
             raise OSMesaUnavailable(f"libOSMesa offers no OpenGL {major}.{minor} core context")

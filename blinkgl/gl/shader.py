@@ -32,7 +32,7 @@ MADE: list[Callable[[], Mapping[str, str]]] = []
 here; a file of the shader folder wins."""
 
 _VERSION = re.compile(r"\s*#\s*version\b")
-_INCLUDE = re.compile(r'\s*#\s*include\b\s*(?P<argument>.*?)\s*(//.*)?$')
+_INCLUDE = re.compile(r"\s*#\s*include\b\s*(?P<argument>.*?)\s*(//.*)?$")
 _QUOTED = re.compile(r'"([^"]+)"$')
 _NAME = re.compile(r"(?!gl_|GL_)[A-Za-z](?!\w*__)\w*$")
 # Where drivers put the line number: Mesa "0:12(5): error: …", NVIDIA "0(12) : error C1503: …", AMD/Intel/Apple "ERROR:
@@ -79,7 +79,9 @@ def shader_folder() -> Traversable:
     return resources.files("blinkgl.shaders")
 
 
-def expand(name: str, stage: str, defines: Mapping[str, Any] | None = None, folder: Traversable | None = None) -> ShaderSource:
+def expand(
+    name: str, stage: str, defines: Mapping[str, Any] | None = None, folder: Traversable | None = None
+) -> ShaderSource:
     """Source of one stage with includes and defines written out.
 
     name    : file in ``folder`` (default: the shipped shaders), or an absolute path; includes are always the folder's.
@@ -96,7 +98,14 @@ def expand(name: str, stage: str, defines: Mapping[str, Any] | None = None, fold
     head = [body.version or DEFAULT_VERSION, f"#define {stage.upper()}_SHADER 1"]
     head += [f"#define {key} {value}" for key, value in normalised(defines)]
     lines = [(line, ("", 0)) for line in head] + body.lines
-    return ShaderSource(name, stage, "\n".join(line for line, _ in lines) + "\n", tuple(origin for _, origin in lines), body.files, tuple(body.made))
+    return ShaderSource(
+        name,
+        stage,
+        "\n".join(line for line, _ in lines) + "\n",
+        tuple(origin for _, origin in lines),
+        body.files,
+        tuple(body.made),
+    )
 
 
 def made_includes() -> dict[str, str]:
@@ -109,7 +118,9 @@ def normalised(defines: Mapping[str, Any] | None) -> tuple[tuple[str, str], ...]
     pairs = []
     for key, value in sorted((defines or {}).items()):
         if not _NAME.match(key):
-            raise ShaderError("not a name GLSL can #define", value=key, accepted="letters, digits, single _; not starting with gl_")
+            raise ShaderError(
+                "not a name GLSL can #define", value=key, accepted="letters, digits, single _; not starting with gl_"
+            )
         if value is None or value is False:
             continue
         text = "1" if value is True else str(value)
@@ -131,14 +142,16 @@ class _Expansion:
 
     def file(self, shown: str, path: Traversable, chain: tuple[str, ...], included_at: str | None = None) -> None:
         if shown in chain:
-            raise ShaderError("include cycle: " + " -> ".join([*chain[chain.index(shown):], shown]), where=included_at)
+            raise ShaderError("include cycle: " + " -> ".join([*chain[chain.index(shown) :], shown]), where=included_at)
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             name = shown.removeprefix("include/")
             if isinstance(error, UnicodeDecodeError) or name == shown or name not in (made := made_includes()):
                 reason = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else "no such shader file"
-                raise ShaderError(reason, where=included_at or "shaders", value=shown, accepted=self._available(path)) from None
+                raise ShaderError(
+                    reason, where=included_at or "shaders", value=shown, accepted=self._available(path)
+                ) from None
             text = made[name]
             self.made[name] = None
         self.files[shown] = text
@@ -150,7 +163,9 @@ class _Expansion:
                 self._include(include["argument"], (*chain, shown), f"{shown}:{number}")
             elif not in_comment and _VERSION.match(line):
                 if chain:
-                    raise ShaderError("#version belongs into the program's own file, not into an include", where=f"{shown}:{number}")
+                    raise ShaderError(
+                        "#version belongs into the program's own file, not into an include", where=f"{shown}:{number}"
+                    )
                 self.version = line.strip()
                 self.lines.append(("", origin))
             else:
@@ -164,7 +179,9 @@ class _Expansion:
             raise ShaderError("malformed #include", where=at, value=argument, accepted='#include "file.glsl"')
         name = quoted[1]
         if name.startswith("/") or ".." in name.split("/"):
-            raise ShaderError("include outside the shader folder", where=at, value=name, accepted="a file in shaders/include")
+            raise ShaderError(
+                "include outside the shader folder", where=at, value=name, accepted="a file in shaders/include"
+            )
         # A guard of the preprocessor, not of this loader: only it knows which #ifdef branches are alive.
         guard = "INCLUDED_" + "".join(c if c.isalnum() else f"_{ord(c):x}x" for c in name)
         self.lines += [(f"#ifndef {guard}", ("", 0)), (f"#define {guard}", ("", 0))]
@@ -205,7 +222,9 @@ class ShaderLoader:
         self.ctx = ctx
         self.folder = shader_folder() if folder is None else folder
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], moderngl.Program] = {}
-        self._made: dict[tuple[str, tuple[tuple[str, str], ...]], dict[str, str]] = {}  # includes of a program that are no files
+        self._made: dict[
+            tuple[str, tuple[tuple[str, str], ...]], dict[str, str]
+        ] = {}  # includes of a program that are no files
 
     def program(self, name: str, defines: Mapping[str, Any] | None = None) -> moderngl.Program:
         """The program of file ``name`` with ``defines``; compiled when first asked for, and again when an include that
@@ -226,7 +245,9 @@ class ShaderLoader:
             program = self.ctx.program(vertex_shader=sources["vertex"].text, fragment_shader=sources["fragment"].text)
         except moderngl.Error as error:
             raise translate(str(error), sources) from None
-        self._made[name, normalised(defines)] = {made: source.files[f"include/{made}"] for source in sources.values() for made in source.made}
+        self._made[name, normalised(defines)] = {
+            made: source.files[f"include/{made}"] for source in sources.values() for made in source.made
+        }
         return program
 
     def clear(self) -> None:

@@ -27,7 +27,11 @@ MAGIC = b"#!AER-DAT4"
 
 
 def _missing(error: type[BlinkGLError], path) -> BlinkGLError:
-    return error("AEDAT4 needs dv-processing, which is not installed", where=str(path), accepted=f"run {install('dv-processing')}")
+    return error(
+        "AEDAT4 needs dv-processing, which is not installed",
+        where=str(path),
+        accepted=f"run {install('dv-processing')}",
+    )
 
 
 class Aedat4Reader:
@@ -75,8 +79,13 @@ class _Decoder:
         if importlib.util.find_spec("dv_processing") is None:
             raise _missing(AssetError, path)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-        self._process = subprocess.Popen([sys.executable, aedat4_decode.__file__, os.fspath(path)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
-                                         stdin=subprocess.DEVNULL, env=environment)
+        self._process = subprocess.Popen(
+            [sys.executable, aedat4_decode.__file__, os.fspath(path)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+        )
         self._finalizer = weakref.finalize(self, _end, self._process)
         self.size: tuple[int, int] = tuple(self._line()["size"])
 
@@ -108,8 +117,11 @@ class _Decoder:
     def _died(self) -> NoReturn:
         status = self._process.wait()
         self.close()
-        raise AssetError("damaged AEDAT4 file: dv-processing " + ("does not come to an end with it" if status == -signal.SIGPROF else "crashed on it"),
-                         where=str(self.path))
+        raise AssetError(
+            "damaged AEDAT4 file: dv-processing "
+            + ("does not come to an end with it" if status == -signal.SIGPROF else "crashed on it"),
+            where=str(self.path),
+        )
 
 
 def _end(process: subprocess.Popen) -> None:
@@ -133,14 +145,18 @@ class Aedat4Writer:
         with output_errors(path):
             open(path, "wb").close()  # dv's own message for an unwritable path does not say why
             try:
-                self._writer = dv.io.MonoCameraWriter(os.fspath(path), dv.io.MonoCameraWriter.EventOnlyConfig("BlinkGL", (width, height)))
+                self._writer = dv.io.MonoCameraWriter(
+                    os.fspath(path), dv.io.MonoCameraWriter.EventOnlyConfig("BlinkGL", (width, height))
+                )
             except RuntimeError as error:
                 raise OutputError(f"cannot write: {' '.join(str(error).split())}", where=str(path)) from error
 
     def append(self, events: Events) -> None:
         if not len(events):
             return
-        self._last = check_events(events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last)
+        self._last = check_events(
+            events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
+        )
         self._count += len(events)
         store = self._store()
         push = store.push_back

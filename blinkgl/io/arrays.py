@@ -16,7 +16,12 @@ from blinkgl.io.columns import check_events, check_size, events_of, microseconds
 from blinkgl.io.images import NpzReader, numpy_errors, read_npy
 
 DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
-_NAMES = {"t": ("t", "ts", "timestamp", "timestamps"), "x": ("x",), "y": ("y",), "p": ("p", "polarity", "polarities", "pol", "on")}
+_NAMES = {
+    "t": ("t", "ts", "timestamp", "timestamps"),
+    "x": ("x",),
+    "y": ("y",),
+    "p": ("p", "polarity", "polarities", "pol", "on"),
+}
 
 
 class ArrayReader:
@@ -45,7 +50,7 @@ class ArrayReader:
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         for i in range(0, len(self._events), size):
-            yield Events(*(getattr(self._events, k)[i:i + size] for k in "xytp"))
+            yield Events(*(getattr(self._events, k)[i : i + size] for k in "xytp"))
 
 
 class ArrayWriter:
@@ -56,7 +61,9 @@ class ArrayWriter:
         self._count, self._last = 0, None
 
     def append(self, events: Events) -> None:
-        self._last = check_events(events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last)
+        self._last = check_events(
+            events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
+        )
         self._count += len(events)
         self._chunks.append(Events(*(getattr(events, k).copy() for k in "xytp")))
 
@@ -79,8 +86,12 @@ def _named(names: Iterable[str], path) -> dict[str, str]:
     """Column -> its name in the file; AssetError when one is missing."""
     found = {k: next((n for n in options if n in names), None) for k, options in _NAMES.items()}
     if missing := [k for k, name in found.items() if name is None]:
-        raise AssetError(f"no column '{missing[0]}'", where=str(path), value=list(names) or "a plain array",
-                         accepted="x, y, t, p in an .npz or a structured .npy")
+        raise AssetError(
+            f"no column '{missing[0]}'",
+            where=str(path),
+            value=list(names) or "a plain array",
+            accepted="x, y, t, p in an .npz or a structured .npy",
+        )
     return found
 
 

@@ -9,8 +9,14 @@ import numpy as np
 
 INVALID = np.array([40, 40, 40], np.uint8)
 _RADIUS = 255
-_BANDS = ((15, (255, 0, 0), (255, 255, 0)), (6, (255, 255, 0), (0, 255, 0)), (4, (0, 255, 0), (0, 255, 255)),
-          (11, (0, 255, 255), (0, 0, 255)), (13, (0, 0, 255), (255, 0, 255)), (6, (255, 0, 255), (255, 0, 0)))
+_BANDS = (
+    (15, (255, 0, 0), (255, 255, 0)),
+    (6, (255, 255, 0), (0, 255, 0)),
+    (4, (0, 255, 0), (0, 255, 255)),
+    (11, (0, 255, 255), (0, 0, 255)),
+    (13, (0, 0, 255), (255, 0, 255)),
+    (6, (255, 0, 255), (255, 0, 0)),
+)
 """Hue bands of the Middlebury wheel: number of steps, from, to (Baker et al., "A Database and Evaluation Methodology
 for Optical Flow", IJCV 2011, colour coding after Ware); unequal, because equal steps of hue do not look equal."""
 
@@ -19,7 +25,7 @@ for Optical Flow", IJCV 2011, colour coding after Ware); unequal, because equal 
 def flow_wheel() -> np.ndarray:
     """(511, 511, 3) uint8: the colour of unit-disc flow (u, v) at [255 + 255 v, 255 + 255 u]; white at rest."""
     ring = np.concatenate([np.linspace(a, b, n, endpoint=False) for n, a, b in _BANDS])
-    v, u = np.mgrid[-_RADIUS:_RADIUS + 1, -_RADIUS:_RADIUS + 1] / _RADIUS
+    v, u = np.mgrid[-_RADIUS : _RADIUS + 1, -_RADIUS : _RADIUS + 1] / _RADIUS
     position = (np.arctan2(-v, -u) / np.pi + 1) / 2 * len(ring)  # closed: no seam at pure +x
     low = position.astype(int) % len(ring)
     high = (low + 1) % len(ring)

@@ -17,8 +17,17 @@ _MAX_TIME = 1 << 62
 """µs; sums and differences of two such times still fit int64."""
 
 
-def events_of(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, where: str, first: int = 0, *, offset: int = 0,
-              signed: bool = False) -> Events:
+def events_of(
+    x: np.ndarray,
+    y: np.ndarray,
+    t: np.ndarray,
+    p: np.ndarray,
+    where: str,
+    first: int = 0,
+    *,
+    offset: int = 0,
+    signed: bool = False,
+) -> Events:
     """Columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
 
     t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. first : index of the
@@ -42,12 +51,21 @@ def microseconds(seconds: np.ndarray, where: str, first: int = 0) -> np.ndarray:
     t = np.rint(np.asarray(seconds, np.float64) * 1e6)
     if len(t) and not (np.abs(t) < _MAX_TIME).all():  # NaN compares False
         i = int(np.argmin(np.abs(t) < _MAX_TIME))
-        raise EventDataError(f"time of event {first + i}", where=where, value=float(seconds[i]), accepted="seconds that fit int64 µs")
+        raise EventDataError(
+            f"time of event {first + i}", where=where, value=float(seconds[i]), accepted="seconds that fit int64 µs"
+        )
     return t.astype(np.int64)
 
 
-def check_events(events: Events, where: str, first: int = 0, *, height: int | None = None, width: int | None = None,
-                 after: int | None = None) -> int | None:
+def check_events(
+    events: Events,
+    where: str,
+    first: int = 0,
+    *,
+    height: int | None = None,
+    width: int | None = None,
+    after: int | None = None,
+) -> int | None:
     """Refuses, naming event and value, what lies outside a sensor of that size (None: not known), a polarity other than
     0 and 1, and times that run backwards, also against ``after``, the last time before these events. Returns the last
     time (``after`` when there are no events). Raises EventDataError."""
@@ -58,13 +76,19 @@ def check_events(events: Events, where: str, first: int = 0, *, height: int | No
         raise EventDataError(f"event times run backwards at event {first}", where=where, value=(after, int(t[0])))
     if (back := t[1:] < t[:-1]).any():
         i = int(np.argmax(back))
-        raise EventDataError(f"event times run backwards at event {first + i + 1}", where=where, value=(int(t[i]), int(t[i + 1])))
+        raise EventDataError(
+            f"event times run backwards at event {first + i + 1}", where=where, value=(int(t[i]), int(t[i + 1]))
+        )
     for name, side in (("x", width), ("y", height)):
         column = getattr(events, name)
         if side is not None and column.max() >= side:
             i = int(np.argmax(column >= side))
-            raise EventDataError(f"event {first + i} is outside the sensor", where=where, value=(int(events.x[i]), int(events.y[i])),
-                                 accepted=", ".join(f"{k} < {n}" for k, n in (("x", width), ("y", height)) if n is not None))
+            raise EventDataError(
+                f"event {first + i} is outside the sensor",
+                where=where,
+                value=(int(events.x[i]), int(events.y[i])),
+                accepted=", ".join(f"{k} < {n}" for k, n in (("x", width), ("y", height)) if n is not None),
+            )
     if events.p.max() > 1:
         i = int(np.argmax(events.p > 1))
         raise EventDataError(f"polarity of event {first + i}", where=where, value=int(events.p[i]), accepted="0 or 1")
@@ -74,13 +98,20 @@ def check_events(events: Events, where: str, first: int = 0, *, height: int | No
 def check_size(height: int | None, width: int | None, where: str) -> None:
     """AssetError when a sensor's declared size (None: not declared) is impossible."""
     if not all(n is None or 0 < n <= MAX_SIDE for n in (height, width)):
-        raise AssetError("impossible sensor size", where=where, value=f"{width}x{height}", accepted=f"1 to {MAX_SIDE} px a side")
+        raise AssetError(
+            "impossible sensor size", where=where, value=f"{width}x{height}", accepted=f"1 to {MAX_SIDE} px a side"
+        )
 
 
 def _whole(column: np.ndarray, name: str, dtype, low: int, high: int, where: str, first: int) -> np.ndarray:
     """``column`` as ``dtype``, every value unchanged."""
     if column.dtype.kind not in "iufb":
-        raise AssetError(f"event column '{name}' holds no numbers", where=where, value=str(column.dtype), accepted="integers or floats")
+        raise AssetError(
+            f"event column '{name}' holds no numbers",
+            where=where,
+            value=str(column.dtype),
+            accepted="integers or floats",
+        )
     limits = None if column.dtype.kind in "fb" else np.iinfo(column.dtype)
     fits = column.dtype.kind == "b" or (limits is not None and limits.min >= low and limits.max <= high)
     if not fits and len(column) and not (column.min() >= low and column.max() <= high):  # NaN compares False

@@ -51,10 +51,16 @@ class DsecEventWriter:
     background : False compresses in the caller's thread.
     """
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, t_offset_us: int = 0, *, background: bool = True):
+    def __init__(
+        self, path: str | os.PathLike, height: int, width: int, t_offset_us: int = 0, *, background: bool = True
+    ):
         if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
-            raise EventDataError("sensor size does not fit uint16 coordinates", where=str(path), value=(height, width),
-                                 accepted=f"1 to {MAX_SIDE} px a side")
+            raise EventDataError(
+                "sensor size does not fit uint16 coordinates",
+                where=str(path),
+                value=(height, width),
+                accepted=f"1 to {MAX_SIDE} px a side",
+            )
         self.path, self.height, self.width, self.t_offset_us = Path(path), int(height), int(width), int(t_offset_us)
         self.count = 0
         self.t_end_us: int | None = None  # may be set any time before close
@@ -66,8 +72,12 @@ class DsecEventWriter:
         self._error: BaseException | None = None
         self._closed = False
         with output_errors(path):
-            self._file = h5py.File(self.path, "w", rdcc_nbytes=0)  # whole chunks only: no cache, a full disk shows at once
-            self._columns = {k: blosc_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,)) for k, dtype in _COLUMNS.items()}
+            self._file = h5py.File(
+                self.path, "w", rdcc_nbytes=0
+            )  # whole chunks only: no cache, a full disk shows at once
+            self._columns = {
+                k: blosc_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,)) for k, dtype in _COLUMNS.items()
+            }
             self._ms_to_idx = blosc_dataset(self._file, "ms_to_idx", (0,), np.uint64, (1 << 13,))
             self._file.create_dataset("t_offset", data=np.int64(self.t_offset_us), track_times=False)
             self._file.attrs["height"], self._file.attrs["width"] = self.height, self.width
@@ -107,7 +117,10 @@ class DsecEventWriter:
         if self._closed:
             return
         t_end_us = self.t_end_us if t_end_us is None else t_end_us
-        end = max(self._last_t + 1 if self.count else self.t_offset_us, self.t_offset_us if t_end_us is None else int(t_end_us))
+        end = max(
+            self._last_t + 1 if self.count else self.t_offset_us,
+            self.t_offset_us if t_end_us is None else int(t_end_us),
+        )
         try:
             self._submit({k: v[: self._fill] for k, v in self._block.items()})
             self._submit(None)
@@ -151,10 +164,16 @@ class DsecEventWriter:
             return
         where, t = str(self.path), events.t
         if t[0] < self.t_offset_us:
-            raise EventDataError("event before the recording's start", where=where, value=int(t[0]), accepted=f">= {self.t_offset_us} µs")
+            raise EventDataError(
+                "event before the recording's start", where=where, value=int(t[0]), accepted=f">= {self.t_offset_us} µs"
+            )
         if t[-1] - self.t_offset_us > _MAX_RELATIVE_US:
-            raise EventDataError("event time beyond what DSEC's 32-bit µs can hold", where=where, value=int(t[-1]),
-                                 accepted=f"at most {self.t_offset_us + _MAX_RELATIVE_US} µs (71.6 minutes per file)")
+            raise EventDataError(
+                "event time beyond what DSEC's 32-bit µs can hold",
+                where=where,
+                value=int(t[-1]),
+                accepted=f"at most {self.t_offset_us + _MAX_RELATIVE_US} µs (71.6 minutes per file)",
+            )
         self._last_t = check_events(events, where, self.count, height=self.height, width=self.width, after=self._last_t)
 
     def _submit(self, block: dict[str, np.ndarray] | None) -> None:
@@ -216,10 +235,16 @@ class DsecEventReader:
         self.path = Path(path)
         self._file = open_hdf5(self.path)
         with hdf5_errors(self.path, self._file):
-            missing = [k for k in ("events/x", "events/y", "events/t", "events/p") if not isinstance(self._file.get(k), h5py.Dataset)]
+            missing = [
+                k
+                for k in ("events/x", "events/y", "events/t", "events/p")
+                if not isinstance(self._file.get(k), h5py.Dataset)
+            ]
             if missing:
                 raise AssetError(f"not a DSEC event file: no dataset '{missing[0]}'", where=str(path))
-            self._columns = {k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"}
+            self._columns = {
+                k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"
+            }
             lengths = {len(c) for c in self._columns.values()}
             if len(lengths) != 1:
                 raise AssetError("event columns differ in length", where=str(path), value=sorted(lengths))
@@ -258,8 +283,12 @@ class DsecEventReader:
         return events.window(t0_us, t1_us)
 
     def _wrong_table(self, t0_us: int, t1_us: int, found: tuple[int, int]) -> NoReturn:
-        raise AssetError(f"'ms_to_idx' does not lead to the events of [{t0_us}, {t1_us}) µs", where=str(self.path), value=found,
-                         accepted=f"the smallest index whose t >= 1000·ms, at most {self.count}")
+        raise AssetError(
+            f"'ms_to_idx' does not lead to the events of [{t0_us}, {t1_us}) µs",
+            where=str(self.path),
+            value=found,
+            accepted=f"the smallest index whose t >= 1000·ms, at most {self.count}",
+        )
 
     def _index(self, ms: int, otherwise: int) -> int:
         table = self._ms_to_idx
@@ -297,13 +326,15 @@ def write_rectify_map(path: str | os.PathLike, rectify_map: np.ndarray) -> None:
     """``rectify_map``: (H, W, 2) float32, ``map[y, x] = (x_rect, y_rect)``. A simulated pin-hole camera's is the
     identity; loaders such as E-RAFT's insist on the file."""
     with output_errors(path), h5py.File(path, "w") as file:
-        file.create_dataset("rectify_map", data=np.asarray(rectify_map, np.float32), track_times=False,
-                            compression=hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE))
+        file.create_dataset(
+            "rectify_map",
+            data=np.asarray(rectify_map, np.float32),
+            track_times=False,
+            compression=hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE),
+        )
 
 
 def identity_rectify_map(height: int, width: int) -> np.ndarray:
     """(H, W, 2) float32 identity for :func:`write_rectify_map`."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     return np.stack([x, y], axis=-1)
-
-

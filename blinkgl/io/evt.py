@@ -38,14 +38,20 @@ class EvtWriter:
 
     def __init__(self, path: str | os.PathLike, height: int, width: int, version: str = "evt3"):
         if height > _MAX_SIDE or width > _MAX_SIDE:
-            raise EventDataError(f"{version.upper()} has 11-bit coordinates", where=str(path), value=(height, width),
-                                 accepted="at most 2048 px a side")
+            raise EventDataError(
+                f"{version.upper()} has 11-bit coordinates",
+                where=str(path),
+                value=(height, width),
+                accepted="at most 2048 px a side",
+            )
         self.path, self.height, self.width, self.version = Path(path), height, width, version
         # time written so far, EVT3's row; -1: none yet
         self._state = np.array([0, -1], np.int64)
         self._count = 0
-        header = (f"% evt {version[-1]}.0\n% format {version.upper()};height={height};width={width}\n"
-                  f"% geometry {width}x{height}\n% integrator_name BlinkGL\n% end\n")
+        header = (
+            f"% evt {version[-1]}.0\n% format {version.upper()};height={height};width={width}\n"
+            f"% geometry {width}x{height}\n% integrator_name BlinkGL\n% end\n"
+        )
         with output_errors(path):
             self._file = open(path, "wb")  # noqa: SIM115 - closed by close/abort
             self._file.write(header.encode())
@@ -55,9 +61,15 @@ class EvtWriter:
             return
         t = events.t
         if t[0] < 0 or t[-1] >= _MAX_TIME:
-            raise EventDataError(f"{self.version.upper()} times count from the recording's start", where=str(self.path),
-                                 value=int(t[0] if t[0] < 0 else t[-1]), accepted="0 to less than 2^34 µs; use --zero-time to shift")
-        check_events(events, str(self.path), self._count, height=self.height, width=self.width, after=int(self._state[0]))
+            raise EventDataError(
+                f"{self.version.upper()} times count from the recording's start",
+                where=str(self.path),
+                value=int(t[0] if t[0] < 0 else t[-1]),
+                accepted="0 to less than 2^34 µs; use --zero-time to shift",
+            )
+        check_events(
+            events, str(self.path), self._count, height=self.height, width=self.width, after=int(self._state[0])
+        )
         if self.version == "evt2":
             words = np.empty(2 * len(t) + 1, np.uint32)
             n = _encode_evt2(events.x, events.y, t, events.p, self._state, not self._count, words)
@@ -115,19 +127,28 @@ class EvtReader:
             while data := file.read(words * dtype.itemsize):
                 whole = len(data) // dtype.itemsize * dtype.itemsize
                 raw = np.frombuffer(data[:whole], dtype)
-                x, y, p = np.empty(most * len(raw), np.uint16), np.empty(most * len(raw), np.uint16), np.empty(most * len(raw), np.uint8)
+                x, y, p = (
+                    np.empty(most * len(raw), np.uint16),
+                    np.empty(most * len(raw), np.uint16),
+                    np.empty(most * len(raw), np.uint8),
+                )
                 t = np.empty(most * len(raw), np.int64)
                 n, bad = decode(raw, state, x, y, t, p)
                 if bad >= 0:
-                    raise AssetError(f"damaged at byte {position + bad * dtype.itemsize}: no {self.version.upper()} word can "
-                                     "stand here",
-                                     where=str(self.path), value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}")
+                    raise AssetError(
+                        f"damaged at byte {position + bad * dtype.itemsize}: no {self.version.upper()} word can "
+                        "stand here",
+                        where=str(self.path),
+                        value=f"0x{int(raw[bad]):0{2 * dtype.itemsize}x}",
+                    )
                 position += whole
                 if n:
                     yield Events(x[:n].copy(), y[:n].copy(), t[:n].copy(), p[:n].copy())
                 if whole < len(data):
-                    raise AssetError(f"truncated: {len(data) - whole} stray bytes after the last {self.version.upper()} word",
-                                     where=str(self.path))
+                    raise AssetError(
+                        f"truncated: {len(data) - whole} stray bytes after the last {self.version.upper()} word",
+                        where=str(self.path),
+                    )
         if state[0] < 0 and state[-1]:
             raise AssetError(f"{state[-1]} events and no TIME_HIGH word, so no times", where=str(self.path))
 
@@ -142,7 +163,9 @@ def _read_header(path: Path) -> tuple[str, int]:
                     break
                 line = file.readline(_LONGEST_LINE)
                 if line.startswith(b" ") and len(line) == _LONGEST_LINE:
-                    raise AssetError(f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path))
+                    raise AssetError(
+                        f"header line {len(lines) + 1} is longer than {_LONGEST_LINE} bytes", where=str(path)
+                    )
                 if not line.startswith(b" ") or not line.endswith(b"\n"):
                     break  # a word that happens to begin with '%'
                 lines.append("%" + line.decode("latin-1").rstrip())
@@ -270,5 +293,13 @@ def _decode_evt3(words, state, x, y, t, p):
         elif kind != 7 and kind != 10 and kind < 14:  # 7, 15 continued, 10 external trigger, 14 others
             bad = i
             break
-    state[0], state[1], state[2], state[3], state[4], state[5], state[6] = high, row, low, base, polarity, wraps, untimed
+    state[0], state[1], state[2], state[3], state[4], state[5], state[6] = (
+        high,
+        row,
+        low,
+        base,
+        polarity,
+        wraps,
+        untimed,
+    )
     return n, bad

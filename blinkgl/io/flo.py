@@ -42,8 +42,12 @@ def read_flo(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     if not (0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE):
         raise AssetError("impossible .flo size", where=str(path), value=(width, height))
     if len(data) != 12 + 8 * width * height:
-        raise AssetError("truncated .flo file" if len(data) < 12 + 8 * width * height else "trailing bytes in .flo file",
-                         where=str(path), value=len(data), accepted=f"{12 + 8 * width * height} bytes")
+        raise AssetError(
+            "truncated .flo file" if len(data) < 12 + 8 * width * height else "trailing bytes in .flo file",
+            where=str(path),
+            value=len(data),
+            accepted=f"{12 + 8 * width * height} bytes",
+        )
     flow = np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2).astype(np.float32)
     valid = np.all(np.abs(flow) <= _UNKNOWN, axis=-1)  # NaN compares False
     return np.where(valid[..., None], flow, np.float32(0)), valid

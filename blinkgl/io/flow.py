@@ -29,7 +29,12 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
         raise AssetError("unknown flow file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
     data = read_npy(path)
     if data.ndim != 3 or data.shape[2] not in (2, 3) or data.dtype.kind != "f":
-        raise AssetError("not a flow field", where=str(path), value=f"{data.dtype} {data.shape}", accepted="float (H, W, 2) or (H, W, 3)")
+        raise AssetError(
+            "not a flow field",
+            where=str(path),
+            value=f"{data.dtype} {data.shape}",
+            accepted="float (H, W, 2) or (H, W, 3)",
+        )
     flow = data[..., :2].astype(np.float32)
     valid = np.isfinite(flow).all(-1) & (data[..., 2] > 0 if data.shape[2] == 3 else True)
     return np.where(valid[..., None], flow, np.float32(0)), valid

@@ -121,7 +121,7 @@ def _png_problem(data: bytes) -> str | None:
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
         end = at + 12 + length
-        if end > len(data) or zlib.crc32(data[at + 4:end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+        if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             break
         if kind == b"IEND":
             return _size_problem(*struct.unpack_from(">II", data, 16))
@@ -130,4 +130,8 @@ def _png_problem(data: bytes) -> str | None:
 
 
 def _size_problem(width: int, height: int) -> str | None:
-    return None if 0 < width * height <= _MAX_PIXELS else f"image of {width}x{height} px is too large (at most {_MAX_PIXELS >> 20} Mpx)"
+    return (
+        None
+        if 0 < width * height <= _MAX_PIXELS
+        else f"image of {width}x{height} px is too large (at most {_MAX_PIXELS >> 20} Mpx)"
+    )

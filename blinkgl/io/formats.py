@@ -26,7 +26,16 @@ from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file
 from blinkgl.io.columns import check_events, check_size
 
-ENDINGS = {".h5": "dsec", ".hdf5": "dsec", ".raw": "evt3", ".aedat4": "aedat4", ".txt": "text", ".csv": "csv", ".npz": "npz", ".npy": "npy"}
+ENDINGS = {
+    ".h5": "dsec",
+    ".hdf5": "dsec",
+    ".raw": "evt3",
+    ".aedat4": "aedat4",
+    ".txt": "text",
+    ".csv": "csv",
+    ".npz": "npz",
+    ".npy": "npy",
+}
 WRITABLE = ("dsec", "evt3", "evt2", "aedat4", "text", "csv", "npz", "npy")
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files that do not say."""
@@ -110,21 +119,26 @@ def open_events(path: str | os.PathLike) -> EventFile:
         from blinkgl.io.dsec import DsecEventReader
         from blinkgl.io.hdf5 import hdf5_errors, open_hdf5
         from blinkgl.io.mvsec import DATASET, MvsecReader
+
         with open_hdf5(path) as file, hdf5_errors(path):
             kind = "mvsec" if DATASET in file else "dsec"
         reader = MvsecReader(path) if kind == "mvsec" else DsecEventReader(path)
     elif kind == "evt3":
         from blinkgl.io.evt import EvtReader
+
         reader = EvtReader(path)
         kind = reader.version
     elif kind == "aedat4":
         from blinkgl.io.aedat4 import Aedat4Reader
+
         reader = Aedat4Reader(path)
     elif kind in ("text", "csv"):
         from blinkgl.io.text import TextReader
+
         reader = TextReader(path)
     else:
         from blinkgl.io.arrays import ArrayReader
+
         reader = ArrayReader(path)
     return EventFile(path, kind, reader.height, reader.width, getattr(reader, "t_offset_us", 0), reader)
 
@@ -133,34 +147,56 @@ def output_format(path: str | os.PathLike, format: str | None = None) -> str:
     """The format to write ``path`` in; OutputError when neither its ending nor ``format`` names one."""
     kind = format or ENDINGS.get(Path(path).suffix.lower())
     if kind not in WRITABLE:
-        raise OutputError("unknown event format" if format else "unknown event file ending", where=str(path),
-                          value=format or Path(path).suffix, accepted=", ".join(WRITABLE if format else ENDINGS))
+        raise OutputError(
+            "unknown event format" if format else "unknown event file ending",
+            where=str(path),
+            value=format or Path(path).suffix,
+            accepted=", ".join(WRITABLE if format else ENDINGS),
+        )
     return kind
 
 
 def _writer(path: Path, kind: str, height: int, width: int, t_offset_us: int, time_unit: str) -> EventWriter:
     check_size(height, width, str(path))
     if time_unit != "s" and kind not in ("text", "csv"):
-        raise OutputError(f"{kind} has a unit of time of its own", where=str(path), value=time_unit, accepted="a unit with .txt and .csv only")
+        raise OutputError(
+            f"{kind} has a unit of time of its own",
+            where=str(path),
+            value=time_unit,
+            accepted="a unit with .txt and .csv only",
+        )
     if kind == "dsec":
         from blinkgl.io.dsec import DsecEventWriter
+
         return DsecEventWriter(path, height, width, t_offset_us)
     if kind in ("evt2", "evt3"):
         from blinkgl.io.evt import EvtWriter
+
         return EvtWriter(path, height, width, kind)
     if kind == "aedat4":
         from blinkgl.io.aedat4 import Aedat4Writer
+
         return Aedat4Writer(path, height, width)
     if kind in ("text", "csv"):
         from blinkgl.io.text import TextWriter
+
         return TextWriter(path, height, width, "," if kind == "csv" else " ", unit=time_unit)
     from blinkgl.io.arrays import ArrayWriter
+
     return ArrayWriter(path, height, width)
 
 
 @contextlib.contextmanager
-def event_writer(path: str | os.PathLike, height: int, width: int, *, format: str | None = None, t_offset_us: int = 0,
-                 time_unit: str = "s", overwrite: bool = True) -> Iterator[EventWriter]:
+def event_writer(
+    path: str | os.PathLike,
+    height: int,
+    width: int,
+    *,
+    format: str | None = None,
+    t_offset_us: int = 0,
+    time_unit: str = "s",
+    overwrite: bool = True,
+) -> Iterator[EventWriter]:
     """``with event_writer("out.h5", 480, 640) as out: out.append(events)``. The file appears under its name when the
     block ends without an exception, and not at all otherwise.
 
@@ -178,7 +214,9 @@ def event_writer(path: str | os.PathLike, height: int, width: int, *, format: st
             raise
 
 
-def write_events(path: str | os.PathLike, chunks: Events | Iterable[Events], height: int, width: int, **options: Any) -> int:
+def write_events(
+    path: str | os.PathLike, chunks: Events | Iterable[Events], height: int, width: int, **options: Any
+) -> int:
     """Writes events or an iterable of chunks; options as :func:`event_writer`. Returns the number of events."""
     count = 0
     with event_writer(path, height, width, **options) as writer:
@@ -188,8 +226,16 @@ def write_events(path: str | os.PathLike, chunks: Events | Iterable[Events], hei
     return count
 
 
-def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str | None = None, size: tuple[int, int] | None = None,
-            zero_time: bool = False, time_unit: str = "s", overwrite: bool = True) -> tuple[EventFile, int]:
+def convert(
+    source: str | os.PathLike,
+    target: str | os.PathLike,
+    *,
+    format: str | None = None,
+    size: tuple[int, int] | None = None,
+    zero_time: bool = False,
+    time_unit: str = "s",
+    overwrite: bool = True,
+) -> tuple[EventFile, int]:
     """Copies events from one format to another, streaming.
 
     size : (height, width) for sources that do not say (default: guessed, see :meth:`EventFile.sized`).
@@ -207,6 +253,14 @@ def convert(source: str | os.PathLike, target: str | os.PathLike, *, format: str
         # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
         offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
         shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
-        count = write_events(target, shifted, file.height, file.width, format=format, t_offset_us=offset,
-                             time_unit=time_unit, overwrite=overwrite)
+        count = write_events(
+            target,
+            shifted,
+            file.height,
+            file.width,
+            format=format,
+            t_offset_us=offset,
+            time_unit=time_unit,
+            overwrite=overwrite,
+        )
     return file, count

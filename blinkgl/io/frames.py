@@ -43,20 +43,30 @@ class FrameSource:
         index = -1
         for index, (frame, t_ns, name) in enumerate(self._frames()):
             if frame.shape[:2] != (self.height, self.width):
-                raise EventDataError("frame size changed", where=f"{self.path}: frame {index} ({name})", value=frame.shape[:2],
-                                     accepted=f"{(self.height, self.width)} as frame 0")
+                raise EventDataError(
+                    "frame size changed",
+                    where=f"{self.path}: frame {index} ({name})",
+                    value=frame.shape[:2],
+                    accepted=f"{(self.height, self.width)} as frame 0",
+                )
             if t_ns is None:
                 t_ns = round(index * 1e9 / self.fps)
             if last is not None and t_ns <= last:
-                raise EventDataError("time stamps must increase", where=f"{self.path}: frame {index} ({name})",
-                                     value=f"{t_ns / 1e9:.9g} s", accepted=f"more than {last / 1e9:.9g} s")
+                raise EventDataError(
+                    "time stamps must increase",
+                    where=f"{self.path}: frame {index} ({name})",
+                    value=f"{t_ns / 1e9:.9g} s",
+                    accepted=f"more than {last / 1e9:.9g} s",
+                )
             last = t_ns
             yield frame, t_ns, name
         if index < 1:
             raise EventDataError("events need at least two frames", where=str(self.path), value=f"{index + 1} frame(s)")
 
 
-def open_frames(path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None) -> FrameSource:
+def open_frames(
+    path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None
+) -> FrameSource:
     """A video (by ending), a folder of images, or .npy/.npz with frames (N, H, W) or (N, H, W, 3).
 
     fps : frame rate; overrides the video's own and any time stamps. timestamps : file with one time per frame, or "time
@@ -77,8 +87,12 @@ def open_frames(path: str | os.PathLike, *, fps: float | None = None, timestamps
     elif path.suffix.lower() in (".npy", ".npz"):
         source = _array(path, fps, timestamps)
     else:
-        raise AssetError("unknown input", where=str(path), value=path.suffix,
-                         accepted="a video (" + " ".join(sorted(VIDEO)) + "), a folder of images, .npy or .npz")
+        raise AssetError(
+            "unknown input",
+            where=str(path),
+            value=path.suffix,
+            accepted="a video (" + " ".join(sorted(VIDEO)) + "), a folder of images, .npy or .npz",
+        )
     if source.count == 1:
         raise EventDataError("events need at least two frames", where=str(path), value="1 frame")
     return source
@@ -88,20 +102,27 @@ def read_any_image(path: Path) -> np.ndarray:
     """(H, W) or (H, W, 3) RGB; uint8, uint16 or float32 as the file holds. AssetError when undecodable."""
     if path.suffix.lower() == ".pfm":
         from blinkgl.io.pfm import read_pfm
+
         return read_pfm(path)
     if path.suffix.lower() == ".exr":
         from blinkgl.io.video import read_exr
+
         return read_exr(path)
     image = read_image(path)
     if image.dtype not in (np.uint8, np.uint16, np.float32):
-        raise AssetError("unsupported pixel type", where=str(path), value=str(image.dtype), accepted="8-bit, 16-bit or float32")
+        raise AssetError(
+            "unsupported pixel type", where=str(path), value=str(image.dtype), accepted="8-bit, 16-bit or float32"
+        )
     return image
 
 
 def _folder(folder: Path, fps: float | None, timestamps) -> FrameSource:
     files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE and p.is_file()), key=_natural)
-    stamp_file = Path(timestamps) if timestamps else next(
-        (f for f in [folder / n for n in _STAMP_FILES] + [folder.parent / "images.txt"] if f.is_file()), None)
+    stamp_file = (
+        Path(timestamps)
+        if timestamps
+        else next((f for f in [folder / n for n in _STAMP_FILES] + [folder.parent / "images.txt"] if f.is_file()), None)
+    )
     times: list[int | None]
     stamps = read_timestamps(stamp_file) if stamp_file is not None and fps is None else None
     if stamps is not None and stamps[0][1] is not None:  # "time name" lines
@@ -113,21 +134,31 @@ def _folder(folder: Path, fps: float | None, timestamps) -> FrameSource:
         times = [by_name[p.name] for p in files]
     elif stamps is not None:
         if len(stamps) != len(files):
-            raise EventDataError("one time stamp per image", where=str(stamp_file), value=f"{len(stamps)} stamps, {len(files)} images")
+            raise EventDataError(
+                "one time stamp per image", where=str(stamp_file), value=f"{len(stamps)} stamps, {len(files)} images"
+            )
         times = [t for t, _ in stamps]
     else:
         times = [None] * len(files)
     if not files:
         raise AssetError("no images in the folder", where=str(folder), accepted=" ".join(sorted(IMAGE)))
     if times[0] is None and fps is None:
-        raise EventDataError("frames without times", where=str(folder), accepted="--fps, or a timestamps.txt beside the images")
+        raise EventDataError(
+            "frames without times", where=str(folder), accepted="--fps, or a timestamps.txt beside the images"
+        )
     first = read_any_image(files[0])
-    return FrameSource(folder, *first.shape[:2], len(files), fps,
-                       lambda: ((read_any_image(p), t, p.name) for p, t in zip(files, times)))
+    return FrameSource(
+        folder,
+        *first.shape[:2],
+        len(files),
+        fps,
+        lambda: ((read_any_image(p), t, p.name) for p, t in zip(files, times)),
+    )
 
 
 def _video(path: Path, fps: float | None, timestamps) -> FrameSource:
     from blinkgl.io.video import VideoReader
+
     reader = VideoReader(path)
     times = [t for t, _ in read_timestamps(Path(timestamps))] if timestamps and fps is None else None
     fps = fps or reader.fps
@@ -137,7 +168,9 @@ def _video(path: Path, fps: float | None, timestamps) -> FrameSource:
     def frames():
         for i, frame in enumerate(reader):
             if times is not None and i >= len(times):
-                raise EventDataError(f"no time stamp for frame {i}", where=str(timestamps), value=f"{len(times)} stamps")
+                raise EventDataError(
+                    f"no time stamp for frame {i}", where=str(timestamps), value=f"{len(times)} stamps"
+                )
             yield frame, times[i] if times is not None else None, f"#{i}"
 
     return FrameSource(path, reader.height, reader.width, reader.expected or None, fps, frames)
@@ -155,12 +188,16 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
                 if name is None:
                     raise AssetError("no array 'frames'", where=str(path), value=data.names)
                 frames = data[name]
-                stamp = next((k for k in ("timestamps", "t", "times", "timestamps_us", "timestamps_ns") if k in data), None)
+                stamp = next(
+                    (k for k in ("timestamps", "t", "times", "timestamps_us", "timestamps_ns") if k in data), None
+                )
                 times = _stamps(stamp, data[stamp]) if stamp else None
     if not (frames.ndim == 3 or (frames.ndim == 4 and frames.shape[3] in (1, 3))) or not frames.shape[0]:
         raise AssetError("not frames", where=str(path), value=frames.shape, accepted="(N, H, W) or (N, H, W, 3)")
     if frames.dtype not in (np.uint8, np.uint16) and frames.dtype.kind != "f":
-        raise AssetError("unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float")
+        raise AssetError(
+            "unsupported pixel type", where=str(path), value=str(frames.dtype), accepted="uint8, uint16 or float"
+        )
     if timestamps:
         times = [t for t, _ in read_timestamps(Path(timestamps))]
     if fps is not None:
@@ -168,7 +205,9 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
     elif times is None:
         raise EventDataError("frames without times", where=str(path), accepted="--fps or --timestamps")
     elif len(times) != len(frames):
-        raise EventDataError("one time stamp per frame", where=str(path), value=f"{len(times)} stamps, {len(frames)} frames")
+        raise EventDataError(
+            "one time stamp per frame", where=str(path), value=f"{len(times)} stamps, {len(frames)} frames"
+        )
 
     def iterate():
         for i in range(len(frames)):
@@ -176,7 +215,11 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
             if frame.dtype.kind == "f":
                 with np.errstate(over="ignore"):  # becomes inf, which is refused by name later
                     frame = frame.astype(np.float32)
-            yield frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame, times[i] if times else None, f"#{i}"
+            yield (
+                frame[..., 0] if frame.ndim == 3 and frame.shape[2] == 1 else frame,
+                times[i] if times else None,
+                f"#{i}",
+            )
 
     return FrameSource(path, *frames.shape[1:3], len(frames), fps, iterate)
 
@@ -204,13 +247,16 @@ def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
         except (ValueError, OverflowError):
             if number == 1:
                 continue
-            raise EventDataError(f"line {number} is not a time stamp", where=str(path), value=line,
-                                 accepted="'time' or 'time name'") from None
+            raise EventDataError(
+                f"line {number} is not a time stamp", where=str(path), value=line, accepted="'time' or 'time name'"
+            ) from None
         stamps.append((t_ns, fields[1] if len(fields) > 1 else None))
     if not stamps:
         raise EventDataError("no time stamps", where=str(path))
     if len({name is None for _, name in stamps}) > 1:
-        raise EventDataError("times with a name and times without one", where=str(path), accepted="'time', or 'time name', in every line")
+        raise EventDataError(
+            "times with a name and times without one", where=str(path), accepted="'time', or 'time name', in every line"
+        )
     return stamps
 
 

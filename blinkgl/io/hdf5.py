@@ -40,7 +40,13 @@ def open_hdf5(path: Path) -> h5py.File:
         file = h5py.File(path, "r")
     except (OSError, ValueError) as error:
         text = " ".join(str(error).split())
-        problem = "truncated HDF5 file" if "truncated" in text else "not an HDF5 file" if "signature" in text else f"cannot be opened: {text}"
+        problem = (
+            "truncated HDF5 file"
+            if "truncated" in text
+            else "not an HDF5 file"
+            if "signature" in text
+            else f"cannot be opened: {text}"
+        )
         raise AssetError(problem, where=str(path)) from error
     with hdf5_errors(path, file):
         links: list[tuple[bytes, int]] = []
@@ -48,8 +54,11 @@ def open_hdf5(path: Path) -> h5py.File:
         file.id.links.visit(lambda name, link: links.append((name, link.type)), info=True)
         for name, kind in links:
             if (what := _leads_out(file.id, name, kind)) is not None:
-                raise AssetError(f"'{name.decode(errors='replace')}' is {what}, which leads to other files; refused", where=str(path),
-                                 accepted="a file that holds its own data")
+                raise AssetError(
+                    f"'{name.decode(errors='replace')}' is {what}, which leads to other files; refused",
+                    where=str(path),
+                    accepted="a file that holds its own data",
+                )
     return file
 
 
@@ -82,13 +91,18 @@ def hdf5_errors(path: Path, file: h5py.File | None = None) -> Iterator[None]:
         if isinstance(error, (OSError, KeyError, RuntimeError, ValueError, TypeError, OverflowError, MemoryError)):
             text = " ".join(str(error).split())[:160]
             if re.search(r"required filter|plugin|can't open directory", text):
-                raise AssetError(f"compressed with an HDF5 filter that is not installed ({text})", where=str(path),
-                                 accepted="a filter of the package hdf5plugin (Blosc, Zstd, LZ4 …), or gzip") from error
+                raise AssetError(
+                    f"compressed with an HDF5 filter that is not installed ({text})",
+                    where=str(path),
+                    accepted="a filter of the package hdf5plugin (Blosc, Zstd, LZ4 …), or gzip",
+                ) from error
             raise AssetError(f"damaged HDF5 file: {text}", where=str(path)) from error
         raise
 
 
-def dataset(file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu") -> h5py.Dataset:
+def dataset(
+    file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, ...], kinds: str = "iu"
+) -> h5py.Dataset:
     """The data set ``name``, with its shape (None: any length) and NumPy kinds ("iu" integers, "f" floats, "b" bools)
     as asked for, and as many values stored as it claims.
 
@@ -97,32 +111,50 @@ def dataset(file: h5py.File, name: str, path: Path, *, shape: tuple[int | None, 
     found = file.get(name)
     if not isinstance(found, h5py.Dataset):
         raise AssetError(f"no dataset '{name}'", where=str(path))
-    fits = found.shape is not None and len(found.shape) == len(shape) and all(b in (None, a) for a, b in zip(found.shape, shape))
+    fits = (
+        found.shape is not None
+        and len(found.shape) == len(shape)
+        and all(b in (None, a) for a, b in zip(found.shape, shape))
+    )
     if not fits or found.dtype.kind not in kinds or found.dtype.shape:
         wanted = {"iu": "integers", "iub": "integers", "f": "floats"}.get(kinds, "numbers")
-        raise AssetError(f"dataset '{name}' has the wrong shape or type", where=str(path), value=f"{found.dtype} {found.shape}",
-                         accepted=f"{wanted} ({', '.join('N' if n is None else str(n) for n in shape)})")
+        raise AssetError(
+            f"dataset '{name}' has the wrong shape or type",
+            where=str(path),
+            value=f"{found.dtype} {found.shape}",
+            accepted=f"{wanted} ({', '.join('N' if n is None else str(n) for n in shape)})",
+        )
     layout = found.id.get_create_plist()
     for code, _, values, _ in (layout.get_filter(k) for k in range(layout.get_nfilters())):
         if code == hdf5plugin.Blosc.filter_id and len(values) < _BLOSC_VALUES:
-            raise AssetError(f"damaged HDF5 file: dataset '{name}' lacks what Blosc needs to unpack it", where=str(path))
+            raise AssetError(
+                f"damaged HDF5 file: dataset '{name}' lacks what Blosc needs to unpack it", where=str(path)
+            )
     if found.chunks is None:
         whole = layout.get_layout() == h5py.h5d.COMPACT or found.id.get_storage_size() >= found.nbytes
     else:
         if math.prod(found.chunks) * found.dtype.itemsize > _MAX_CHUNK_BYTES:
-            raise AssetError(f"dataset '{name}' has chunks too large to unpack", where=str(path), value=found.chunks,
-                             accepted=f"at most {_MAX_CHUNK_BYTES >> 20} MB each")
+            raise AssetError(
+                f"dataset '{name}' has chunks too large to unpack",
+                where=str(path),
+                value=found.chunks,
+                accepted=f"at most {_MAX_CHUNK_BYTES >> 20} MB each",
+            )
         whole = found.id.get_num_chunks() >= math.prod(-(-n // c) for n, c in zip(found.shape, found.chunks))
     if not whole:
         raise AssetError(f"dataset '{name}' claims {found.size} values, but fewer are stored", where=str(path))
     return found
 
 
-def blosc_dataset(file: h5py.File, name: str, shape: tuple[int, ...], dtype: DTypeLike, chunks: tuple[int, ...]) -> h5py.Dataset:
+def blosc_dataset(
+    file: h5py.File, name: str, shape: tuple[int, ...], dtype: DTypeLike, chunks: tuple[int, ...]
+) -> h5py.Dataset:
     """A new data set that grows along its first axis: Blosc-zstd level 1 with bit shuffle
     (filter 32001), as in DSEC's files."""
     codec = hdf5plugin.Blosc(cname="zstd", clevel=_LEVEL, shuffle=_BIT_SHUFFLE)
-    return file.create_dataset(name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, compression=codec)
+    return file.create_dataset(
+        name, shape, dtype, maxshape=(None, *shape[1:]), chunks=chunks, track_times=False, compression=codec
+    )
 
 
 def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
@@ -138,20 +170,32 @@ def write_rows(data: h5py.Dataset, start: int, rows: np.ndarray) -> None:
         rows = np.concatenate([data[begin:start], rows])
     data.resize(begin + len(rows), axis=0)
     for i in range(0, len(rows), step):
-        piece = rows[i:i + step]
+        piece = rows[i : i + step]
         if len(piece) < step:  # HDF5 stores the last chunk whole, filled with zeros
             piece = np.concatenate([piece, np.zeros((step - len(piece), *piece.shape[1:]), piece.dtype)])
         packed = _compressed(piece)
         # As HDF5's filter does: what does not become smaller is stored as it is, and the chunk says so.
         skipped = 1 if packed is None else 0
-        data.id.write_direct_chunk((begin + i, *(0,) * (data.ndim - 1)), piece.tobytes() if skipped else packed, skipped)
+        data.id.write_direct_chunk(
+            (begin + i, *(0,) * (data.ndim - 1)), piece.tobytes() if skipped else packed, skipped
+        )
 
 
 def _compressed(array: np.ndarray) -> bytes | None:
     """One Blosc buffer; None when it is not smaller than the array."""
     out, size = ctypes.create_string_buffer(array.nbytes), ctypes.c_size_t
-    n = _blosc().blosc_compress_ctx(_LEVEL, _BIT_SHUFFLE, size(array.dtype.itemsize), size(array.nbytes),
-                                    array.ctypes.data_as(ctypes.c_void_p), out, size(array.nbytes), b"zstd", size(0), 1)
+    n = _blosc().blosc_compress_ctx(
+        _LEVEL,
+        _BIT_SHUFFLE,
+        size(array.dtype.itemsize),
+        size(array.nbytes),
+        array.ctypes.data_as(ctypes.c_void_p),
+        out,
+        size(array.nbytes),
+        b"zstd",
+        size(0),
+        1,
+    )
     if n < 0:
         raise RuntimeError(f"Blosc could not compress {array.nbytes} bytes: {n}")
     return out.raw[:n] if n else None

@@ -92,11 +92,19 @@ def npy_header(file: BinaryIO, size: int, where: str) -> tuple[tuple[int, ...], 
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read(file)
     if dtype.hasobject:
-        raise AssetError("array of Python objects, which could run any code when loaded; refused", where=where, accepted="an array of numbers")
+        raise AssetError(
+            "array of Python objects, which could run any code when loaded; refused",
+            where=where,
+            accepted="an array of numbers",
+        )
     expected = file.tell() + math.prod(shape) * dtype.itemsize
     if size != expected or min(shape, default=0) < 0:
-        raise AssetError("truncated or malformed array: its header does not agree with its length", where=where,
-                         value=f"{dtype} {shape} in {size} bytes", accepted=f"{expected} bytes")
+        raise AssetError(
+            "truncated or malformed array: its header does not agree with its length",
+            where=where,
+            value=f"{dtype} {shape} in {size} bytes",
+            accepted=f"{expected} bytes",
+        )
     return shape, fortran, dtype
 
 
@@ -125,8 +133,12 @@ class NpzReader:
             raise AssetError("no such array" if name not in self.names else "is no array", where=where)
         size = self._archive.getinfo(f"{name}.npy").file_size
         if size > memory_limit():
-            raise AssetError("array too large for this machine's memory", where=where, value=f"{size / 1e9:.1f} GB",
-                             accepted=f"at most {memory_limit() / 1e9:.1f} GB")
+            raise AssetError(
+                "array too large for this machine's memory",
+                where=where,
+                value=f"{size / 1e9:.1f} GB",
+                accepted=f"at most {memory_limit() / 1e9:.1f} GB",
+            )
         with self._archive.open(f"{name}.npy") as member:
             npy_header(member, size, where)
         with self._archive.open(f"{name}.npy") as member:
@@ -147,4 +159,6 @@ def numpy_errors(path: str | os.PathLike) -> Iterator[None]:
     except AssetError:
         raise
     except Exception as error:
-        raise AssetError(f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)) from error
+        raise AssetError(
+            f"cannot read: {' '.join(str(error).split())[:160] or type(error).__name__}", where=str(path)
+        ) from error

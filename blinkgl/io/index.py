@@ -29,7 +29,20 @@ from blinkgl.io.sequence_dir import MANIFEST, read_manifest
 
 INDEX = "index.jsonl"
 _PART = 20_000
-_KEYS = ("split", "sequence", "seed", "emulator", "events", "labels", "frames", "height", "width", "t_offset_us", "duration_us", "blinkgl")
+_KEYS = (
+    "split",
+    "sequence",
+    "seed",
+    "emulator",
+    "events",
+    "labels",
+    "frames",
+    "height",
+    "width",
+    "t_offset_us",
+    "duration_us",
+    "blinkgl",
+)
 
 
 def sequence_folders(root: str | Path) -> Iterator[Path]:
@@ -48,8 +61,12 @@ def sequence_folders(root: str | Path) -> Iterator[Path]:
 def entry(root: Path, folder: Path) -> dict[str, Any]:
     """A sequence's line. Raises AssetError for a damaged manifest."""
     manifest = read_manifest(folder)
-    return {"path": folder.relative_to(root).as_posix(), "name": folder.name, **{key: manifest.get(key) for key in _KEYS},
-            "bytes": sum(file["bytes"] for file in manifest["files"].values())}
+    return {
+        "path": folder.relative_to(root).as_posix(),
+        "name": folder.name,
+        **{key: manifest.get(key) for key in _KEYS},
+        "bytes": sum(file["bytes"] for file in manifest["files"].values()),
+    }
 
 
 def write_index(root: str | Path) -> int:
@@ -128,7 +145,13 @@ def read_index(root: str | Path) -> list[dict[str, Any]]:
     except FileNotFoundError:
         raise AssetError("no such file", where=str(path)) from None
     except ValueError as error:
-        raise AssetError(f"damaged index: {error}", where=str(path), accepted="run 'blinkgl report' to make it anew") from None
+        raise AssetError(
+            f"damaged index: {error}", where=str(path), accepted="run 'blinkgl report' to make it anew"
+        ) from None
     if twice := [name for name, count in Counter(line["path"] for line in entries).items() if count > 1]:
-        raise AssetError(f"damaged index: {shown(twice[0])} is listed twice", where=str(path), accepted="run 'blinkgl report' to make it anew")
+        raise AssetError(
+            f"damaged index: {shown(twice[0])} is listed twice",
+            where=str(path),
+            accepted="run 'blinkgl report' to make it anew",
+        )
     return entries

@@ -31,7 +31,7 @@ class MvsecReader:
             table = event_table(file, self.path, self._name)
             for i in range(0, len(table), size):
                 with hdf5_errors(self.path):
-                    rows = table[i:i + size]
+                    rows = table[i : i + size]
                 yield events_of_rows(rows, str(self.path), i)
 
 

@@ -11,7 +11,9 @@ import numpy as np
 from blinkgl.errors import AssetError
 from blinkgl.io.atomic import output_errors
 
-_HEADER = re.compile(rb"^(PF|Pf)\s+(\d{1,9})\s+(\d{1,9})\s+([-+]?(?:\d{1,40}\.?\d{0,40}|\.\d{1,40})(?:[eE][-+]?\d{1,4})?)[ \t\r]?\n")
+_HEADER = re.compile(
+    rb"^(PF|Pf)\s+(\d{1,9})\s+(\d{1,9})\s+([-+]?(?:\d{1,40}\.?\d{0,40}|\.\d{1,40})(?:[eE][-+]?\d{1,4})?)[ \t\r]?\n"
+)
 
 
 def encode_pfm(image: np.ndarray) -> bytes:
@@ -47,7 +49,9 @@ def decode_pfm(data: bytes, path: str | os.PathLike) -> np.ndarray:
     channels = 3 if kind == b"PF" else 1
     expected = header.end() + 4 * width * height * channels
     if len(data) != expected or width == 0 or height == 0 or not 0 < abs(scale) < float("inf"):
-        raise AssetError("truncated or malformed PFM file", where=str(path), value=f"{len(data)} bytes", accepted=f"{expected}")
+        raise AssetError(
+            "truncated or malformed PFM file", where=str(path), value=f"{len(data)} bytes", accepted=f"{expected}"
+        )
     pixels = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end()).astype(np.float32)
     shape = (height, width, 3) if channels == 3 else (height, width)
     return np.ascontiguousarray(pixels.reshape(shape)[::-1])

@@ -60,12 +60,25 @@ def component(array: np.ndarray, which: str) -> np.ndarray:
         return np.linalg.norm(array.astype(np.float64), axis=-1)
     k = "xyzw".find(which) if len(which) == 1 else -1
     if not 0 <= k < array.shape[2]:
-        raise ConfigError("no such component", where="component", value=which, accepted="one of auto, length, " + ", ".join("xyzw"[: array.shape[2]]))
+        raise ConfigError(
+            "no such component",
+            where="component",
+            value=which,
+            accepted="one of auto, length, " + ", ".join("xyzw"[: array.shape[2]]),
+        )
     return array[..., k]
 
 
-def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str | None = None, low: float | None = None,
-            high: float | None = None, hit: np.ndarray | None = None) -> tuple[np.ndarray, dict]:
+def picture(
+    kind: str,
+    array: np.ndarray,
+    *,
+    which: str = "auto",
+    colours: str | None = None,
+    low: float | None = None,
+    high: float | None = None,
+    hit: np.ndarray | None = None,
+) -> tuple[np.ndarray, dict]:
     """(H, W, 3) uint8 and a legend: {"kind": "bar", "map", "low", "high", "log"}, {"kind":
     "wheel", "high"} or {"kind": kind}.
 
@@ -103,4 +116,10 @@ def picture(kind: str, array: np.ndarray, *, which: str = "auto", colours: str |
     auto = finite_range(values, signed)
     low, high = auto[0] if low is None else low, auto[1] if high is None else high
     log = kind == "depth" and low > 0
-    return map_scalar(values, name, low, high, log), {"kind": "bar", "map": name, "low": float(low), "high": float(high), "log": log}
+    return map_scalar(values, name, low, high, log), {
+        "kind": "bar",
+        "map": name,
+        "low": float(low),
+        "high": float(high),
+        "log": log,
+    }

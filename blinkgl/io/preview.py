@@ -39,8 +39,18 @@ class PreviewWriter:
     Raises OutputError when the video cannot be written.
     """
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, *, t0_us: int = 0, flow: bool = True,
-                 rate_hz: float = 40, fps: float = 20, label: str = "frame"):
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        height: int,
+        width: int,
+        *,
+        t0_us: int = 0,
+        flow: bool = True,
+        rate_hz: float = 40,
+        fps: float = 20,
+        label: str = "frame",
+    ):
         self._counts = np.zeros((2, height, width), np.uint16)
         self._pending = 0
         factor = min(1.0, _MAX_PANEL_HEIGHT / height)
@@ -116,7 +126,7 @@ class PreviewWriter:
     def _panel_view(self, panel: int) -> np.ndarray:
         w, h = self._panel
         left = panel * (w + _GAP)
-        return self._canvas[_BAR:_BAR + h, left:left + w]
+        return self._canvas[_BAR : _BAR + h, left : left + w]
 
     def _fit(self, image: np.ndarray) -> np.ndarray:
         larger = self._panel[1] > image.shape[0]
@@ -129,7 +139,7 @@ class PreviewWriter:
         draw.text((8, _BAR / 2), self._names[panel], fill=_TEXT, font=self._font, anchor="lm")
         draw.text((w - 8, _BAR / 2), detail, fill=_DIM, font=self._small, anchor="rm")
         left = panel * (w + _GAP)
-        self._canvas[:_BAR, left:left + w] = np.asarray(strip)
+        self._canvas[:_BAR, left : left + w] = np.asarray(strip)
 
     def _legend(self) -> None:
         """The colour wheel in the flow panel's lower right corner."""
@@ -137,10 +147,10 @@ class PreviewWriter:
         size = 2 * _LEGEND + 1
         if min(view.shape[:2]) < 3 * size:
             return
-        y, x = np.mgrid[-_LEGEND:_LEGEND + 1, -_LEGEND:_LEGEND + 1]
+        y, x = np.mgrid[-_LEGEND : _LEGEND + 1, -_LEGEND : _LEGEND + 1]
         inside = np.clip(_LEGEND + 0.5 - np.hypot(x, y), 0, 1)[..., None]  # one pixel of anti-aliasing
         wheel = cv2.resize(flow_wheel(), (size, size), interpolation=cv2.INTER_AREA)
-        corner = view[-size - 6:-6, -size - 6:-6]
+        corner = view[-size - 6 : -6, -size - 6 : -6]
         ring = np.clip(1.5 - np.abs(np.hypot(x, y) - _LEGEND), 0, 1)[..., None]
         mixed = corner * (1 - inside) + wheel * inside
         corner[:] = mixed * (1 - ring) + 60 * ring

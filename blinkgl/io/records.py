@@ -58,7 +58,9 @@ def parse(text: str, model: TypeAdapter | None = None) -> Any:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = ".".join(shown(part) for part in first["loc"])
-        raise ValueError(f"{place}: {first['msg'].removeprefix('Value error, ').lower()}" if place else first["msg"].lower()) from None
+        raise ValueError(
+            f"{place}: {first['msg'].removeprefix('Value error, ').lower()}" if place else first["msg"].lower()
+        ) from None
     except RecursionError:
         raise ValueError("nested too deeply") from None
     except json.JSONDecodeError as error:
@@ -113,7 +115,13 @@ def entries_below(folder: str | os.PathLike) -> Iterator[tuple[str, str, int]]:
                 if stat.S_ISDIR(status.st_mode):
                     pending.append(name + "/")
                 else:
-                    kind = "file" if stat.S_ISREG(status.st_mode) else "symbolic link" if stat.S_ISLNK(status.st_mode) else "special file"
+                    kind = (
+                        "file"
+                        if stat.S_ISREG(status.st_mode)
+                        else "symbolic link"
+                        if stat.S_ISLNK(status.st_mode)
+                        else "special file"
+                    )
                     yield name, kind, status.st_size
         if empty and prefix:
             yield prefix[:-1], "empty folder", 0

@@ -74,10 +74,24 @@ class SequenceWriter:
     OutputError : the directory exists, or cannot be written.
     """
 
-    def __init__(self, final: str | os.PathLike, height: int, width: int, *, config_yaml: str, t_offset_us: int = 0,
-                 labels: LabelsConfig | None = None, events: bool = True):
+    def __init__(
+        self,
+        final: str | os.PathLike,
+        height: int,
+        width: int,
+        *,
+        config_yaml: str,
+        t_offset_us: int = 0,
+        labels: LabelsConfig | None = None,
+        events: bool = True,
+    ):
         self.final = Path(final)
-        self.height, self.width, self.config_yaml, self.t_offset_us = int(height), int(width), config_yaml, int(t_offset_us)
+        self.height, self.width, self.config_yaml, self.t_offset_us = (
+            int(height),
+            int(width),
+            config_yaml,
+            int(t_offset_us),
+        )
         self.labels = labels
         self.info: dict[str, Any] = {}
         self.t_end_us: int | None = None
@@ -99,8 +113,11 @@ class SequenceWriter:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="sequence-writer")
         self._slots = threading.BoundedSemaphore(_IN_FLIGHT)
         try:
-            self._events = (DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us)
-                            if self._with_events else None)
+            self._events = (
+                DsecEventWriter(self._tmp / "events.h5", self.height, self.width, self.t_offset_us)
+                if self._with_events
+                else None
+            )
         except BaseException:
             self._discard()
             raise
@@ -170,10 +187,12 @@ class SequenceWriter:
 
     def external(self, name: str, save: Callable[[Path], None]) -> None:
         """Runs ``save(path)`` in the background thread."""
+
         def task() -> None:
             path = self.path(name)
             with output_errors(path):
                 save(path)
+
         self._promised.add(name)
         self._submit(task)
 
@@ -199,6 +218,7 @@ class SequenceWriter:
                 file.flush()
                 os.fsync(file.fileno())
             self._files[name] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+
         self._submit(task)
 
     def _submit(self, task: Callable[[], None]) -> None:
@@ -246,9 +266,17 @@ class SequenceWriter:
                 if path.is_file() and name not in self._files:
                     fsync(path)
                     self._files[name] = _digest(path)
-            manifest = {"format": "blinkgl-sequence", "format_version": 1, "height": self.height, "width": self.width,
-                        "t_offset_us": self.t_offset_us, "events": self._events.count if self._events is not None else 0,
-                        "flow_pixels_out_of_range": self.lost, **self.info, "files": self._files}
+            manifest = {
+                "format": "blinkgl-sequence",
+                "format_version": 1,
+                "height": self.height,
+                "width": self.width,
+                "t_offset_us": self.t_offset_us,
+                "events": self._events.count if self._events is not None else 0,
+                "flow_pixels_out_of_range": self.lost,
+                **self.info,
+                "files": self._files,
+            }
             path = self._tmp / MANIFEST
             path.write_text(json.dumps(manifest, indent=1, sort_keys=True, default=_plain) + "\n", encoding="utf-8")
             fsync(path)
@@ -261,11 +289,17 @@ class SequenceWriter:
     def _check_untouched(self) -> None:
         """OutputError when a file that was written is gone or cut: somebody tidied up under us.
         Half of it must not pass for the whole."""
-        sizes = {name: path.stat().st_size if (path := self._tmp / name).is_file() else None for name in self._promised | self._files.keys()}
+        sizes = {
+            name: path.stat().st_size if (path := self._tmp / name).is_file() else None
+            for name in self._promised | self._files.keys()
+        }
         for name, size in sorted(sizes.items()):
             if size is None or size != self._files.get(name, {"bytes": size})["bytes"]:
-                raise OutputError(f"{name} was deleted or altered while the sequence was being written", where=str(self.final),
-                                  accepted="a folder that nobody else writes to")
+                raise OutputError(
+                    f"{name} was deleted or altered while the sequence was being written",
+                    where=str(self.final),
+                    accepted="a folder that nobody else writes to",
+                )
 
     def _discard(self) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
@@ -285,8 +319,11 @@ def refuse_existing(final: str | os.PathLike) -> None:
     if final.is_dir() and not any(final.iterdir()):
         return
     if final.exists() or final.is_symlink():
-        raise OutputError("output folder exists" if final.is_dir() else "output path is a file", where=str(final),
-                          accepted="a new folder name")
+        raise OutputError(
+            "output folder exists" if final.is_dir() else "output path is a file",
+            where=str(final),
+            accepted="a new folder name",
+        )
 
 
 class _File(BaseModel):

@@ -43,7 +43,11 @@ class TextReader:
             with open(path, "rb") as file:
                 while line := file.readline(_LONGEST_LINE + 1):
                     if len(line) > _LONGEST_LINE:
-                        raise AssetError(f"line {self._lines + 1} is longer than {_LONGEST_LINE} bytes", where=str(path), value=line[:40])
+                        raise AssetError(
+                            f"line {self._lines + 1} is longer than {_LONGEST_LINE} bytes",
+                            where=str(path),
+                            value=line[:40],
+                        )
                     text = line.decode("utf-8-sig", "replace").strip()
                     if text and text[0] not in "#%":
                         size = re.fullmatch(r"(\d{1,9})[ \t,]+(\d{1,9})", text)
@@ -65,8 +69,12 @@ class TextReader:
         names = re.split(r"[,\t]|\s+(?![\[(])", text.lower().replace('"', ""))
         found = [_COLUMN.fullmatch(name.strip()) for name in names if name.strip()]
         if len(found) != 4 or not all(m and m["name"] in known for m, known in zip(found, _COLUMN_NAMES)):
-            raise AssetError(f"line {self._lines + 1} is not an event, and does not name the columns of one", where=str(self.path), value=text,
-                             accepted=f"{_ACCEPTED}, in this order")
+            raise AssetError(
+                f"line {self._lines + 1} is not an event, and does not name the columns of one",
+                where=str(self.path),
+                value=text,
+                accepted=f"{_ACCEPTED}, in this order",
+            )
         if found[0]["unit"]:
             self._unit = _SECONDS if found[0]["unit"] == "s" else _MICROSECONDS
         if found[1]["size"] and found[2]["size"]:
@@ -85,7 +93,9 @@ class TextReader:
                 text, rest = text[:cut], text[cut:]
                 if len(rest) > _LONGEST_LINE:
                     line += text.count(b"\n") + 1
-                    raise AssetError(f"line {line} is longer than {_LONGEST_LINE} bytes", where=str(self.path), value=rest[:40])
+                    raise AssetError(
+                        f"line {line} is longer than {_LONGEST_LINE} bytes", where=str(self.path), value=rest[:40]
+                    )
                 buffer = np.frombuffer(text, np.uint8)
                 capacity = text.count(b"\n")
                 x, y, p = np.empty(capacity, np.uint16), np.empty(capacity, np.uint16), np.empty(capacity, np.uint8)
@@ -94,9 +104,18 @@ class TextReader:
                 if bad >= 0:
                     content = text.split(b"\n", bad + 1)[bad].decode("latin-1")
                     if mixed:
-                        raise AssetError(f"line {line + bad + 1} has its time in another unit", where=str(self.path), value=content,
-                                         accepted="either integers (µs) or numbers with a point (s) in the whole file")
-                    raise AssetError(f"line {line + bad + 1} is not an event", where=str(self.path), value=content, accepted=_ACCEPTED)
+                        raise AssetError(
+                            f"line {line + bad + 1} has its time in another unit",
+                            where=str(self.path),
+                            value=content,
+                            accepted="either integers (µs) or numbers with a point (s) in the whole file",
+                        )
+                    raise AssetError(
+                        f"line {line + bad + 1} is not an event",
+                        where=str(self.path),
+                        value=content,
+                        accepted=_ACCEPTED,
+                    )
                 line += capacity
                 if n:
                     yield Events(x[:n], y[:n], t[:n], p[:n])
@@ -122,7 +141,9 @@ class TextWriter:
     def append(self, events: Events) -> None:
         if len(events) and events.t[0] < 0:
             raise EventDataError("negative time", where=str(self.path), value=int(events.t[0]), accepted=">= 0 µs")
-        self._last = check_events(events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last)
+        self._last = check_events(
+            events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
+        )
         self._count += len(events)
         # 13 digits of seconds, point, 6, two coordinates of 5, polarity, separators, newline
         buffer = np.empty(len(events) * 40, np.uint8)
@@ -225,7 +246,7 @@ def _parse(buffer, x, y, t, p, unit):
             if not (c == 32 or c == 9 or c == 44 or c == 13 or c == 10):
                 return n, line, False
             values[field], ok = _scaled(mantissa, exponent + (6 if field == 0 and not integer else 0))
-            if not ok or (field > 0 and exponent < 0 and values[field] * 10.0 ** -exponent != mantissa):
+            if not ok or (field > 0 and exponent < 0 and values[field] * 10.0**-exponent != mantissa):
                 return n, line, False  # also coordinates between pixels: rectified events are not raw events
             if field == 0 and (values[0] != 0 or not integer):  # a plain 0 is the same in both
                 kind = 0 if integer else 1

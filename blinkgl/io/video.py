@@ -23,15 +23,49 @@ class VideoWriter:
     width and height have to be even. One encoder thread: the bytes do not depend on the machine's core count. Use as a
     context manager. Raises OutputError, one line with ffmpeg's own reason, when the file cannot be written."""
 
-    def __init__(self, path: str | os.PathLike, height: int, width: int, fps: float, *, preset: str = "veryfast", crf: int = 20):
+    def __init__(
+        self, path: str | os.PathLike, height: int, width: int, fps: float, *, preset: str = "veryfast", crf: int = 20
+    ):
         if height % 2 or width % 2:
             raise ValueError(f"yuv420p needs even sizes, got {width}x{height}")
         self.path, self._shape = Path(path), (height, width, 3)
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the writer
-        command = [_ffmpeg(OutputError, path), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
-                   "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-", "-an", "-c:v", "libx264", "-preset", preset, "-crf", str(crf),
-                   "-pix_fmt", "yuv420p", "-threads", "1", "-fflags", "+bitexact", "-flags:v", "+bitexact", "-map_metadata", "-1",
-                   "-movflags", "+faststart", os.fspath(path)]
+        command = [
+            _ffmpeg(OutputError, path),
+            "-y",
+            "-loglevel",
+            "error",
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "rgb24",
+            "-s",
+            f"{width}x{height}",
+            "-r",
+            f"{fps:g}",
+            "-i",
+            "-",
+            "-an",
+            "-c:v",
+            "libx264",
+            "-preset",
+            preset,
+            "-crf",
+            str(crf),
+            "-pix_fmt",
+            "yuv420p",
+            "-threads",
+            "1",
+            "-fflags",
+            "+bitexact",
+            "-flags:v",
+            "+bitexact",
+            "-map_metadata",
+            "-1",
+            "-movflags",
+            "+faststart",
+            os.fspath(path),
+        ]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=self._log)
 
     def write(self, frame: np.ndarray) -> None:
@@ -71,7 +105,9 @@ class VideoWriter:
 
     def _fail(self, error: OSError | None) -> None:
         self._process.wait()
-        reason = _last_line(self._log) or (str(error) if error else f"ffmpeg ended with status {self._process.returncode}")
+        reason = _last_line(self._log) or (
+            str(error) if error else f"ffmpeg ended with status {self._process.returncode}"
+        )
         self.abort()
         raise OutputError(f"cannot write video: {reason}", where=str(self.path)) from error
 
@@ -101,15 +137,34 @@ class VideoReader:
             probe.close()
         except Exception as error:  # IOError, RuntimeError, IndexError, StopIteration …
             raise AssetError(f"cannot read video: {_gist(str(error))}", where=str(path)) from error
-        self.width, self.height = meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]  # ffmpeg turns frames upright
+        self.width, self.height = (
+            meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]
+        )  # ffmpeg turns frames upright
         self.fps = float(meta.get("fps") or 0)
         self.expected = round(float(meta.get("duration") or 0) * self.fps)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         size = self.width * self.height * 3
         with tempfile.TemporaryFile() as log:
-            command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-nostdin", "-i", os.fspath(self.path), "-map", "0:v:0",
-                       "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{self.width}x{self.height}", "-"]
+            command = [
+                imageio_ffmpeg.get_ffmpeg_exe(),
+                "-loglevel",
+                "error",
+                "-nostdin",
+                "-i",
+                os.fspath(self.path),
+                "-map",
+                "0:v:0",
+                "-fps_mode",
+                "passthrough",
+                "-f",
+                "rawvideo",
+                "-pix_fmt",
+                "rgb24",
+                "-s",
+                f"{self.width}x{self.height}",
+                "-",
+            ]
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, bufsize=size)
             count = 0
             try:
@@ -122,9 +177,16 @@ class VideoReader:
                 process.stdout.close()
                 process.wait()
         # Decoders also grumble about files that they decode whole: those words alone do not condemn a file.
-        damaged = re.search(r"invalid data|error while decoding|partial file|concealing|corrupt|truncat|ended prematurely", trouble, re.I)
+        damaged = re.search(
+            r"invalid data|error while decoding|partial file|concealing|corrupt|truncat|ended prematurely",
+            trouble,
+            re.I,
+        )
         if status or data or count == 0 or damaged or count < 0.95 * self.expected - 2:
-            raise AssetError(f"video truncated or corrupt after frame {count}" + (f": {trouble}" if trouble else ""), where=str(self.path))
+            raise AssetError(
+                f"video truncated or corrupt after frame {count}" + (f": {trouble}" if trouble else ""),
+                where=str(self.path),
+            )
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
@@ -132,10 +194,26 @@ def read_exr(path: str | os.PathLike) -> np.ndarray:
     ffmpeg does. AssetError: undecodable."""
     if not os.path.isfile(path):
         raise AssetError("no such file", where=str(path))
-    command = [_ffmpeg(AssetError, path), "-loglevel", "error", "-nostdin", "-i", os.fspath(path), "-frames:v", "1", "-c:v", "pfm", "-f", "image2pipe", "-"]
+    command = [
+        _ffmpeg(AssetError, path),
+        "-loglevel",
+        "error",
+        "-nostdin",
+        "-i",
+        os.fspath(path),
+        "-frames:v",
+        "1",
+        "-c:v",
+        "pfm",
+        "-f",
+        "image2pipe",
+        "-",
+    ]
     result = subprocess.run(command, capture_output=True)
     if result.returncode or not result.stdout:
-        raise AssetError(f"cannot decode OpenEXR image: {_gist(result.stderr.decode(errors='replace'))}", where=str(path))
+        raise AssetError(
+            f"cannot decode OpenEXR image: {_gist(result.stderr.decode(errors='replace'))}", where=str(path)
+        )
     return decode_pfm(result.stdout, path)
 
 
@@ -143,7 +221,11 @@ def _ffmpeg(error: type, where) -> str:
     try:
         return imageio_ffmpeg.get_ffmpeg_exe()
     except RuntimeError as problem:
-        raise error("no ffmpeg binary for video", where=str(where), accepted="use pip install imageio-ffmpeg, or set IMAGEIO_FFMPEG_EXE") from problem
+        raise error(
+            "no ffmpeg binary for video",
+            where=str(where),
+            accepted="use pip install imageio-ffmpeg, or set IMAGEIO_FFMPEG_EXE",
+        ) from problem
 
 
 def _last_line(log) -> str:
@@ -155,6 +237,12 @@ def _gist(text: str) -> str:
     """ffmpeg's most telling line, without addresses."""
     lines = [re.sub(r"^\[[^\]]*\]\s*", "", line).strip() for line in text.splitlines()]
     lines = [re.sub(r" @ 0x[0-9a-f]+", "", line) for line in lines if line]
-    telling = [line for line in lines if re.search(r"invalid|error|not found|no space|denied|partial|truncat|corrupt|moov|no such|premature", line, re.I)
-               and not line.startswith(("Conversion failed", "Error opening input file"))]
+    telling = [
+        line
+        for line in lines
+        if re.search(
+            r"invalid|error|not found|no space|denied|partial|truncat|corrupt|moov|no such|premature", line, re.I
+        )
+        and not line.startswith(("Conversion failed", "Error opening input file"))
+    ]
     return (telling or lines or [""])[-1][:200]

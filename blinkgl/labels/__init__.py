@@ -19,7 +19,28 @@ from blinkgl.labels.occlusion import OcclusionAt
 from blinkgl.labels.table import LABELS, asked_for, label_of, register, unregister
 from blinkgl.labels.velocity import Velocity
 
-for _row in (Images(), Depth(), Ids(), Normals(), Velocity(), FlowTo("forward"), FlowTo("backward"), OcclusionAt("forward"), OcclusionAt("backward")):
+for _row in (
+    Images(),
+    Depth(),
+    Ids(),
+    Normals(),
+    Velocity(),
+    FlowTo("forward"),
+    FlowTo("backward"),
+    OcclusionAt("forward"),
+    OcclusionAt("backward"),
+):
     register(_row)
 
-__all__ = ["LABELS", "Flow", "Form", "Label", "LabelFrame", "LabelRequest", "asked_for", "label_of", "register", "unregister"]
+__all__ = [
+    "LABELS",
+    "Flow",
+    "Form",
+    "Label",
+    "LabelFrame",
+    "LabelRequest",
+    "asked_for",
+    "label_of",
+    "register",
+    "unregister",
+]

@@ -36,7 +36,11 @@ class Form:
         """Whether ``name`` is one of its files."""
         if self.rows:
             return name == self.file(0)
-        return name.startswith(self.folder + "/") and name.endswith("." + self.ending) and "/" not in name[len(self.folder) + 1:]
+        return (
+            name.startswith(self.folder + "/")
+            and name.endswith("." + self.ending)
+            and "/" not in name[len(self.folder) + 1 :]
+        )
 
 
 def npy(folder: str) -> Form:
@@ -62,6 +66,7 @@ def image_png(folder: str) -> Form:
 def _images(name: str) -> Callable[[Any], Any]:
     """A function of :mod:`blinkgl.io.images`, which is imported when it is first used:
     configuration reads this module."""
+
     def call(value: Any) -> Any:
         from blinkgl.io import images
 

@@ -18,8 +18,14 @@ if TYPE_CHECKING:
     from blinkgl.render.passes import Shot
 
 _KEYS = {
-    "flow": Key(tuple[Literal["forward", "backward"], ...], Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"), "depth"),
-    "float_flow": Key(tuple[Literal["npy", "flo", "h5"], ...], Field((), description="float32 flow besides the PNG"), "depth"),
+    "flow": Key(
+        tuple[Literal["forward", "backward"], ...],
+        Field(("forward",), description="directions of optical flow, DSEC 16-bit PNG"),
+        "depth",
+    ),
+    "float_flow": Key(
+        tuple[Literal["npy", "flo", "h5"], ...], Field((), description="float32 flow besides the PNG"), "depth"
+    ),
 }
 _PX, _SHARE = 2 / 128, 0.95
 """Flow drawn by two renderers: agrees to two quanta of the PNG in so large a share of the
@@ -68,8 +74,12 @@ class FlowTo(Label):
     def forms(self) -> tuple[Form, ...]:
         folder = f"flow/{self.towards}"
         # Float forms have folders of their own: DSEC loaders take every file of flow/forward for a PNG.
-        return (Form(folder, "png", _png, _read), Form(folder + "_npy", "npy", _npy, _read), Form(folder + "_flo", "flo", _flo, _read),
-                Form(folder, "h5", rows=_rows))
+        return (
+            Form(folder, "png", _png, _read),
+            Form(folder + "_npy", "npy", _npy, _read),
+            Form(folder + "_flo", "flo", _flo, _read),
+            Form(folder, "h5", rows=_rows),
+        )
 
     def written(self, labels: LabelsConfig) -> tuple[Form, ...]:
         return (self.forms[0], *(form for form in self.forms[1:] if form.ending in labels.float_flow))
@@ -86,9 +96,30 @@ class FlowTo(Label):
     @property
     def views(self) -> tuple[View, ...]:
         way = self.towards
-        return (View(self.name, self.title, "px", "motion", lambda value: value.flow, lambda scene, frame: self._of(frame, "flow"), "px", 1e-2, grading.motion),
-                View(f"valid_{way}", f"valid, {way}", "", "mask", lambda value: value.valid, lambda scene, frame: self._of(frame, "valid"), "mismatch", 0.0,
-                     grading.different))
+        return (
+            View(
+                self.name,
+                self.title,
+                "px",
+                "motion",
+                lambda value: value.flow,
+                lambda scene, frame: self._of(frame, "flow"),
+                "px",
+                1e-2,
+                grading.motion,
+            ),
+            View(
+                f"valid_{way}",
+                f"valid, {way}",
+                "",
+                "mask",
+                lambda value: value.valid,
+                lambda scene, frame: self._of(frame, "valid"),
+                "mismatch",
+                0.0,
+                grading.different,
+            ),
+        )
 
     def _of(self, frame, what: str) -> np.ndarray:
         true = getattr(frame, self.towards)

@@ -38,4 +38,17 @@ class Ids(Label):
 
     @property
     def views(self) -> tuple[View, ...]:
-        return (View("id", "instance id", self.unit, self.kind, lambda value: value, self.reference, "mismatch", 0.0, grading.different, same_triangle=False),)
+        return (
+            View(
+                "id",
+                "instance id",
+                self.unit,
+                self.kind,
+                lambda value: value,
+                self.reference,
+                "mismatch",
+                0.0,
+                grading.different,
+                same_triangle=False,
+            ),
+        )

@@ -38,8 +38,12 @@ class Buffer(NamedTuple):
         return self.components * self.dtype.itemsize
 
 
-BUFFERS = {"R32F": Buffer("float", 1, np.dtype(np.float32)), "RG32F": Buffer("vec2", 2, np.dtype(np.float32)),
-           "RGBA32F": Buffer("vec4", 4, np.dtype(np.float32)), "R32UI": Buffer("uint", 1, np.dtype(np.uint32))}
+BUFFERS = {
+    "R32F": Buffer("float", 1, np.dtype(np.float32)),
+    "RG32F": Buffer("vec2", 2, np.dtype(np.float32)),
+    "RGBA32F": Buffer("vec4", 4, np.dtype(np.float32)),
+    "R32UI": Buffer("uint", 1, np.dtype(np.uint32)),
+}
 VARYINGS = ("local", "normal")
 _NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
 KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
@@ -201,7 +205,11 @@ class Label:
         array = np.asarray(value)
         if array.shape[:2] != (height, width):
             return f"not {width}x{height} px: {array.shape}"
-        shapes = [(height, width), (height, width, 3)] if self.channels is None else [(height, width, self.channels) if self.channels else (height, width)]
+        shapes = (
+            [(height, width), (height, width, 3)]
+            if self.channels is None
+            else [(height, width, self.channels) if self.channels else (height, width)]
+        )
         kind = "" if self.dtype is None else np.dtype(self.dtype).kind
         if array.shape not in shapes or (kind and _NUMBERS.get(array.dtype.kind) != _NUMBERS[kind]):
             said = f" {np.dtype(self.dtype)}" if kind else ""
@@ -241,5 +249,16 @@ class Label:
     @property
     def views(self) -> tuple[View, ...]:
         """What the shader debugger shows and judges."""
-        return (View(self.name, self.heading, self.unit, self.kind, lambda value: value, self.reference, self.judged_in or self.unit,
-                     self.tolerance, self.error),)
+        return (
+            View(
+                self.name,
+                self.heading,
+                self.unit,
+                self.kind,
+                lambda value: value,
+                self.reference,
+                self.judged_in or self.unit,
+                self.tolerance,
+                self.error,
+            ),
+        )

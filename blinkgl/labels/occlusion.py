@@ -14,7 +14,11 @@ from blinkgl.labels.label import Drawn, Key, Label, Towards, View
 if TYPE_CHECKING:
     from blinkgl.config.labels import LabelsConfig
 
-_KEYS = {"occlusion": Key(bool, Field(True, description="masks of pixels that are not visible at the flow's other end"), "depth")}
+_KEYS = {
+    "occlusion": Key(
+        bool, Field(True, description="masks of pixels that are not visible at the flow's other end"), "depth"
+    )
+}
 
 
 class OcclusionAt(Label):
@@ -25,7 +29,11 @@ class OcclusionAt(Label):
     dtype = bool
 
     def __init__(self, towards: Towards):
-        self.towards, self.name, self.about = towards, f"occlusion_{towards}", f"masks of pixels hidden at the end of {towards} flow"
+        self.towards, self.name, self.about = (
+            towards,
+            f"occlusion_{towards}",
+            f"masks of pixels hidden at the end of {towards} flow",
+        )
         self.needs, self.there = (f"flow_{towards}", "ids"), ("depth", "ids")
         self.shard = "occlusion.png" if towards == "forward" else None
 
@@ -43,7 +51,15 @@ class OcclusionAt(Label):
 
         flow = drawn.value(f"flow_{self.towards}")
         z_there = drawn.raw(f"flow_{self.towards}")[..., 2]
-        return occlusion_mask(flow.flow, z_there, flow.valid, drawn.raw("ids"), drawn.there("depth"), drawn.there("ids"), drawn.scene.camera.near)
+        return occlusion_mask(
+            flow.flow,
+            z_there,
+            flow.valid,
+            drawn.raw("ids"),
+            drawn.there("depth"),
+            drawn.there("ids"),
+            drawn.scene.camera.near,
+        )
 
     @property
     def forms(self) -> tuple[Form, ...]:
@@ -52,6 +68,20 @@ class OcclusionAt(Label):
     @property
     def views(self) -> tuple[View, ...]:
         way = self.towards
-        return (View(f"occluded_{way}", f"occluded, {way}", "", "mask", lambda value: value, lambda scene, frame: getattr(frame, way).occluded,
-                     "fraction of pixels", 1e-2, grading.different, "mean", same_triangle=False, band_there=True,
-                     note="off the band at t' as well: the mask rests on one depth sample per pixel there"),)
+        return (
+            View(
+                f"occluded_{way}",
+                f"occluded, {way}",
+                "",
+                "mask",
+                lambda value: value,
+                lambda scene, frame: getattr(frame, way).occluded,
+                "fraction of pixels",
+                1e-2,
+                grading.different,
+                "mean",
+                same_triangle=False,
+                band_there=True,
+                note="off the band at t' as well: the mask rests on one depth sample per pixel there",
+            ),
+        )

@@ -33,7 +33,11 @@ def _written(drawn: list) -> str:
     before, inside = [], []
     for label in drawn:
         define = define_of(label.name)
-        before += [f"#ifdef {define}", f'#include "labels/{label.name}.glsl"',
-                   f"layout(location = {define}) out {BUFFERS[label.buffer].glsl} out_{label.name};", "#endif"]
+        before += [
+            f"#ifdef {define}",
+            f'#include "labels/{label.name}.glsl"',
+            f"layout(location = {define}) out {BUFFERS[label.buffer].glsl} out_{label.name};",
+            "#endif",
+        ]
         inside += [f"#ifdef {define}", f"    out_{label.name} = label_{label.name}();", "#endif"]
     return "\n".join([*before, "void write_labels()", "{", *inside, "}"]) + "\n"

@@ -1,6 +1,6 @@
 """Which labels there are: one table of rows, and nothing else that lists them.
 
-    register(Position())        # a Label: docs/extending.md has the whole of one
+register(Position())        # a Label: docs/extending.md has the whole of one
 """
 
 from __future__ import annotations
@@ -69,7 +69,10 @@ def asked_for(labels: LabelsConfig) -> LabelRequest:
 def _checked(label: Any) -> dict[str, Key]:
     """The label's keys. Raises TypeError as :func:`register`."""
     if not isinstance(label, Label):
-        raise TypeError(f"{label!r} is not a Label" + (": register an instance of it" if isinstance(label, type) and issubclass(label, Label) else ""))
+        raise TypeError(
+            f"{label!r} is not a Label"
+            + (": register an instance of it" if isinstance(label, type) and issubclass(label, Label) else "")
+        )
     called = type(label).__name__
 
     def unless(right: Any, part: str, problem: str) -> None:
@@ -78,42 +81,85 @@ def _checked(label: Any) -> dict[str, Key]:
 
     name = getattr(label, "name", None)
     unless(name is not None, "name", "is missing")
-    unless(isinstance(name, str) and re.fullmatch(r"[a-z](_?[a-z0-9])*", name), "name", f"is {name!r} and not a word of a-z, 0-9 and single _")
+    unless(
+        isinstance(name, str) and re.fullmatch(r"[a-z](_?[a-z0-9])*", name),
+        "name",
+        f"is {name!r} and not a word of a-z, 0-9 and single _",
+    )
     called = f"'{name}'"
     unless(name not in LABELS, "name", "is taken: there is such a label already")
     unless(bool(getattr(label, "about", "")), "about", "is missing")
     unless(label.kind in KINDS, "kind", f"is {label.kind!r} and none of {', '.join(KINDS)}")
 
-    unless(label.buffer is None or label.buffer in BUFFERS, "buffer", f"is {label.buffer!r} and none of {', '.join(BUFFERS)}")
+    unless(
+        label.buffer is None or label.buffer in BUFFERS,
+        "buffer",
+        f"is {label.buffer!r} and none of {', '.join(BUFFERS)}",
+    )
     made = type(label).finish is not Label.finish or label.anti_aliased
     unless(label.buffer or made, "buffer", "is missing, and so is `finish`: nothing makes the label")
     unless(label.buffer or label.glsl is None, "buffer", "is missing: `glsl` has nowhere to write to")
     if label.buffer and label.glsl is None:
-        unless(resources.files("blinkgl.shaders").joinpath(f"include/labels/{name}.glsl").is_file(), "glsl",
-               f"is missing, and so is the file shaders/include/labels/{name}.glsl")
+        unless(
+            resources.files("blinkgl.shaders").joinpath(f"include/labels/{name}.glsl").is_file(),
+            "glsl",
+            f"is missing, and so is the file shaders/include/labels/{name}.glsl",
+        )
     if label.glsl is not None:
         head = f"{BUFFERS[label.buffer].glsl} label_{name}()"
         unless(isinstance(label.glsl, str), "glsl", f"is {label.glsl!r} and not text")
-        unless(re.search(re.escape(head).replace(r"\ ", r"\s+").replace(r"\(\)", r"\s*\(\s*(void)?\s*\)"), label.glsl), "glsl", f"does not define {head}")
+        unless(
+            re.search(re.escape(head).replace(r"\ ", r"\s+").replace(r"\(\)", r"\s*\(\s*(void)?\s*\)"), label.glsl),
+            "glsl",
+            f"does not define {head}",
+        )
     for part, known in (("varyings", VARYINGS), ("needs", LABELS), ("there", LABELS)):
         there = getattr(label, part)
-        unless(isinstance(there, tuple) and set(there) <= {*known}, part, f"is {there!r} and not a tuple of some of {', '.join(known)}")
-    unless(label.towards in (None, "forward", "backward"), "towards", f"is {label.towards!r} and neither 'forward', 'backward' nor None")
+        unless(
+            isinstance(there, tuple) and set(there) <= {*known},
+            part,
+            f"is {there!r} and not a tuple of some of {', '.join(known)}",
+        )
+    unless(
+        label.towards in (None, "forward", "backward"),
+        "towards",
+        f"is {label.towards!r} and neither 'forward', 'backward' nor None",
+    )
     unless(label.towards or not label.there, "there", "is said, but not `towards` where the label leads")
     unless(all(LABELS[other].buffer for other in label.there), "there", "names a label without a `buffer`")
 
     forms = label.forms
-    unless(isinstance(forms, tuple) and forms and all(isinstance(form, Form) for form in forms), "forms", f"is {forms!r} and not a tuple of one Form or more")
-    unless(forms[0].encode and forms[0].read, "forms", "cannot both be written and read: the first lacks `encode` or `read`")
+    unless(
+        isinstance(forms, tuple) and forms and all(isinstance(form, Form) for form in forms),
+        "forms",
+        f"is {forms!r} and not a tuple of one Form or more",
+    )
+    unless(
+        forms[0].encode and forms[0].read,
+        "forms",
+        "cannot both be written and read: the first lacks `encode` or `read`",
+    )
     taken = {form.folder + "." + form.ending: other.name for other in LABELS.values() for form in other.forms}
     for form in forms:
-        unless(form.folder + "." + form.ending not in taken, "forms", f"writes where label '{taken.get(form.folder + '.' + form.ending)}' does: {form.file(0)}")
+        unless(
+            form.folder + "." + form.ending not in taken,
+            "forms",
+            f"writes where label '{taken.get(form.folder + '.' + form.ending)}' does: {form.file(0)}",
+        )
 
     if type(label).views is Label.views:
         unless(type(label).reference is not Label.reference, "reference", "is missing")
         tolerance = getattr(label, "tolerance", None)
         unless(tolerance is not None, "tolerance", "is missing")
-        unless(isinstance(tolerance, (int, float)) and tolerance >= 0, "tolerance", f"is {tolerance!r} and not a number >= 0")
+        unless(
+            isinstance(tolerance, (int, float)) and tolerance >= 0,
+            "tolerance",
+            f"is {tolerance!r} and not a number >= 0",
+        )
     keys = label.keys
-    unless(isinstance(keys, dict) and keys and all(isinstance(key, Key) for key in keys.values()), "keys", f"is {keys!r} and not a table of Keys")
+    unless(
+        isinstance(keys, dict) and keys and all(isinstance(key, Key) for key in keys.values()),
+        "keys",
+        f"is {keys!r} and not a table of Keys",
+    )
     return keys

@@ -16,8 +16,14 @@ def machine_line(opengl: str | None = None) -> str:
     """One line for a report: processor, cores, memory, versions, OpenGL renderer, date."""
     import numba
 
-    parts = [_processor(), f"{len(os.sched_getaffinity(0))} cores", f"{_memory_gib():.0f} GiB",
-             f"Python {platform.python_version()}", f"NumPy {np.__version__}", f"numba {numba.__version__}"]
+    parts = [
+        _processor(),
+        f"{len(os.sched_getaffinity(0))} cores",
+        f"{_memory_gib():.0f} GiB",
+        f"Python {platform.python_version()}",
+        f"NumPy {np.__version__}",
+        f"numba {numba.__version__}",
+    ]
     if opengl:
         parts.append(opengl)
     return ", ".join([*parts, datetime.datetime.now().astimezone().date().isoformat()])

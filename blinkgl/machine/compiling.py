@@ -45,7 +45,7 @@ def working_clock() -> float:
 
 
 def compiling_line(seconds: float) -> str:
-    """"compiling kernels, once per machine: 14 s"; "" where there was next to nothing to compile."""
+    """ "compiling kernels, once per machine: 14 s"; "" where there was next to nothing to compile."""
     return f"compiling kernels, once per machine: {seconds:.0f} s" if seconds >= 0.5 else ""
 
 
@@ -65,12 +65,19 @@ def compile_ahead(emulators: tuple[str, ...] = ()) -> float:
 
     before, waves = compiled_s(), np.sin(np.arange(64 * 64, dtype=np.float32).reshape(64, 64) / 9)
     for emulator in emulators or EMULATORS:
-        for frames in ([0.5 + 0.4 * np.roll(waves, k) for k in range(4)], [np.uint8(127 + 90 * np.roll(waves, k)) for k in range(4)]):
+        for frames in (
+            [0.5 + 0.4 * np.roll(waves, k) for k in range(4)],
+            [np.uint8(127 + 90 * np.roll(waves, k)) for k in range(4)],
+        ):
             for _ in frames_to_events(frames, fps=100, emulator=emulator):
                 pass
     # What else a sequence needs: paths, occlusion, preview.
-    small = {"camera": {"width": 64, "height": 48}, "time": {"duration": 0.02, "label_rate": 50}, "labels": {"flow": ["forward", "backward"]},
-             "scene": {"objects": {"count": 3}, "textures": {"variants": 2, "photographs": False, "max_size": 32}}}
+    small = {
+        "camera": {"width": 64, "height": 48},
+        "time": {"duration": 0.02, "label_rate": 50},
+        "labels": {"flow": ["forward", "backward"]},
+        "scene": {"objects": {"count": 3}, "textures": {"variants": 2, "photographs": False, "max_size": 32}},
+    }
     with tempfile.TemporaryDirectory() as folder:
         try:
             for _ in generate_run(RunTemplate(small, Path(".")), folder + "/out"):

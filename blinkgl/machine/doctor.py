@@ -68,14 +68,23 @@ def _try(section: str, name: str, action: Callable[[], str], remedy: str) -> Che
 def _system() -> Iterator[Check]:
     yield Check("System", "blinkgl", "info", __version__)
     new_enough = sys.version_info >= (3, 10)
-    yield Check("System", "Python", "ok" if new_enough else "missing", platform.python_version(), "" if new_enough else "use Python 3.10 or newer")
+    yield Check(
+        "System",
+        "Python",
+        "ok" if new_enough else "missing",
+        platform.python_version(),
+        "" if new_enough else "use Python 3.10 or newer",
+    )
     yield Check("System", "platform", "info", platform.platform())
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     yield Check("System", "cores, memory", "info", f"{cores} cores, {memory:.1f} GiB")
     names = ("LP_NUM_THREADS", "NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR", "OMP_NUM_THREADS")
-    changed = [f"{name}={value}" for name, value in sorted(os.environ.items())
-               if name in names or name.startswith(("GLCONTEXT_", "LIBGL_", "GALLIUM_", "MESA_", "__EGL_", "EGL_"))]
+    changed = [
+        f"{name}={value}"
+        for name, value in sorted(os.environ.items())
+        if name in names or name.startswith(("GLCONTEXT_", "LIBGL_", "GALLIUM_", "MESA_", "__EGL_", "EGL_"))
+    ]
     if changed:
         yield Check("System", "environment", "info", " ".join(changed))
 
@@ -92,7 +101,9 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
     for index, text in enumerate(devices):
         yield Check(section, f"EGL device {index}", "info", text)
     if not devices:
-        yield Check(section, "EGL devices", "absent", "none", f"sudo apt-get install -y --no-install-recommends {APT_PACKAGES}")
+        yield Check(
+            section, "EGL devices", "absent", "none", f"sudo apt-get install -y --no-install-recommends {APT_PACKAGES}"
+        )
     try:
         gl = create_context(backend, device)
     except BlinkGLError as error:
@@ -107,10 +118,14 @@ def _opengl(backend: str, device: int) -> Iterator[Check]:
         yield Check(section, "renderer", "info", gl.renderer)
         yield Check(section, "version", "ok", gl.version)
         info = gl.ctx.info
-        yield Check(section, "limits", "info",
-                    f"texture {info['GL_MAX_TEXTURE_SIZE']} px, viewport "
-                    f"{'x'.join(str(v) for v in info['GL_MAX_VIEWPORT_DIMS'])}, {info['GL_MAX_DRAW_BUFFERS']} draw buffers, "
-                    f"{gl.ctx.max_samples} samples, anisotropy {gl.ctx.max_anisotropy:g}")
+        yield Check(
+            section,
+            "limits",
+            "info",
+            f"texture {info['GL_MAX_TEXTURE_SIZE']} px, viewport "
+            f"{'x'.join(str(v) for v in info['GL_MAX_VIEWPORT_DIMS'])}, {info['GL_MAX_DRAW_BUFFERS']} draw buffers, "
+            f"{gl.ctx.max_samples} samples, anisotropy {gl.ctx.max_anisotropy:g}",
+        )
         driver = "install a newer driver (OpenGL 4.5) or use 'gl: {backend: osmesa}'"
         for name in ("R32F", "RG32F", "RGBA32F", "R32UI", "R16F", "RGBA8"):
             yield _try(section, f"{name} target", lambda name=name: _draw_exactly(gl, name), driver)
@@ -128,7 +143,9 @@ void main() {
 
 
 def _full_screen(gl, output: str, expression: str):
-    program = gl.ctx.program(vertex_shader=_TRIANGLE, fragment_shader=f"#version 430 core\n{output}\nvoid main() {{ {expression} }}")
+    program = gl.ctx.program(
+        vertex_shader=_TRIANGLE, fragment_shader=f"#version 430 core\n{output}\nvoid main() {{ {expression} }}"
+    )
     return program, gl.ctx.vertex_array(program, [])
 
 
@@ -144,7 +161,10 @@ def _draw_exactly(gl, name: str) -> str:
     else:
         expected = np.array([16777215.0, -1.0000001, 1e-30, 3e38], np.float32)
     values = expected / 255 if bytes_ else expected
-    literals = ", ".join(f"{v}u" if integer else f"{float(v):.9g}{'' if 'e' in f'{float(v):.9g}' or '.' in f'{float(v):.9g}' else '.0'}" for v in values)
+    literals = ", ".join(
+        f"{v}u" if integer else f"{float(v):.9g}{'' if 'e' in f'{float(v):.9g}' or '.' in f'{float(v):.9g}' else '.0'}"
+        for v in values
+    )
     kind, expression = ("uint", literals) if integer else ("vec4", f"vec4({literals})")
     program, vertices = _full_screen(gl, f"layout(location = 0) out {kind} value;", f"value = {expression};")
     with gl.framebuffer(4, 4, (name,), depth=False) as target:
@@ -240,14 +260,21 @@ def _numba() -> Iterator[Check]:
         from llvmlite import binding
 
         features = binding.get_host_cpu_features()
-        widest = next((name for name in ("avx512f", "avx2", "avx", "sse4.2", "sve", "neon") if features.get(name)), "none found")
+        widest = next(
+            (name for name in ("avx512f", "avx2", "avx", "sse4.2", "sve", "neon") if features.get(name)), "none found"
+        )
         return f"{widest} on {binding.get_host_cpu_name()}"
 
     mend = f"{python()} -m pip install --force-reinstall numba"
     yield _try(section, "numba", version, mend)
     yield _try(section, "threads", threads, mend)
     yield _try(section, "SIMD", simd, mend)
-    yield Check(section, "bf16", "info", bf16_instructions() or "no instructions for it: eflow computes in fp32, whatever a recipe says")
+    yield Check(
+        section,
+        "bf16",
+        "info",
+        bf16_instructions() or "no instructions for it: eflow computes in fp32, whatever a recipe says",
+    )
 
 
 def _codecs() -> Iterator[Check]:
@@ -259,7 +286,12 @@ def _codecs() -> Iterator[Check]:
 
         data = np.arange(100_000, dtype=np.uint32) // 7
         with h5py.File("doctor.h5", "w", driver="core", backing_store=False) as file:
-            file.create_dataset("x", data=data, chunks=(1 << 14,), **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE))
+            file.create_dataset(
+                "x",
+                data=data,
+                chunks=(1 << 14,),
+                **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE),
+            )
             if not np.array_equal(file["x"][:], data):
                 raise ValueError("read other values than written")
             ratio = data.nbytes / file["x"].id.get_storage_size()
@@ -268,8 +300,29 @@ def _codecs() -> Iterator[Check]:
     def x264() -> str:
         import imageio_ffmpeg
 
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "64x64", "-r", "10",
-                   "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p", "-f", "null", "-"]
+        command = [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-hide_banner",
+            "-loglevel",
+            "error",
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "rgb24",
+            "-s",
+            "64x64",
+            "-r",
+            "10",
+            "-i",
+            "-",
+            "-c:v",
+            "libx264",
+            "-pix_fmt",
+            "yuv420p",
+            "-f",
+            "null",
+            "-",
+        ]
         done = subprocess.run(command, input=bytes(64 * 64 * 3 * 3), capture_output=True, timeout=60)
         if done.returncode:
             raise ValueError(done.stderr.decode(errors="replace"))

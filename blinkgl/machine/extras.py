@@ -9,10 +9,16 @@ import sys
 
 EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "check": (("pyrender",), "an independent renderer to compare with"),
-    "cycles": (("bpy",), "Blender's path tracer to compare with; better in an environment of its own, see docs/install.md"),
+    "cycles": (
+        ("bpy",),
+        "Blender's path tracer to compare with; better in an environment of its own, see docs/install.md",
+    ),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
     "cluster": (("ray",), "many machines"),
-    "formats": (("faery", "dv-processing"), "dv-processing: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing"),
+    "formats": (
+        ("faery", "dv-processing"),
+        "dv-processing: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing",
+    ),
     "viz": (("rerun-sdk",), "3D viewer"),
     "urdf": (("pybullet",), "its random meshes as an object pool"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),

@@ -50,7 +50,7 @@ class Side:
 
     @property
     def size(self) -> str:
-        """"640x480", width first."""
+        """ "640x480", width first."""
         return f"{self.counts.shape[1]}x{self.counts.shape[0]}"
 
     @property
@@ -105,38 +105,72 @@ class Comparison:
         """(quantity, a, b) as text, for a table; quantities of the pair stand in the last column."""
         sides = [self.a] + ([self.b] if self.b else [])
         each = lambda text: tuple(text(s) for s in sides) + ("",) * (2 - len(sides))
-        rows = [("sensor", *each(lambda s: s.size)),
-                ("events", *each(lambda s: f"{s.count:,}")),
-                ("rate", *each(lambda s: f"{s.count / self.duration_s / 1e6:.4g} M/s")),
-                ("rate of a pixel", *each(lambda s: f"{s.count / self.duration_s / s.counts.size:.4g} Hz")),
-                ("ON / OFF", *each(lambda s: f"{s.on_off_ratio:.3f}")),
-                ("active pixels", *each(lambda s: f"{100 * np.mean(s.counts > 0):.1f} %")),
-                ("median interval of a pixel", *each(lambda s: f"{s.median_iei_us / 1000:.3g} ms"))]
+        rows = [
+            ("sensor", *each(lambda s: s.size)),
+            ("events", *each(lambda s: f"{s.count:,}")),
+            ("rate", *each(lambda s: f"{s.count / self.duration_s / 1e6:.4g} M/s")),
+            ("rate of a pixel", *each(lambda s: f"{s.count / self.duration_s / s.counts.size:.4g} Hz")),
+            ("ON / OFF", *each(lambda s: f"{s.on_off_ratio:.3f}")),
+            ("active pixels", *each(lambda s: f"{100 * np.mean(s.counts > 0):.1f} %")),
+            ("median interval of a pixel", *each(lambda s: f"{s.median_iei_us / 1000:.3g} ms")),
+        ]
         if self.a.frame_correlation is not None:
-            rows += [("polarity sum : Δ ln(I+10), correlation", *each(lambda s: _spread(s.frame_correlation))),
-                     ("implied contrast threshold", *each(lambda s: _spread(s.implied_threshold)))]
+            rows += [
+                ("polarity sum : Δ ln(I+10), correlation", *each(lambda s: _spread(s.frame_correlation))),
+                ("implied contrast threshold", *each(lambda s: _spread(s.implied_threshold))),
+            ]
         if self.b:
             rows += [("event-rate ratio B / A per interval", "", _spread(self.rate_ratio))]
             if self.same_size:
-                rows += [("polarity sums A : B per interval, correlation", "", _spread(self.polarity_correlation)),
-                         ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}")]
+                rows += [
+                    ("polarity sums A : B per interval, correlation", "", _spread(self.polarity_correlation)),
+                    ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}"),
+                ]
             rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
         return rows
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists (maps left out), for JSON."""
+
         def side(s: Side) -> dict:
             return {k: _plain(v) for k, v in asdict(s).items() if k != "counts"} | {
-                "size": s.size, "on_off_ratio": _plain(s.on_off_ratio), "median_iei_us": _plain(s.median_iei_us)}
-        pair = {} if self.b is None else {
-            "b": side(self.b), "rate_ratio": _plain(self.rate_ratio), "pixel_correlation": _plain(self.pixel_correlation),
-            "polarity_correlation": _plain(self.polarity_correlation), "iei_distance": _plain(self.iei_distance)}
-        return {"edges_us": _plain(self.edges_us), "duration_s": self.duration_s, "iei_edges_us": _plain(IEI_EDGES_US), "a": side(self.a), **pair}
+                "size": s.size,
+                "on_off_ratio": _plain(s.on_off_ratio),
+                "median_iei_us": _plain(s.median_iei_us),
+            }
+
+        pair = (
+            {}
+            if self.b is None
+            else {
+                "b": side(self.b),
+                "rate_ratio": _plain(self.rate_ratio),
+                "pixel_correlation": _plain(self.pixel_correlation),
+                "polarity_correlation": _plain(self.polarity_correlation),
+                "iei_distance": _plain(self.iei_distance),
+            }
+        )
+        return {
+            "edges_us": _plain(self.edges_us),
+            "duration_s": self.duration_s,
+            "iei_edges_us": _plain(IEI_EDGES_US),
+            "a": side(self.a),
+            **pair,
+        }
 
 
-def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames: str | os.PathLike | None = None, fps: float | None = None,
-            timestamps: str | os.PathLike | None = None, gamma: str | float = "linear", frame_delay_ms: float = 0.0,
-            interval_ms: float = 20.0, zero_time: bool = False) -> Comparison:
+def compare(
+    a: str | os.PathLike,
+    b: str | os.PathLike | None = None,
+    *,
+    frames: str | os.PathLike | None = None,
+    fps: float | None = None,
+    timestamps: str | os.PathLike | None = None,
+    gamma: str | float = "linear",
+    frame_delay_ms: float = 0.0,
+    interval_ms: float = 20.0,
+    zero_time: bool = False,
+) -> Comparison:
     """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the
     time they share; alone, ``a`` is described.
 
@@ -158,23 +192,37 @@ def compare(a: str | os.PathLike, b: str | os.PathLike | None = None, *, frames:
     start, stop = max(s[0] - d for s, d in zip(spans, shifts)), min(s[1] - d for s, d in zip(spans, shifts))
     changes: Iterator[np.ndarray | None]
     if frames is not None:
-        edges, changes = _frame_intervals(frames, fps, timestamps, gamma, round(frame_delay_ms * 1000), start, stop, files)
+        edges, changes = _frame_intervals(
+            frames, fps, timestamps, gamma, round(frame_delay_ms * 1000), start, stop, files
+        )
     else:
         count = int(np.ceil(max(stop - start, 0) / (interval_ms * 1000)))
         edges = start + np.arange(count + 1) * round(interval_ms * 1000)
         changes = iter([None] * count)
     if len(edges) < 2:
-        raise EventDataError("no common time", where=", ".join(str(f.path) for f in files),
-                             value=[tuple(round((t - d) / 1e6, 6) for t in s) for s, d in zip(spans, shifts)],
-                             accepted="recordings that overlap (seconds shown), or --zero-time")
+        raise EventDataError(
+            "no common time",
+            where=", ".join(str(f.path) for f in files),
+            value=[tuple(round((t - d) / 1e6, 6) for t in s) for s, d in zip(spans, shifts)],
+            accepted="recordings that overlap (seconds shown), or --zero-time",
+        )
     return _accumulate(files, shifts, edges, changes)
 
 
-def _accumulate(files: list[EventFile], shifts: list[int], edges: np.ndarray, changes: Iterator[np.ndarray | None]) -> Comparison:
+def _accumulate(
+    files: list[EventFile], shifts: list[int], edges: np.ndarray, changes: Iterator[np.ndarray | None]
+) -> Comparison:
     shapes, intervals = [(f.height, f.width) for f in files], len(edges) - 1
     same = len(files) == 2 and shapes[0] == shapes[1]
-    sides = [Side(str(f.path), counts=np.zeros(shape, np.int64), rate_hz=np.zeros(intervals), iei=np.zeros(len(IEI_EDGES_US) - 1, np.int64))
-             for f, shape in zip(files, shapes)]
+    sides = [
+        Side(
+            str(f.path),
+            counts=np.zeros(shape, np.int64),
+            rate_hz=np.zeros(intervals),
+            iei=np.zeros(len(IEI_EDGES_US) - 1, np.int64),
+        )
+        for f, shape in zip(files, shapes)
+    ]
     last = [np.full(shape, -1, np.int64) for shape in shapes]
     bins = IEI_EDGES_US
     polarity = np.full(intervals, np.nan)
@@ -206,7 +254,9 @@ def _accumulate(files: list[EventFile], shifts: list[int], edges: np.ndarray, ch
         return Comparison(edges, sides[0], None)
     if not same:
         return Comparison(edges, *sides)
-    return Comparison(edges, *sides, pixel_correlation=_correlation(sides[0].counts, sides[1].counts), polarity_correlation=polarity)
+    return Comparison(
+        edges, *sides, pixel_correlation=_correlation(sides[0].counts, sides[1].counts), polarity_correlation=polarity
+    )
 
 
 @numba.njit(cache=True, nogil=True)
@@ -262,14 +312,29 @@ def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, st
     """Edges (µs) of the frame intervals inside [start, stop) and, lazily, the change of ln(I + 10) over each."""
     from blinkgl.io.frames import open_frames
     from blinkgl.recordings.simulation import Decoder
+
     source = open_frames(path, fps=fps, timestamps=timestamps)
     if any((f.height, f.width) != (source.height, source.width) for f in files):
-        sizes = "; ".join(f"{name}: {width}x{height}" for name, width, height in [(path, source.width, source.height), *((f.path, f.width, f.height) for f in files)])
-        raise EventDataError(f"frames and recordings differ in size ({sizes})", where="compare", accepted="frames of the recordings' size")
+        sizes = "; ".join(
+            f"{name}: {width}x{height}"
+            for name, width, height in [
+                (path, source.width, source.height),
+                *((f.path, f.width, f.height) for f in files),
+            ]
+        )
+        raise EventDataError(
+            f"frames and recordings differ in size ({sizes})",
+            where="compare",
+            accepted="frames of the recordings' size",
+        )
     # The first interval may begin a little before the first event, the last end a little after the last one.
     slack = lambda a, b: (b - a) // 4
     times = np.array([t // 1000 + delay_us for _, t, _ in source], np.int64)
-    inside = [k for k in range(len(times) - 1) if times[k] >= start - slack(times[k], times[k + 1]) and times[k + 1] <= stop + slack(times[k], times[k + 1])]
+    inside = [
+        k
+        for k in range(len(times) - 1)
+        if times[k] >= start - slack(times[k], times[k + 1]) and times[k + 1] <= stop + slack(times[k], times[k + 1])
+    ]
     if not inside:
         return np.empty(0, np.int64), iter(())
     lo, hi = inside[0], inside[-1] + 1
@@ -284,7 +349,7 @@ def _frame_intervals(path, fps, timestamps, gamma, delay_us: int, start: int, st
                     yield log - before
                 before = log
 
-    return times[lo:hi + 1], changes()
+    return times[lo : hi + 1], changes()
 
 
 def _blurred(values: np.ndarray) -> np.ndarray:
@@ -340,7 +405,13 @@ def plot(result: Comparison, path: str | os.PathLike) -> None:
 
     ax = axes[0, 0]
     for side, tag, colour in sides:
-        ax.step(result.edges_us / 1e6, np.append(side.rate_hz, side.rate_hz[-1:]) / 1e6, where="post", color=colour, label=tag)
+        ax.step(
+            result.edges_us / 1e6,
+            np.append(side.rate_hz, side.rate_hz[-1:]) / 1e6,
+            where="post",
+            color=colour,
+            label=tag,
+        )
     ax.set(title="event rate", xlabel="time [s]", ylabel="M events/s", ylim=(0, None))
     ax.legend(frameon=False)
 
@@ -373,9 +444,15 @@ def plot(result: Comparison, path: str | os.PathLike) -> None:
     ax = axes[1, 2]
     if result.same_size:
         limit = int(top) + 1
-        joint = np.histogram2d(np.minimum(result.a.counts, limit).ravel(), np.minimum(result.b.counts, limit).ravel(),
-                               bins=min(limit + 1, 60), range=[[0, limit + 1]] * 2)[0]
-        ax.imshow(np.log10(joint.T + 1), origin="lower", extent=(0, limit + 1, 0, limit + 1), cmap="Greys", aspect="equal")
+        joint = np.histogram2d(
+            np.minimum(result.a.counts, limit).ravel(),
+            np.minimum(result.b.counts, limit).ravel(),
+            bins=min(limit + 1, 60),
+            range=[[0, limit + 1]] * 2,
+        )[0]
+        ax.imshow(
+            np.log10(joint.T + 1), origin="lower", extent=(0, limit + 1, 0, limit + 1), cmap="Greys", aspect="equal"
+        )
         ax.plot([0, limit + 1], [0, limit + 1], ":", color="#d1495b", lw=1)
         ax.set(title=f"events per pixel, r = {result.pixel_correlation:.3f}", xlabel="A", ylabel="B")
     else:

@@ -63,9 +63,19 @@ class SimulationReport:
         return (self.last_ns - self.first_ns) * 1e-9
 
 
-def frames_to_events(frames: Iterable, *, fps: float | None = None, emulator: str | EmulatorConfig = EmulatorConfig.members.default,
-                     gamma: str | float | None = None, interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
-                     readout: ReadoutConfig | None = None, report: SimulationReport | None = None) -> Iterator[Events]:
+def frames_to_events(
+    frames: Iterable,
+    *,
+    fps: float | None = None,
+    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    gamma: str | float | None = None,
+    interpolate: str = "linear",
+    factor: int = 4,
+    max_px: float = 1.0,
+    seed: int = 0,
+    readout: ReadoutConfig | None = None,
+    report: SimulationReport | None = None,
+) -> Iterator[Events]:
     """Events of a stream of frames, one chunk per step, sorted, int64 µs on the frames' clock.
 
     Parameters
@@ -88,8 +98,18 @@ def frames_to_events(frames: Iterable, *, fps: float | None = None, emulator: st
     ConfigError : unknown emulator, gamma or interpolation.
     """
     report = report if report is not None else SimulationReport()
-    steps = simulated_steps(frames, fps=fps, emulator=emulator, gamma=gamma, interpolate=interpolate, factor=factor, max_px=max_px, seed=seed,
-                            readout=readout, report=report)
+    steps = simulated_steps(
+        frames,
+        fps=fps,
+        emulator=emulator,
+        gamma=gamma,
+        interpolate=interpolate,
+        factor=factor,
+        max_px=max_px,
+        seed=seed,
+        readout=readout,
+        report=report,
+    )
     return (step.events for step in steps if len(step.events))
 
 
@@ -102,14 +122,25 @@ class Step(NamedTuple):
     frame: np.ndarray
 
 
-def simulated_steps(frames: Iterable, *, report: SimulationReport, fps: float | None = None,
-                    emulator: str | EmulatorConfig = EmulatorConfig.members.default, gamma: str | float | None = None,
-                    interpolate: str = "linear", factor: int = 4, max_px: float = 1.0, seed: int = 0,
-                    readout: ReadoutConfig | None = None) -> Iterator[Step]:
+def simulated_steps(
+    frames: Iterable,
+    *,
+    report: SimulationReport,
+    fps: float | None = None,
+    emulator: str | EmulatorConfig = EmulatorConfig.members.default,
+    gamma: str | float | None = None,
+    interpolate: str = "linear",
+    factor: int = 4,
+    max_px: float = 1.0,
+    seed: int = 0,
+    readout: ReadoutConfig | None = None,
+) -> Iterator[Step]:
     """As :func:`frames_to_events`, every step of it."""
     config = emulator_config(emulator)
     if interpolate not in INTERPOLATIONS:
-        raise ConfigError("unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS))
+        raise ConfigError(
+            "unknown interpolation", where="interpolate", value=interpolate, accepted=", ".join(INTERPOLATIONS)
+        )
     return _run(timed(frames, fps), config, _checked_gamma(gamma), interpolate, factor, max_px, seed, readout, report)
 
 
@@ -118,12 +149,27 @@ def _run(frames, config, gamma, interpolate, factor, max_px, seed, readout, repo
     if first is None:
         raise EventDataError("events need at least two frames", value="0 frames")
     camera = EventCamera(config, readout, *first[0].shape[:2], seed)
-    yield from stepped(itertools.chain([first], frames), camera, gamma=gamma, interpolate=interpolate, factor=factor, max_px=max_px,
-                       report=report)
+    yield from stepped(
+        itertools.chain([first], frames),
+        camera,
+        gamma=gamma,
+        interpolate=interpolate,
+        factor=factor,
+        max_px=max_px,
+        report=report,
+    )
 
 
-def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, *, gamma: str | float | None, interpolate: str, factor: int,
-            max_px: float, report: SimulationReport | None = None) -> Iterator[Step]:
+def stepped(
+    frames: Iterator[tuple[np.ndarray, int, str]],
+    camera: EventCamera,
+    *,
+    gamma: str | float | None,
+    interpolate: str,
+    factor: int,
+    max_px: float,
+    report: SimulationReport | None = None,
+) -> Iterator[Step]:
     """Frames (array, t_ns, name), those in between included, through an event camera. Raises
     EventDataError as :func:`frames_to_events`."""
     report = report if report is not None else SimulationReport()
@@ -138,9 +184,13 @@ def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, 
         last = None
         for frame, t_ns, name in itertools.chain([first], frames):
             if frame.shape != shape:
-                raise EventDataError("frame size changed", where=name, value=frame.shape, accepted=f"{shape} as the first frame")
+                raise EventDataError(
+                    "frame size changed", where=name, value=frame.shape, accepted=f"{shape} as the first frame"
+                )
             if last is not None and t_ns <= last:
-                raise EventDataError("time stamps must increase", where=name, value=f"{t_ns} ns", accepted=f"more than {last} ns")
+                raise EventDataError(
+                    "time stamps must increase", where=name, value=f"{t_ns} ns", accepted=f"more than {last} ns"
+                )
             last = t_ns
             report.frames += 1
             yield (frame if table and frame.dtype == np.uint8 else decode(frame, name)), t_ns
@@ -170,9 +220,17 @@ def stepped(frames: Iterator[tuple[np.ndarray, int, str]], camera: EventCamera, 
         yield Step(t_ns, events, seen[0])
 
 
-def file_to_events(source: str | os.PathLike, target: str | os.PathLike, *, fps: float | None = None,
-                   timestamps: str | os.PathLike | None = None, preview: str | os.PathLike | None = None, overwrite: bool = True,
-                   progress: Callable[[SimulationReport, float | None], None] | None = None, **options: Any) -> SimulationReport:
+def file_to_events(
+    source: str | os.PathLike,
+    target: str | os.PathLike,
+    *,
+    fps: float | None = None,
+    timestamps: str | os.PathLike | None = None,
+    preview: str | os.PathLike | None = None,
+    overwrite: bool = True,
+    progress: Callable[[SimulationReport, float | None], None] | None = None,
+    **options: Any,
+) -> SimulationReport:
     """Frames of ``source`` (see :func:`~blinkgl.io.frames.open_frames`) to an event file whose ending names the format
     (.h5 .raw .aedat4 .txt .csv .npz .npy); options as :func:`frames_to_events`. The files appear whole or not at all.
 
@@ -199,19 +257,32 @@ def file_to_events(source: str | os.PathLike, target: str | os.PathLike, *, fps:
             yield frame, t_ns, f"{source}: frame {i} ({name})"
 
     with contextlib.ExitStack() as stack:
-        out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us if kind == "dsec" else 0, overwrite=overwrite))
+        out = stack.enter_context(
+            event_writer(target, height, width, t_offset_us=start_us if kind == "dsec" else 0, overwrite=overwrite)
+        )
         video = None
         if preview is not None:
             rate = min(1e9 / gap_ns, 100.0)
-            video = stack.enter_context(PreviewWriter(stack.enter_context(atomic_file(preview, overwrite=overwrite)), height, width,
-                                                      t0_us=start_us, flow=False, rate_hz=rate, fps=min(rate, 25.0)))
+            video = stack.enter_context(
+                PreviewWriter(
+                    stack.enter_context(atomic_file(preview, overwrite=overwrite)),
+                    height,
+                    width,
+                    t0_us=start_us,
+                    flow=False,
+                    rate_hz=rate,
+                    fps=min(rate, 25.0),
+                )
+            )
         decode = Decoder("srgb" if options.get("gamma") is None else _checked_gamma(options["gamma"]))
         done = 0
         for step in simulated_steps(given(), report=report, **options):
             if video is not None:
                 video.add_events(step.events)
                 if video.due(step.t_ns // 1000):
-                    video.frame(step.t_ns // 1000, decode(step.frame, "") if step.frame.dtype == np.uint8 else step.frame)
+                    video.frame(
+                        step.t_ns // 1000, decode(step.frame, "") if step.frame.dtype == np.uint8 else step.frame
+                    )
             out.append(step.events)
             if progress is not None and report.frames > done:
                 done = report.frames
@@ -245,13 +316,19 @@ class Decoder:
             _luma_by_table(np.ascontiguousarray(frame), table, _LUMA, out)
             return out
         if frame.dtype.kind != "f":
-            raise EventDataError("unsupported pixel type", where=name, value=str(frame.dtype), accepted="uint8, uint16 or float")
+            raise EventDataError(
+                "unsupported pixel type", where=name, value=str(frame.dtype), accepted="uint8, uint16 or float"
+            )
         frame = np.asarray(frame, np.float32)
         low, high = frame.min(), frame.max()
         if not (low >= 0 and high < np.inf):  # NaN fails both
             where = np.argwhere(~((frame >= 0) & (frame < np.inf)))[0]
-            raise EventDataError(f"intensity at pixel x={where[1]}, y={where[0]} cannot be used", where=name,
-                                 value=float(frame[tuple(where)]), accepted="a finite value >= 0")
+            raise EventDataError(
+                f"intensity at pixel x={where[1]}, y={where[0]} cannot be used",
+                where=name,
+                value=float(frame[tuple(where)]),
+                accepted="a finite value >= 0",
+            )
         linear = self._curve(frame, "linear")
         return np.ascontiguousarray(linear if linear.ndim == 2 else linear @ _LUMA, np.float32)
 
@@ -266,7 +343,11 @@ class Decoder:
 def _luma_by_table(frame, table, weights, out):
     for y in range(out.shape[0]):
         for x in range(out.shape[1]):
-            out[y, x] = weights[0] * table[frame[y, x, 0]] + weights[1] * table[frame[y, x, 1]] + weights[2] * table[frame[y, x, 2]]
+            out[y, x] = (
+                weights[0] * table[frame[y, x, 0]]
+                + weights[1] * table[frame[y, x, 1]]
+                + weights[2] * table[frame[y, x, 2]]
+            )
 
 
 def emulator_config(emulator: str | EmulatorConfig | dict) -> EmulatorConfig:
@@ -290,7 +371,9 @@ def _checked_gamma(gamma: str | float | None) -> str | float | None:
             return value
     except (TypeError, ValueError):
         pass
-    raise ConfigError("unknown transfer curve", where="gamma", value=gamma, accepted="srgb, linear or an exponent up to 10")
+    raise ConfigError(
+        "unknown transfer curve", where="gamma", value=gamma, accepted="srgb, linear or an exponent up to 10"
+    )
 
 
 def timed(frames: Iterable, fps: float | None = None) -> Iterator[tuple[np.ndarray, int, str]]:

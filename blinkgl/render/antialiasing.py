@@ -28,8 +28,13 @@ class Samples(NamedTuple):
         return self.grid**2 * max(1, self.multi)
 
 
-ANTIALIASING = {"none": Samples(), "msaa4": Samples(multi=4), "taps4": Samples(taps=4), "ssaa2": Samples(grid=2),
-                "ssaa4": Samples(grid=4)}
+ANTIALIASING = {
+    "none": Samples(),
+    "msaa4": Samples(multi=4),
+    "taps4": Samples(taps=4),
+    "ssaa2": Samples(grid=2),
+    "ssaa4": Samples(grid=4),
+}
 
 
 def samples_of(name: str, where: str = "render.antialiasing") -> Samples:

@@ -67,8 +67,12 @@ class Frame:
         As the program wrote it: all components of its format."""
         if output == DEPTH_BUFFER:
             if self._canvas.pass_.depth != "texture":
-                raise GLError("the pass keeps no depth buffer that can be read", where=type(self._canvas.pass_).__name__, value=output,
-                              accepted='one with `depth = "texture"`')
+                raise GLError(
+                    "the pass keeps no depth buffer that can be read",
+                    where=type(self._canvas.pass_).__name__,
+                    value=output,
+                    accepted='one with `depth = "texture"`',
+                )
             return self.target.depth
         return self.target.colour[self._canvas.attachment(output)]
 
@@ -103,8 +107,11 @@ class Frame:
 
     def _check(self) -> None:
         if self._canvas.number != self._number:
-            raise GLError("this frame is no longer on the card: its pass has drawn another one", where=f"frame at {self.t_ns * 1e-9:.9g} s",
-                          accepted="read() before the next frame is drawn")
+            raise GLError(
+                "this frame is no longer on the card: its pass has drawn another one",
+                where=f"frame at {self.t_ns * 1e-9:.9g} s",
+                accepted="read() before the next frame is drawn",
+            )
 
 
 class Canvas:
@@ -117,14 +124,22 @@ class Canvas:
         self.planes: dict[str, tuple[int, int | None]] = {}
         """Name of each picture -> attachment, and component where it is one of several."""
         for i, output in enumerate(pass_.outputs):
-            self.planes |= {name: (i, k) for k, name in enumerate(output.planes)} if output.planes else {output.name: (i, None)}
-        self._held: dict[int, tuple[int, dict[str, np.ndarray]]] = {}  # attachment -> number of the frame held, and its pictures
+            self.planes |= (
+                {name: (i, k) for k, name in enumerate(output.planes)} if output.planes else {output.name: (i, None)}
+            )
+        self._held: dict[
+            int, tuple[int, dict[str, np.ndarray]]
+        ] = {}  # attachment -> number of the frame held, and its pictures
         self._used: dict[str, Frame] = {}  # inputs of the last frame
 
     def make_target(self, width: int, height: int) -> Target:
         pass_ = self.pass_
-        return self.painter.gl.framebuffer(*pass_.size(width, height), colour=tuple(o.format for o in pass_.outputs), depth=pass_.depth,
-                                           samples=pass_.samples.multi)
+        return self.painter.gl.framebuffer(
+            *pass_.size(width, height),
+            colour=tuple(o.format for o in pass_.outputs),
+            depth=pass_.depth,
+            samples=pass_.samples.multi,
+        )
 
     def draw(self, shot: Shot) -> Frame:
         """What the pass draws of a moment into :attr:`target`."""
@@ -189,7 +204,7 @@ class Canvas:
             for name, component in planes.items():
                 given_out = self._given_out(i, part, component)
                 if r is not None:
-                    pictures[name][r.y0:r.y1, r.x0:r.x1] = given_out
+                    pictures[name][r.y0 : r.y1, r.x0 : r.x1] = given_out
                 elif name in pictures:
                     pictures[name][...] = given_out
                 else:
@@ -208,10 +223,14 @@ class Canvas:
     def _known(self, names: list[str], name: str) -> tuple[int, str]:
         """(number, name) of ``name``, "" standing for the first."""
         if not names or (name and name not in names):
-            raise GLError("the pass has no such output", where=type(self.pass_).__name__, value=name, accepted=", ".join(names) or "none")
+            raise GLError(
+                "the pass has no such output",
+                where=type(self.pass_).__name__,
+                value=name,
+                accepted=", ".join(names) or "none",
+            )
         return (names.index(name), name) if name else (0, names[0])
 
     def release(self) -> None:
         self.number = -1
         self.target.release()
-

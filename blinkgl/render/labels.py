@@ -34,8 +34,11 @@ class Labels:
                 if end_ns is None:
                     raise TypeError(f"label '{who[0]}' leads to another time: t_{towards}_ns")
                 ends[towards] = end_ns
-        there = {towards: self._buffers(end_ns, names) for towards, end_ns in ends.items()
-                 if (names := LabelRequest(*(name for name in request if LABELS[name].towards == towards)).there)}
+        there = {
+            towards: self._buffers(end_ns, names)
+            for towards, end_ns in ends.items()
+            if (names := LabelRequest(*(name for name in request if LABELS[name].towards == towards)).there)
+        }
         drawn: dict[str, np.ndarray] = {}
         if names := request.buffers:
             frame = draw.draw(Geometry(names), t_ns, ends)
@@ -50,10 +53,20 @@ class Labels:
         draw.stats.render_s += working_clock() - started
         return LabelFrame(t_ns, {name: values[name] for name in request})
 
-    def _finished(self, name: str, drawn: dict[str, np.ndarray], there: dict[str, dict[str, np.ndarray]], values: dict[str, Any]) -> Any:
+    def _finished(
+        self, name: str, drawn: dict[str, np.ndarray], there: dict[str, dict[str, np.ndarray]], values: dict[str, Any]
+    ) -> Any:
         if name not in values:
             label, draw = LABELS[name], self._renderer
-            value = label.finish(_Drawn(label, draw.scene, drawn, there.get(label.towards, {}), lambda other: self._finished(other, drawn, there, values)))
+            value = label.finish(
+                _Drawn(
+                    label,
+                    draw.scene,
+                    drawn,
+                    there.get(label.towards, {}),
+                    lambda other: self._finished(other, drawn, there, values),
+                )
+            )
             if (wrong := label.wrong(value, draw.height, draw.width)) is not None:
                 raise TypeError(f"label '{name}': `finish` gives {wrong}")
             values[name] = value
@@ -62,7 +75,11 @@ class Labels:
     def shown_at(self, x: int, y: int, t_ns: int) -> str:
         """See :meth:`Renderer.shown_at`."""
         number = int(self._buffers(t_ns, LabelRequest("ids").buffers)["ids"][y, x])
-        names = [f"object '{o.name}' (id {number})" for o in self._renderer.scene.objects if number and o.instance_id == number]
+        names = [
+            f"object '{o.name}' (id {number})"
+            for o in self._renderer.scene.objects
+            if number and o.instance_id == number
+        ]
         return names[0] if names else "the background"
 
     def forget(self) -> None:
@@ -83,7 +100,9 @@ class Labels:
 class _Drawn:
     """:class:`blinkgl.labels.label.Drawn`: what one label may look at."""
 
-    def __init__(self, label: Label, scene: Scene, drawn: dict[str, np.ndarray], there: dict[str, np.ndarray], value_of):
+    def __init__(
+        self, label: Label, scene: Scene, drawn: dict[str, np.ndarray], there: dict[str, np.ndarray], value_of
+    ):
         self.scene, self._label, self._drawn, self._there, self._value_of = scene, label, drawn, there, value_of
 
     def raw(self, name: str) -> np.ndarray:

@@ -22,8 +22,9 @@ def cam_from_obj(T_world_cam: np.ndarray, T_world_obj: np.ndarray) -> np.ndarray
     return out
 
 
-def cam_from_obj_rate(T_world_cam: np.ndarray, dT_world_cam: np.ndarray,
-                      T_world_obj: np.ndarray, dT_world_obj: np.ndarray) -> np.ndarray:
+def cam_from_obj_rate(
+    T_world_cam: np.ndarray, dT_world_cam: np.ndarray, T_world_obj: np.ndarray, dT_world_obj: np.ndarray
+) -> np.ndarray:
     """(..., 4, 4) float64 d(T_cam_obj)/dt, 1/s, by the product rule on :func:`cam_from_obj`."""
     R_t = np.swapaxes(T_world_cam[..., :3, :3], -1, -2)
     dR_t = np.swapaxes(dT_world_cam[..., :3, :3], -1, -2)

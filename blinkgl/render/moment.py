@@ -54,7 +54,13 @@ class Moment:
     view : :class:`View` of the camera.   Arrays per item have a row per part that is drawn, ``DrawItem.number``."""
 
     def __init__(self, t_ns: int, view: View, T_world_cam: np.ndarray, T_world_obj: np.ndarray, stage: Stage):
-        self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = t_ns, view, T_world_cam, T_world_obj, stage
+        self.t_ns, self.view, self.T_world_cam, self.T_world_obj, self._stage = (
+            t_ns,
+            view,
+            T_world_cam,
+            T_world_obj,
+            stage,
+        )
 
     def through(self, view: View) -> Moment:
         """The same instant through another camera at the same place."""

@@ -7,7 +7,16 @@ import numpy as np
 
 
 @nb.njit(cache=True, nogil=True)
-def occlusion_mask(flow: np.ndarray, w_next: np.ndarray, valid: np.ndarray, ids: np.ndarray, depth_next: np.ndarray, ids_next: np.ndarray, near: float = 0.0, tolerance: float = 1e-3) -> np.ndarray:
+def occlusion_mask(
+    flow: np.ndarray,
+    w_next: np.ndarray,
+    valid: np.ndarray,
+    ids: np.ndarray,
+    depth_next: np.ndarray,
+    ids_next: np.ndarray,
+    near: float = 0.0,
+    tolerance: float = 1e-3,
+) -> np.ndarray:
     """Valid pixels whose point is not visible at t'.
 
     flow : (H, W, 2) float32 px.   w_next : (H, W) float32 depth of the point at t'.   valid : (H, W) bool.

@@ -48,7 +48,9 @@ class Painter:
         """Draw into ``target`` from now on, which is cleared: the first attachment to
         ``background``, 0 where it ends, the others to 0."""
         self.prepare(target)
-        target.clear(*([*background, 0.0, 0.0, 0.0, 0.0][: pixel.components] for pixel in target.formats[:1]), depth=0.0)
+        target.clear(
+            *([*background, 0.0, 0.0, 0.0, 0.0][: pixel.components] for pixel in target.formats[:1]), depth=0.0
+        )
         self.stats.frames += 1
 
     def prepare(self, target: Target) -> None:

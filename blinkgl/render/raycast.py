@@ -109,9 +109,7 @@ def build_tree(vertices: np.ndarray, faces: np.ndarray) -> Tree:
     lower, upper = np.empty((2 * n, 3)), np.empty((2 * n, 3))
     child, count = np.empty(2 * n, np.int32), np.empty(2 * n, np.int32)  # leaves hold 2 to 4 triangles: < 2 n nodes
     order, nodes = _build(corners, lower, upper, child, count)
-    return Tree(
-        corners[order], order.astype(np.int32), lower[:nodes], upper[:nodes], child[:nodes], count[:nodes]
-    )
+    return Tree(corners[order], order.astype(np.int32), lower[:nodes], upper[:nodes], child[:nodes], count[:nodes])
 
 
 def join_trees(trees: list[Tree], cull: list[bool]) -> Forest:
@@ -182,8 +180,26 @@ def _local_ray(axes, rx, ry, d):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_tree(
-    triangles: np.ndarray, face: np.ndarray, lower: np.ndarray, upper: np.ndarray, child: np.ndarray, count: np.ndarray, root: np.ndarray, first: np.ndarray, size: np.ndarray, cull: np.ndarray, extent: np.ndarray,
-    origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: np.ndarray, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
+    triangles: np.ndarray,
+    face: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    child: np.ndarray,
+    count: np.ndarray,
+    root: np.ndarray,
+    first: np.ndarray,
+    size: np.ndarray,
+    cull: np.ndarray,
+    extent: np.ndarray,
+    origins: np.ndarray,
+    axes: np.ndarray,
+    rays: np.ndarray,
+    near: float,
+    far: np.ndarray,
+    skip: np.ndarray,
+    hit: np.ndarray,
+    bary: np.ndarray,
+    depth: np.ndarray,
 ) -> None:
     """Nearest hit of each ray through the hierarchy.
 
@@ -255,8 +271,26 @@ def nearest_tree(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_exhaustive(
-    triangles: np.ndarray, face: np.ndarray, lower: np.ndarray, upper: np.ndarray, child: np.ndarray, count: np.ndarray, root: np.ndarray, first: np.ndarray, size: np.ndarray, cull: np.ndarray, extent: np.ndarray,
-    origins: np.ndarray, axes: np.ndarray, rays: np.ndarray, near: float, far: np.ndarray, skip: np.ndarray, hit: np.ndarray, bary: np.ndarray, depth: np.ndarray,
+    triangles: np.ndarray,
+    face: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    child: np.ndarray,
+    count: np.ndarray,
+    root: np.ndarray,
+    first: np.ndarray,
+    size: np.ndarray,
+    cull: np.ndarray,
+    extent: np.ndarray,
+    origins: np.ndarray,
+    axes: np.ndarray,
+    rays: np.ndarray,
+    near: float,
+    far: np.ndarray,
+    skip: np.ndarray,
+    hit: np.ndarray,
+    bary: np.ndarray,
+    depth: np.ndarray,
 ) -> None:
     """The slow twin of :func:`nearest_tree`: every triangle against every ray; the same arguments and answer."""
     d = np.empty(3)

@@ -191,9 +191,26 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
     hit, bary, depth = np.empty((n, 3), np.int32), np.zeros((n, 3)), np.empty(n)
     kernel = nearest_exhaustive if exhaustive else nearest_tree
     kernel(
-        forest.triangles, forest.face, forest.lower, forest.upper, forest.child, forest.count,
-        forest.root, forest.first, forest.size, forest.cull, forest.extent,
-        origins, np.ascontiguousarray(axes), np.ascontiguousarray(rays), float(scene.camera.near), far, skip, hit, bary, depth,
+        forest.triangles,
+        forest.face,
+        forest.lower,
+        forest.upper,
+        forest.child,
+        forest.count,
+        forest.root,
+        forest.first,
+        forest.size,
+        forest.cull,
+        forest.extent,
+        origins,
+        np.ascontiguousarray(axes),
+        np.ascontiguousarray(rays),
+        float(scene.camera.near),
+        far,
+        skip,
+        hit,
+        bary,
+        depth,
     )
     return hit, bary, depth
 
@@ -323,7 +340,9 @@ def surface(scene: Scene, hits: Hits) -> Surface:
 def irradiance(scene: Scene, normal: np.ndarray) -> np.ndarray:
     """(...) E(n) of the scene's light for (..., 3) unit normals."""
     light = scene.light
-    return light.sun * np.maximum(0.0, normal @ np.asarray(light.sun_direction)) + light.sky * (0.5 + 0.5 * normal[..., 2])
+    return light.sun * np.maximum(0.0, normal @ np.asarray(light.sun_direction)) + light.sky * (
+        0.5 + 0.5 * normal[..., 2]
+    )
 
 
 def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:

@@ -47,7 +47,15 @@ class Renderer:
     moves drawn again, to the same pixels.
     painter : class that issues the draw calls; a subclass may look on."""
 
-    def __init__(self, gl: GLContext, scene: Scene, config: RenderConfig, *, whole: bool = False, painter: type[Painter] = Painter):
+    def __init__(
+        self,
+        gl: GLContext,
+        scene: Scene,
+        config: RenderConfig,
+        *,
+        whole: bool = False,
+        painter: type[Painter] = Painter,
+    ):
         scene = without_collapsed_faces(at_level_of_detail(scene, config.lod))
         self.gl, self.scene, self.config, self.stats = gl, scene, config, RenderStats()
         self.width, self.height = scene.camera.width, scene.camera.height
@@ -156,8 +164,9 @@ class Renderer:
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
         return self.draw(filtered(Colour(samples)), t_ns)
 
-    def labels(self, t_ns: int, request: LabelRequest, t_forward_ns: int | None = None,
-               t_backward_ns: int | None = None) -> LabelFrame:
+    def labels(
+        self, t_ns: int, request: LabelRequest, t_forward_ns: int | None = None, t_backward_ns: int | None = None
+    ) -> LabelFrame:
         """Ground truth at t_ns: flow_forward runs from t_ns to t_forward_ns, flow_backward to t_backward_ns."""
         return self._labels.frame(t_ns, request, t_forward_ns, t_backward_ns)
 

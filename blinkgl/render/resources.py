@@ -84,7 +84,8 @@ class SceneResources:
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
         self.items = [
             _draw_item(index, part.mesh, part.material, obj.category, not obj.path.is_static)
-            for index, obj in enumerate(scene.objects) for part in obj.parts
+            for index, obj in enumerate(scene.objects)
+            for part in obj.parts
         ]
         for part, item in enumerate(self.items):
             item.part = part
@@ -124,8 +125,11 @@ class SceneResources:
         if key not in self._textures:
             image = material.texture.image
             srgb8 = image.dtype == np.uint8
-            self._textures[key] = self._upload(image if srgb8 else linear_image(image), material.texture.name,
-                                               internal_format=0x8C41 if srgb8 else None)  # GL_SRGB8
+            self._textures[key] = self._upload(
+                image if srgb8 else linear_image(image),
+                material.texture.name,
+                internal_format=0x8C41 if srgb8 else None,
+            )  # GL_SRGB8
         return self._textures[key]
 
     def albedo_luminance(self, material: Material) -> float:
@@ -155,25 +159,45 @@ class SceneResources:
             data[:, 6:] = _near_zero(mesh.uvs * np.asarray(uv_scale, np.float64))
             if not np.isfinite(data).all():
                 first = int(np.flatnonzero(~np.isfinite(data).all(axis=1))[0])
-                raise AssetError(f"vertex {first} has a position, normal or texture coordinate (x, y, z; n; u, v) beyond float32",
-                                 where=mesh.name or "mesh", value=data[first].tolist(), accepted="finite numbers")
-            self._buffers[key] = (self.ctx.buffer(data.tobytes()),
-                                  self.ctx.buffer(np.ascontiguousarray(mesh.faces, np.int32).tobytes()))
+                raise AssetError(
+                    f"vertex {first} has a position, normal or texture coordinate (x, y, z; n; u, v) beyond float32",
+                    where=mesh.name or "mesh",
+                    value=data[first].tolist(),
+                    accepted="finite numbers",
+                )
+            self._buffers[key] = (
+                self.ctx.buffer(data.tobytes()),
+                self.ctx.buffer(np.ascontiguousarray(mesh.faces, np.int32).tobytes()),
+            )
         return self._buffers[key]
 
     def _upload(self, image: np.ndarray, name: str, internal_format: int | None = None) -> moderngl.Texture:
         height, width, components = image.shape
         limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
         if max(height, width) > limit:
-            raise AssetError("texture is larger than this OpenGL takes", where=name, value=(width, height),
-                             accepted=f"at most {limit} px on a side")
+            raise AssetError(
+                "texture is larger than this OpenGL takes",
+                where=name,
+                value=(width, height),
+                accepted=f"at most {limit} px on a side",
+            )
         if image.dtype != np.uint8 and not (image.min() >= 0 and image.max() <= MAX_RADIANCE):  # NaN too
             y, x, _ = np.argwhere(~((image >= 0) & (image <= MAX_RADIANCE)))[0].tolist()
-            raise AssetError(f"texel x={x}, y={y} cannot be drawn", where=name or "texture", value=image[y, x].tolist(),
-                             accepted=f"linear light from 0 to {MAX_RADIANCE:g}")
+            raise AssetError(
+                f"texel x={x}, y={y} cannot be drawn",
+                where=name or "texture",
+                value=image[y, x].tolist(),
+                accepted=f"linear light from 0 to {MAX_RADIANCE:g}",
+            )
         dtype = "f1" if image.dtype == np.uint8 else "f4"
-        texture = self.ctx.texture((width, height), components, np.ascontiguousarray(image).tobytes(), alignment=1,
-                                   dtype=dtype, internal_format=internal_format)
+        texture = self.ctx.texture(
+            (width, height),
+            components,
+            np.ascontiguousarray(image).tobytes(),
+            alignment=1,
+            dtype=dtype,
+            internal_format=internal_format,
+        )
         texture.build_mipmaps()
         texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         texture.anisotropy = self.anisotropy
@@ -195,7 +219,13 @@ def _draw_item(index: int, mesh: Mesh, material: Material, category: str, moves:
     centre = (low + high) / 2
     radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
     if not radius <= MAX_RADIUS:  # NaN too
-        raise AssetError("mesh is too large to be drawn in float32", where=mesh.name or f"object {index}", value=radius,
-                         accepted=f"at most {MAX_RADIUS:g} units from its centre, all coordinates finite")
+        raise AssetError(
+            "mesh is too large to be drawn in float32",
+            where=mesh.name or f"object {index}",
+            value=radius,
+            accepted=f"at most {MAX_RADIUS:g} units from its centre, all coordinates finite",
+        )
     two_sided = material.double_sided or not mesh.closed
-    return DrawItem(index, mesh, material, centre, radius, low, high, _LAYER[category], two_sided, not material.unlit, moves)
+    return DrawItem(
+        index, mesh, material, centre, radius, low, high, _LAYER[category], two_sided, not material.unlit, moves
+    )

@@ -29,7 +29,9 @@ class Histogram:
     right: int = WIDTH - LEFT
 
 
-def histogram(values: np.ndarray, *, log: bool = False, bins: int = 36, span: tuple[float, float] | None = None) -> Histogram | None:
+def histogram(
+    values: np.ndarray, *, log: bool = False, bins: int = 36, span: tuple[float, float] | None = None
+) -> Histogram | None:
     """Bars of ``values`` over ``span`` (default: the 0.1 … 99.9 % range); None without values. log: of the axis."""
     values = values[np.isfinite(values)]
     if log:
@@ -46,14 +48,20 @@ def histogram(values: np.ndarray, *, log: bool = False, bins: int = 36, span: tu
     edges = np.linspace(scale(low), scale(high), bins + 1)
     counts, _ = np.histogram(np.clip(scale(values), edges[0], edges[-1]), edges)
     step, room = (WIDTH - 2 * LEFT) / bins, HEIGHT - BOTTOM - 8
-    bars = [(LEFT + i * step + 0.5, max(1.0, count / counts.max() * room)) for i, count in enumerate(counts.tolist()) if count]
+    bars = [
+        (LEFT + i * step + 0.5, max(1.0, count / counts.max() * room))
+        for i, count in enumerate(counts.tolist())
+        if count
+    ]
 
     def place(v: float) -> float:
         return LEFT + (float(scale(v)) - edges[0]) / (edges[-1] - edges[0]) * (WIDTH - 2 * LEFT)
 
     median = float(np.median(values))
     label = min(max(place(min(max(median, low), high)), LEFT + 60), WIDTH - LEFT - 60)
-    return Histogram(bars, step - 1, float(low), float(high), median, place(median) if low <= median <= high else None, label)
+    return Histogram(
+        bars, step - 1, float(low), float(high), median, place(median) if low <= median <= high else None, label
+    )
 
 
 def number(value: float) -> str:

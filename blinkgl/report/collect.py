@@ -93,7 +93,16 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
         unreadable.append(str(error))
     if not sequences and plan is None:
         raise AssetError("no sequence found", where=str(root), accepted="a folder that 'blinkgl generate' wrote")
-    found = Collected(root, sequences, plan, record.get("environment", {}), failed, run.costs(), unreadable=unreadable, damaged=damaged)
+    found = Collected(
+        root,
+        sequences,
+        plan,
+        record.get("environment", {}),
+        failed,
+        run.costs(),
+        unreadable=unreadable,
+        damaged=damaged,
+    )
     rng = np.random.default_rng(seed)
     _sample(found, rng, examples)
     _parameters(found, rng)
@@ -103,8 +112,13 @@ def collect(root: str | Path, *, examples: int = 6, seed: int = 0) -> Collected:
 def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
     """Displacements, speeds, depths, numbers of objects from some labels; rates from every sequence."""
     values: dict[str, list] = {k: [] for k in ("displacement", "speed", "depth", "objects", "share")}
-    found.quantities["rate"] = np.array([1e6 * s["events"] / s["duration_us"] / (s["height"] * s["width"]) for s in found.sequences
-                                         if s["duration_us"] and s["events"] is not None])
+    found.quantities["rate"] = np.array(
+        [
+            1e6 * s["events"] / s["duration_us"] / (s["height"] * s["width"])
+            for s in found.sequences
+            if s["duration_us"] and s["events"] is not None
+        ]
+    )
     found.quantities["events"] = np.array([s["events"] for s in found.sequences if s["events"] is not None], float)
     order = rng.permutation(len(found.sequences))[:SAMPLED_SEQUENCES]
     order = [number for number in order if found.sequences[number]["path"] not in found.damaged]
@@ -120,7 +134,9 @@ def _sample(found: Collected, rng: np.random.Generator, examples: int) -> None:
             picks = sorted(rng.permutation(len(flows))[:LABELS_EACH])
             for k in picks:
                 flow, valid = read_flow_png(flows[k])
-                displacement = np.hypot(flow[..., 0], flow[..., 1])[::PIXEL_STEP, ::PIXEL_STEP][valid[::PIXEL_STEP, ::PIXEL_STEP]]
+                displacement = np.hypot(flow[..., 0], flow[..., 1])[::PIXEL_STEP, ::PIXEL_STEP][
+                    valid[::PIXEL_STEP, ::PIXEL_STEP]
+                ]
                 values["displacement"].append(displacement)
                 values["speed"].append(displacement / ((pairs[k][1] - pairs[k][0]) * 1e-6))
                 if (depth := _value(folder, "depth", flows[k])) is not None:
@@ -182,9 +198,18 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
         image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
     speed = np.hypot(flow[..., 0], flow[..., 1])[valid]
     top = float(np.percentile(speed, 99)) if speed.size else 0.0
-    caption = (f"{line['emulator'] or ''}, t = {start / 1e6:.3f} s; events of {window / 1000:.1f} ms ({len(events):,}); "
-               f"flow over {(end - start) / 1000:g} ms, full colour {top:.1f} px")
-    return Example(line["path"], image, event_colour(counts), flow_colour(flow, top or None, valid), caption, _others(folder, int(flows[k].stem)))
+    caption = (
+        f"{line['emulator'] or ''}, t = {start / 1e6:.3f} s; events of {window / 1000:.1f} ms ({len(events):,}); "
+        f"flow over {(end - start) / 1000:g} ms, full colour {top:.1f} px"
+    )
+    return Example(
+        line["path"],
+        image,
+        event_colour(counts),
+        flow_colour(flow, top or None, valid),
+        caption,
+        _others(folder, int(flows[k].stem)),
+    )
 
 
 def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
@@ -197,7 +222,11 @@ def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:
         if name in ("images", _FLOW.name) or form.read is None or not (folder / form.file(index)).is_file():
             continue
         value = form.read(folder / form.file(index))
-        pictures += [(view.title, picture(view.kind, view.of(value))[0]) for view in label.views if not (view.kind == "mask" and len(label.views) > 1)]
+        pictures += [
+            (view.title, picture(view.kind, view.of(value))[0])
+            for view in label.views
+            if not (view.kind == "mask" and len(label.views) > 1)
+        ]
     return pictures
 
 
@@ -243,8 +272,15 @@ def _walk(group: str, node: Any, path: tuple[str, ...], configs: list[dict], int
             counted += [_label(option)] * len(having)
             _walk(group, option, path, having, into)
         labels = [_label(o) for o in options]
-        into.append(Parameter(group, ".".join(path), kind, [{"share": p["share"], "value": la} for p, la in zip(spec, labels)] if kind == "shares"
-                              else labels, counted))
+        into.append(
+            Parameter(
+                group,
+                ".".join(path),
+                kind,
+                [{"share": p["share"], "value": la} for p, la in zip(spec, labels)] if kind == "shares" else labels,
+                counted,
+            )
+        )
     elif isinstance(node, dict):
         for key, value in node.items():
             _walk(group, value, (*path, str(key)), configs, into)
@@ -268,7 +304,9 @@ def _fits(value: Any, option: Any) -> bool:
     """Whether a drawn table may have come of this option: its plain keys agree, what was drawn is inside its range."""
     if is_distribution(option):
         kind, spec = next(iter(option.items()))
-        return kind not in ("uniform", "log_uniform", "integer") or (value is not None and float(spec[0]) <= value <= float(spec[1]))
+        return kind not in ("uniform", "log_uniform", "integer") or (
+            value is not None and float(spec[0]) <= value <= float(spec[1])
+        )
     if not isinstance(option, dict) or not isinstance(value, dict):
         return isinstance(option, list) or value == option
     return all(key in value and _fits(value[key], inner) for key, inner in option.items())
@@ -278,5 +316,3 @@ def _label(option: Any) -> str:
     if isinstance(option, dict):
         return str(next((option[tag] for tag in ("emulator", "kind") if tag in option), "; ".join(map(str, option))))
     return str(option)
-
-

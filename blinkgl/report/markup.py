@@ -38,8 +38,13 @@ def data_uri(file: bytes) -> str:
 def _environment() -> jinja2.Environment:
     import jinja2  # a page is the last thing that anybody makes
 
-    environment = jinja2.Environment(loader=jinja2.FunctionLoader(_source), autoescape=True, undefined=jinja2.StrictUndefined,
-                                     trim_blocks=True, lstrip_blocks=True)
+    environment = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_source),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.filters.update(number=number, size=size)
     return environment
 

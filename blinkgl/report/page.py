@@ -38,13 +38,28 @@ def build_report(found: Collected) -> str:
     sizes = Counter(f"{x['width']}×{x['height']}" for x in sequences)
     seconds = sum(x["duration_us"] or 0 for x in sequences) / 1e6
     return render(
-        "report/data_set.html", title=f"Data set {found.root.resolve().name}", most_listed=_MAX_LISTED,
-        tiles=[(f"{len(sequences):,}", "sequences"), (f"{seconds:,.4g} s", "simulated"), (number(sum(x["events"] or 0 for x in sequences)), "events"),
-               (f"{sum(x['labels'] or 0 for x in sequences):,}", "flow labels"), (size(sum(x["bytes"] for x in sequences)), "on disk")],
-        groups=groups, missing=any(made != wanted for _, made, wanted in groups), kinds=[(k, v, None) for k, v in sorted(kinds.items())],
-        sizes=[(k, v, None) for k, v in sizes.most_common(8)], environment=found.environment, examples=[_example(e) for e in found.examples],
-        distributions=_distributions(found.quantities), parameters=[_parameter(p) for p in found.parameters], cost=_cost(costs) if costs else None,
-        failures=[*sorted(found.failed.items()), *(("", line) for line in found.unreadable)], retried=[c for c in costs if c["attempts"] > 1])
+        "report/data_set.html",
+        title=f"Data set {found.root.resolve().name}",
+        most_listed=_MAX_LISTED,
+        tiles=[
+            (f"{len(sequences):,}", "sequences"),
+            (f"{seconds:,.4g} s", "simulated"),
+            (number(sum(x["events"] or 0 for x in sequences)), "events"),
+            (f"{sum(x['labels'] or 0 for x in sequences):,}", "flow labels"),
+            (size(sum(x["bytes"] for x in sequences)), "on disk"),
+        ],
+        groups=groups,
+        missing=any(made != wanted for _, made, wanted in groups),
+        kinds=[(k, v, None) for k, v in sorted(kinds.items())],
+        sizes=[(k, v, None) for k, v in sizes.most_common(8)],
+        environment=found.environment,
+        examples=[_example(e) for e in found.examples],
+        distributions=_distributions(found.quantities),
+        parameters=[_parameter(p) for p in found.parameters],
+        cost=_cost(costs) if costs else None,
+        failures=[*sorted(found.failed.items()), *(("", line) for line in found.unreadable)],
+        retried=[c for c in costs if c["attempts"] > 1],
+    )
 
 
 def _groups(found: Collected) -> list[tuple[str, int, int]]:
@@ -59,18 +74,33 @@ def _groups(found: Collected) -> list[tuple[str, int, int]]:
 
 def _example(e: Example) -> dict[str, Any]:
     pictures = (("frame", e.image), ("events", e.events), ("flow", e.flow), *e.others)
-    return {"name": e.name, "caption": e.caption, "pictures": [(label, None if array is None else png(_small(array))) for label, array in pictures]}
+    return {
+        "name": e.name,
+        "caption": e.caption,
+        "pictures": [(label, None if array is None else png(_small(array))) for label, array in pictures],
+    }
 
 
 def _distributions(q: dict[str, np.ndarray]) -> list[tuple]:
-    charts = [("displacement", "Displacement from label to label", True, "px"), ("speed", "Image speed", True, "px/s"),
-              ("rate", "Event rate", True, "events/s/px"), ("depth", "Depth", True, "m"), ("objects", "Bodies in view", False, ""),
-              ("share", "Share of the image per body", True, "")]
+    charts = [
+        ("displacement", "Displacement from label to label", True, "px"),
+        ("speed", "Image speed", True, "px/s"),
+        ("rate", "Event rate", True, "events/s/px"),
+        ("depth", "Depth", True, "m"),
+        ("objects", "Bodies in view", False, ""),
+        ("share", "Share of the image per body", True, ""),
+    ]
     return [(title, unit, histogram(q[key], log=log)) for key, title, log, unit in charts if key in q and q[key].size]
 
 
 def _parameter(p: Parameter) -> dict[str, Any]:
-    shown: dict[str, Any] = {"path": p.path, "group": p.group or "all", "kind": p.kind, "count": len(p.values), "counts": None}
+    shown: dict[str, Any] = {
+        "path": p.path,
+        "group": p.group or "all",
+        "kind": p.kind,
+        "count": len(p.values),
+        "counts": None,
+    }
     if p.kind not in ("uniform", "log_uniform", "integer"):
         return {**shown, "counts": _counts(p)}
     low, high = (float(v) for v in p.spec)
@@ -78,11 +108,16 @@ def _parameter(p: Parameter) -> dict[str, Any]:
     whole = p.kind == "integer"
     bins, span = (min(int(high - low) + 1, 40), (low - 0.5, high + 0.5)) if whole else (20, (low, high))
     said, outside = _coverage(values, low, high, p.kind)
-    return {**shown, "histogram": histogram(values, log=p.kind == "log_uniform", span=span, bins=bins), "coverage": said, "outside": outside}
+    return {
+        **shown,
+        "histogram": histogram(values, log=p.kind == "log_uniform", span=span, bins=bins),
+        "coverage": said,
+        "outside": outside,
+    }
 
 
 def _coverage(values: np.ndarray, low: float, high: float, kind: str) -> tuple[str, int]:
-    """"9 of 10 tenths of [0.18, 0.25] hit", and how many values lie outside."""
+    """ "9 of 10 tenths of [0.18, 0.25] hit", and how many values lie outside."""
     said = f"of [{number(low)}, {number(high)}]"
     if not values.size or high <= low:
         return f"range {said}", 0
@@ -116,14 +151,20 @@ def _cost(costs: list[dict[str, Any]]) -> dict[str, Any]:
             seconds[stage] += value
         seconds["other"] += max(0.0, c["total_s"] - sum(c["seconds"].values()))
     total, simulated = sum(c["total_s"] for c in costs), sum(c["simulated_s"] for c in costs)
-    facts = [("wall time of all sequences", f"{total / 3600:.2f} h" if total > 3600 else f"{total:.1f} s"),
-             ("per simulated second", f"{total / simulated:.2f} s" if simulated else "-"),
-             ("processor time per sequence", f"{np.mean([c.get('cpu_s', np.nan) for c in costs]):.1f} s"),
-             ("event frames", f"{sum(c['frames'] for c in costs):,}"), ("largest process", size(1024 * max(c["peak_rss_kib"] for c in costs))),
-             ("made at the first attempt", f"{sum(c['attempts'] == 1 for c in costs)} of {len(costs)}")]
-    return {"stages": sorted(seconds.items(), key=lambda kv: -kv[1]), "facts": facts,
-            "wall": histogram(np.array([c["total_s"] for c in costs]), log=True),
-            "bytes": histogram(np.array([c["bytes"] for c in costs], float), log=True)}
+    facts = [
+        ("wall time of all sequences", f"{total / 3600:.2f} h" if total > 3600 else f"{total:.1f} s"),
+        ("per simulated second", f"{total / simulated:.2f} s" if simulated else "-"),
+        ("processor time per sequence", f"{np.mean([c.get('cpu_s', np.nan) for c in costs]):.1f} s"),
+        ("event frames", f"{sum(c['frames'] for c in costs):,}"),
+        ("largest process", size(1024 * max(c["peak_rss_kib"] for c in costs))),
+        ("made at the first attempt", f"{sum(c['attempts'] == 1 for c in costs)} of {len(costs)}"),
+    ]
+    return {
+        "stages": sorted(seconds.items(), key=lambda kv: -kv[1]),
+        "facts": facts,
+        "wall": histogram(np.array([c["total_s"] for c in costs]), log=True),
+        "bytes": histogram(np.array([c["bytes"] for c in costs], float), log=True),
+    }
 
 
 def _small(array: np.ndarray) -> np.ndarray:

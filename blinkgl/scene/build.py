@@ -15,8 +15,17 @@ from blinkgl.scene.worlds.pool import SPLITS, resolve
 from blinkgl.scene.worlds.random_world import pools, random_world
 
 
-def build_scene(config: SceneConfig, camera: CameraConfig, t0_ns: int, t1_ns: int, *, split: str = "train", seed: int = 0, sequence: int = 0,
-                base: Path | str = ".") -> Scene:
+def build_scene(
+    config: SceneConfig,
+    camera: CameraConfig,
+    t0_ns: int,
+    t1_ns: int,
+    *,
+    split: str = "train",
+    seed: int = 0,
+    sequence: int = 0,
+    base: Path | str = ".",
+) -> Scene:
     """The scene over [t0_ns, t1_ns].
 
     camera : what it is seen by; a file's own may take its place (``scene.intrinsics``).
@@ -42,8 +51,16 @@ def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -
 
     base : folder that the configuration's relative paths start from. Raises ConfigError and AssetError."""
     time, seed = config.time, config.seed
-    scene = build_scene(config.scene, config.camera, time.t0_ns, time.t1_ns, split=config.output.split, seed=seed,
-                        sequence=index, base=base)
+    scene = build_scene(
+        config.scene,
+        config.camera,
+        time.t0_ns,
+        time.t1_ns,
+        split=config.output.split,
+        seed=seed,
+        sequence=index,
+        base=base,
+    )
     return recording(scene, config)
 
 

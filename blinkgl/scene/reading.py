@@ -38,8 +38,12 @@ def contents(path: Path, what: str, where: str | None = None, max_bytes: int = M
     try:
         size = path.stat().st_size
         if size > max_bytes:
-            raise AssetError(f"the {what} file is too large", where=where, value=f"{size / 1e6:.0f} MB",
-                             accepted=f"at most {max_bytes / 1e6:.0f} MB")
+            raise AssetError(
+                f"the {what} file is too large",
+                where=where,
+                value=f"{size / 1e6:.0f} MB",
+                accepted=f"at most {max_bytes / 1e6:.0f} MB",
+            )
         return path.read_bytes()
     except (OSError, ValueError) as error:
         raise AssetError(f"cannot read the {what}: {getattr(error, 'strerror', None) or error}", where=where) from None

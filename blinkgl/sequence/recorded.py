@@ -45,13 +45,25 @@ def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
     for number, pattern in enumerate(config.folders):
         matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
         if not matches:
-            raise ConfigError("no such folder", where=f"frames.folders.{number}", value=pattern, accepted="a folder of frames, or a pattern")
+            raise ConfigError(
+                "no such folder",
+                where=f"frames.folders.{number}",
+                value=pattern,
+                accepted="a folder of frames, or a pattern",
+            )
         found += matches
     if not found:
-        raise ConfigError("no folders of frames", where="frames.folders", value=[], accepted="one folder per sequence, or patterns")
+        raise ConfigError(
+            "no folders of frames", where="frames.folders", value=[], accepted="one folder per sequence, or patterns"
+        )
     for folder in found:
         if not (folder / config.images).is_dir():
-            raise ConfigError("no such folder", where="frames.images", value=str(folder / config.images), accepted="a folder of images")
+            raise ConfigError(
+                "no such folder",
+                where="frames.images",
+                value=str(folder / config.images),
+                accepted="a folder of images",
+            )
     return found
 
 
@@ -67,10 +79,15 @@ def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
 def used_images(config: FramesConfig, folder: Path) -> list[Path]:
     """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer
     than an event file can hold."""
-    files = _listed(folder / config.images, IMAGE)[config.first:]
+    files = _listed(folder / config.images, IMAGE)[config.first :]
     files = files[: config.count]
     if len(files) < 3 or (config.count and len(files) < config.count):
-        raise AssetError("too few frames", where=str(folder / config.images), value=len(files), accepted=f"at least {config.count or 3}")
+        raise AssetError(
+            "too few frames",
+            where=str(folder / config.images),
+            value=len(files),
+            accepted=f"at least {config.count or 3}",
+        )
     try:
         check_span(len(files), config.fps)
     except Refused as error:
@@ -86,20 +103,38 @@ class RecordedSequence(Simulation):
     images.   flows, masks : files of labels, or none.
     Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them."""
 
-    def __init__(self, config: SequenceConfig, index: int, *, base: Path, events: bool, labels: bool, pictures_hz: float | None):
+    def __init__(
+        self, config: SequenceConfig, index: int, *, base: Path, events: bool, labels: bool, pictures_hz: float | None
+    ):
         clock, frames = StageClock(), config.frames
         assert frames is not None
         self._recorded = frames
         self.folder = folder_of(frames, index, base)
         self.files = used_images(frames, self.folder)
         self.flows, self.masks = flow_files(self.folder, frames, len(self.files))
-        self._kept: dict[int, np.ndarray] = {0: read_frame(self.files[0])}  # read already, and an image of a label to come
+        self._kept: dict[int, np.ndarray] = {
+            0: read_frame(self.files[0])
+        }  # read already, and an image of a label to come
         size = self._kept[0].shape[:2]
-        resolved = config.model_copy(update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, base),)})})
-        camera = EventCamera(config.events, config.readout, *size, kernel_seed(config.seed, index, Role.EVENTS)) if events else None
+        resolved = config.model_copy(
+            update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, base),)})}
+        )
+        camera = (
+            EventCamera(config.events, config.readout, *size, kernel_seed(config.seed, index, Role.EVENTS))
+            if events
+            else None
+        )
         self._luminance: np.ndarray | None = None
-        super().__init__(resolved, index, clock, size=size, span_ns=(0, self._time_of(len(self.files) - 1, frames.fps)), camera=camera,
-                         pictures_hz=None if pictures_hz is None else min(pictures_hz, frames.fps * 8), labels=labels)
+        super().__init__(
+            resolved,
+            index,
+            clock,
+            size=size,
+            span_ns=(0, self._time_of(len(self.files) - 1, frames.fps)),
+            camera=camera,
+            pictures_hz=None if pictures_hz is None else min(pictures_hz, frames.fps * 8),
+            labels=labels,
+        )
 
     def _resume(self) -> None:
         """Nothing is drawn here."""
@@ -118,8 +153,14 @@ class RecordedSequence(Simulation):
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         frames = self._recorded
-        steps = stepped(timed(self._given()), self.camera, gamma=frames.gamma, interpolate=frames.interpolate, factor=frames.factor,
-                        max_px=frames.max_px)
+        steps = stepped(
+            timed(self._given()),
+            self.camera,
+            gamma=frames.gamma,
+            interpolate=frames.interpolate,
+            factor=frames.factor,
+            max_px=frames.max_px,
+        )
         while True:
             with self.clock("events"):  # reading and interpolating, too
                 step = next(steps, None)
@@ -151,13 +192,22 @@ class RecordedSequence(Simulation):
         return {}
 
     def facts(self) -> dict[str, Any]:
-        return {"source": {"folder": self.folder.name, "images": len(self.files), "first": self.files[0].name, "last": self.files[-1].name}}
+        return {
+            "source": {
+                "folder": self.folder.name,
+                "images": len(self.files),
+                "first": self.files[0].name,
+                "last": self.files[-1].name,
+            }
+        }
 
 
 def _listed(folder: Path, suffixes) -> list[Path]:
     if not folder.is_dir():
         raise AssetError("no such folder", where=str(folder))
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
+    return sorted(
+        p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
+    )
 
 
 def flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path], list[Path]]:
@@ -166,11 +216,15 @@ def flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path
         return [], []
     everything = _listed(folder / frames.flow, _FLOW)
     masks = [p for p in everything if p.stem.endswith("_mask")]
-    flows = [p for p in everything if p not in set(masks)][frames.first:]
+    flows = [p for p in everything if p not in set(masks)][frames.first :]
     if len(flows) < used - 1 or (masks and len(masks) < frames.first + used - 1):
-        raise AssetError("not one flow file per pair of frames", where=str(folder / frames.flow),
-                         value=f"{len(flows)} flow files, {len(masks)} masks", accepted=f"at least {used - 1} for {used} frames")
-    return flows, masks[frames.first:]
+        raise AssetError(
+            "not one flow file per pair of frames",
+            where=str(folder / frames.flow),
+            value=f"{len(flows)} flow files, {len(masks)} masks",
+            accepted=f"at least {used - 1} for {used} frames",
+        )
+    return flows, masks[frames.first :]
 
 
 def _flow(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

@@ -46,8 +46,20 @@ class RenderedSequence(Simulation):
     sensor : what is recorded, and through which camera. A scene that was made already is
     recorded as the configuration says."""
 
-    def __init__(self, config: SequenceConfig, index: int, gl: GLContext | None, *, base: Path, events: bool, labels: bool,
-                 pictures_hz: float | None, scene: Scene | None, renderer: Renderer | None, window_ns: tuple[int, int] | None):
+    def __init__(
+        self,
+        config: SequenceConfig,
+        index: int,
+        gl: GLContext | None,
+        *,
+        base: Path,
+        events: bool,
+        labels: bool,
+        pictures_hz: float | None,
+        scene: Scene | None,
+        renderer: Renderer | None,
+        window_ns: tuple[int, int] | None,
+    ):
         clock = StageClock()
         scene = scene or (renderer.scene if renderer is not None else None)
         if scene is None:
@@ -64,17 +76,36 @@ class RenderedSequence(Simulation):
             camera = None
             if events:
                 emulator, readout = self.sensor.emulator, self.sensor.readout
-                camera = EventCamera(emulator, readout, *size, kernel_seed(config.seed, index, Role.EVENTS), config.timeline.reconstruction)
-                self.timeline = make_timeline(config.timeline, *span_ns, renderer, emulator_of(emulator).response(emulator))
-            super().__init__(config, index, clock, size=size, span_ns=span_ns, pictures_hz=pictures_hz, camera=camera, labels=labels,
-                             stack=stack.pop_all())
+                camera = EventCamera(
+                    emulator,
+                    readout,
+                    *size,
+                    kernel_seed(config.seed, index, Role.EVENTS),
+                    config.timeline.reconstruction,
+                )
+                self.timeline = make_timeline(
+                    config.timeline, *span_ns, renderer, emulator_of(emulator).response(emulator)
+                )
+            super().__init__(
+                config,
+                index,
+                clock,
+                size=size,
+                span_ns=span_ns,
+                pictures_hz=pictures_hz,
+                camera=camera,
+                labels=labels,
+                stack=stack.pop_all(),
+            )
 
     def _resume(self) -> None:
         self.renderer.gl.resume()
 
     def _event_pass(self) -> Iterator[tuple[int, Events]]:
         try:
-            yield from emulate(drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate), self.camera, self.clock)
+            yield from emulate(
+                drawn(self.renderer, self.timeline, self.camera.emulator.needs_rate), self.camera, self.clock
+            )
         except EventDataError as error:
             raise self._explained(error) from error
 
@@ -83,8 +114,12 @@ class RenderedSequence(Simulation):
         if error.pixel is None or error.t_ns is None:
             return error
         seen = self.renderer.shown_at(*error.pixel, error.t_ns)
-        explained = EventDataError(f"{error.problem}: it shows {seen}", where=f"{error.where} at {error.t_ns * 1e-9:.9g} s", value=error.value,
-                                   accepted=error.accepted)
+        explained = EventDataError(
+            f"{error.problem}: it shows {seen}",
+            where=f"{error.where} at {error.t_ns * 1e-9:.9g} s",
+            value=error.value,
+            accepted=error.accepted,
+        )
         explained.pixel, explained.t_ns = error.pixel, error.t_ns
         return explained
 
@@ -102,7 +137,9 @@ class RenderedSequence(Simulation):
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
-        return Picture(t_ns, self.renderer.colour(t_ns, antialiasing="none").read(), self.renderer.velocity(t_ns).read())
+        return Picture(
+            t_ns, self.renderer.colour(t_ns, antialiasing="none").read(), self.renderer.velocity(t_ns).read()
+        )
 
     @property
     def seconds(self) -> dict[str, float]:
@@ -132,8 +169,15 @@ class RenderedSequence(Simulation):
             "opengl": {"renderer": gl.renderer, "version": gl.version, "vendor": gl.vendor, "backend": gl.backend},
             "timeline": {"kind": timeline.kind, "reconstruction": timeline.reconstruction, **self.achieved},
             "triangles": self.triangles,
-            "objects": [{"name": o.name, "id": o.instance_id, "category": o.category,
-                         "source_hashes": sorted({p.mesh.source_hash for p in o.parts})} for o in scene.objects],
+            "objects": [
+                {
+                    "name": o.name,
+                    "id": o.instance_id,
+                    "category": o.category,
+                    "source_hashes": sorted({p.mesh.source_hash for p in o.parts}),
+                }
+                for o in scene.objects
+            ],
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
         }
@@ -142,5 +186,7 @@ class RenderedSequence(Simulation):
 def poses_at(scene: Scene, times_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """T_world_cam (M, 4, 4) and T_world_obj (n, M, 4, 4), float64, at M times."""
     t = np.asarray(times_ns, np.int64)
-    return (scene.camera_path.poses(t),
-            np.stack([o.path.poses(t) for o in scene.objects]) if scene.objects else np.zeros((0, len(t), 4, 4)))
+    return (
+        scene.camera_path.poses(t),
+        np.stack([o.path.poses(t) for o in scene.objects]) if scene.objects else np.zeros((0, len(t), 4, 4)),
+    )

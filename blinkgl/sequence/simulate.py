@@ -34,9 +34,19 @@ from blinkgl.sequence.items import EventChunk, GroundTruth, Item, Picture
 from blinkgl.timeline import Ticks, Timeline
 
 
-def simulate_sequence(config: SequenceConfig, index: int = 0, gl: GLContext | None = None, *, base: Path = Path("."), events: bool = True,
-                      labels: bool = True, pictures_hz: float | None = None, scene: Scene | None = None, renderer: Renderer | None = None,
-                      window_ns: tuple[int, int] | None = None) -> Simulation:
+def simulate_sequence(
+    config: SequenceConfig,
+    index: int = 0,
+    gl: GLContext | None = None,
+    *,
+    base: Path = Path("."),
+    events: bool = True,
+    labels: bool = True,
+    pictures_hz: float | None = None,
+    scene: Scene | None = None,
+    renderer: Renderer | None = None,
+    window_ns: tuple[int, int] | None = None,
+) -> Simulation:
     """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth` and
     :class:`Picture` in time order.
 
@@ -51,16 +61,25 @@ def simulate_sequence(config: SequenceConfig, index: int = 0, gl: GLContext | No
     what is drawn, not of recorded frames.)
     Raises BlinkGLError for anything the user or the machine caused, here or while iterating."""
     if pictures_hz is not None and not events:
-        raise ConfigError("pictures are of event frames, and there are none", where="pictures_hz", value=pictures_hz, accepted="None, or events=True")
+        raise ConfigError(
+            "pictures are of event frames, and there are none",
+            where="pictures_hz",
+            value=pictures_hz,
+            accepted="None, or events=True",
+        )
     # They import this module, for what they share.
     from blinkgl.sequence.recorded import RecordedSequence
     from blinkgl.sequence.rendered import RenderedSequence
 
     wanted = dict(events=events, labels=labels, pictures_hz=pictures_hz)
     if config.frames is None:
-        return RenderedSequence(config, index, gl, base=base, scene=scene, renderer=renderer, window_ns=window_ns, **wanted)
+        return RenderedSequence(
+            config, index, gl, base=base, scene=scene, renderer=renderer, window_ns=window_ns, **wanted
+        )
     if scene is not None or renderer is not None or window_ns is not None:
-        raise ConfigError("nothing is drawn of recorded frames", where="frames", accepted="neither scene, renderer nor window_ns")
+        raise ConfigError(
+            "nothing is drawn of recorded frames", where="frames", accepted="neither scene, renderer nor window_ns"
+        )
     return RecordedSequence(config, index, base=base, **wanted)
 
 
@@ -83,8 +102,19 @@ class Simulation(ABC):
     timeline: Timeline | None = None
     omissions: tuple[str, ...] = ()
 
-    def __init__(self, config: SequenceConfig, index: int, clock: StageClock, *, size: tuple[int, int], span_ns: tuple[int, int],
-                 pictures_hz: float | None, camera: EventCamera | None, labels: bool, stack: ExitStack | None = None):
+    def __init__(
+        self,
+        config: SequenceConfig,
+        index: int,
+        clock: StageClock,
+        *,
+        size: tuple[int, int],
+        span_ns: tuple[int, int],
+        pictures_hz: float | None,
+        camera: EventCamera | None,
+        labels: bool,
+        stack: ExitStack | None = None,
+    ):
         self.config, self.index, self.clock, self.camera = config, index, clock, camera
         (self.height, self.width), (self.t0_ns, self.t1_ns) = size, span_ns
         self.pictures_hz, self.events, self.labels = pictures_hz, 0, 0

@@ -20,8 +20,11 @@ def run(a: str, b: str | None, out: str | None = None, **options: Any) -> int:
     result = compare(a, b, **options)
     console = plain_console()
     intervals = len(result.edges_us) - 1
-    table = Table(title=f"{result.duration_s:.6g} s from {result.edges_us[0] / 1e6:.6f} s in {intervals} "
-                        f"interval{'s' * (intervals > 1)}; mean (min … max) over them; polarity sums blurred by {BLUR_PX:g} px", title_justify="left")
+    table = Table(
+        title=f"{result.duration_s:.6g} s from {result.edges_us[0] / 1e6:.6f} s in {intervals} "
+        f"interval{'s' * (intervals > 1)}; mean (min … max) over them; polarity sums blurred by {BLUR_PX:g} px",
+        title_justify="left",
+    )
     table.add_column("")
     table.add_column(f"A {Path(result.a.name).name}")
     if result.b:

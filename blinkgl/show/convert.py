@@ -14,7 +14,9 @@ def run(source: str, target: str, *, size: str | None = None, **options: Any) ->
     known = None
     if size is not None:
         width, cross, height = size.lower().partition("x")
-        if not (cross and width.isdigit() and height.isdigit() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536):
+        if not (
+            cross and width.isdigit() and height.isdigit() and 0 < int(width) <= 65536 and 0 < int(height) <= 65536
+        ):
             raise ConfigError("not a size", where="--size", value=size, accepted="WIDTHxHEIGHT, e.g. 640x480")
         known = (int(height), int(width))
     file, count = convert(source, target, size=known, **options)

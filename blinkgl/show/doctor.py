@@ -44,4 +44,6 @@ def show(report: Report) -> None:
             console.print(Text(f"\n{title}", style="bold"))
             for check in mendable:
                 console.print(Text(f"  {check.name}: {check.remedy}"), soft_wrap=True)
-    console.print(Text("\nAll required parts are there." if report.ok else "\nSomething required is missing.", style="bold"))
+    console.print(
+        Text("\nAll required parts are there." if report.ok else "\nSomething required is missing.", style="bold")
+    )

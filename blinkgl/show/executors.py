@@ -6,7 +6,9 @@ from blinkgl.dataset.executor import Executor, Inline, Local
 from blinkgl.errors import ConfigError
 
 
-def choose_executor(name: str, workers: int | None, *, address: str | None = None, gpus: float = 0.0, devices: str | None = None) -> Executor:
+def choose_executor(
+    name: str, workers: int | None, *, address: str | None = None, gpus: float = 0.0, devices: str | None = None
+) -> Executor:
     """``local`` without ``workers`` is this process itself. Raises ConfigError: unknown name,
     options of another executor, no Ray."""
     if name not in ("local", "ray"):
@@ -29,5 +31,10 @@ def _devices(text: str | None) -> list[int] | None:
         return None
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdigit() for part in parts):
-        raise ConfigError("not a list of device numbers", where="--devices", value=text, accepted="numbers as `blinkgl doctor` lists them, e.g. 0,1")
+        raise ConfigError(
+            "not a list of device numbers",
+            where="--devices",
+            value=text,
+            accepted="numbers as `blinkgl doctor` lists them, e.g. 0,1",
+        )
     return [int(part) for part in parts]

@@ -25,14 +25,31 @@ def show(result: Explanation, console: Console) -> None:
         scene.add_row(key, value)
     console.print(scene)
     passes = Table(title=f"what is computed (timed on {result.machine})", title_justify="left")
-    for column, side in (("pass", "left"), ("why", "left"), ("variants", "left"), ("MB/frame", "right"), ("times", "right"), ("seconds", "right")):
+    for column, side in (
+        ("pass", "left"),
+        ("why", "left"),
+        ("variants", "left"),
+        ("MB/frame", "right"),
+        ("times", "right"),
+        ("seconds", "right"),
+    ):
         passes.add_column(column, justify=side)
     for p in result.passes:
-        passes.add_row(p.name, p.why, ", ".join(p.variants), f"{p.bytes / 1e6:.2f}" if p.bytes else "–", f"{p.count:,}", f"{p.seconds:.2f}")
+        passes.add_row(
+            p.name,
+            p.why,
+            ", ".join(p.variants),
+            f"{p.bytes / 1e6:.2f}" if p.bytes else "–",
+            f"{p.count:,}",
+            f"{p.seconds:.2f}",
+        )
     console.print(passes)
     left = Table(title="what is left out", title_justify="left", show_header=False)
     for what, why in result.left_out:
         left.add_row(what, why)
     console.print(left)
-    say(console, f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
-                  f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video")
+    say(
+        console,
+        f"expected: about {result.frames:,} event frames, {result.seconds:.1f} s of drawing and events "
+        f"({result.seconds_per_simulated_second:.1f} s per simulated second), plus scene, compression and video",
+    )

@@ -26,14 +26,33 @@ SET_ASIDE = 3
 """Exit status of a run that is over but lacks sequences."""
 
 
-def run(config: str, out: str, *, num: int | None = None, seed: int | None = None, overrides: Sequence[str] = (), quiet: bool = False,
-        executor: Executor | None = None, resume: bool = False, mixed: bool = False, time_limit_s: float = 0.0) -> int:
+def run(
+    config: str,
+    out: str,
+    *,
+    num: int | None = None,
+    seed: int | None = None,
+    overrides: Sequence[str] = (),
+    quiet: bool = False,
+    executor: Executor | None = None,
+    resume: bool = False,
+    mixed: bool = False,
+    time_limit_s: float = 0.0,
+) -> int:
     """:func:`~blinkgl.dataset.run.run_dataset` behind a display; status :data:`SET_ASIDE` when sequences are missing,
     whose names and reasons are said even when ``quiet``. Raises what it raises."""
     template = load_run(config, overrides, seed=seed)
     console = plain_console(quiet=quiet)
-    outcome = run_dataset(template, out, executor, num=num, resume=resume, mixed=mixed, time_limit_s=time_limit_s,
-                          listener=None if quiet else Display(console, Path(out)))
+    outcome = run_dataset(
+        template,
+        out,
+        executor,
+        num=num,
+        resume=resume,
+        mixed=mixed,
+        time_limit_s=time_limit_s,
+        listener=None if quiet else Display(console, Path(out)),
+    )
     show_outcome(console, outcome, Path(out))
     if quiet:
         for name, reason in sorted(outcome.set_aside.items()):
@@ -47,9 +66,16 @@ class Display:
 
     def __init__(self, console: Console, out: Path):
         self._console, self._out = console, out
-        self._bars = Progress(plain_column("{task.description}"), BarColumn(bar_width=30), plain_column("{task.percentage:>3.0f}%"),
-                              plain_column("{task.fields[detail]}"), TimeElapsedColumn(), console=console, transient=True,
-                              disable=not console.is_terminal)
+        self._bars = Progress(
+            plain_column("{task.description}"),
+            BarColumn(bar_width=30),
+            plain_column("{task.percentage:>3.0f}%"),
+            plain_column("{task.fields[detail]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
         self._tasks: dict[str, TaskID] = {}
         self._at_work: dict[str, tuple[float, int, int]] = {}  # fraction, frames, events of what is being made
         self._done = self._frames = self._events = self._bytes = self._given_up = 0
@@ -71,7 +97,11 @@ class Display:
             self._at_work[name] = (message["fraction"], message["frames"], message["events"])
             if name not in self._tasks:
                 self._tasks[name] = self._bars.add_task(name, total=1.0, detail="")
-            detail = f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {_shares(message['seconds'])}" if message["fraction"] < 1 else "labels, files"
+            detail = (
+                f"{message['frames']} frames, {message['events'] / 1e6:.2f} M events, {_shares(message['seconds'])}"
+                if message["fraction"] < 1
+                else "labels, files"
+            )
             self._bars.update(self._tasks[name], completed=message["fraction"], detail=detail)
         elif kind != "silent":
             self._at_work.pop(name, None)
@@ -79,7 +109,11 @@ class Display:
                 self._bars.remove_task(self._tasks.pop(name))
         if kind == "done":
             report = report_of(message)
-            self._done, self._frames, self._events = self._done + 1, self._frames + report.frames, self._events + report.events
+            self._done, self._frames, self._events = (
+                self._done + 1,
+                self._frames + report.frames,
+                self._events + report.events,
+            )
             self._bytes += message["bytes"]
             if not self._console.is_terminal or self._todo > 1:
                 self._say(_line(report) + (f"; {self.summary()}" if self._todo > 1 else ""))
@@ -87,19 +121,27 @@ class Display:
             self._say(f"{name}: {message['error']}")
         elif kind == "failed":
             self._given_up += bool(message.get("given_up"))
-            self._say(f"{name} failed, {'set aside' if message.get('given_up') else 'will be tried again'}: "
-                      f"{message['error']}")
-        self._bars.update(self._total, completed=self._done + sum(f for f, _, _ in self._at_work.values()), detail=self.summary())
+            self._say(
+                f"{name} failed, {'set aside' if message.get('given_up') else 'will be tried again'}: "
+                f"{message['error']}"
+            )
+        self._bars.update(
+            self._total, completed=self._done + sum(f for f, _, _ in self._at_work.values()), detail=self.summary()
+        )
 
     def end(self, outcome: Outcome) -> None:
         self._bars.stop()
 
     def summary(self) -> str:
-        """"12/20, 85 frames/s, 1.2 M events/s, 0:03:10 left, 0.21 GB of about 0.35 GB"."""
+        """ "12/20, 85 frames/s, 1.2 M events/s, 0:03:10 left, 0.21 GB of about 0.35 GB"."""
         elapsed = max(time.monotonic() - self._started, 1e-3)
         frames = self._frames + sum(f for _, f, _ in self._at_work.values())
         events = self._events + sum(e for _, _, e in self._at_work.values())
-        parts = [f"{self._done}/{self._todo}", f"{frames / elapsed:.0f} frames/s", f"{events / elapsed / 1e6:.2f} M events/s"]
+        parts = [
+            f"{self._done}/{self._todo}",
+            f"{frames / elapsed:.0f} frames/s",
+            f"{events / elapsed / 1e6:.2f} M events/s",
+        ]
         if made := self._done + sum(f for f, _, _ in self._at_work.values()):
             left = (self._todo - self._given_up - made) * elapsed / made
             parts.append(f"{int(left // 3600)}:{int(left // 60) % 60:02d}:{int(left) % 60:02d} left")
@@ -127,7 +169,7 @@ class Display:
 
 
 def _shares(seconds: dict[str, float]) -> str:
-    """"render 63 %, events 12 %": where most of the time has gone so far."""
+    """ "render 63 %, events 12 %": where most of the time has gone so far."""
     total = sum(seconds.values()) or 1.0
     largest = sorted(STAGES, key=lambda name: -seconds.get(name, 0.0))[:2]
     return ", ".join(f"{name} {100 * seconds.get(name, 0.0) / total:.0f} %" for name in largest)
@@ -144,17 +186,27 @@ def show_outcome(console: Console, outcome: Outcome, out: Path) -> None:
     if outcome.made:
         show_table(console, outcome.made, outcome.elapsed_s)
     else:
-        say(console, f"nothing to make: all {outcome.found} sequences are whole" if not outcome.set_aside else "no sequence was made")
+        say(
+            console,
+            f"nothing to make: all {outcome.found} sequences are whole"
+            if not outcome.set_aside
+            else "no sequence was made",
+        )
     if outcome.set_aside:
-        say(console, f"{len(outcome.set_aside)} of {outcome.planned} sequences are set aside; run again with --resume to try "
-                     f"them again (logs: {out}/.run/logs)")
+        say(
+            console,
+            f"{len(outcome.set_aside)} of {outcome.planned} sequences are set aside; run again with --resume to try "
+            f"them again (logs: {out}/.run/logs)",
+        )
         for name, reason in sorted(outcome.set_aside.items()):
             say(console, f"  {name}: {reason}")
 
 
 def _line(report: SequenceReport) -> str:
-    return (f"{report.path}: {report.frames} frames, {report.events / 1e6:.2f} M events, {report.labels} labels, "
-            f"{report.total_s:.1f} s ({report.total_s / report.simulated_s:.1f} s per simulated second)")
+    return (
+        f"{report.path}: {report.frames} frames, {report.events / 1e6:.2f} M events, {report.labels} labels, "
+        f"{report.total_s:.1f} s ({report.total_s / report.simulated_s:.1f} s per simulated second)"
+    )
 
 
 def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -> None:
@@ -162,8 +214,11 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     workers each spent wall time at once."""
     s, first = made.summary(), made.first
     assert first is not None, "there is nothing to show of no sequences"
-    table = Table(title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",
-                  title_justify="left", show_header=False)
+    table = Table(
+        title=f"{s['sequences']} sequence{'s' if s['sequences'] != 1 else ''}, {s['simulated_s']:g} simulated seconds",
+        title_justify="left",
+        show_header=False,
+    )
     table.add_row("event frames", f"{s['frames']:,}")
     table.add_row("events", f"{s['events'] / 1e6:.2f} M")
     table.add_row("labels", f"{s['labels']:,}")
@@ -174,8 +229,11 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     table.add_row("rate", f"{s['events_per_second'] / 1e6:.2f} M events/s")
     if (error := first.timeline.get("time_error")) is not None:
         name = f"p{error['percentile']:g}"
-        table.add_row("time error, estimated", f"median {error['median_us']} µs, {name} {error[name + '_us']} µs"
-                      + (" (first sequence)" if len(made) > 1 else ""))
+        table.add_row(
+            "time error, estimated",
+            f"median {error['median_us']} µs, {name} {error[name + '_us']} µs"
+            + (" (first sequence)" if len(made) > 1 else ""),
+        )
     table.add_section()
     for name in (*STAGES, "other"):
         seconds = s[f"{name}_s"]

@@ -13,7 +13,9 @@ from blinkgl.errors import ConfigError
 from blinkgl.show.terminal import plain_column, plain_console, say
 
 
-def emulator_options(name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None) -> dict[str, Any]:
+def emulator_options(
+    name: str, config: str | None, overrides: Sequence[str], sensor: str | None = None
+) -> dict[str, Any]:
     """``emulator`` and ``readout`` of :func:`blinkgl.simulate` from an emulator's name, an optional YAML mapping (it
     may name the emulator itself), ``key=value`` overrides, and an optional sensor whose
     values hold where nothing else is said."""
@@ -35,27 +37,53 @@ def emulator_options(name: str, config: str | None, overrides: Sequence[str], se
     return {"emulator": emulator_config({**camera.values(data["emulator"]), **data}), "readout": camera.readout}
 
 
-def run(source: str, target: str, *, emulator: str, sensor: str | None = None, config: str | None = None, overrides: Sequence[str] = (),
-        quiet: bool = False, **options: Any) -> int:
+def run(
+    source: str,
+    target: str,
+    *,
+    emulator: str,
+    sensor: str | None = None,
+    config: str | None = None,
+    overrides: Sequence[str] = (),
+    quiet: bool = False,
+    **options: Any,
+) -> int:
     """``options``: of :func:`~blinkgl.recordings.simulation.file_to_events`."""
     from blinkgl.machine.compiling import compiled_s, compiling_line
     from blinkgl.recordings.simulation import file_to_events
 
     console = plain_console(quiet=quiet)
-    bar = Progress(plain_column("{task.description}"), BarColumn(), plain_column("{task.fields[detail]}"), TimeElapsedColumn(),
-                   TimeRemainingColumn(), console=console, transient=True, disable=quiet or not console.is_terminal)
+    bar = Progress(
+        plain_column("{task.description}"),
+        BarColumn(),
+        plain_column("{task.fields[detail]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        disable=quiet or not console.is_terminal,
+    )
     with bar:
         task = bar.add_task(Path(target).name, total=None, detail="")
 
         def progress(report, fraction) -> None:
-            bar.update(task, total=1.0 if fraction is not None else None, completed=fraction or 0.0,
-                       detail=f"{report.frames} frames, {report.events / 1e6:.2f} M events")
+            bar.update(
+                task,
+                total=1.0 if fraction is not None else None,
+                completed=fraction or 0.0,
+                detail=f"{report.frames} frames, {report.events / 1e6:.2f} M events",
+            )
 
-        report = file_to_events(source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options)
+        report = file_to_events(
+            source, target, progress=progress, **emulator_options(emulator, config, overrides, sensor), **options
+        )
     rate = report.events / report.duration_s if report.duration_s else 0.0
-    say(console, f"{target}: {report.events:,} events in {report.duration_s:.6g} s ({rate / 1e6:.3g} M/s, "
-                 f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator "
-                 "steps")
+    say(
+        console,
+        f"{target}: {report.events:,} events in {report.duration_s:.6g} s ({rate / 1e6:.3g} M/s, "
+        f"{100 * report.on / max(report.events, 1):.1f} % ON) from {report.frames} frames, {report.steps} emulator "
+        "steps",
+    )
     if report.displacement is not None:
         say(console, str(report.displacement))
     elif report.steps > report.frames:

@@ -30,14 +30,34 @@ def plain_column(text: str) -> TextColumn:
     return TextColumn(text, markup=False)
 
 
-_PLAIN = {"–": "-", "—": "-", "−": "-", "…": "...", "µ": "u", "μ": "u", "×": "x", "·": "*", "²": "^2", "³": "^3", "°": " deg", "≥": ">=", "≤": "<=",
-          "→": "->", "±": "+-", "σ": "sigma", "‘": "'", "’": "'", "“": '"', "”": '"'}
+_PLAIN = {
+    "–": "-",
+    "—": "-",
+    "−": "-",
+    "…": "...",
+    "µ": "u",
+    "μ": "u",
+    "×": "x",
+    "·": "*",
+    "²": "^2",
+    "³": "^3",
+    "°": " deg",
+    "≥": ">=",
+    "≤": "<=",
+    "→": "->",
+    "±": "+-",
+    "σ": "sigma",
+    "‘": "'",
+    "’": "'",
+    "“": '"',
+    "”": '"',
+}
 
 
 def _plainly(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
-    return "".join(_PLAIN.get(c, "?") for c in error.object[error.start:error.end]), error.end
+    return "".join(_PLAIN.get(c, "?") for c in error.object[error.start : error.end]), error.end
 
 
 def never_fail_to_print() -> None:

@@ -15,8 +15,23 @@ from blinkgl.trade.measure import QUICK, TRACED_LEVELS, Options
 from blinkgl.trade.run import convergence_line, trade, write
 
 
-def run(config: str, out: str, *, overrides: list[str], quick: bool, only: list[str], skip: list[str], sequence: int | None, clip: float | None,
-        limit_ms: float, rounds: int | None, minutes: float | None, cost: str, reference: str = "raster", seed: int | None = None) -> int:
+def run(
+    config: str,
+    out: str,
+    *,
+    overrides: list[str],
+    quick: bool,
+    only: list[str],
+    skip: list[str],
+    sequence: int | None,
+    clip: float | None,
+    limit_ms: float,
+    rounds: int | None,
+    minutes: float | None,
+    cost: str,
+    reference: str = "raster",
+    seed: int | None = None,
+) -> int:
     """Measures, writes the files, and names the settings that nothing beats. Raises BlinkGLError."""
     if cost not in ("wall", "cpu"):
         raise ConfigError("unknown cost", where="--cost", value=cost, accepted="wall or cpu")
@@ -24,7 +39,10 @@ def run(config: str, out: str, *, overrides: list[str], quick: bool, only: list[
         raise ConfigError("unknown reference", where="--reference", value=reference, accepted="raster or cycles")
     template = load_run(config, overrides, seed=seed)
     options = QUICK if quick else Options()
-    changes: dict[str, Any] = {"limit_us": round(limit_ms * 1000), "sequence": template.sequence(0).output.first_index if sequence is None else sequence}
+    changes: dict[str, Any] = {
+        "limit_us": round(limit_ms * 1000),
+        "sequence": template.sequence(0).output.first_index if sequence is None else sequence,
+    }
     if reference == "cycles":
         changes |= {"reference": reference, "levels": TRACED_LEVELS}
     if clip is not None:
@@ -34,7 +52,15 @@ def run(config: str, out: str, *, overrides: list[str], quick: bool, only: list[
     if minutes is not None:
         changes |= {"rounds_s": minutes * 30, "reference_s": minutes * 30}
     console = plain_console()
-    result = trade(template, quick=quick, only=only, skip=skip, options=replace(options, **changes), cost=f"{cost}_s", say=lambda text: say(console, text))
+    result = trade(
+        template,
+        quick=quick,
+        only=only,
+        skip=skip,
+        options=replace(options, **changes),
+        cost=f"{cost}_s",
+        say=lambda text: say(console, text),
+    )
     show(result, console)
     paths = write(result, out)
     say(console, f"written to {out}: " + ", ".join(p.name for p in paths))
@@ -46,20 +72,47 @@ def show(result: dict, console: Console) -> None:
     console.width = max(console.width, 120)
     table = Table(title="settings that no other one beats in cost and error, cheapest first", title_justify="left")
     table.add_column("setting")
-    for name in ("wall s/s", "cpu s/s", "frames/s", "time µs 50/95 %", "shift px 50/95 %", "missed/extra", "voxel grid"):
+    for name in (
+        "wall s/s",
+        "cpu s/s",
+        "frames/s",
+        "time µs 50/95 %",
+        "shift px 50/95 %",
+        "missed/extra",
+        "voxel grid",
+    ):
         table.add_column(name, justify="right", no_wrap=True)
     for r in sorted((r for r in result["settings"] if r["on_front"]), key=lambda r: r[result["cost"]]):
-        table.add_row(r["name"], f"{r['wall_s']:.2f}", f"{r['cpu_s']:.2f}", f"{r['frames_per_s']:.0f}", f"{r['time_median_us']:.0f}/{r['time_p95_us']:.0f}",
-                      f"{r['shift_median_px']:.3f}/{r['shift_p95_px']:.3f}", f"{100 * r['missed']:.1f}/{100 * r['extra']:.1f} %", f"{100 * r['voxel']:.1f} %")
+        table.add_row(
+            r["name"],
+            f"{r['wall_s']:.2f}",
+            f"{r['cpu_s']:.2f}",
+            f"{r['frames_per_s']:.0f}",
+            f"{r['time_median_us']:.0f}/{r['time_p95_us']:.0f}",
+            f"{r['shift_median_px']:.3f}/{r['shift_p95_px']:.3f}",
+            f"{100 * r['missed']:.1f}/{100 * r['extra']:.1f} %",
+            f"{100 * r['voxel']:.1f} %",
+        )
     console.print(table)
     console.print(result["machine"], highlight=False, soft_wrap=True)
     for name, size in result["sizes"].items():
         last = size["levels"][-1]
         if last["frame_wall_s"] is not None:
             mine = [r for r in result["settings"] if (r["size"] or "full") == name]
-            span = lambda key, mine=mine: " to ".join(f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max))
-            console.print(f"seconds per frame of {size['width']}x{size['height']}, wall (processor): Cycles "
-                          f"{last['frame_wall_s']:.2f} ({last['frame_cpu_s']:.2f}), the settings {span('wall_s')} "
-                          f"({span('cpu_s')})", highlight=False, soft_wrap=True)
+            span = lambda key, mine=mine: " to ".join(
+                f"{f(r[key] / r['frames_per_s'] for r in mine):.4f}" for f in (min, max)
+            )
+            console.print(
+                f"seconds per frame of {size['width']}x{size['height']}, wall (processor): Cycles "
+                f"{last['frame_wall_s']:.2f} ({last['frame_cpu_s']:.2f}), the settings {span('wall_s')} "
+                f"({span('cpu_s')})",
+                highlight=False,
+                soft_wrap=True,
+            )
         line = convergence_line(result, name)
-        console.print(("" if name == "full" else f"{name}: ") + line, highlight=False, soft_wrap=True, style="" if size["converged"] else "yellow")
+        console.print(
+            ("" if name == "full" else f"{name}: ") + line,
+            highlight=False,
+            soft_wrap=True,
+            style="" if size["converged"] else "yellow",
+        )

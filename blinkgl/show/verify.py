@@ -14,7 +14,9 @@ def run(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -
     """:func:`~blinkgl.dataset.verify.verify_dataset` in words; status 2 when something is wrong."""
     console = plain_console()
     with console.status("looking") as status:
-        result = verify_dataset(folder, deep=deep, seed=seed, base=base, progress=lambda number, name: status.update(f"{number}: {name}"))
+        result = verify_dataset(
+            folder, deep=deep, seed=seed, base=base, progress=lambda number, name: status.update(f"{number}: {name}")
+        )
     for name, lines in sorted(result.problems.items()):
         for line in lines[:_MOST_LINES]:
             say(console, f"{shown(name)}: {line}" if name != "." else line)
@@ -29,7 +31,7 @@ def run(folder: str, *, deep: int = 0, seed: int = 0, base: str | None = None) -
 
 
 def last_line(result: Verification, deep: bool) -> str:
-    """"20 sequences, 3 made again and compared bit by bit: no problem found"; says also what
+    """ "20 sequences, 3 made again and compared bit by bit: no problem found"; says also what
     was compared in part or not at all."""
     parts = [f"{result.sequences} sequences"]
     if deep:
@@ -37,5 +39,9 @@ def last_line(result: Verification, deep: bool) -> str:
     if result.in_part:
         parts.append(f"{len(result.in_part)} made again and compared in part")
     bad = len(result.problems)
-    verdict = f"problems in {bad} place{'s' * (bad != 1)}" if bad else "no problem found" + (" in what could be compared" if result.notes else "")
+    verdict = (
+        f"problems in {bad} place{'s' * (bad != 1)}"
+        if bad
+        else "no problem found" + (" in what could be compared" if result.notes else "")
+    )
     return ", ".join(parts) + f": {verdict}"

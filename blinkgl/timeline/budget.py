@@ -57,7 +57,15 @@ def _left_out(scheme, older, a, middle, b, newer, slope_a, slope_b, t, error, we
         if scheme == _HERMITE:
             alpha, beta = limited(slope_a[i] * step / change), limited(slope_b[i] * step / change)
         elif scheme == _PCHIP:
-            alpha, beta = end_slopes(np.float64(older[i]), np.float64(a[i]), np.float64(b[i]), np.float64(newer[i]), step, t[1] - t[0], t[4] - t[3])
+            alpha, beta = end_slopes(
+                np.float64(older[i]),
+                np.float64(a[i]),
+                np.float64(b[i]),
+                np.float64(newer[i]),
+                step,
+                t[1] - t[0],
+                t[4] - t[3],
+            )
         y = (np.float64(middle[i]) - np.float64(a[i])) / change
         error[i] = abs(curve_time(min(max(y, 0.0), 1.0), alpha, beta, 0.0) - s_middle)
 
@@ -124,7 +132,15 @@ class TimeError:
         _left_out(self._scheme, *(frame[1] for frame in five), five[1][2], five[3][2], t, error, weight)
         self._measure(t, error, weight, *(np.abs(five[2][1] - five[k][1]) for k in (1, 3)), five[2][3])
 
-    def _measure(self, t: np.ndarray, error: np.ndarray, weight: np.ndarray, before: np.ndarray, after: np.ndarray, speed: np.ndarray) -> None:
+    def _measure(
+        self,
+        t: np.ndarray,
+        error: np.ndarray,
+        weight: np.ndarray,
+        before: np.ndarray,
+        after: np.ndarray,
+        speed: np.ndarray,
+    ) -> None:
         """before, after : |change| of the signal in the two intervals."""
         ok = np.isfinite(speed)
         mean_speed = contraharmonic_mean(speed)
@@ -155,14 +171,26 @@ class TimeError:
 
     def info(self) -> dict[str, Any]:
         """The achieved errors as estimated: percentiles over the events of the whole sequence."""
+
         def of(histogram: np.ndarray, percent: float) -> float | None:
             if not histogram.any():
                 return None
             cumulative = np.cumsum(histogram)
-            return float(f"{_EDGES[min(np.searchsorted(cumulative, percent / 100 * cumulative[-1]), len(_EDGES) - 1)]:.3g}")
+            return float(
+                f"{_EDGES[min(np.searchsorted(cumulative, percent / 100 * cumulative[-1]), len(_EDGES) - 1)]:.3g}"
+            )
 
         wanted = {"median": 50.0, "p95": 95.0, f"p{self.percentile:g}": self.percentile}
-        return {"time_error": {
-            "reconstruction": self.reconstruction, "percentile": self.percentile, ("target_px" if self.in_px else "target_us"):
-            float(f"{self.target if self.in_px else self.target * 1e6:.9g}"), "measurements": self.measurements, "order": round(1 + self.m, 2),
-            **{f"{name}_us": of(self._us, p) for name, p in wanted.items()}, **{f"{name}_px": of(self._px, p) for name, p in wanted.items()}}}
+        return {
+            "time_error": {
+                "reconstruction": self.reconstruction,
+                "percentile": self.percentile,
+                ("target_px" if self.in_px else "target_us"): float(
+                    f"{self.target if self.in_px else self.target * 1e6:.9g}"
+                ),
+                "measurements": self.measurements,
+                "order": round(1 + self.m, 2),
+                **{f"{name}_us": of(self._us, p) for name, p in wanted.items()},
+                **{f"{name}_px": of(self._px, p) for name, p in wanted.items()},
+            }
+        }

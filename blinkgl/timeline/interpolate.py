@@ -18,7 +18,9 @@ from blinkgl.srgb import to_srgb8
 
 Timed = tuple[np.ndarray, int]
 _EPS = np.float32(1e-3)
-_LEAST = 16  # px, of a side: below, OpenCV's dense flow raises, returns NaN or ends the process, depending on the other side
+_LEAST = (
+    16  # px, of a side: below, OpenCV's dense flow raises, returns NaN or ends the process, depending on the other side
+)
 
 
 def cubic(frames: Iterable[Timed], factor: int = 4) -> Iterator[Timed]:
@@ -54,7 +56,9 @@ def _segment(a, b, slope_a: np.ndarray, slope_b: np.ndarray, factor: int) -> Ite
         if t == a[2]:
             continue
         s = (t - a[2]) * 1e-6 / h
-        weights = map(np.float32, ((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), h * s * (1 - s) ** 2, h * s * s * (s - 1)))
+        weights = map(
+            np.float32, ((1 + 2 * s) * (1 - s) ** 2, s * s * (3 - 2 * s), h * s * (1 - s) ** 2, h * s * s * (s - 1))
+        )
         frame = np.empty_like(a[1])
         _combine(a[1].ravel(), b[1].ravel(), slope_a.ravel(), slope_b.ravel(), *weights, frame.reshape(-1))
         np.exp(frame, out=frame)
@@ -97,11 +101,15 @@ class Displacement:
         self.largest = max(self.largest, float(speed.max()))
 
     def __str__(self) -> str:
-        return (f"displacement per given frame: median {self.median:.2g} px, 99th percentile {self.p99:.2g} px, "
-                f"largest {self.largest:.2g} px; {self.inserted} frames interpolated by dense-flow warp, not recorded")
+        return (
+            f"displacement per given frame: median {self.median:.2g} px, 99th percentile {self.p99:.2g} px, "
+            f"largest {self.largest:.2g} px; {self.inserted} frames interpolated by dense-flow warp, not recorded"
+        )
 
 
-def motion(frames: Iterable[Timed], max_px: float = 1.0, *, most: int = 64, displacement: Displacement | None = None) -> Iterator[Timed]:
+def motion(
+    frames: Iterable[Timed], max_px: float = 1.0, *, most: int = 64, displacement: Displacement | None = None
+) -> Iterator[Timed]:
     """So many frames in between that no more than ``max_px`` (99.5 % of the pixels) are moved
     per step, at most ``most`` per pair.
 
@@ -115,8 +123,12 @@ def motion(frames: Iterable[Timed], max_px: float = 1.0, *, most: int = 64, disp
     last: tuple[np.ndarray, np.ndarray, int] | None = None
     for frame, t in frames:
         if min(frame.shape[:2]) < _LEAST:
-            raise EventDataError("too small for dense flow", where="interpolate: motion", value=f"{frame.shape[1]}x{frame.shape[0]}",
-                                 accepted=f"at least {_LEAST}x{_LEAST}, or interpolate: linear")
+            raise EventDataError(
+                "too small for dense flow",
+                where="interpolate: motion",
+                value=f"{frame.shape[1]}x{frame.shape[0]}",
+                accepted=f"at least {_LEAST}x{_LEAST}, or interpolate: linear",
+            )
         grey = _to8(frame)
         if last is not None:
             a, grey_a, t_a = last
@@ -144,7 +156,10 @@ def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
         to_b = forward * f((1 - s) ** 2) - backward * f(s * (1 - s))
         # What b does not see (a's inconsistent pixels) comes from a, and the other way round.
         weight_a, weight_b = f(1 - s) * look(seen_b, to_b), f(s) * look(seen_a, to_a)
-        yield (weight_a * look(a, to_a) + weight_b * look(b, to_b)) / (weight_a + weight_b), t_a + (t_b - t_a) * k // steps
+        yield (
+            (weight_a * look(a, to_a) + weight_b * look(b, to_b)) / (weight_a + weight_b),
+            t_a + (t_b - t_a) * k // steps,
+        )
 
 
 def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:

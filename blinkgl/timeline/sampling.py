@@ -26,15 +26,18 @@ def uniform_times(fps: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
         yield t1_ns
 
 
-def displacement_times(max_px: float, min_step_ns: int, max_step_ns: int, t0_ns: int, t1_ns: int,
-                       speed: Callable[[int], float]) -> Iterator[int]:
+def displacement_times(
+    max_px: float, min_step_ns: int, max_step_ns: int, t0_ns: int, t1_ns: int, speed: Callable[[int], float]
+) -> Iterator[int]:
     """Steps so short that ``speed * step <= max_px`` at both ends of each step, within [min_step, max_step].
 
     speed : t_ns -> largest image speed at that time, px/s."""
     return bounded_times(lambda t_ns: speed(t_ns) / max_px, min_step_ns, max_step_ns, t0_ns, t1_ns)
 
 
-def bounded_times(pace: Callable[[int], float], min_step_ns: int, max_step_ns: int, t0_ns: int, t1_ns: int) -> Iterator[int]:
+def bounded_times(
+    pace: Callable[[int], float], min_step_ns: int, max_step_ns: int, t0_ns: int, t1_ns: int
+) -> Iterator[int]:
     """Steps so short that ``pace * step <= 1`` at both ends of each step, within [min_step, max_step].
 
     pace : t_ns -> how many steps per second the scene asks for at that time.

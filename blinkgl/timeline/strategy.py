@@ -1,10 +1,10 @@
 """The strategies of ``timeline:``: frame times that adapt to what is drawn.
 
-    timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer,
-    emulator_of(config.events).response(config.events)) for t_ns in timeline:
-        luminance = ...                              # the frame at t_ns
-        timeline.observe(t_ns, luminance, rate)
-    timeline.info()                                  # what was achieved, for the manifest
+timeline = make_timeline(config.timeline, t0_ns, t1_ns, renderer,
+emulator_of(config.events).response(config.events)) for t_ns in timeline:
+    luminance = ...                              # the frame at t_ns
+    timeline.observe(t_ns, luminance, rate)
+timeline.info()                                  # what was achieved, for the manifest
 """
 
 from __future__ import annotations
@@ -47,7 +47,9 @@ class Timeline:
 
     def __iter__(self) -> Iterator[int]:
         c = self.config
-        return bounded_times(self._counted, round(c.min_step_us * 1000), round(c.max_step_us * 1000), self.t0_ns, self.t1_ns)
+        return bounded_times(
+            self._counted, round(c.min_step_us * 1000), round(c.max_step_us * 1000), self.t0_ns, self.t1_ns
+        )
 
     def pace(self, t_ns: int) -> float:
         """Steps per second that the scene asks for at one time."""
@@ -76,7 +78,9 @@ class Displacement(Timeline):
     """Steps in which pixels move ``max_px``, by the image velocity of those that move."""
 
     def pace(self, t_ns: int) -> float:
-        speeds = moving(np.linalg.norm(self.pictures.velocity_of_movers(t_ns, self.config.sample_every).read(), axis=-1))
+        speeds = moving(
+            np.linalg.norm(self.pictures.velocity_of_movers(t_ns, self.config.sample_every).read(), axis=-1)
+        )
         if not len(speeds):
             return 0.0
         pace = percentile(speeds, self.config.percentile) / self.config.max_px
@@ -89,7 +93,9 @@ class Brightness(Timeline):
     def pace(self, t_ns: int) -> float:
         picture = self.pictures.brightness(t_ns, self.config.sample_every).read()
         changes = moving(np.abs(self.response.change(picture[..., 0], picture[..., 1])))
-        return percentile(changes, self.config.percentile) / (self.config.max_fraction_of_threshold * self.response.threshold)
+        return percentile(changes, self.config.percentile) / (
+            self.config.max_fraction_of_threshold * self.response.threshold
+        )
 
 
 class Budget(Timeline):
@@ -98,15 +104,21 @@ class Budget(Timeline):
     def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response):
         super().__init__(config, t0_ns, t1_ns, pictures, response)
         in_px = config.max_time_error_px is not None
-        self.error = TimeError(config.reconstruction, config.max_time_error_px if in_px else config.max_time_error_us * 1e-6, in_px,
-                               config.percentile)
+        self.error = TimeError(
+            config.reconstruction,
+            config.max_time_error_px if in_px else config.max_time_error_us * 1e-6,
+            in_px,
+            config.percentile,
+        )
         self._speeds: dict[int, np.ndarray] = {}
 
     def __iter__(self) -> Iterator[int]:
         last = None
         for k, t in enumerate(super().__iter__()):
             if last is not None and k % PROBE_EVERY == 0 and t - last >= 2 * self.config.min_step_us * 1000:
-                yield last + (t - last) // 2  # this step in two halves: its own error is then measured, not extrapolated
+                yield (
+                    last + (t - last) // 2
+                )  # this step in two halves: its own error is then measured, not extrapolated
             yield t
             last = t
 
@@ -122,7 +134,9 @@ class Budget(Timeline):
         speed = self._speeds[nearest]
         # Pixels at the centres of the small picture's, which covers the whole image even where that is no multiple of
         # the stride or smaller than the stride.
-        rows, columns = (((np.arange(few) + 0.5) * many / few).astype(np.intp) for few, many in zip(speed.shape, luminance.shape))
+        rows, columns = (
+            ((np.arange(few) + 0.5) * many / few).astype(np.intp) for few, many in zip(speed.shape, luminance.shape)
+        )
         pick = lambda a: a[np.ix_(rows, columns)]
         small = pick(luminance)
         slope = self.response.change(small, pick(rate)) if rate is not None else None
@@ -136,7 +150,9 @@ PROBE_EVERY = 12
 _KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Brightness, "budget": Budget}
 
 
-def make_timeline(config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response) -> Timeline:
+def make_timeline(
+    config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response
+) -> Timeline:
     """Of any ``timeline:`` configuration."""
     return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response)
 

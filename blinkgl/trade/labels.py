@@ -29,6 +29,15 @@ def flow_errors(scene: Scene, renderer: Renderer, t_ns: int, t_next_ns: int, see
     flow, valid = exact.flow.reshape(PIXELS, len(_AROUND), 2)[:, 0], exact.valid.reshape(PIXELS, -1)[:, 0]
     ours = renderer.labels(t_ns, LabelRequest("ids", "flow_forward"), t_next_ns)
     x, y = xy.T
-    counts = (ids == ids[:, :1]).all(axis=1) & (ids[:, 0] > 0) & (ours.ids[y, x] == ids[:, 0]) & valid & ours.forward.valid[y, x]
+    counts = (
+        (ids == ids[:, :1]).all(axis=1)
+        & (ids[:, 0] > 0)
+        & (ours.ids[y, x] == ids[:, 0])
+        & valid
+        & ours.forward.valid[y, x]
+    )
     error = np.hypot(*(ours.forward.flow[y, x] - flow)[counts].T)
-    return {"flow_median_px": float(np.median(error)) if len(error) else float("nan"), "flow_max_px": float(error.max(initial=0)) if len(error) else float("nan")}
+    return {
+        "flow_median_px": float(np.median(error)) if len(error) else float("nan"),
+        "flow_max_px": float(error.max(initial=0)) if len(error) else float("nan"),
+    }

@@ -98,7 +98,11 @@ def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
         if n == 0 or m == 0:
             continue
         if len(low) <= n:
-            low, high, row_start = np.empty(2 * n + 2, np.int64), np.empty(2 * n + 2, np.int64), np.empty(2 * n + 2, np.int64)
+            low, high, row_start = (
+                np.empty(2 * n + 2, np.int64),
+                np.empty(2 * n + 2, np.int64),
+                np.empty(2 * n + 2, np.int64),
+            )
         low[0] = high[0] = row_start[0] = 0
         cells = 1
         lo = hi = 0
@@ -125,8 +129,11 @@ def _match(starts_a, order_a, t_a, starts_b, order_b, t_b, limit, partner):
                     other = cost[here + j - 1] + limit
                     if other < best:
                         best, what = other, _EXTRA
-                    pair = (cost[above + min(j - 1, top)] + limit * max(j - 1 - top, 0)
-                            + 2 * abs(t - t_b[order_b[b0 + j - 1]]))
+                    pair = (
+                        cost[above + min(j - 1, top)]
+                        + limit * max(j - 1 - top, 0)
+                        + 2 * abs(t - t_b[order_b[b0 + j - 1]])
+                    )
                     if pair <= best:
                         best, what = pair, _MATCH
                 cost[here + j], choice[here + j] = best, what

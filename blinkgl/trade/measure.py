@@ -55,7 +55,14 @@ class Options:
 
 
 TRACED_LEVELS = ((8, 0.5), (16, 0.25), (32, 0.125))
-QUICK = Options(tiles=(3, 2, 24, 18), levels=((8, 0.12), (16, 0.08), (32, 0.056)), reference_s=60.0, rounds=3, rounds_s=60.0, clip_s=0.05)
+QUICK = Options(
+    tiles=(3, 2, 24, 18),
+    levels=((8, 0.12), (16, 0.08), (32, 0.056)),
+    reference_s=60.0,
+    rounds=3,
+    rounds_s=60.0,
+    clip_s=0.05,
+)
 
 
 @dataclass
@@ -79,9 +86,22 @@ class Measured:
 
     def to_dict(self) -> dict:
         s = self.setting
-        return {"name": s.name, "sampling": s.sampling, "reconstruction": s.reconstruction, "antialiasing": s.antialiasing, "other": s.other,
-                "size": s.size, "overrides": list(s.overrides), "wall_s": self.cost, "cpu_s": float(np.median(self.cpu_s)),
-                "wall_rounds": self.wall_s, "frames_per_s": self.frames_per_s, "triangles": self.triangles, **self.errors.to_dict(), **self.flow}
+        return {
+            "name": s.name,
+            "sampling": s.sampling,
+            "reconstruction": s.reconstruction,
+            "antialiasing": s.antialiasing,
+            "other": s.other,
+            "size": s.size,
+            "overrides": list(s.overrides),
+            "wall_s": self.cost,
+            "cpu_s": float(np.median(self.cpu_s)),
+            "wall_rounds": self.wall_s,
+            "frames_per_s": self.frames_per_s,
+            "triangles": self.triangles,
+            **self.errors.to_dict(),
+            **self.flow,
+        }
 
 
 @dataclass
@@ -101,21 +121,43 @@ class Level:
 
     @property
     def ratio(self) -> dict[str, float]:
-        return {k: self.movement[k] / self.smallest[k] if self.smallest[k] else float("inf") for k in JUDGED} if self.movement else {}
+        return (
+            {k: self.movement[k] / self.smallest[k] if self.smallest[k] else float("inf") for k in JUDGED}
+            if self.movement
+            else {}
+        )
 
     @property
     def converged(self) -> bool:
         return bool(self.ratio) and max(self.ratio.values()) <= ENOUGH
 
     def to_dict(self) -> dict:
-        return {"scale": self.scale, "max_px": self.max_px, "frames": self.frames, "seconds": self.seconds, "events": len(self.events),
-                "frame_wall_s": self.frame_wall_s, "frame_cpu_s": self.frame_cpu_s, "movement": self.movement, "smallest": self.smallest, "ratio": self.ratio, "converged": self.converged}
+        return {
+            "scale": self.scale,
+            "max_px": self.max_px,
+            "frames": self.frames,
+            "seconds": self.seconds,
+            "events": len(self.events),
+            "frame_wall_s": self.frame_wall_s,
+            "frame_cpu_s": self.frame_cpu_s,
+            "movement": self.movement,
+            "smallest": self.smallest,
+            "ratio": self.ratio,
+            "converged": self.converged,
+        }
 
 
 class Bench:
     """One sequence at one image size: its scenes, its clip, its judged pixels."""
 
-    def __init__(self, gl: GLContext, template: RunTemplate, options: Options, size: str = "", say: Callable[[str], None] = lambda _: None):
+    def __init__(
+        self,
+        gl: GLContext,
+        template: RunTemplate,
+        options: Options,
+        size: str = "",
+        say: Callable[[str], None] = lambda _: None,
+    ):
         self.gl, self.options, self.say = gl, options, say
         if options.reference == "cycles":
             from blinkgl.tools import peer_cycles
@@ -144,7 +186,9 @@ class Bench:
         self.t1_ns = self.t0_ns + length // 1000 * 1000
 
     def config(self, overrides: Iterable[str]) -> SequenceConfig:
-        return RunTemplate(apply_overrides(self._template.tree, list(overrides)), self._template.base).sequence(self.options.sequence)
+        return RunTemplate(apply_overrides(self._template.tree, list(overrides)), self._template.base).sequence(
+            self.options.sequence
+        )
 
     def scene_of(self, config: SequenceConfig) -> Scene:
         key = json.dumps(config.scene.model_dump(), sort_keys=True)
@@ -186,7 +230,9 @@ class Bench:
         config = config.model_copy(update={"events": self.emulator, "readout": None})
 
         def clip(end_ns: int) -> Simulation:
-            return simulate_sequence(config, self.options.sequence, labels=False, renderer=renderer, window_ns=(self.t0_ns, end_ns))
+            return simulate_sequence(
+                config, self.options.sequence, labels=False, renderer=renderer, window_ns=(self.t0_ns, end_ns)
+            )
 
         for _ in clip(self.t0_ns + (self.t1_ns - self.t0_ns) // 20):  # programs, targets, kernels: made the first time
             pass
@@ -227,7 +273,9 @@ class Bench:
             started = time.perf_counter()
             with self._source(scale) as source:
                 times = list(source.times(max_px, self.t0_ns, self.t1_ns))
-                events, frames = reference_events(source, times, self.emulator, self.height, self.width, self.seed, self.mask)
+                events, frames = reference_events(
+                    source, times, self.emulator, self.height, self.width, self.seed, self.mask
+                )
             level = Level(scale, max_px, frames, time.perf_counter() - started, events)
             if cost := source.cost:
                 level.frame_wall_s, level.frame_cpu_s = float(np.median(cost.wall_s)), float(np.median(cost.cpu_s))
@@ -252,7 +300,9 @@ class Bench:
         return FineTiles(self.gl, self.scene, self.tiles, scale)
 
     def errors(self, reference: Events, events: Events, speeds: SpeedMaps) -> EventErrors:
-        return event_errors(reference, events, speeds, self.t0_ns // 1000, self.t1_ns // 1000, limit_us=self.options.limit_us)
+        return event_errors(
+            reference, events, speeds, self.t0_ns // 1000, self.t1_ns // 1000, limit_us=self.options.limit_us
+        )
 
     def _affordable(self, levels: list[Level], scale: int, max_px: float, spent: float) -> bool:
         last = levels[-1]

@@ -62,8 +62,16 @@ class SpeedMaps:
         return self.speed[np.searchsorted(middle, t), y, x]
 
 
-def event_errors(reference: Events, judged: Events, speeds: SpeedMaps, t0_us: int, t1_us: int, *, limit_us: int,
-                 mask: np.ndarray | None = None) -> EventErrors:
+def event_errors(
+    reference: Events,
+    judged: Events,
+    speeds: SpeedMaps,
+    t0_us: int,
+    t1_us: int,
+    *,
+    limit_us: int,
+    mask: np.ndarray | None = None,
+) -> EventErrors:
     """Errors of ``judged`` in [t0_us, t1_us); mask : (H, W) bool, the pixels that count (default: all).
 
     limit_us : longest distance between partners; see :func:`blinkgl.trade.matching.match_events`."""
@@ -80,8 +88,15 @@ def event_errors(reference: Events, judged: Events, speeds: SpeedMaps, t0_us: in
     true = voxel_grid(theirs, t0_us, t1_us, height, width)
     norm = float(np.linalg.norm(true))
     difference = float(np.linalg.norm(voxel_grid(mine, t0_us, t1_us, height, width) - true))
-    return EventErrors(len(mine), total, *_spread(late), *_spread(shift), share(total - int(found.sum())), share(matching.extra),
-                       difference / norm if norm else float("nan"))
+    return EventErrors(
+        len(mine),
+        total,
+        *_spread(late),
+        *_spread(shift),
+        share(total - int(found.sum())),
+        share(matching.extra),
+        difference / norm if norm else float("nan"),
+    )
 
 
 def voxel_grid(events: Events, t0_us: int, t1_us: int, height: int, width: int, bins: int = BINS) -> np.ndarray:

@@ -17,9 +17,29 @@ def page(result: dict, picture: bytes) -> str:
     for name, judged in result["sizes"].items():
         line = convergence_line(result, name)
         trust.append((("" if name == "full" else f"{name}: ") + line[0].upper() + line[1:] + ".", judged["converged"]))
-    tiles = [(len(result["settings"]), "settings measured"), (len(result["front"]), "worth choosing"), (f"{size['width']}×{size['height']}", "image"),
-             (f"{size['clip_s']:g} s", "simulated clip"), (number(size["judged_pixels"]), "pixels judged"), (result["rounds"], "rounds")]
-    thresholds = ", ".join(f"{k} {v:g}" for k, v in size["emulator"].items() if isinstance(v, float) and k.startswith(("contrast", "threshold_sigma")))
-    return render("trade/trade.html", title="What accuracy costs", result=result, settings=result["settings"], tiles=tiles, trust=trust, measures=NAMES,
-                  picture=data_uri(picture), emulator=size["emulator"], thresholds=thresholds,
-                  configuration=json.dumps(result["config"], indent=1, default=str))
+    tiles = [
+        (len(result["settings"]), "settings measured"),
+        (len(result["front"]), "worth choosing"),
+        (f"{size['width']}×{size['height']}", "image"),
+        (f"{size['clip_s']:g} s", "simulated clip"),
+        (number(size["judged_pixels"]), "pixels judged"),
+        (result["rounds"], "rounds"),
+    ]
+    thresholds = ", ".join(
+        f"{k} {v:g}"
+        for k, v in size["emulator"].items()
+        if isinstance(v, float) and k.startswith(("contrast", "threshold_sigma"))
+    )
+    return render(
+        "trade/trade.html",
+        title="What accuracy costs",
+        result=result,
+        settings=result["settings"],
+        tiles=tiles,
+        trust=trust,
+        measures=NAMES,
+        picture=data_uri(picture),
+        emulator=size["emulator"],
+        thresholds=thresholds,
+        configuration=json.dumps(result["config"], indent=1, default=str),
+    )

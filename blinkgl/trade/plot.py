@@ -10,9 +10,11 @@ import numpy as np
 COLOURS = {"none": "#d9552f", "msaa4": "#e0a526", "taps4": "#8a5fc0", "ssaa2": "#3d6bd6", "ssaa4": "#2a9d8f"}
 MARKERS = {"linear": "o", "pchip": "^", "hermite": "s"}
 COSTS = {"wall_s": "seconds of computing per simulated second", "cpu_s": "processor seconds per simulated second"}
-PANELS = (("voxel", "", 100.0, "%"),
-          ("wrong", "missed + invented events", 100.0, "%"),
-          ("shift_median_px", "typical displacement of an event's edge", 1.0, "px"))
+PANELS = (
+    ("voxel", "", 100.0, "%"),
+    ("wrong", "missed + invented events", 100.0, "%"),
+    ("shift_median_px", "typical displacement of an event's edge", 1.0, "px"),
+)
 
 
 def pareto(result: dict) -> bytes:
@@ -30,12 +32,17 @@ def pareto(result: dict) -> bytes:
         _panel(ax, rows, cost, key, factor, unit, large=ax is axes[0])
         ax.set_title(title, fontsize=11)
     size = result["sizes"][result["size"]]
-    figure.suptitle("Speed against accuracy: left is cheaper, down is better; nothing is below and left of the line\n"
-                    f"{size['width']}x{size['height']} px, {size['clip_s']:g} s simulated", fontsize=12.5)
+    figure.suptitle(
+        "Speed against accuracy: left is cheaper, down is better; nothing is below and left of the line\n"
+        f"{size['width']}x{size['height']} px, {size['clip_s']:g} s simulated",
+        fontsize=12.5,
+    )
     axes[0].set_ylabel("error of the events: difference of the voxel grids a network sees, relative")
     _legend(axes[0], rows)
     canvas.draw()
-    for _ in range(8):  # until the names, whose length on the axis is not known beforehand, have room left of their points
+    for _ in range(
+        8
+    ):  # until the names, whose length on the axis is not known beforehand, have room left of their points
         names = _label(axes[0], [r for r in rows if r["on_front"]], cost, canvas.get_renderer())
         if all(name.get_window_extent(canvas.get_renderer()).x0 > axes[0].bbox.x0 + 5 for name in names):
             break
@@ -58,9 +65,17 @@ def _panel(ax, rows: list[dict], cost: str, key: str, factor: float, unit: str, 
         if not (math.isfinite(r[key]) and r[key] > 0):
             continue
         best = r["on_front"]
-        ax.plot(r[cost], r[key] * factor, MARKERS.get(r["reconstruction"], "D"), color=COLOURS.get(r["antialiasing"], "0.5"),
-                ms=(11 if best else 7) * (1 if large else 0.7), mec="black" if best else "white", mew=1.4 if best else 0.6, alpha=1 if best else 0.6,
-                zorder=4 if best else 3)
+        ax.plot(
+            r[cost],
+            r[key] * factor,
+            MARKERS.get(r["reconstruction"], "D"),
+            color=COLOURS.get(r["antialiasing"], "0.5"),
+            ms=(11 if best else 7) * (1 if large else 0.7),
+            mec="black" if best else "white",
+            mew=1.4 if best else 0.6,
+            alpha=1 if best else 0.6,
+            zorder=4 if best else 3,
+        )
     best = sorted((r for r in rows if r["on_front"]), key=lambda r: r[cost])
     if large:
         ax.step([r[cost] for r in best], [r[key] * factor for r in best], where="post", color="0.25", lw=1.2, zorder=2)
@@ -82,10 +97,29 @@ def _legend(ax, rows: list[dict]) -> None:
     from matplotlib.lines import Line2D
 
     used = {r["antialiasing"] for r in rows}
-    handles = [Line2D([], [], marker="o", ls="", color=c, label=f"anti-aliasing: {n}") for n, c in COLOURS.items() if n in used]
+    handles = [
+        Line2D([], [], marker="o", ls="", color=c, label=f"anti-aliasing: {n}") for n, c in COLOURS.items() if n in used
+    ]
     used = {r["reconstruction"] for r in rows}
-    handles += [Line2D([], [], marker=m, ls="", color="0.4", label=f"between frames: {n}") for n, m in MARKERS.items() if n in used]
-    handles.append(Line2D([], [], marker="o", ls="-", color="0.25", mfc="white", mec="black", mew=1.4, ms=10, label="not beaten by any other setting"))
+    handles += [
+        Line2D([], [], marker=m, ls="", color="0.4", label=f"between frames: {n}")
+        for n, m in MARKERS.items()
+        if n in used
+    ]
+    handles.append(
+        Line2D(
+            [],
+            [],
+            marker="o",
+            ls="-",
+            color="0.25",
+            mfc="white",
+            mec="black",
+            mew=1.4,
+            ms=10,
+            label="not beaten by any other setting",
+        )
+    )
     ax.legend(handles=handles, loc="upper right", fontsize=10, framealpha=0.9, ncols=2)
 
 
@@ -97,9 +131,18 @@ def _label(ax, rows: list[dict], cost: str, renderer) -> list:
     for r in sorted(rows, key=lambda r: r[cost]):
         x, y = ax.transData.transform((r[cost], r["voxel"] * factor))
         at = min(y - 14, floor)
-        text = ax.annotate(r["name"], (r[cost], r["voxel"] * factor), xytext=(x - 14, at), textcoords="figure pixels", ha="right", va="center", fontsize=9.5,
-                           arrowprops={"arrowstyle": "-", "color": "0.6", "lw": 0.7, "shrinkA": 1, "shrinkB": 6}, zorder=5,
-                           bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75})
+        text = ax.annotate(
+            r["name"],
+            (r[cost], r["voxel"] * factor),
+            xytext=(x - 14, at),
+            textcoords="figure pixels",
+            ha="right",
+            va="center",
+            fontsize=9.5,
+            arrowprops={"arrowstyle": "-", "color": "0.6", "lw": 0.7, "shrinkA": 1, "shrinkB": 6},
+            zorder=5,
+            bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
+        )
         height = height or text.get_window_extent(renderer).height
         floor = at - height - 3
         names.append(text)

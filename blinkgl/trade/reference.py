@@ -32,7 +32,9 @@ scene (a path tracer) takes the rasteriser's place by being one of these."""
 MAX_STEP_NS = 20_000_000
 
 
-def lattice(width: int, height: int, columns: int, rows: int, tile_width: int, tile_height: int) -> tuple[Rectangle, ...]:
+def lattice(
+    width: int, height: int, columns: int, rows: int, tile_width: int, tile_height: int
+) -> tuple[Rectangle, ...]:
     """``columns`` x ``rows`` rectangles spread evenly over an image; one of the whole image when they would touch."""
     if columns * tile_width >= width or rows * tile_height >= height:
         return (Rectangle(0, 0, width, height),)
@@ -45,7 +47,7 @@ def mask_of(tiles: tuple[Rectangle, ...], height: int, width: int) -> np.ndarray
     """(H, W) bool."""
     mask = np.zeros((height, width), bool)
     for r in tiles:
-        mask[r.y0:r.y1, r.x0:r.x1] = True
+        mask[r.y0 : r.y1, r.x0 : r.x1] = True
     return mask
 
 
@@ -75,7 +77,9 @@ class FineTiles:
                 self._renderer.look_through(camera)
                 self._renderer.luminance(t_ns).read(out=self._fine)
                 # INTER_AREA at a whole-numbered ratio is the mean.
-                frame[r.y0:r.y1, r.x0:r.x1] = cv2.resize(self._fine, (r.x1 - r.x0, r.y1 - r.y0), interpolation=cv2.INTER_AREA)
+                frame[r.y0 : r.y1, r.x0 : r.x1] = cv2.resize(
+                    self._fine, (r.x1 - r.x0, r.y1 - r.y0), interpolation=cv2.INTER_AREA
+                )
             yield frame
 
     def speed(self, t_ns: int) -> float:
@@ -83,7 +87,9 @@ class FineTiles:
         largest = 0.0
         for camera in self._cameras:
             self._renderer.look_through(camera)
-            largest = max(largest, largest_speed(self._renderer.velocity_of_movers(t_ns, self._scale).read()) / self._scale)
+            largest = max(
+                largest, largest_speed(self._renderer.velocity_of_movers(t_ns, self._scale).read()) / self._scale
+            )
         return largest
 
     def times(self, max_px: float, t0_ns: int, t1_ns: int) -> Iterator[int]:
@@ -91,8 +97,15 @@ class FineTiles:
         return displacement_times(max_px, 1000, MAX_STEP_NS, t0_ns, t1_ns, self.speed)
 
 
-def reference_events(source: FrameSource, times: Iterable[int], config: EmulatorConfig, height: int, width: int, seed: int,
-                     mask: np.ndarray) -> tuple[Events, int]:
+def reference_events(
+    source: FrameSource,
+    times: Iterable[int],
+    config: EmulatorConfig,
+    height: int,
+    width: int,
+    seed: int,
+    mask: np.ndarray,
+) -> tuple[Events, int]:
     """Events (of the masked pixels) of the frames of a source, linear in time between them; and the number of frames.
 
     Linear, because the times are so dense that it does not matter, and no scheme that is judged should judge."""

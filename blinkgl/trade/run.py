@@ -21,8 +21,27 @@ from blinkgl.trade.measure import ENOUGH, QUICK, Bench, Options
 from blinkgl.trade.pareto import pareto_front
 from blinkgl.trade.settings import SIZES, Setting, design
 
-COLUMNS = ("name", "wall_s", "cpu_s", "frames_per_s", "triangles", "time_median_us", "time_p95_us", "shift_median_px", "shift_p95_px", "missed",
-           "extra", "wrong", "count", "voxel", "flow_median_px", "flow_max_px", "events", "reference_events", "on_front")
+COLUMNS = (
+    "name",
+    "wall_s",
+    "cpu_s",
+    "frames_per_s",
+    "triangles",
+    "time_median_us",
+    "time_p95_us",
+    "shift_median_px",
+    "shift_p95_px",
+    "missed",
+    "extra",
+    "wrong",
+    "count",
+    "voxel",
+    "flow_median_px",
+    "flow_max_px",
+    "events",
+    "reference_events",
+    "on_front",
+)
 
 
 def chosen(settings: tuple[Setting, ...], only: list[str], skip: list[str] = ()) -> tuple[Setting, ...]:
@@ -31,13 +50,26 @@ def chosen(settings: tuple[Setting, ...], only: list[str], skip: list[str] = ())
     has = lambda s, texts: any(text.lower() in s.name.lower() for text in texts)
     found = tuple(s for s in settings if (not only or has(s, only)) and not has(s, skip))
     if not found:
-        raise ConfigError("no setting is called that", where="--only, --skip", value=", ".join([*only, *skip]), accepted="part of a name such as "
-                          + ", ".join(f"'{s.name}'" for s in settings[:3]))
+        raise ConfigError(
+            "no setting is called that",
+            where="--only, --skip",
+            value=", ".join([*only, *skip]),
+            accepted="part of a name such as " + ", ".join(f"'{s.name}'" for s in settings[:3]),
+        )
     return found
 
 
-def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None = None, skip: list[str] | None = None, options: Options | None = None,
-          cost: str = "wall_s", settings: tuple[Setting, ...] | None = None, say: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+def trade(
+    template: RunTemplate,
+    *,
+    quick: bool = False,
+    only: list[str] | None = None,
+    skip: list[str] | None = None,
+    options: Options | None = None,
+    cost: str = "wall_s",
+    settings: tuple[Setting, ...] | None = None,
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
     """The whole measurement as plain data (what trade.json holds).
 
     cost : "wall_s" or "cpu_s", what the front is drawn over. settings : instead of the designed set.
@@ -46,7 +78,9 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
     options = options or (QUICK if quick else Options())
     base = template.sequence(options.sequence)
     follows = emulator_of(base.events).noiseless(base.events).reconstructions
-    settings = tuple(s for s in settings or design(quick, isinstance(base.scene, RandomSceneConfig)) if s.reconstruction in follows)
+    settings = tuple(
+        s for s in settings or design(quick, isinstance(base.scene, RandomSceneConfig)) if s.reconstruction in follows
+    )
     settings = chosen(settings, only or [], skip or [])
     rows: list[dict] = []
     sizes: dict[str, dict] = {}
@@ -56,41 +90,81 @@ def trade(template: RunTemplate, *, quick: bool = False, only: list[str] | None 
             if not mine:
                 continue
             bench = Bench(gl, template, options, size, say)
-            say(f"{bench.width}x{bench.height}, {bench.duration_s:g} s of sequence {options.sequence}, {len(mine)} "
-                "settings")
+            say(
+                f"{bench.width}x{bench.height}, {bench.duration_s:g} s of sequence {options.sequence}, {len(mine)} "
+                "settings"
+            )
             results = bench.measure(mine)
             levels = bench.judge(results, bench.speeds())
             rows += [{**r.to_dict(), "width": bench.width, "height": bench.height} for r in results]
             sizes[size or "full"] = {
-                "width": bench.width, "height": bench.height, "judged_pixels": int(bench.mask.sum()), "tiles": len(bench.tiles),
-                "t0_us": bench.t0_ns // 1000, "t1_us": bench.t1_ns // 1000, "clip_s": bench.duration_s, "emulator": bench.emulator.model_dump(),
-                "levels": [level.to_dict() for level in levels], "converged": levels[-1].converged}
+                "width": bench.width,
+                "height": bench.height,
+                "judged_pixels": int(bench.mask.sum()),
+                "tiles": len(bench.tiles),
+                "t0_us": bench.t0_ns // 1000,
+                "t1_us": bench.t1_ns // 1000,
+                "clip_s": bench.duration_s,
+                "emulator": bench.emulator.model_dump(),
+                "levels": [level.to_dict() for level in levels],
+                "converged": levels[-1].converged,
+            }
         machine = machine_line(gl.renderer)
     main = rows[0]["size"]  # sizes are different data sets: one front, over the largest
     best = {r["name"] for r in pareto_front([r for r in rows if r["size"] == main], cost, "voxel")}
     for r in rows:
         r["on_front"] = r["name"] in best
-    return {"machine": machine, "config": template.tree, "sequence": options.sequence, "quick": quick, "reference": options.reference, "only": only or [], "skip": skip or [], "cost": cost,
-            "error": "voxel", "size": main or "full", "limit_us": options.limit_us, "enough": ENOUGH, "rounds": max(len(r["wall_rounds"]) for r in rows),
-            "seconds": time.perf_counter() - started, "sizes": sizes, "settings": rows, "front": [r["name"] for r in sorted(rows, key=lambda r: r[cost])
-                                                                                                if r["on_front"]]}
+    return {
+        "machine": machine,
+        "config": template.tree,
+        "sequence": options.sequence,
+        "quick": quick,
+        "reference": options.reference,
+        "only": only or [],
+        "skip": skip or [],
+        "cost": cost,
+        "error": "voxel",
+        "size": main or "full",
+        "limit_us": options.limit_us,
+        "enough": ENOUGH,
+        "rounds": max(len(r["wall_rounds"]) for r in rows),
+        "seconds": time.perf_counter() - started,
+        "sizes": sizes,
+        "settings": rows,
+        "front": [r["name"] for r in sorted(rows, key=lambda r: r[cost]) if r["on_front"]],
+    }
 
 
 def convergence_line(result: dict, size: str = "full") -> str:
     """One sentence on how far the reference can be trusted."""
     levels = result["sizes"][size]["levels"]
     last = levels[-1]
-    samples = f"{last['scale']**2} paths a pixel by Cycles" if result.get("reference") == "cycles" else f"{last['scale']}x{last['scale']} samples a pixel"
+    samples = (
+        f"{last['scale'] ** 2} paths a pixel by Cycles"
+        if result.get("reference") == "cycles"
+        else f"{last['scale']}x{last['scale']} samples a pixel"
+    )
     what = f"{samples}, {last['max_px']:g} px between frames ({last['frames']} frames)"
     if not last["ratio"]:
         return f"the reference, {what}, was NOT checked: there was time for one level only"
     moved = ", ".join(f"{NAMES[k]} {100 * v:.2g} %" for k, v in last["ratio"].items())
-    verdict = "converged" if result["sizes"][size]["converged"] else f"did NOT converge to a tenth ({100 * result['enough']:.0f} %) within the limits"
-    return (f"the reference {verdict}: {what}; from the level before it moved by, in parts of the smallest error judged: "
-            f"{moved}")
+    verdict = (
+        "converged"
+        if result["sizes"][size]["converged"]
+        else f"did NOT converge to a tenth ({100 * result['enough']:.0f} %) within the limits"
+    )
+    return (
+        f"the reference {verdict}: {what}; from the level before it moved by, in parts of the smallest error judged: "
+        f"{moved}"
+    )
 
 
-NAMES = {"time_median_us": "median time", "time_p95_us": "95 % time", "wrong": "missed and extra", "voxel": "voxel grid"}
+NAMES = {
+    "time_median_us": "median time",
+    "time_p95_us": "95 % time",
+    "wrong": "missed and extra",
+    "voxel": "voxel grid",
+}
 
 
 def write(result: dict, out: str | Path) -> list[Path]:

@@ -19,11 +19,24 @@ from dataclasses import dataclass
 
 SAMPLINGS = {
     **{f"uniform {fps}/s": (f"timeline={{kind: uniform, fps: {fps}}}",) for fps in (50, 100, 200, 400, 800, 1600)},
-    **{f"displacement {px:g} px": (f"timeline={{kind: displacement, max_px: {px}, min_step_us: 20}}",) for px in (4, 2, 1, 0.5, 0.25, 0.125)},
-    **{f"brightness {c:g} C": (f"timeline={{kind: brightness, max_fraction_of_threshold: {c}, min_step_us: 20}}",) for c in (4, 2, 1)},
-    **{f"budget {px:g} px": (f"timeline={{kind: budget, max_time_error_px: {px}, min_step_us: 20}}",) for px in (0.1, 0.05, 0.025)},
+    **{
+        f"displacement {px:g} px": (f"timeline={{kind: displacement, max_px: {px}, min_step_us: 20}}",)
+        for px in (4, 2, 1, 0.5, 0.25, 0.125)
+    },
+    **{
+        f"brightness {c:g} C": (f"timeline={{kind: brightness, max_fraction_of_threshold: {c}, min_step_us: 20}}",)
+        for c in (4, 2, 1)
+    },
+    **{
+        f"budget {px:g} px": (f"timeline={{kind: budget, max_time_error_px: {px}, min_step_us: 20}}",)
+        for px in (0.1, 0.05, 0.025)
+    },
 }
-RECONSTRUCTIONS = {"linear": (), "pchip": ("timeline.reconstruction=pchip",), "hermite": ("timeline.reconstruction=hermite",)}
+RECONSTRUCTIONS = {
+    "linear": (),
+    "pchip": ("timeline.reconstruction=pchip",),
+    "hermite": ("timeline.reconstruction=hermite",),
+}
 ANTIALIASINGS = {name: (f"render.antialiasing={name}",) for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")}
 OTHERS = {
     "": (),
@@ -51,12 +64,19 @@ class Setting:
 
     @property
     def name(self) -> str:
-        return ", ".join(part for part in (self.sampling, self.reconstruction, self.antialiasing, self.other, self.size) if part)
+        return ", ".join(
+            part for part in (self.sampling, self.reconstruction, self.antialiasing, self.other, self.size) if part
+        )
 
     @property
     def overrides(self) -> tuple[str, ...]:
         """As ``--set`` options; the size is not among them."""
-        return (*SAMPLINGS[self.sampling], *RECONSTRUCTIONS[self.reconstruction], *ANTIALIASINGS[self.antialiasing], *OTHERS[self.other])
+        return (
+            *SAMPLINGS[self.sampling],
+            *RECONSTRUCTIONS[self.reconstruction],
+            *ANTIALIASINGS[self.antialiasing],
+            *OTHERS[self.other],
+        )
 
 
 def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
@@ -75,16 +95,44 @@ def design(quick: bool, random_scene: bool = True) -> tuple[Setting, ...]:
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 400)]
         points += [Setting(s, "pchip", "ssaa2") for s in extra[1::3]]
         points += [Setting(displacement(1)[0], antialiasing=a, other=sharper[0]) for a in ("none", "ssaa2")]
-        points += [Setting(displacement(1)[0], antialiasing="none", other=o) for o in others if o not in sharper and not o.endswith(("4", "128 px", "0.25 px"))]
+        points += [
+            Setting(displacement(1)[0], antialiasing="none", other=o)
+            for o in others
+            if o not in sharper and not o.endswith(("4", "128 px", "0.25 px"))
+        ]
     else:
-        points = [Setting(s, antialiasing=a) for s in displacement(2, 1, 0.5, 0.25) for a in ANTIALIASINGS if (s, a) != (displacement(0.25)[0], "ssaa4")]
+        points = [
+            Setting(s, antialiasing=a)
+            for s in displacement(2, 1, 0.5, 0.25)
+            for a in ANTIALIASINGS
+            if (s, a) != (displacement(0.25)[0], "ssaa4")
+        ]
         points += [Setting(s, r, "ssaa2") for s in displacement(4, 2, 1, 0.5) for r in curves]
         points += [Setting(s, r, "ssaa4") for s in displacement(4, 2, 1) for r in curves]
-        points += [Setting(s, "pchip", a, o) for s in displacement(2, 1) for a in ("none", "taps4", "ssaa2", "ssaa4") for o in ("", *sharper)]
-        points += [Setting(s, "pchip", a, sharper[1]) for s in displacement(0.5, 0.25) for a in ("ssaa2", "ssaa4") if (s, a) != (displacement(0.25)[0], "ssaa2")]
-        points += [Setting(s, antialiasing=a, other=o) for s in displacement(2, 1, 0.5) for a in ("none", "taps4", "ssaa2", "ssaa4") for o in sharper]
+        points += [
+            Setting(s, "pchip", a, o)
+            for s in displacement(2, 1)
+            for a in ("none", "taps4", "ssaa2", "ssaa4")
+            for o in ("", *sharper)
+        ]
+        points += [
+            Setting(s, "pchip", a, sharper[1])
+            for s in displacement(0.5, 0.25)
+            for a in ("ssaa2", "ssaa4")
+            if (s, a) != (displacement(0.25)[0], "ssaa2")
+        ]
+        points += [
+            Setting(s, antialiasing=a, other=o)
+            for s in displacement(2, 1, 0.5)
+            for a in ("none", "taps4", "ssaa2", "ssaa4")
+            for o in sharper
+        ]
         points += [Setting(s, antialiasing="ssaa2") for s in uniform(100, 200, 400, 800)]
         points += [Setting(s, r, "ssaa2") for s in extra for r in ("linear", "pchip")]
-        points += [Setting(displacement(1)[0], "pchip", a, o) for o in others if o not in sharper for a in ("none", "ssaa2")]
-        points += [Setting(s, "pchip", a, size="half size") for s, a in zip(displacement(2, 1, 1), ("none", "none", "ssaa2"))]
+        points += [
+            Setting(displacement(1)[0], "pchip", a, o) for o in others if o not in sharper for a in ("none", "ssaa2")
+        ]
+        points += [
+            Setting(s, "pchip", a, size="half size") for s, a in zip(displacement(2, 1, 1), ("none", "none", "ssaa2"))
+        ]
     return tuple(dict.fromkeys(points))

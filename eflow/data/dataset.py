@@ -61,7 +61,9 @@ class Mixture:
                 for n in range(epoch * count, (epoch + 1) * count):  # n-th sample ever drawn from this source
                     pass_, place = divmod(n, size)
                     picks.append((source, int(self._permutation(source, pass_, size)[place])))
-            order = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch))).permutation(len(picks))
+            order = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch))).permutation(
+                len(picks)
+            )
             self._cache = (epoch, [Key(epoch, position, *picks[i]) for position, i in enumerate(order)])
         return self._cache[1]
 
@@ -88,14 +90,26 @@ class FlowDataset(Dataset):
     empty : "error" refuses a sample without an event in either window; "skip" takes the next sample that has some.
     """
 
-    def __init__(self, sources: list[Source], representation: Representation, *, seed: int = 0, augment: AugmentConfig | None = None,
-                 crop: tuple[int, int] | None = None, empty: str = "error"):
+    def __init__(
+        self,
+        sources: list[Source],
+        representation: Representation,
+        *,
+        seed: int = 0,
+        augment: AugmentConfig | None = None,
+        crop: tuple[int, int] | None = None,
+        empty: str = "error",
+    ):
         self.sources, self.representation, self.seed = sources, representation, seed
         self.augment, self.crop, self.empty = augment, crop, empty
         self._starts = np.cumsum([0, *(len(s) for s in sources)])
         if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
-            raise ConfigError("time reversal needs backward flow, which a training set lacks", where="data.augment.time_reversal",
-                              value=augment.time_reversal, accepted="0, or data generated with labels.flow: [forward, backward]")
+            raise ConfigError(
+                "time reversal needs backward flow, which a training set lacks",
+                where="data.augment.time_reversal",
+                value=augment.time_reversal,
+                accepted="0, or data generated with labels.flow: [forward, backward]",
+            )
 
     def __len__(self) -> int:
         return int(self._starts[-1])
@@ -120,8 +134,11 @@ class FlowDataset(Dataset):
             if self.empty == "error":
                 which = "old" if not len(sample.old) else "new"
                 w = getattr(sample, which)
-                raise EventDataError(f"no events in the {which} window [{w.t0}, {w.t1}) µs", where=sample.name,
-                                     accepted="use data.empty=skip to leave such samples out")
+                raise EventDataError(
+                    f"no events in the {which} window [{w.t0}, {w.t1}) µs",
+                    where=sample.name,
+                    accepted="use data.empty=skip to leave such samples out",
+                )
         raise EventDataError("no sample has events", where=sample.name)
 
     def _tensors(self, s: RawSample, rng: np.random.Generator | None) -> dict:
@@ -135,7 +152,9 @@ class FlowDataset(Dataset):
                 raise EventDataError("flow is NaN or infinite and marked valid", where=s.name)
             out["flow"] = torch.from_numpy(np.ascontiguousarray(s.flow.transpose(2, 0, 1), dtype=np.float32))
             out["valid"] = torch.from_numpy(np.ascontiguousarray(s.valid)) & ((out["flow"] ** 2).sum(0) < MAX_FLOW**2)
-            out["mask"] = torch.from_numpy(np.ascontiguousarray(s.mask)) if s.mask is not None else torch.ones_like(out["valid"])
+            out["mask"] = (
+                torch.from_numpy(np.ascontiguousarray(s.mask)) if s.mask is not None else torch.ones_like(out["valid"])
+            )
         if rng is not None:
             if self.augment is not None and rng.random() < self.augment.scale_probability:
                 out = scaled(out, float(np.exp2(rng.uniform(*self.augment.scale))), least=self.crop)
@@ -185,9 +204,17 @@ def cropped(sample: dict, size: tuple[int, int], rng: np.random.Generator, name:
     """Random crop (H, W). Raises EventDataError when the sample is smaller."""
     height, width = sample["new"].shape[-2:]
     if height < size[0] or width < size[1]:
-        raise EventDataError("sample is smaller than the crop", where=f"data.crop, {name}", value=(height, width), accepted=f"at least {size}")
+        raise EventDataError(
+            "sample is smaller than the crop",
+            where=f"data.crop, {name}",
+            value=(height, width),
+            accepted=f"at least {size}",
+        )
     top, left = int(rng.integers(height - size[0] + 1)), int(rng.integers(width - size[1] + 1))
-    return {k: v[..., top:top + size[0], left:left + size[1]].contiguous() if torch.is_tensor(v) else v for k, v in sample.items()}
+    return {
+        k: v[..., top : top + size[0], left : left + size[1]].contiguous() if torch.is_tensor(v) else v
+        for k, v in sample.items()
+    }
 
 
 class StepSampler(Sampler):
@@ -195,22 +222,38 @@ class StepSampler(Sampler):
     1 of the mixture, rank r every world-th of them."""
 
     def __init__(self, mixture: Mixture, batch: int, start: int, stop: int, rank: int = 0, world: int = 1):
-        self.mixture, self.batch, self.start, self.stop, self.rank, self.world = mixture, batch, start, stop, rank, world
+        self.mixture, self.batch, self.start, self.stop, self.rank, self.world = (
+            mixture,
+            batch,
+            start,
+            stop,
+            rank,
+            world,
+        )
 
     def __len__(self) -> int:
         return max(self.stop - self.start, 0)
 
     def __iter__(self) -> Iterator[list[Key]]:
         for step in range(self.start, self.stop):
-            yield [self.mixture.key(n) for n in range(step * self.batch + self.rank, (step + 1) * self.batch, self.world)]
+            yield [
+                self.mixture.key(n) for n in range(step * self.batch + self.rank, (step + 1) * self.batch, self.world)
+            ]
 
 
 def collate(samples: list[dict]) -> dict:
     """Stacks tensors, lists the rest."""
     if len({tuple(s["new"].shape) for s in samples}) > 1:
-        raise EventDataError("samples of a batch differ in size", where="data.crop", value=[tuple(s["new"].shape[-2:]) for s in samples],
-                             accepted="a crop that fits all training sets")
-    return {k: torch.stack([s[k] for s in samples]) if torch.is_tensor(samples[0][k]) else [s[k] for s in samples] for k in samples[0]}
+        raise EventDataError(
+            "samples of a batch differ in size",
+            where="data.crop",
+            value=[tuple(s["new"].shape[-2:]) for s in samples],
+            accepted="a crop that fits all training sets",
+        )
+    return {
+        k: torch.stack([s[k] for s in samples]) if torch.is_tensor(samples[0][k]) else [s[k] for s in samples]
+        for k in samples[0]
+    }
 
 
 class _Carrying(Dataset):
@@ -240,10 +283,17 @@ def _collate_or_carry(samples: list) -> dict | BlinkGLError:
 def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool = False) -> Iterator[dict]:
     """Batches in the sampler's order; the same ones for any number of workers. Raises what
     ``dataset`` and :func:`collate` raise."""
-    loader = DataLoader(_Carrying(dataset), batch_sampler=sampler, num_workers=workers, collate_fn=_collate_or_carry, pin_memory=pin,
-                        persistent_workers=workers > 0, prefetch_factor=4 if workers else None,
-                        generator=torch.Generator(),  # else each start would draw from torch's global one
-                        multiprocessing_context="forkserver" if workers else None)
+    loader = DataLoader(
+        _Carrying(dataset),
+        batch_sampler=sampler,
+        num_workers=workers,
+        collate_fn=_collate_or_carry,
+        pin_memory=pin,
+        persistent_workers=workers > 0,
+        prefetch_factor=4 if workers else None,
+        generator=torch.Generator(),  # else each start would draw from torch's global one
+        multiprocessing_context="forkserver" if workers else None,
+    )
     for batch in loader:
         if isinstance(batch, BlinkGLError):
             raise batch

@@ -35,9 +35,15 @@ class NpzRows:
                 raise AssetError(f"no array '{missing[0]}'", where=str(path), accepted=", ".join(names))
             for name in names:
                 with archive.open(f"{name}.npy") as member:
-                    shape, fortran, dtype = npy_header(member, archive.getinfo(f"{name}.npy").file_size, f"{path}: '{name}'")
+                    shape, fortran, dtype = npy_header(
+                        member, archive.getinfo(f"{name}.npy").file_size, f"{path}: '{name}'"
+                    )
                     if fortran or not shape or dtype.kind not in "fiu":
-                        raise AssetError(f"array '{name}' is not a C-ordered array of numbers", where=str(path), value=f"{dtype} {shape}")
+                        raise AssetError(
+                            f"array '{name}' is not a C-ordered array of numbers",
+                            where=str(path),
+                            value=f"{dtype} {shape}",
+                        )
                     self._layout[name] = (shape, dtype, member.tell())
 
     def shape(self, name: str) -> tuple[int, ...]:
@@ -71,7 +77,9 @@ class MvsecSource:
         self.dt, self._index, self._sequences = dt, [], []
         for path in files:
             self._sequences.append(s := _MvsecSequence(path))
-            i0, i1 = np.searchsorted(s.image_us, (s.flow_us[0], s.flow_us[-1]))  # flow must cover [image i, image i + dt]
+            i0, i1 = np.searchsorted(
+                s.image_us, (s.flow_us[0], s.flow_us[-1])
+            )  # flow must cover [image i, image i + dt]
             self._index += [(s, i) for i in range(max(int(i0), dt), min(int(i1), len(s.image_us)) - dt)]
 
     def __len__(self) -> int:
@@ -86,10 +94,12 @@ class MvsecSource:
         mask[new.y, new.x] = True
         inside = np.zeros_like(mask)
         top, left = (HEIGHT - CROP) // 2, (WIDTH - CROP) // 2
-        inside[top:top + CROP, left:left + CROP] = True
+        inside[top : top + CROP, left : left + CROP] = True
         if "outdoor" in s.name:
             inside[HOOD_ROW:] = False
-        return RawSample(old, new, HEIGHT, WIDTH, f"{s.name}/{i:06d}", s.name, flow=flow, valid=valid, mask=mask & inside)
+        return RawSample(
+            old, new, HEIGHT, WIDTH, f"{s.name}/{i:06d}", s.name, flow=flow, valid=valid, mask=mask & inside
+        )
 
 
 class _MvsecSequence:
@@ -98,7 +108,9 @@ class _MvsecSequence:
         with open_hdf5(path) as file, hdf5_errors(path):
             self._count = len(event_table(file, path))
             stamps = dataset(file, "davis/left/image_raw_ts", path, shape=(None,), kinds="f")[()]
-            self._inds = dataset(file, "davis/left/image_raw_event_inds", path, shape=(len(stamps),), kinds="iuf")[()].astype(np.int64)
+            self._inds = dataset(file, "davis/left/image_raw_event_inds", path, shape=(len(stamps),), kinds="iuf")[
+                ()
+            ].astype(np.int64)
         if not len(stamps):
             raise AssetError("no images, so no times to take samples between", where=str(path))
         flow = path.with_name(f"{self.name}_gt_flow_dist.npz")
@@ -110,7 +122,12 @@ class _MvsecSequence:
         self.flow_us = _stamps(self._flow.read("timestamps") - self.t0_s, f"{flow}: 'timestamps'")
         for name in ("x_flow_dist", "y_flow_dist"):
             if self._flow.shape(name) != (expected := (len(self.flow_us), HEIGHT, WIDTH)):
-                raise AssetError(f"array '{name}' has the wrong shape", where=str(flow), value=self._flow.shape(name), accepted=str(expected))
+                raise AssetError(
+                    f"array '{name}' has the wrong shape",
+                    where=str(flow),
+                    value=self._flow.shape(name),
+                    accepted=str(expected),
+                )
         self._file, self._pid = None, None
         self._rows: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -128,7 +145,7 @@ class _MvsecSequence:
         while True:
             i, j = max(low - margin, 0), min(high + margin, self._count)
             with hdf5_errors(self.path):
-                rows = table[i:max(i, j)]
+                rows = table[i : max(i, j)]
             t = microseconds(rows[:, 2] - self.t0_s, str(self.path), i)
             enough = len(t) and (i == 0 or t[0] < t0) and (j == self._count or t[-1] >= t1)
             if enough or (i == 0 and j == self._count):
@@ -153,7 +170,9 @@ class _MvsecSequence:
         if k not in self._rows:
             while len(self._rows) > 8:
                 self._rows.pop(next(iter(self._rows)))
-            self._rows[k] = np.stack([self._flow.read(n, k).astype(np.float32) for n in ("x_flow_dist", "y_flow_dist")], axis=-1)
+            self._rows[k] = np.stack(
+                [self._flow.read(n, k).astype(np.float32) for n in ("x_flow_dist", "y_flow_dist")], axis=-1
+            )
         return self._rows[k]
 
 
@@ -163,7 +182,11 @@ def _stamps(seconds: np.ndarray, where: str) -> np.ndarray:
         raise AssetError("not a list of times", where=where, value=seconds.shape, accepted="(N,) with N >= 2")
     t = microseconds(seconds, where)
     if (back := np.flatnonzero(t[1:] <= t[:-1])).size:
-        raise AssetError(f"time {int(back[0]) + 1} does not come after the one before", where=where, value=tuple(seconds[back[0]:back[0] + 2].tolist()))
+        raise AssetError(
+            f"time {int(back[0]) + 1} does not come after the one before",
+            where=where,
+            value=tuple(seconds[back[0] : back[0] + 2].tolist()),
+        )
     return t
 
 

@@ -41,8 +41,20 @@ class VoxelGrid:
         t0, t1 = window.t0, window.t1
         if self.bounds == "events" and len(window):
             t0, t1 = int(window.t[0]), int(window.t[-1])
-        return _guarded(voxel.voxel_grid, window, window.x, window.y, window.t, window.p, t0, t1, self.bins, height, width,
-                        normalise=self.normalise)
+        return _guarded(
+            voxel.voxel_grid,
+            window,
+            window.x,
+            window.y,
+            window.t,
+            window.p,
+            t0,
+            t1,
+            self.bins,
+            height,
+            width,
+            normalise=self.normalise,
+        )
 
 
 @dataclass(frozen=True)
@@ -78,7 +90,9 @@ def _on_pixels(window: Window, height: int, width: int) -> Window:
         return window
     x, y = np.rint(window.x), np.rint(window.y)
     keep = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    return Window(x[keep].astype(np.uint16), y[keep].astype(np.uint16), window.t[keep], window.p[keep], window.t0, window.t1)
+    return Window(
+        x[keep].astype(np.uint16), y[keep].astype(np.uint16), window.t[keep], window.p[keep], window.t0, window.t1
+    )
 
 
 def _guarded(function, window: Window, *args, **kw) -> np.ndarray:

@@ -98,9 +98,17 @@ class FolderSource:
         height, width = self._size(sequence, reader, flow, rectify)
         span = entry.to_us - entry.from_us
         return RawSample(
-            old=self._window(reader, entry.from_us - span, entry.from_us, rectify), new=self._window(reader, entry.from_us, entry.to_us, rectify),
-            height=height, width=width, name=f"{sequence.name}/{entry.index:06d}", scene=sequence.scene,
-            flow=flow, valid=valid, backward=backward, backward_valid=backward_valid)
+            old=self._window(reader, entry.from_us - span, entry.from_us, rectify),
+            new=self._window(reader, entry.from_us, entry.to_us, rectify),
+            height=height,
+            width=width,
+            name=f"{sequence.name}/{entry.index:06d}",
+            scene=sequence.scene,
+            flow=flow,
+            valid=valid,
+            backward=backward,
+            backward_valid=backward_valid,
+        )
 
     def entry(self, index: int) -> tuple[Sequence, Entry]:
         """The sequence and label of sample ``index``."""
@@ -119,7 +127,9 @@ class FolderSource:
     def _map(self, path: Path) -> np.ndarray:
         if path not in self._maps:
             with open_hdf5(path) as file, hdf5_errors(path):
-                rectify_map = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(np.float32)
+                rectify_map = dataset(file, "rectify_map", path, shape=(None, None, 2), kinds="f")[()].astype(
+                    np.float32
+                )
             if not np.isfinite(rectify_map).all():
                 raise AssetError("rectification map with NaN or infinity", where=str(path))
             self._maps[path] = rectify_map
@@ -131,17 +141,30 @@ class FolderSource:
         if rectify is None:
             return Window(e.x, e.y, e.t, e.p, t0, t1)
         if len(e) and (e.y.max() >= rectify.shape[0] or e.x.max() >= rectify.shape[1]):
-            raise EventDataError("event outside the rectification map", where=str(reader.path), value=(int(e.x.max()), int(e.y.max())),
-                                 accepted=f"x < {rectify.shape[1]}, y < {rectify.shape[0]}")
+            raise EventDataError(
+                "event outside the rectification map",
+                where=str(reader.path),
+                value=(int(e.x.max()), int(e.y.max())),
+                accepted=f"x < {rectify.shape[1]}, y < {rectify.shape[0]}",
+            )
         xy = rectify[e.y, e.x]
         return Window(np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1]), e.t, e.p, t0, t1)
 
     @staticmethod
     def _size(sequence: Sequence, reader: DsecEventReader, flow, rectify) -> tuple[int, int]:
-        sizes = {tuple(map(int, s)) for s in ((reader.height, reader.width) if reader.height else None,
-                 flow.shape[:2] if flow is not None else None, rectify.shape[:2] if rectify is not None else None) if s is not None}
+        sizes = {
+            tuple(map(int, s))
+            for s in (
+                (reader.height, reader.width) if reader.height else None,
+                flow.shape[:2] if flow is not None else None,
+                rectify.shape[:2] if rectify is not None else None,
+            )
+            if s is not None
+        }
         if len(sizes) > 1:
-            raise AssetError("event file, flow and rectification map differ in size", where=str(sequence.events), value=sorted(sizes))
+            raise AssetError(
+                "event file, flow and rectification map differ in size", where=str(sequence.events), value=sorted(sizes)
+            )
         return sizes.pop() if sizes else (480, 640)  # DSEC's and BlinkFlow's sensor; their files do not say
 
 
@@ -153,7 +176,12 @@ def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
         return read_flow_png(path)
     data = read_npy(path)
     if data.ndim != 3 or data.shape[2] not in (2, 3) or data.dtype.kind != "f":
-        raise AssetError("not a flow field", where=str(path), value=f"{data.dtype} {data.shape}", accepted="float (H, W, 2) or (H, W, 3)")
+        raise AssetError(
+            "not a flow field",
+            where=str(path),
+            value=f"{data.dtype} {data.shape}",
+            accepted="float (H, W, 2) or (H, W, 3)",
+        )
     flow = data[..., :2].astype(np.float32)
     valid = data[..., 2] > 0 if data.shape[2] == 3 else np.ones(data.shape[:2], bool)
     bad = valid & ~np.isfinite(flow).all(-1)
@@ -171,21 +199,29 @@ def find_blinkgl(root: Path) -> list[Sequence]:
     without forward flow are passed over. Flow is taken from the 16-bit PNG (quantum 1/128 px)."""
     found = []
     indexed = (root / INDEX).is_file()
-    folders = [root / line["path"] for line in read_index(root)] if indexed else [m.parent for m in sorted(root.rglob("manifest.json"))]
+    folders = (
+        [root / line["path"] for line in read_index(root)]
+        if indexed
+        else [m.parent for m in sorted(root.rglob("manifest.json"))]
+    )
     for folder in folders:
         if any(part.startswith(".") for part in folder.relative_to(root).parts) or not (folder / "events.h5").is_file():
             continue
         there, back = LABELS["flow_forward"], LABELS["flow_backward"]
         stamps = folder / there.stamps
         forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
-        if not forward and not stamps.exists():  # made without flow: there is nothing to learn from it, and nothing wrong with it
+        if (
+            not forward and not stamps.exists()
+        ):  # made without flow: there is nothing to learn from it, and nothing wrong with it
             continue
         times = read_times(stamps)
         _same_count(folder / there.forms[0].folder, forward, times)
         if backward:
             _same_count(folder / back.forms[0].folder, backward, times)
-        entries = tuple(Entry(int(f.stem), t0, t1, f, backward[i] if backward else None)
-                        for i, (f, (t0, t1)) in enumerate(zip(forward, times, strict=True)))
+        entries = tuple(
+            Entry(int(f.stem), t0, t1, f, backward[i] if backward else None)
+            for i, (f, (t0, t1)) in enumerate(zip(forward, times, strict=True))
+        )
         name = folder.relative_to(root).as_posix()
         name = folder.name if name == "." else name
         found.append(Sequence(name, name, folder / "events.h5", entries))
@@ -198,15 +234,32 @@ def find_dsec(root: Path) -> list[Sequence]:
     ``<sequence>.csv`` gives a test sequence its times."""
     found = []
     for events in sorted(root.rglob("events.h5")):
-        if events.parent.name not in ("left", "events_left") or "forward_flow" in {p.name for p in events.parent.parent.iterdir()}:
+        if events.parent.name not in ("left", "events_left") or "forward_flow" in {
+            p.name for p in events.parent.parent.iterdir()
+        }:
             continue
         folder = events.parent.parent.parent if events.parent.name == "left" else events.parent.parent
-        flow_folder = next((f for f in (folder / "flow", root / "train_optical_flow" / folder.name / "flow") if f.is_dir()), None)
+        flow_folder = next(
+            (f for f in (folder / "flow", root / "train_optical_flow" / folder.name / "flow") if f.is_dir()), None
+        )
         rectify = events.parent / "rectify_map.h5"
-        test = next((c for c in (folder / "test_forward_flow_timestamps.csv", folder / f"{folder.name}.csv",
-                                 root / "test_forward_optical_flow_timestamps" / f"{folder.name}.csv") if c.is_file()), None)
+        test = next(
+            (
+                c
+                for c in (
+                    folder / "test_forward_flow_timestamps.csv",
+                    folder / f"{folder.name}.csv",
+                    root / "test_forward_optical_flow_timestamps" / f"{folder.name}.csv",
+                )
+                if c.is_file()
+            ),
+            None,
+        )
         if flow_folder is not None:
-            times, files = read_times(flow_folder / "forward_timestamps.txt"), sorted((flow_folder / "forward").glob("*.png"))
+            times, files = (
+                read_times(flow_folder / "forward_timestamps.txt"),
+                sorted((flow_folder / "forward").glob("*.png")),
+            )
             _same_count(flow_folder / "forward", files, times)
             entries = tuple(Entry(int(f.stem), t0, t1, f) for f, (t0, t1) in zip(files, times, strict=True))
         elif test is not None:
@@ -230,7 +283,9 @@ def find_blinkflow(root: Path) -> list[Sequence]:
         at = lambda i, fps=fps: round(i * 1e6 / fps)
         # backward_flow/k belongs to frames k+1 -> k in the published sets, so the one that starts at label i is file i
         # - 1.
-        entries = tuple(Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in ((int(f.stem), f) for f in files) if i > 0)
+        entries = tuple(
+            Entry(i, at(i), at(i + 1), f, backward.get(i - 1)) for i, f in ((int(f.stem), f) for f in files) if i > 0
+        )
         parts = folder.relative_to(root).parts or (folder.parent.name, folder.name)
         name = "/".join(parts[-2:])
         found.append(Sequence(name, parts[-2] if len(parts) > 1 else name, folder / "events_left/events.h5", entries))
@@ -268,17 +323,27 @@ def read_submission_times(path: Path) -> list[tuple[int, int, int]]:
     """DSEC's test CSV: (from_us, to_us, file_index) rows. Raises AssetError."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
-            rows = [tuple(int(v) for v in row[:3]) for row in csv.reader(file) if row and not row[0].lstrip().startswith(("#", "from"))]
+            rows = [
+                tuple(int(v) for v in row[:3])
+                for row in csv.reader(file)
+                if row and not row[0].lstrip().startswith(("#", "from"))
+            ]
     except (OSError, ValueError):
-        raise AssetError("not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index") from None
+        raise AssetError(
+            "not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index"
+        ) from None
     if not rows or any(len(r) != 3 for r in rows):
-        raise AssetError("not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index")
+        raise AssetError(
+            "not DSEC's test CSV", where=str(path), accepted="from_timestamp_us, to_timestamp_us, file_index"
+        )
     return rows
 
 
 def _same_count(folder: Path, files: list, times: list) -> None:
     if len(files) != len(times):
-        raise AssetError("flow files and time stamps differ in number", where=str(folder), value=(len(files), len(times)))
+        raise AssetError(
+            "flow files and time stamps differ in number", where=str(folder), value=(len(files), len(times))
+        )
 
 
 def detect_format(root: Path) -> str:
@@ -295,7 +360,9 @@ def detect_format(root: Path) -> str:
         return "mvsec"
     if next(root.rglob("events.h5"), None):
         return "dsec"
-    raise AssetError("no data set found", where=str(root), accepted="a folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences")
+    raise AssetError(
+        "no data set found", where=str(root), accepted="a folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences"
+    )
 
 
 def open_source(path: str | os.PathLike, format: str = "auto", *, dt: int = 1) -> Source:

@@ -45,7 +45,9 @@ class Window:
 
     def with_events(self, x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray) -> Window:
         """Further events merged in, time order kept."""
-        columns = [np.concatenate([a, b.astype(a.dtype)]) for a, b in ((self.x, x), (self.y, y), (self.t, t), (self.p, p))]
+        columns = [
+            np.concatenate([a, b.astype(a.dtype)]) for a, b in ((self.x, x), (self.y, y), (self.t, t), (self.p, p))
+        ]
         order = np.argsort(columns[2], kind="stable")
         return Window(*(c[order] for c in columns), self.t0, self.t1)
 
@@ -80,9 +82,16 @@ class RawSample:
         sign = np.ones(2, np.float32)
         sign[component] = -1
         signed = lambda f: None if f is None else turn(f) * sign  # a fresh array: sources may share theirs
-        return replace(self, old=self.old.flipped(axis, size), new=self.new.flipped(axis, size), flow=signed(self.flow),
-                       backward=signed(self.backward), valid=turn(self.valid), backward_valid=turn(self.backward_valid),
-                       mask=turn(self.mask))
+        return replace(
+            self,
+            old=self.old.flipped(axis, size),
+            new=self.new.flipped(axis, size),
+            flow=signed(self.flow),
+            backward=signed(self.backward),
+            valid=turn(self.valid),
+            backward_valid=turn(self.backward_valid),
+            mask=turn(self.mask),
+        )
 
     def invert(self) -> RawSample:
         """Contrast inverted: every polarity swapped, the flow unchanged."""
@@ -97,8 +106,15 @@ class RawSample:
             raise ValueError("time reversal needs the backward flow")
         t = self.new.t0  # mirrored about the reference: [t, t + Δ) becomes (t - Δ, t]
         move = lambda w: replace(w.reversed(), t=2 * t - w.t[::-1], t0=2 * t - w.t1, t1=2 * t - w.t0)
-        return replace(self, old=move(self.new), new=move(self.old), flow=self.backward, valid=self.backward_valid,
-                       backward=self.flow, backward_valid=self.valid)
+        return replace(
+            self,
+            old=move(self.new),
+            new=move(self.old),
+            flow=self.backward,
+            valid=self.backward_valid,
+            backward=self.flow,
+            backward_valid=self.valid,
+        )
 
     def drop(self, fraction: float, rng: np.random.Generator) -> RawSample:
         """Each event lost with probability ``fraction``."""
@@ -118,9 +134,14 @@ class RawSample:
 
     def noise(self, rate_hz: float, rng: np.random.Generator) -> RawSample:
         """Background activity: uniform Poisson events of either polarity, ``rate_hz`` per pixel."""
+
         def add(w: Window) -> Window:
             n = rng.poisson(rate_hz * (w.t1 - w.t0) * 1e-6 * self.height * self.width)
-            return w.with_events(rng.integers(0, self.width, n), rng.integers(0, self.height, n), rng.integers(w.t0, w.t1, n),
-                                 rng.integers(0, 2, n).astype(np.uint8))
+            return w.with_events(
+                rng.integers(0, self.width, n),
+                rng.integers(0, self.height, n),
+                rng.integers(w.t0, w.t1, n),
+                rng.integers(0, 2, n).astype(np.uint8),
+            )
 
         return replace(self, old=add(self.old), new=add(self.new))

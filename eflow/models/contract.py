@@ -56,14 +56,26 @@ class FlowModel(nn.Module):
         channels = self.representation.channels
         height, width = new.shape[-2:]
         if new.ndim != 4 or new.shape[1] != channels:
-            raise EventDataError("event tensor of another representation", where=type(self).__name__, value=tuple(new.shape),
-                                 accepted=f"(N, {channels}, H, W)")
+            raise EventDataError(
+                "event tensor of another representation",
+                where=type(self).__name__,
+                value=tuple(new.shape),
+                accepted=f"(N, {channels}, H, W)",
+            )
         if height % self.divisor or width % self.divisor:
-            raise EventDataError("height and width are not multiples of the network's stride", where=type(self).__name__,
-                                 value=(height, width), accepted=f"multiples of {self.divisor} (eflow predict and evaluate pad)")
+            raise EventDataError(
+                "height and width are not multiples of the network's stride",
+                where=type(self).__name__,
+                value=(height, width),
+                accepted=f"multiples of {self.divisor} (eflow predict and evaluate pad)",
+            )
         if min(height, width) < self.least:
-            raise EventDataError("input is too small for the network", where=type(self).__name__, value=(height, width),
-                                 accepted=f"at least {self.least} px a side")
+            raise EventDataError(
+                "input is too small for the network",
+                where=type(self).__name__,
+                value=(height, width),
+                accepted=f"at least {self.least} px a side",
+            )
 
 
 def initialise(module: nn.Module) -> None:

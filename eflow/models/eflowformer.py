@@ -24,7 +24,12 @@ class Mlp(nn.Sequential):
     hidden layer then stays in the cache."""
 
     def __init__(self):
-        super().__init__(nn.LayerNorm(FEATURES), nn.Linear(FEATURES, MLP_RATIO * FEATURES), nn.GELU(), nn.Linear(MLP_RATIO * FEATURES, FEATURES))
+        super().__init__(
+            nn.LayerNorm(FEATURES),
+            nn.Linear(FEATURES, MLP_RATIO * FEATURES),
+            nn.GELU(),
+            nn.Linear(MLP_RATIO * FEATURES, FEATURES),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         if torch.is_grad_enabled() or x.device.type != "cpu":
@@ -42,7 +47,10 @@ class EnhancementLayer(nn.Module):
         self.norm_local, self.local = nn.LayerNorm(FEATURES), WindowAttention(FEATURES, HEADS, WINDOW)
         self.mlp_local = Mlp() if twins else None
         self.position = ConditionalPosition(FEATURES)
-        self.norm_global, self.globally = nn.LayerNorm(FEATURES), GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins)
+        self.norm_global, self.globally = (
+            nn.LayerNorm(FEATURES),
+            GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins),
+        )
         self.mlp_global = Mlp()
         self.norm_cross, self.cross = nn.LayerNorm(FEATURES), GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins)
         self.mlp_cross = Mlp()

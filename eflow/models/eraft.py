@@ -25,7 +25,9 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.conv1, self.norm1 = nn.Conv2d(inputs, outputs, 3, stride, 1), norm(outputs)
         self.conv2, self.norm2 = nn.Conv2d(outputs, outputs, 3, 1, 1), norm(outputs)
-        self.shortcut = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride), norm(outputs)) if stride > 1 else nn.Identity()
+        self.shortcut = (
+            nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride), norm(outputs)) if stride > 1 else nn.Identity()
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         y = F.relu(self.norm1(self.conv1(x)), inplace=True)
@@ -38,9 +40,13 @@ class Trunk(nn.Sequential):
 
     def __init__(self, inputs: int, outputs: int, norm: str):
         make = {"instance": nn.InstanceNorm2d, "batch": nn.BatchNorm2d}[norm]
-        blocks = [ResidualBlock(a, b, s, make) for a, b, s in
-                  ((64, 64, 1), (64, 64, 1), (64, 96, 2), (96, 96, 1), (96, 128, 2), (128, 128, 1))]
-        super().__init__(nn.Conv2d(inputs, 64, 7, 2, 3), make(64), nn.ReLU(inplace=True), *blocks, nn.Conv2d(128, outputs, 1))
+        blocks = [
+            ResidualBlock(a, b, s, make)
+            for a, b, s in ((64, 64, 1), (64, 64, 1), (64, 96, 2), (96, 96, 1), (96, 128, 2), (128, 128, 1))
+        ]
+        super().__init__(
+            nn.Conv2d(inputs, 64, 7, 2, 3), make(64), nn.ReLU(inplace=True), *blocks, nn.Conv2d(128, outputs, 1)
+        )
 
 
 class MotionEncoder(nn.Module):
@@ -69,15 +75,21 @@ class SepConvGru(nn.Module):
     def __init__(self):
         super().__init__()
         inputs = HIDDEN + CONTEXT + 128
-        self.gates = nn.ModuleList([nn.Conv2d(inputs, 2 * HIDDEN, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))])
-        self.candidates = nn.ModuleList([nn.Conv2d(inputs, HIDDEN, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))])
+        self.gates = nn.ModuleList(
+            [nn.Conv2d(inputs, 2 * HIDDEN, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
+        )
+        self.candidates = nn.ModuleList(
+            [nn.Conv2d(inputs, HIDDEN, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
+        )
 
     def prepare(self, context: Tensor) -> list[tuple[Tensor, Tensor]]:
         """For each convolution, its weights over [hidden, motion] and the context's contribution (bias included)."""
         ready = []
         for conv in (c for pair in zip(self.gates, self.candidates, strict=True) for c in pair):
-            weight = torch.cat([conv.weight[:, :HIDDEN], conv.weight[:, HIDDEN + CONTEXT:]], 1)
-            ready.append((weight, F.conv2d(context, conv.weight[:, HIDDEN:HIDDEN + CONTEXT], conv.bias, padding=conv.padding)))
+            weight = torch.cat([conv.weight[:, :HIDDEN], conv.weight[:, HIDDEN + CONTEXT :]], 1)
+            ready.append(
+                (weight, F.conv2d(context, conv.weight[:, HIDDEN : HIDDEN + CONTEXT], conv.bias, padding=conv.padding))
+            )
         return ready
 
     def forward(self, h: Tensor, ready: list[tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
@@ -103,10 +115,16 @@ class Update(nn.Module):
     def __init__(self):
         super().__init__()
         self.motion, self.gru = MotionEncoder(), SepConvGru()
-        self.flow_head = nn.Sequential(nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 2, 3, padding=1))
-        self.mask_head = nn.Sequential(nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 9 * 64, 1))
+        self.flow_head = nn.Sequential(
+            nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 2, 3, padding=1)
+        )
+        self.mask_head = nn.Sequential(
+            nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 9 * 64, 1)
+        )
 
-    def forward(self, h: Tensor, context, taps: Tensor, flow: Tensor, with_mask: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    def forward(
+        self, h: Tensor, context, taps: Tensor, flow: Tensor, with_mask: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """h (N, 128, h, w), context: :meth:`SepConvGru.prepare`'s result (or the context itself: the slow twin), taps
         (N, 324, h, w), flow (N, 2, h, w) -> hidden, Δflow, mask logits (None unless wanted)."""
         motion = self.motion(taps, flow)
@@ -129,7 +147,9 @@ class Eraft(FlowModel):
         self.update = Update()
         self.plain = False
         initialise(self)
-        nn.init.normal_(self.update.flow_head[-1].weight, std=1e-3)  # the first Δflows are near zero, whatever the depth
+        nn.init.normal_(
+            self.update.flow_head[-1].weight, std=1e-3
+        )  # the first Δflows are near zero, whatever the depth
 
     def forward(self, batch: dict) -> FlowPrediction:
         """Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution px."""
@@ -156,8 +176,12 @@ class Eraft(FlowModel):
                 flow = flow + delta.float()
             if wanted:
                 flows.append((convex_upsample_slow if self.plain else convex_upsample)(flow, mask))
-        return FlowPrediction(flows if self.training else flows[-1:], has_match=self.training and first is not None, low=flow,
-                              backward_match=self.backward(correlation))
+        return FlowPrediction(
+            flows if self.training else flows[-1:],
+            has_match=self.training and first is not None,
+            low=flow,
+            backward_match=self.backward(correlation),
+        )
 
     # ---- what E-FlowFormer changes -------------------------------------------------------------------------------
 
@@ -178,5 +202,3 @@ class Eraft(FlowModel):
         if self.config.correlation == "on_demand" or (self.config.correlation == "auto" and tokens > DENSE_TOKENS):
             return OnDemandCorrelation(f1, f2)
         return DenseCorrelation(f1, f2, slow=self.plain)
-
-

@@ -29,8 +29,12 @@ class EvFlowNet(FlowModel):
         widths = (self.representation.channels, w, 2 * w, 4 * w, 8 * w)
         self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
         self.residuals = nn.Sequential(Residual(8 * w), Residual(8 * w))
-        self.decoders = nn.ModuleList([nn.Conv2d(c, c_out, 3, padding=1) for c, c_out in
-                                       ((16 * w, 4 * w), (8 * w + 2, 2 * w), (4 * w + 2, w), (2 * w + 2, w // 2))])
+        self.decoders = nn.ModuleList(
+            [
+                nn.Conv2d(c, c_out, 3, padding=1)
+                for c, c_out in ((16 * w, 4 * w), (8 * w + 2, 2 * w), (4 * w + 2, w), (2 * w + 2, w // 2))
+            ]
+        )
         self.heads = nn.ModuleList([ScaledTanh(c) for c in (4 * w, 2 * w, w, w // 2)])
         initialise(self)
         for head in self.heads:

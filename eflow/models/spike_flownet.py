@@ -47,7 +47,9 @@ class SpikeFlowNet(FlowModel):
         self.residuals = nn.Sequential(Residual(512), Residual(512))
         inputs = (512, 128 + 256 + 2, 64 + 128 + 2, 64 + 64 + 2)  # decoder features, skip, flow; at 1/16, 1/8, 1/4, 1/2
         self.ups = nn.ModuleList([nn.ConvTranspose2d(c, c_out, 4, 2, 1) for c, c_out in zip(inputs, (128, 64, 64))])
-        self.heads = nn.ModuleList([nn.Sequential(nn.Conv2d(c, 32, 3, padding=1), nn.LeakyReLU(0.1), nn.Conv2d(32, 2, 1)) for c in inputs])
+        self.heads = nn.ModuleList(
+            [nn.Sequential(nn.Conv2d(c, 32, 3, padding=1), nn.LeakyReLU(0.1), nn.Conv2d(32, 2, 1)) for c in inputs]
+        )
         initialise(self)
         for head in self.heads:
             nn.init.normal_(head[-1].weight, std=1e-3)
@@ -66,12 +68,21 @@ class SpikeFlowNet(FlowModel):
                 currents[layer] = currents[layer] + current
                 membrane = membranes[layer] + current
                 x = _Fire.apply(membrane, self.config.threshold)
-                membranes[layer] = membrane - self.config.threshold * x.detach()  # soft reset: what exceeds the threshold stays
+                membranes[layer] = (
+                    membrane - self.config.threshold * x.detach()
+                )  # soft reset: what exceeds the threshold stays
         x, flows = self.residuals(F.leaky_relu(currents[3], 0.1)), []
         for scale, head in enumerate(self.heads):
             flows.append(head(x).float())
             if scale < 3:
                 up = F.leaky_relu(self.ups[scale](x), 0.1)
-                x = torch.cat([up, currents[2 - scale].to(up.dtype), F.interpolate(flows[-1], scale_factor=2, mode="bilinear").to(up.dtype)], 1)
+                x = torch.cat(
+                    [
+                        up,
+                        currents[2 - scale].to(up.dtype),
+                        F.interpolate(flows[-1], scale_factor=2, mode="bilinear").to(up.dtype),
+                    ],
+                    1,
+                )
         full = [to_size(f, height, width) for f in (flows if self.training else flows[-1:])]
         return FlowPrediction(full, kind="scales")

@@ -84,9 +84,13 @@ class SteFlowNet(FlowModel):
                 h, w = first.shape[-2:]
                 flow = to_size(flow, h, w)  # full-resolution px at every scale
                 local = flow.detach() / (height / h)
-                taps = sum(local_correlation(first, backward_warp(state, local * (i / self.config.slices)).to(first.dtype))
-                           for i, state in enumerate(states[scale][1:], 1)) / (self.config.slices - 1)
-                parts = [top if scale == 3 else states[scale][-1], taps, local.to(taps.dtype)] + ([] if features is None else [features])
+                taps = sum(
+                    local_correlation(first, backward_warp(state, local * (i / self.config.slices)).to(first.dtype))
+                    for i, state in enumerate(states[scale][1:], 1)
+                ) / (self.config.slices - 1)
+                parts = [top if scale == 3 else states[scale][-1], taps, local.to(taps.dtype)] + (
+                    [] if features is None else [features]
+                )
                 residual, features = self.decoders[scale](*parts)
                 flow = flow.detach() + residual
                 if self.training:

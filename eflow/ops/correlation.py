@@ -32,7 +32,11 @@ _CHUNK, _ROWS = 2048, 256
 
 def pixel_grid(h: int, w: int, like: Tensor) -> Tensor:
     """(1, 2, h, w) float32 coordinates (x, y)."""
-    y, x = torch.meshgrid(torch.arange(h, device=like.device, dtype=torch.float32), torch.arange(w, device=like.device, dtype=torch.float32), indexing="ij")
+    y, x = torch.meshgrid(
+        torch.arange(h, device=like.device, dtype=torch.float32),
+        torch.arange(w, device=like.device, dtype=torch.float32),
+        indexing="ij",
+    )
     return torch.stack([x, y])[None]
 
 
@@ -101,7 +105,12 @@ class OnDemandCorrelation:
                 for level, f2 in enumerate(self.levels):
                     index, inside, fraction = patch_index(flat[:, part].reshape(-1, 2) / 2**level, *f2.shape[-2:])
                     tokens = f2.flatten(2).transpose(1, 2)  # (N, cells, D)
-                    picked = torch.stack([t[i] for t, i in zip(tokens, index.view(n, -1, index.shape[-1] * index.shape[-2]), strict=True)])
+                    picked = torch.stack(
+                        [
+                            t[i]
+                            for t, i in zip(tokens, index.view(n, -1, index.shape[-1] * index.shape[-2]), strict=True)
+                        ]
+                    )
                     patch = torch.einsum("ntd,ntkd->ntk", self.f1[:, part], picked)
                     taps.append(lerp_patch(patch.reshape(inside.shape) * inside, fraction))
                 rows.append(torch.cat(taps, 1).view(n, -1, CHANNELS))
@@ -111,14 +120,14 @@ class OnDemandCorrelation:
         n, h, w = self.shape
         with fp32(self.f1):
             target = self.levels[0].flatten(2)
-            parts = [expected_position(self.f1[:, s:s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
+            parts = [expected_position(self.f1[:, s : s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
             return torch.cat(parts, 2).view(n, 2, h, w) - pixel_grid(h, w, target)
 
     def match_backward(self) -> Tensor:
         n, h, w = self.shape
         with fp32(self.f1):
             target, source = self.f1.transpose(1, 2), self.levels[0].flatten(2).transpose(1, 2)
-            parts = [expected_position(source[:, s:s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
+            parts = [expected_position(source[:, s : s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
             return torch.cat(parts, 2).view(n, 2, h, w) - pixel_grid(h, w, target)
 
 
@@ -133,7 +142,9 @@ def expected_position(logits: Tensor, h: int, w: int) -> Tensor:
     """(N, rows, h*w) logits -> (N, 2, rows) expected (x, y). By the marginals: sums, which
     TF32 and bf16 products do not touch."""
     if not torch.is_grad_enabled() and logits.shape[1] > _ROWS:  # row blocks that stay in the cache
-        return torch.cat([expected_position(logits[:, s:s + _ROWS], h, w) for s in range(0, logits.shape[1], _ROWS)], 2)
+        return torch.cat(
+            [expected_position(logits[:, s : s + _ROWS], h, w) for s in range(0, logits.shape[1], _ROWS)], 2
+        )
     p = logits.float().softmax(-1).unflatten(-1, (h, w))
     x = torch.arange(w, device=p.device, dtype=torch.float32)
     y = torch.arange(h, device=p.device, dtype=torch.float32)
@@ -194,7 +205,7 @@ def _taps(volume, coords, scale, first, out):
         x = min(max(coords[m, 0] * scale, np.float32(-RADIUS - 2)), np.float32(w + RADIUS + 1))
         y = min(max(coords[m, 1] * scale, np.float32(-RADIUS - 2)), np.float32(h + RADIUS + 1))
         if not (np.isfinite(x) and np.isfinite(y)):
-            out[m, first:first + side * side] = np.nan
+            out[m, first : first + side * side] = np.nan
             continue
         bx, by = np.floor(x), np.floor(y)
         fx, fy = x - bx, y - by
@@ -221,4 +232,6 @@ def local_correlation(f1: Tensor, f2: Tensor, radius: int = 4) -> Tensor:
     h, w = f1.shape[-2:]
     padded = F.pad(f2, (radius,) * 4)
     side = 2 * radius + 1
-    return torch.stack([(f1 * padded[..., dy:dy + h, dx:dx + w]).mean(1) for dy in range(side) for dx in range(side)], 1)
+    return torch.stack(
+        [(f1 * padded[..., dy : dy + h, dx : dx + w]).mean(1) for dy in range(side) for dx in range(side)], 1
+    )

@@ -22,7 +22,9 @@ def convex_upsample(flow: Tensor, mask: Tensor) -> Tensor:
     with fp32(flow):
         weights = mask.float().view(n, 9, SCALE * SCALE, h * w).softmax(1)
         padded = F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode="replicate")
-        neighbours = torch.stack([padded[..., dy:dy + h, dx:dx + w] for dy in range(3) for dx in range(3)], 2).view(n, 2, 9, 1, h * w)
+        neighbours = torch.stack([padded[..., dy : dy + h, dx : dx + w] for dy in range(3) for dx in range(3)], 2).view(
+            n, 2, 9, 1, h * w
+        )
         fine = torch.stack([(weights * neighbours[:, c]).sum(1) for c in range(2)], 1)  # (N, 2, 64, h*w)
         return F.pixel_shuffle(fine.view(n, 2 * SCALE * SCALE, h, w), SCALE)
 

@@ -9,8 +9,19 @@ import numba
 import numpy as np
 
 
-def voxel_grid(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, bins: int, height: int, width: int, *,
-               normalise: str = "nonzero") -> np.ndarray:
+def voxel_grid(
+    x: np.ndarray,
+    y: np.ndarray,
+    t: np.ndarray,
+    p: np.ndarray,
+    t0: int,
+    t1: int,
+    bins: int,
+    height: int,
+    width: int,
+    *,
+    normalise: str = "nonzero",
+) -> np.ndarray:
     """Signed event voxel grid with a linear kernel in time (Zhu et al., CVPR 2019, eq. 1), bin
     coordinate (B-1)(t-t0)/(t1-t0).
 
@@ -101,8 +112,9 @@ def _normalise(cells, everything):
             cells[i] = np.float32((cells[i] - mean) * scale)
 
 
-def count_slices(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, slices: int, height: int,
-                 width: int) -> np.ndarray:
+def count_slices(
+    x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, slices: int, height: int, width: int
+) -> np.ndarray:
     """Events counted per slice of equal duration and polarity: (slices, 2, height, width) float32, channel 0 OFF, 1 ON.
 
     x, y : uint16 px. t in [t0, t1]; t == t1 falls into the last slice. Raises ValueError as :func:`voxel_grid`."""
@@ -126,8 +138,9 @@ def _count(x, y, t, p, t0, span, counts):
     return outside
 
 
-def counts_and_times(x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, height: int,
-                     width: int) -> np.ndarray:
+def counts_and_times(
+    x: np.ndarray, y: np.ndarray, t: np.ndarray, p: np.ndarray, t0: int, t1: int, height: int, width: int
+) -> np.ndarray:
     """EV-FlowNet's image (Zhu et al., RSS 2018): (4, height, width) float32 = OFF count, ON count, latest OFF time,
     latest ON time; times as fractions of the window, 0 where no event was. Raises ValueError as :func:`voxel_grid`."""
     out = np.zeros((4, height, width), np.float32)

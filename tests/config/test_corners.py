@@ -14,36 +14,139 @@ from blinkgl.errors import ConfigError
 
 # Sound at all low and at all high ends, or at each single one; refused by a combination.
 MIXED = [
-    ({"timeline": {"min_step_us": {"uniform": [100, 900]}, "max_step_us": {"uniform": [500, 2000]}}}, "timeline: min_step_us must not exceed"),
-    ({"timeline": {"min_step_us": {"log_uniform": [100, 900]}, "max_step_us": {"integer": [500, 2000]}}}, "timeline: min_step_us must not exceed"),
-    ({"time": {"duration": {"uniform": [0.1, 1]}, "label_rate": {"uniform": [1, 10]}}}, "time: duration * label_rate must be at least 1"),
-    ({"time": {"duration": {"uniform": [0.1, 1]}, "label_rate": {"choice": [10, {"uniform": [1, 2]}]}}}, "time: duration * label_rate must be at least 1"),
-    ({"scene": {"sky": {"size": {"uniform": [40, 100]}}, "region": {"width": {"uniform": [20, 40]}}}}, "scene.sky.size: must be at least 48"),
-    ({"scene": {"objects": {"size": [1, {"uniform": [2, 40]}]}, "sky": {"size": {"uniform": [50, 120]}}}}, "scene.sky.size: must be at least 110"),
-    ({"timeline": {"choice": [{"kind": "uniform"}, {"reconstruction": "pchip"}]}, "events": {"choice": [{"emulator": "v2e"}, {"emulator": "esim"}]}},
-     "timeline.reconstruction: v2e follows straight lines alone"),
-    ({"timeline": {"reconstruction": {"choice": ["linear", "pchip"]}}, "events": {"weighted": {"x": 1}}}, "events: not a table"),
-    ({"timeline": {"reconstruction": {"choice": ["linear", "pchip"]}}, "events": {"shares": [{"share": 0.5, "value": {"emulator": "esim"}}, {
-        "share": 0.5, "value": {"emulator": "voltmeter"}}]}}, "timeline.reconstruction: voltmeter follows"),
-    ({"events": {"emulator": "v2e", "photoreceptor_noise": {"choice": [False, True]}, "cutoff_hz": {"choice": [0, 30]}}}, "events: photoreceptor_noise needs"),
-    ({"events": {"emulator": "v2e", "photoreceptor_noise": {"choice": [False, True]}, "preset": {"choice": ["noisy", "clean"]}}},
-     "events: photoreceptor_noise needs"),
+    (
+        {"timeline": {"min_step_us": {"uniform": [100, 900]}, "max_step_us": {"uniform": [500, 2000]}}},
+        "timeline: min_step_us must not exceed",
+    ),
+    (
+        {"timeline": {"min_step_us": {"log_uniform": [100, 900]}, "max_step_us": {"integer": [500, 2000]}}},
+        "timeline: min_step_us must not exceed",
+    ),
+    (
+        {"time": {"duration": {"uniform": [0.1, 1]}, "label_rate": {"uniform": [1, 10]}}},
+        "time: duration * label_rate must be at least 1",
+    ),
+    (
+        {"time": {"duration": {"uniform": [0.1, 1]}, "label_rate": {"choice": [10, {"uniform": [1, 2]}]}}},
+        "time: duration * label_rate must be at least 1",
+    ),
+    (
+        {"scene": {"sky": {"size": {"uniform": [40, 100]}}, "region": {"width": {"uniform": [20, 40]}}}},
+        "scene.sky.size: must be at least 48",
+    ),
+    (
+        {"scene": {"objects": {"size": [1, {"uniform": [2, 40]}]}, "sky": {"size": {"uniform": [50, 120]}}}},
+        "scene.sky.size: must be at least 110",
+    ),
+    (
+        {
+            "timeline": {"choice": [{"kind": "uniform"}, {"reconstruction": "pchip"}]},
+            "events": {"choice": [{"emulator": "v2e"}, {"emulator": "esim"}]},
+        },
+        "timeline.reconstruction: v2e follows straight lines alone",
+    ),
+    (
+        {"timeline": {"reconstruction": {"choice": ["linear", "pchip"]}}, "events": {"weighted": {"x": 1}}},
+        "events: not a table",
+    ),
+    (
+        {
+            "timeline": {"reconstruction": {"choice": ["linear", "pchip"]}},
+            "events": {
+                "shares": [
+                    {"share": 0.5, "value": {"emulator": "esim"}},
+                    {"share": 0.5, "value": {"emulator": "voltmeter"}},
+                ]
+            },
+        },
+        "timeline.reconstruction: voltmeter follows",
+    ),
+    (
+        {
+            "events": {
+                "emulator": "v2e",
+                "photoreceptor_noise": {"choice": [False, True]},
+                "cutoff_hz": {"choice": [0, 30]},
+            }
+        },
+        "events: photoreceptor_noise needs",
+    ),
+    (
+        {
+            "events": {
+                "emulator": "v2e",
+                "photoreceptor_noise": {"choice": [False, True]},
+                "preset": {"choice": ["noisy", "clean"]},
+            }
+        },
+        "events: photoreceptor_noise needs",
+    ),
     ({"events": {"emulator": {"choice": ["esim", "v2e"]}, "log_eps": 1e-3}}, "events.log_eps: unknown key"),
-    ({"events": {"choice": [{"emulator": "esim"}, {"emulator": "v2e", "leak_rate_hz": {"choice": [1, {"uniform": [5, 2e4]}]}}]}},
-     "events.leak_rate_hz: too large"),
-    ({"camera": {"near": {"uniform": [0.05, 7]}, "fov": {"uniform": [10, 100]}}}, "scene.region.height: the region is too low"),
-    ({"readout": {"events_per_second": {"uniform": [1e4, 1e7]}, "queue_events": {"integer": [1, 2**24]}}, "time": {"duration": {"uniform": [1, 3000]}, "start": 0}},
-     "time.duration: events that wait"),
-    ({"time": {"duration": {"uniform": [1000, 4000]}, "label_rate": {"uniform": [1, 300]}}}, "time.label_rate: 1200000 labels"),
-    ({"quality": {"choice": ["accurate", None]}, "timeline": {"kind": {"choice": ["displacement", "uniform"]}, "max_px": 1}}, "timeline.max_px: unknown key"),
-    ({"sensor": {"choice": ["davis346", None]}, "readout": {"choice": [None, {"row_ns": 5}]}}, "readout.events_per_second: is required"),
+    (
+        {
+            "events": {
+                "choice": [
+                    {"emulator": "esim"},
+                    {"emulator": "v2e", "leak_rate_hz": {"choice": [1, {"uniform": [5, 2e4]}]}},
+                ]
+            }
+        },
+        "events.leak_rate_hz: too large",
+    ),
+    (
+        {"camera": {"near": {"uniform": [0.05, 7]}, "fov": {"uniform": [10, 100]}}},
+        "scene.region.height: the region is too low",
+    ),
+    (
+        {
+            "readout": {"events_per_second": {"uniform": [1e4, 1e7]}, "queue_events": {"integer": [1, 2**24]}},
+            "time": {"duration": {"uniform": [1, 3000]}, "start": 0},
+        },
+        "time.duration: events that wait",
+    ),
+    (
+        {"time": {"duration": {"uniform": [1000, 4000]}, "label_rate": {"uniform": [1, 300]}}},
+        "time.label_rate: 1200000 labels",
+    ),
+    (
+        {
+            "quality": {"choice": ["accurate", None]},
+            "timeline": {"kind": {"choice": ["displacement", "uniform"]}, "max_px": 1},
+        },
+        "timeline.max_px: unknown key",
+    ),
+    (
+        {"sensor": {"choice": ["davis346", None]}, "readout": {"choice": [None, {"row_ns": 5}]}},
+        "readout.events_per_second: is required",
+    ),
     ({"scene": {"objects": {"count": {"uniform": [1, 9]}}}}, "scene.objects.count: not a whole number"),
     ({"labels": {"depth": {"uniform": [0, 1]}}}, "labels.depth: not true or false"),
-    ({"scene": {"kind": "explicit", "camera": {"keyframes": [{"time": 0}, {"time": {"uniform": [1, 5]}}, {"time": {"uniform": [2, 6]}}]},
-                "meshes": {"a": {"primitive": "cuboid"}}, "objects": [{"mesh": "a"}]}}, "scene.camera.keyframes.2.time: the key frames' times"),
-    ({"scene": {"kind": "explicit", "camera": {}, "meshes": {"choice": [{"a": {"primitive": "cuboid"}}, {"b": {"primitive": "cone"}}]},
-                "objects": [{"mesh": {"choice": ["a", "b"]}}]}}, "scene.objects.0.mesh: no such name"),
-    ({"frames": {"fps": {"log_uniform": [1e-3, 30]}, "count": {"integer": [3, 100]}}}, "frames.fps: 100 frames at this rate last"),
+    (
+        {
+            "scene": {
+                "kind": "explicit",
+                "camera": {"keyframes": [{"time": 0}, {"time": {"uniform": [1, 5]}}, {"time": {"uniform": [2, 6]}}]},
+                "meshes": {"a": {"primitive": "cuboid"}},
+                "objects": [{"mesh": "a"}],
+            }
+        },
+        "scene.camera.keyframes.2.time: the key frames' times",
+    ),
+    (
+        {
+            "scene": {
+                "kind": "explicit",
+                "camera": {},
+                "meshes": {"choice": [{"a": {"primitive": "cuboid"}}, {"b": {"primitive": "cone"}}]},
+                "objects": [{"mesh": {"choice": ["a", "b"]}}],
+            }
+        },
+        "scene.objects.0.mesh: no such name",
+    ),
+    (
+        {"frames": {"fps": {"log_uniform": [1e-3, 30]}, "count": {"integer": [3, 100]}}},
+        "frames.fps: 100 frames at this rate last",
+    ),
 ]
 
 
@@ -54,15 +157,31 @@ def test_mixed_corners_are_refused_when_the_file_is_read(tree, message):
     assert str(caught.value).startswith(message)
 
 
-@pytest.mark.parametrize("tree", [
-    {"timeline": {"min_step_us": {"uniform": [100, 500]}, "max_step_us": {"uniform": [500, 2000]}}},
-    {"sensor": {"choice": ["davis346", "dvxplorer"]}, "events": {"emulator": {"choice": ["esim", "v2e", "voltmeter"]}, "refractory_us": {"uniform": [0, 9]}},
-     "readout": {"choice": [None, {"row_ns": 5}]}},
-    {"quality": {"choice": ["fast", "reference", None]}, "timeline": {"max_step_us": {"uniform": [5000, 9000]}},
-     "events": {"emulator": {"choice": ["esim", "v2e"]}}},
-    {"scene": {"kind": {"choice": ["random"]}, "walls": {"choice": [True, False, {"count": {"integer": [0, 4]}}]}}},
-    {"events": {"choice": [{"contrast_threshold": {"uniform": [0.1, 0.3]}}, {"emulator": "voltmeter", "k1": {"choice": [3, {"uniform": [4, 5]}]}}]}},
-])
+@pytest.mark.parametrize(
+    "tree",
+    [
+        {"timeline": {"min_step_us": {"uniform": [100, 500]}, "max_step_us": {"uniform": [500, 2000]}}},
+        {
+            "sensor": {"choice": ["davis346", "dvxplorer"]},
+            "events": {"emulator": {"choice": ["esim", "v2e", "voltmeter"]}, "refractory_us": {"uniform": [0, 9]}},
+            "readout": {"choice": [None, {"row_ns": 5}]},
+        },
+        {
+            "quality": {"choice": ["fast", "reference", None]},
+            "timeline": {"max_step_us": {"uniform": [5000, 9000]}},
+            "events": {"emulator": {"choice": ["esim", "v2e"]}},
+        },
+        {"scene": {"kind": {"choice": ["random"]}, "walls": {"choice": [True, False, {"count": {"integer": [0, 4]}}]}}},
+        {
+            "events": {
+                "choice": [
+                    {"contrast_threshold": {"uniform": [0.1, 0.3]}},
+                    {"emulator": "voltmeter", "k1": {"choice": [3, {"uniform": [4, 5]}]}},
+                ]
+            }
+        },
+    ],
+)
 def test_sound_recipes_are_accepted_and_drawn(tree):
     RunTemplate(tree, None).check()
     for index in range(40):
@@ -71,11 +190,20 @@ def test_sound_recipes_are_accepted_and_drawn(tree):
 
 def test_independent_distributions_do_not_multiply():
     """Twenty distributions: 2^20 corners; only what is looked at together is combined."""
-    tree = {"events": {key: {"uniform": [0.1, 0.5]} for key in ("contrast_threshold", "contrast_threshold_off", "threshold_sigma", "log_eps")},
-            "camera": {"fov": {"uniform": [50, 60]}, "cx": {"uniform": [10, 20]}}, "render": {"mip_bias": {"uniform": [-1, 0]}},
-            "labels": {k: {"choice": [True, False]} for k in ("images", "depth", "ids", "normals", "velocity")},
-            "scene": {"camera_motion": {k: [{"uniform": [1, 2]}, {"uniform": [2, 3]}] for k in ("speed", "rotation_rate")},
-                      "light": {"sun": {"uniform": [0, 1]}, "sky": {"uniform": [0, 1]}}, "objects": {"count": {"integer": [1, 5]}}}}
+    tree = {
+        "events": {
+            key: {"uniform": [0.1, 0.5]}
+            for key in ("contrast_threshold", "contrast_threshold_off", "threshold_sigma", "log_eps")
+        },
+        "camera": {"fov": {"uniform": [50, 60]}, "cx": {"uniform": [10, 20]}},
+        "render": {"mip_bias": {"uniform": [-1, 0]}},
+        "labels": {k: {"choice": [True, False]} for k in ("images", "depth", "ids", "normals", "velocity")},
+        "scene": {
+            "camera_motion": {k: [{"uniform": [1, 2]}, {"uniform": [2, 3]}] for k in ("speed", "rotation_rate")},
+            "light": {"sun": {"uniform": [0, 1]}, "sky": {"uniform": [0, 1]}},
+            "objects": {"count": {"integer": [1, 5]}},
+        },
+    }
     assert len(sites(tree)) == 19
     assert len(list(corners(SequenceConfig, tree, FILLS))) < 120
     RunTemplate(tree, None).check()
@@ -83,8 +211,18 @@ def test_independent_distributions_do_not_multiply():
 
 def test_too_many_together_is_said():
     keys = [{"time": {"uniform": [k, k + 0.5]}} for k in range(20)]
-    tree = {"scene": {"kind": "explicit", "camera": {"keyframes": keys}, "meshes": {"a": {"primitive": "cuboid"}}, "objects": [{"mesh": "a"}]}}
-    with pytest.raises(ConfigError, match="too many distributions are looked at together .got '1048576 combinations'.; expected at most 4096"):
+    tree = {
+        "scene": {
+            "kind": "explicit",
+            "camera": {"keyframes": keys},
+            "meshes": {"a": {"primitive": "cuboid"}},
+            "objects": [{"mesh": "a"}],
+        }
+    }
+    with pytest.raises(
+        ConfigError,
+        match="too many distributions are looked at together .got '1048576 combinations'.; expected at most 4096",
+    ):
         RunTemplate(tree, None).check()
 
 
@@ -93,6 +231,7 @@ def test_too_many_together_is_said():
 
 def test_a_validator_that_sees_everything_is_refused():
     with pytest.raises(TypeError, match="Sly._both.*@rule"):
+
         class Sly(Config):
             a: int = 0
             b: int = 0
@@ -123,17 +262,31 @@ def test_a_rule_is_given_what_it_names_and_nothing_else():
     assert seen == [(1, 3, (4, 5), ("x",), True), (1, None, (4, 5), ("x",), False)]
 
 
-@pytest.mark.parametrize("keys, function", [(("a", "nothing"), lambda a, b: None), (("a",), lambda a, b: None), (("a.b",), lambda a: None)])
+@pytest.mark.parametrize(
+    "keys, function", [(("a", "nothing"), lambda a, b: None), (("a",), lambda a, b: None), (("a.b",), lambda a: None)]
+)
 def test_a_wrong_declaration_is_found_when_the_class_is_made(keys, function):
     with pytest.raises(TypeError):
-        type("Wrong", (Config,), {"__annotations__": {"a": int}, "a": 1, "_rule": rule(*keys)(function), "__module__": __name__})
+        type(
+            "Wrong",
+            (Config,),
+            {"__annotations__": {"a": int}, "a": 1, "_rule": rule(*keys)(function), "__module__": __name__},
+        )
 
 
 def test_an_undeclared_write_of_a_fill_is_found():
     with pytest.raises(TypeError, match="wrote camera.width"):
         Fill(("quality",), ("timeline",), lambda q: {"camera": {"width": 3}})({"quality": "fast"})
-    for quality, kind, emulator in itertools.product(("fast", "balanced", "accurate", "reference"), (None, "uniform"), (None, "v2e")):
-        FILLS[0]({"quality": quality, "timeline": {"kind": kind} if kind else {}, "events": {"emulator": emulator} if emulator else {}})
+    for quality, kind, emulator in itertools.product(
+        ("fast", "balanced", "accurate", "reference"), (None, "uniform"), (None, "v2e")
+    ):
+        FILLS[0](
+            {
+                "quality": quality,
+                "timeline": {"kind": kind} if kind else {},
+                "events": {"emulator": emulator} if emulator else {},
+            }
+        )
     for sensor, emulator in itertools.product(("imx636", "davis346"), ("esim", "v2e", "voltmeter", None)):
         FILLS[1]({"sensor": sensor, "events": {"emulator": emulator} if emulator else {}})
 
@@ -182,7 +335,7 @@ def test_what_the_recording_of_reads_finds():
         except (Refused, TypeError):  # an isinstance of the recorder
             pass
         declared = [path for path, _ in one.paths()]
-        assert log and all(any(p[:len(d)] == d or d[:len(p)] == p for d in declared) for p in log)
+        assert log and all(any(p[: len(d)] == d or d[: len(p)] == p for d in declared) for p in log)
 
 
 # --- random recipes ---------------------------------------------------------------------------------------------------
@@ -193,18 +346,39 @@ def _random_recipe(rng: random.Random) -> dict:
         a, b = sorted(rng.uniform(low, high) for _ in range(2))
         if whole:
             a, b = int(a), int(b)
-        kind = rng.choice(["plain", "uniform", "log_uniform", "choice", "nested"] if not whole else ["plain", "integer", "choice"])
-        return {"plain": a, "choice": {"choice": [a, b]}, "nested": {"choice": [a, {"uniform": [a, b]}]}}.get(kind, {kind: [a, b]})
+        kind = rng.choice(
+            ["plain", "uniform", "log_uniform", "choice", "nested"] if not whole else ["plain", "integer", "choice"]
+        )
+        return {"plain": a, "choice": {"choice": [a, b]}, "nested": {"choice": [a, {"uniform": [a, b]}]}}.get(
+            kind, {kind: [a, b]}
+        )
 
     tree = {
         "seed": rng.randrange(1000),
         "time": {"duration": some(0.05, 2), "label_rate": some(1, 40)},
-        "timeline": {"min_step_us": some(10, 3000), "max_step_us": some(500, 20000), "reconstruction": rng.choice(["linear", {"choice": ["linear", "pchip"]}])},
+        "timeline": {
+            "min_step_us": some(10, 3000),
+            "max_step_us": some(500, 20000),
+            "reconstruction": rng.choice(["linear", {"choice": ["linear", "pchip"]}]),
+        },
         "camera": {"width": some(8, 700, True), "near": some(0.01, 4), "fov": some(20, 150)},
-        "events": rng.choice([{"contrast_threshold": some(0.0005, 1)}, {"emulator": {"choice": ["esim", "voltmeter"]}, "refractory_us": some(0, 10)},
-                              {"emulator": "v2e", "cutoff_hz": rng.choice([some(0, 300), {"choice": [0, 30]}]), "photoreceptor_noise": {"choice": [True, False]},
-                               "preset": rng.choice(["clean", {"choice": ["clean", "noisy"]}])}]),
-        "scene": {"region": {"width": some(5, 60), "height": some(1, 20)}, "sky": {"size": some(30, 200)}, "objects": {"size": [some(0.1, 2), some(1, 20)]}},
+        "events": rng.choice(
+            [
+                {"contrast_threshold": some(0.0005, 1)},
+                {"emulator": {"choice": ["esim", "voltmeter"]}, "refractory_us": some(0, 10)},
+                {
+                    "emulator": "v2e",
+                    "cutoff_hz": rng.choice([some(0, 300), {"choice": [0, 30]}]),
+                    "photoreceptor_noise": {"choice": [True, False]},
+                    "preset": rng.choice(["clean", {"choice": ["clean", "noisy"]}]),
+                },
+            ]
+        ),
+        "scene": {
+            "region": {"width": some(5, 60), "height": some(1, 20)},
+            "sky": {"size": some(30, 200)},
+            "objects": {"size": [some(0.1, 2), some(1, 20)]},
+        },
     }
     if rng.random() < 0.5:
         tree["quality"] = rng.choice(["fast", "accurate", {"choice": ["fast", None, "reference"]}])

@@ -66,20 +66,23 @@ def test_a_logarithmic_draw_never_leaves_its_range():
     assert {draw({"a": spec}, 0, i)["a"] for i in range(5)} == {0.1}, "exp(log(0.1)) is another number"
 
 
-@pytest.mark.parametrize("node, message", [
-    ({"uniform": [2, 1]}, "p.q.uniform: the range is empty"),
-    ({"uniform": [1]}, "p.q.uniform: not a range"),
-    ({"uniform": "ab"}, "p.q.uniform: not a range"),
-    ({"uniform": [-1e308, 1e308]}, "p.q.uniform: the range is too wide"),
-    ({"integer": [0, 10**19]}, "p.q.integer: the range is too wide"),
-    ({"uniform": [0, 10**400]}, "p.q.uniform: not a range"),
-    ({"uniform": [0, "nan"]}, "p.q.uniform: not a range"),
-    ({"log_uniform": [0, 1]}, "p.q.log_uniform: a logarithmic range needs positive ends"),
-    ({"integer": [1, 2.5]}, "p.q.integer: not whole numbers"),
-    ({"choice": []}, "p.q.choice: not a list of choices"),
-    ({"weighted": {"a": 0}}, "p.q.weighted: not a table of weights"),
-    ({"weighted": {"a": -1, "b": 3}}, "p.q.weighted: not a table of weights"),
-])
+@pytest.mark.parametrize(
+    "node, message",
+    [
+        ({"uniform": [2, 1]}, "p.q.uniform: the range is empty"),
+        ({"uniform": [1]}, "p.q.uniform: not a range"),
+        ({"uniform": "ab"}, "p.q.uniform: not a range"),
+        ({"uniform": [-1e308, 1e308]}, "p.q.uniform: the range is too wide"),
+        ({"integer": [0, 10**19]}, "p.q.integer: the range is too wide"),
+        ({"uniform": [0, 10**400]}, "p.q.uniform: not a range"),
+        ({"uniform": [0, "nan"]}, "p.q.uniform: not a range"),
+        ({"log_uniform": [0, 1]}, "p.q.log_uniform: a logarithmic range needs positive ends"),
+        ({"integer": [1, 2.5]}, "p.q.integer: not whole numbers"),
+        ({"choice": []}, "p.q.choice: not a list of choices"),
+        ({"weighted": {"a": 0}}, "p.q.weighted: not a table of weights"),
+        ({"weighted": {"a": -1, "b": 3}}, "p.q.weighted: not a table of weights"),
+    ],
+)
 def test_malformed_distributions_name_the_path(node, message):
     for function in (lambda t: draw(t, 0, 0), sites):
         with pytest.raises(ConfigError, match="^" + message):

@@ -26,7 +26,9 @@ def test_a_preset_is_what_its_file_says(tmp_path, name):
 def test_what_is_said_wins(tmp_path):
     preset = load_quality("balanced")
     assert preset["timeline"]["kind"] == "displacement", "or choose another timeline below"
-    config = sequence(tmp_path, {"quality": "balanced", "timeline": {"max_px": 0.3}, "render": {"antialiasing": "msaa4"}})
+    config = sequence(
+        tmp_path, {"quality": "balanced", "timeline": {"max_px": 0.3}, "render": {"antialiasing": "msaa4"}}
+    )
     assert (config.timeline.max_px, config.render.antialiasing) == (0.3, "msaa4")
     assert config.timeline.min_step_us == preset["timeline"].get("min_step_us", 200.0)
     config = sequence(tmp_path, {"quality": "balanced"}, "timeline={kind: uniform, fps: 77}")
@@ -37,7 +39,10 @@ def test_what_is_said_wins(tmp_path):
 def test_emulators_that_follow_straight_lines(tmp_path):
     assert sequence(tmp_path, {"quality": "accurate"}).timeline.reconstruction != "linear", "or this test shows nothing"
     config = sequence(tmp_path, {"quality": "accurate", "events": {"emulator": "v2e"}})
-    assert config.timeline.reconstruction == "linear" and config.render.antialiasing == load_quality("accurate")["render"]["antialiasing"]
+    assert (
+        config.timeline.reconstruction == "linear"
+        and config.render.antialiasing == load_quality("accurate")["render"]["antialiasing"]
+    )
 
 
 def test_no_quality_changes_nothing(tmp_path):
@@ -56,7 +61,11 @@ def test_a_preset_is_resolved_in_what_is_written(tmp_path):
 def test_errors(tmp_path):
     with pytest.raises(ConfigError, match="quality: .*'fast', 'balanced', 'accurate' or 'reference'"):
         sequence(tmp_path, {"quality": "best"})
-    for bad, where in (({"timeline": 3}, "timeline"), ({"render": [1]}, "render"), ({"timeline": {"max_pxx": 1}}, "timeline.max_pxx")):
+    for bad, where in (
+        ({"timeline": 3}, "timeline"),
+        ({"render": [1]}, "render"),
+        ({"timeline": {"max_pxx": 1}}, "timeline.max_pxx"),
+    ):
         with pytest.raises(ConfigError, match=where):
             sequence(tmp_path, {"quality": "fast", **bad})
     with pytest.raises(ConfigError):

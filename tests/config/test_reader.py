@@ -14,27 +14,41 @@ from blinkgl.config.sequence import load_run
 from blinkgl.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
-BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi"))
-MERGE_BOMB = "a: &a {x: 1}\n" + "".join(f"{b}: &{b} {{<<: [{', '.join(['*' + a] * 9)}]}}\n" for a, b in zip("abcdefgh", "bcdefghi"))
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{b}: &{b} [{', '.join(['*' + a] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi")
+)
+MERGE_BOMB = "a: &a {x: 1}\n" + "".join(
+    f"{b}: &{b} {{<<: [{', '.join(['*' + a] * 9)}]}}\n" for a, b in zip("abcdefgh", "bcdefghi")
+)
 
 
-@pytest.mark.parametrize("text, problem", [
-    (BOMB, f"more than {MAX_VALUES} values, aliases expanded"),
-    (MERGE_BOMB, f"more than {MAX_VALUES} values, aliases expanded"),
-    ("[" * 100_000, f"more than {MAX_DEPTH} tables and lists inside one another"),
-    ("{a: " * 100_000, f"more than {MAX_DEPTH} tables and lists inside one another"),
-    ("a: &a [*a]", "alias 'a' is inside what it stands for"),
-    ("a: &a {b: {c: *a}}", "alias 'a' is inside what it stands for"),
-    ("seed: 0x" + "f" * 6000, "a number of 6002 digits"),
-    ("seed: 1." + "1" * 6000, "a number of 6002 digits"),
-    ("a: 1\nb: {c: 1, c: 2}", "key 'c' is given twice"),
-    ("a: {<<: {b: 1}, <<: {b: 2}}", "key '<<' is given twice"),
-    ("? [a]\n: 1", "a key is not plain text"), ("null: 1", "a key is not plain text"),
-    ("a: !!set {b}", "could not determine a constructor"), ("a: !!binary aGk=", "could not determine a constructor"),
-    ("a: !!python/name:os.system", "could not determine a constructor"),
-    ("a: !!int abc", "not a YAML int"), ("a: !!bool abc", "not a YAML bool"), ("a: !!map [1]", "not a table"), ("a: !!seq {b: 1}", "not a list"),
-    ("a: \ud800", "surrogates not allowed"), ("a: \x07", "control characters are not allowed"), ("a: 1\n---\nb: 2", "another document"),
-])
+@pytest.mark.parametrize(
+    "text, problem",
+    [
+        (BOMB, f"more than {MAX_VALUES} values, aliases expanded"),
+        (MERGE_BOMB, f"more than {MAX_VALUES} values, aliases expanded"),
+        ("[" * 100_000, f"more than {MAX_DEPTH} tables and lists inside one another"),
+        ("{a: " * 100_000, f"more than {MAX_DEPTH} tables and lists inside one another"),
+        ("a: &a [*a]", "alias 'a' is inside what it stands for"),
+        ("a: &a {b: {c: *a}}", "alias 'a' is inside what it stands for"),
+        ("seed: 0x" + "f" * 6000, "a number of 6002 digits"),
+        ("seed: 1." + "1" * 6000, "a number of 6002 digits"),
+        ("a: 1\nb: {c: 1, c: 2}", "key 'c' is given twice"),
+        ("a: {<<: {b: 1}, <<: {b: 2}}", "key '<<' is given twice"),
+        ("? [a]\n: 1", "a key is not plain text"),
+        ("null: 1", "a key is not plain text"),
+        ("a: !!set {b}", "could not determine a constructor"),
+        ("a: !!binary aGk=", "could not determine a constructor"),
+        ("a: !!python/name:os.system", "could not determine a constructor"),
+        ("a: !!int abc", "not a YAML int"),
+        ("a: !!bool abc", "not a YAML bool"),
+        ("a: !!map [1]", "not a table"),
+        ("a: !!seq {b: 1}", "not a list"),
+        ("a: \ud800", "surrogates not allowed"),
+        ("a: \x07", "control characters are not allowed"),
+        ("a: 1\n---\nb: 2", "another document"),
+    ],
+)
 def test_refused_at_once(text, problem):
     started = time.process_time()
     with pytest.raises(ConfigError) as caught:
@@ -51,20 +65,38 @@ def test_a_bomb_in_a_run_and_in_an_override(tmp_path):
         load_run(path)
     path.write_text("")
     with pytest.raises(ConfigError, match="--set scene:.*aliases expanded"):
-        load_run(path, ["scene=[&a [x,x,x,x,x,x,x,x,x,x]" + "".join(f", &{b} [{','.join(['*' + a] * 10)}]" for a, b in zip("abcdef", "bcdefg")) + "]"])
+        load_run(
+            path,
+            [
+                "scene=[&a [x,x,x,x,x,x,x,x,x,x]"
+                + "".join(f", &{b} [{','.join(['*' + a] * 10)}]" for a, b in zip("abcdef", "bcdefg"))
+                + "]"
+            ],
+        )
 
 
 def test_aliases_and_merge_keys_as_people_use_them():
-    text = ("base: &base {width: 3, height: 4}\nwide: {<<: *base, width: 9}\nboth: [*base, *base]\nmore: {<<: [{x: 1}, "
-            "*base]}")
-    assert parse_yaml(text, "") == {"base": {"width": 3, "height": 4}, "wide": {"width": 9, "height": 4},
-                                    "both": [{"width": 3, "height": 4}] * 2, "more": {"x": 1, "width": 3, "height": 4}}
+    text = (
+        "base: &base {width: 3, height: 4}\nwide: {<<: *base, width: 9}\nboth: [*base, *base]\nmore: {<<: [{x: 1}, "
+        "*base]}"
+    )
+    assert parse_yaml(text, "") == {
+        "base": {"width": 3, "height": 4},
+        "wide": {"width": 9, "height": 4},
+        "both": [{"width": 3, "height": 4}] * 2,
+        "more": {"x": 1, "width": 3, "height": 4},
+    }
     assert parse_yaml("a: 2026-01-01", "") == {"a": "2026-01-01"}, "text: nothing here is a date"
 
 
 def test_the_shipped_files_read_as_any_safe_loader_reads_them():
     folder = resources.files("blinkgl.configs")
-    files = [f for part in ("", "eflow", "quality", "sensors") for f in (folder / part if part else folder).iterdir() if f.name.endswith(".yaml")]
+    files = [
+        f
+        for part in ("", "eflow", "quality", "sensors")
+        for f in (folder / part if part else folder).iterdir()
+        if f.name.endswith(".yaml")
+    ]
     assert len(files) > 15
     for file in files:
         tree = read_yaml(str(file))
@@ -91,11 +123,13 @@ def test_files(tmp_path):
 
 
 def test_without_libyaml_the_same():
-    code = ("import sys; sys.modules['yaml._yaml'] = None; from blinkgl.config import reader\n"
-            "from yaml.parser import Parser; assert issubclass(reader._Loader, Parser), reader._Loader.__mro__\n"
-            "assert reader.parse_yaml('a: [1, {b: x}]', '') == {'a': [1, {'b': 'x'}]}\n"
-            f"try: reader.parse_yaml({BOMB!r}, 'f')\n"
-            "except Exception as error: print(error)")
+    code = (
+        "import sys; sys.modules['yaml._yaml'] = None; from blinkgl.config import reader\n"
+        "from yaml.parser import Parser; assert issubclass(reader._Loader, Parser), reader._Loader.__mro__\n"
+        "assert reader.parse_yaml('a: [1, {b: x}]', '') == {'a': [1, {'b': 'x'}]}\n"
+        f"try: reader.parse_yaml({BOMB!r}, 'f')\n"
+        "except Exception as error: print(error)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "aliases expanded" in done.stdout, done.stderr
 
@@ -104,5 +138,9 @@ def test_nobody_else_knows_yaml():
     """One reader: what holds for it holds for every file that is read."""
     own = {"blinkgl/config/reader.py"}
     sources = [p for room in ("blinkgl", "eflow", "tools") for p in (ROOT / room).rglob("*.py")]
-    found = {str(p.relative_to(ROOT)) for p in sources if any(line.split()[:2] in (["import", "yaml"], ["from", "yaml"]) for line in p.read_text().splitlines())}
+    found = {
+        str(p.relative_to(ROOT))
+        for p in sources
+        if any(line.split()[:2] in (["import", "yaml"], ["from", "yaml"]) for line in p.read_text().splitlines())
+    }
     assert found == own

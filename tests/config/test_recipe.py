@@ -22,23 +22,45 @@ def load(tmp_path, tree, overrides=()):
     return load_run(path, overrides)
 
 
-TREE = {"seed": 3, "camera": {"width": 64, "height": 48}, "events": {"emulator": "v2e", "cutoff_hz": {"log_uniform": [50, 500]}},
-        "groups": {"a": {"output": {"sequences": 3}}, "b": {"output": {"split": "test", "sequences": 2}, "camera": {"width": 80}}}}
+TREE = {
+    "seed": 3,
+    "camera": {"width": 64, "height": 48},
+    "events": {"emulator": "v2e", "cutoff_hz": {"log_uniform": [50, 500]}},
+    "groups": {
+        "a": {"output": {"sequences": 3}},
+        "b": {"output": {"split": "test", "sequences": 2}, "camera": {"width": 80}},
+    },
+}
 
 
 def test_groups_share_what_they_do_not_say(tmp_path):
     plan = Plan.of(load(tmp_path, TREE))
-    assert [t.name for t in plan.tasks] == ["train/a_000000", "train/a_000001", "train/a_000002", "test/b_000000", "test/b_000001"]
+    assert [t.name for t in plan.tasks] == [
+        "train/a_000000",
+        "train/a_000001",
+        "train/a_000002",
+        "test/b_000000",
+        "test/b_000001",
+    ]
     configs = {t.name: plan.config(t) for t in plan.tasks}
     assert {c.camera.height for c in configs.values()} == {48}
     assert [c.camera.width for c in configs.values()] == [64, 64, 64, 80, 80]
-    assert len({c.events.cutoff_hz for c in configs.values()}) == 5, "each sequence draws for itself, groups with seeds of their own"
+    assert len({c.events.cutoff_hz for c in configs.values()}) == 5, (
+        "each sequence draws for itself, groups with seeds of their own"
+    )
     assert [t.name for t in Plan.of(load(tmp_path, TREE), num=1).tasks] == ["train/a_000000", "test/b_000000"]
 
 
 def test_a_group_does_not_depend_on_the_others(tmp_path):
     before = {g.name: (g.template.sequence(1), g.identity) for g in all_groups(load(tmp_path, TREE))}
-    grown = {**TREE, "groups": {"new": {"output": {"name": "new"}}, "b": {**TREE["groups"]["b"], "output": {"split": "test", "sequences": 99}}, "a": TREE["groups"]["a"]}}
+    grown = {
+        **TREE,
+        "groups": {
+            "new": {"output": {"name": "new"}},
+            "b": {**TREE["groups"]["b"], "output": {"split": "test", "sequences": 99}},
+            "a": TREE["groups"]["a"],
+        },
+    }
     after = {g.name: (g.template.sequence(1), g.identity) for g in all_groups(load(tmp_path, grown))}
     assert after["a"] == before["a"]
     assert after["b"][1] == before["b"][1], "how many there are is no part of what they are"
@@ -48,42 +70,90 @@ def test_a_group_does_not_depend_on_the_others(tmp_path):
 
 def test_identity_knows_types_and_not_the_order_of_keys():
     identity = lambda tree: all_groups(RunTemplate(tree, Path()))[0].identity
-    assert identity({"seed": 1, "camera": {"width": 9, "height": 8}}) == identity({"camera": {"height": 8, "width": 9}, "seed": 1})
-    assert identity({"render": {"antialiasing": {"weighted": {"none": 1, "ssaa2": 1}}}}) != identity({"render": {"antialiasing": {"weighted": {"ssaa2": 1, "none": 2}}}})
+    assert identity({"seed": 1, "camera": {"width": 9, "height": 8}}) == identity(
+        {"camera": {"height": 8, "width": 9}, "seed": 1}
+    )
+    assert identity({"render": {"antialiasing": {"weighted": {"none": 1, "ssaa2": 1}}}}) != identity(
+        {"render": {"antialiasing": {"weighted": {"ssaa2": 1, "none": 2}}}}
+    )
 
 
 def test_tables_of_another_kind_replace():
     common = {"scene": {"kind": "random", "objects": {"count": 3}}, "events": {"emulator": "v2e", "cutoff_hz": 3}}
     own = {"scene": {"kind": "explicit", "camera": {}}, "events": {"shares": []}}
     assert merge(common, own) == own
-    assert merge(common, {"events": {"emulator": "v2e", "leak_rate_hz": 1}})["events"] == {"emulator": "v2e", "cutoff_hz": 3, "leak_rate_hz": 1}
+    assert merge(common, {"events": {"emulator": "v2e", "leak_rate_hz": 1}})["events"] == {
+        "emulator": "v2e",
+        "cutoff_hz": 3,
+        "leak_rate_hz": 1,
+    }
 
 
-@pytest.mark.parametrize("changes, message", [
-    ({"groups": {}}, "groups: not a table of groups"),
-    ({"groups": {"a": 3}}, "groups.a: not a group"),
-    ({"groups": {"a": {"enabled": "maybe"}}}, "groups.a.enabled: not a switch"),
-    ({"groups": {"a": {"output": {"name": "x"}}, "b": {"output": {"name": "x"}}}}, "groups.b.output: writes the same folders as group 'a'"),
-    ({"groups": {"a": {"camera": {"widht": 3}}}}, "camera.widht: in group 'a': unknown key; expected 'width' (nearest)"),
-    ({"groups": {"a": {"output": {"split": {"choice": ["train", "test"]}}}}}, "output: in group 'a': belongs to the whole run and cannot be drawn"),
-    ({"groups": {"a": {"enabled": False}}}, "groups: every group is switched off"),
-    ({"events": {"shares": [{"share": 0.8, "value": {"emulator": "v2e"}}, {"share": 0.3, "value": {"emulator": "voltmeter"}}]}},
-     "events.shares: in group 'a': the shares do not sum to 1"),
-    ({"events": {"shares": [{"share": 1.0}]}}, "events.shares: in group 'a': not a list of shares"),
-    ({"events": {"shares": [{"share": 0.5, "value": {"emulator": "v2e"}}, {"share": 0.5, "value": {"emulator": "blender"}}]}}, "events.emulator: in group 'a': unknown choice"),
-])
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"groups": {}}, "groups: not a table of groups"),
+        ({"groups": {"a": 3}}, "groups.a: not a group"),
+        ({"groups": {"a": {"enabled": "maybe"}}}, "groups.a.enabled: not a switch"),
+        (
+            {"groups": {"a": {"output": {"name": "x"}}, "b": {"output": {"name": "x"}}}},
+            "groups.b.output: writes the same folders as group 'a'",
+        ),
+        (
+            {"groups": {"a": {"camera": {"widht": 3}}}},
+            "camera.widht: in group 'a': unknown key; expected 'width' (nearest)",
+        ),
+        (
+            {"groups": {"a": {"output": {"split": {"choice": ["train", "test"]}}}}},
+            "output: in group 'a': belongs to the whole run and cannot be drawn",
+        ),
+        ({"groups": {"a": {"enabled": False}}}, "groups: every group is switched off"),
+        (
+            {
+                "events": {
+                    "shares": [
+                        {"share": 0.8, "value": {"emulator": "v2e"}},
+                        {"share": 0.3, "value": {"emulator": "voltmeter"}},
+                    ]
+                }
+            },
+            "events.shares: in group 'a': the shares do not sum to 1",
+        ),
+        ({"events": {"shares": [{"share": 1.0}]}}, "events.shares: in group 'a': not a list of shares"),
+        (
+            {
+                "events": {
+                    "shares": [
+                        {"share": 0.5, "value": {"emulator": "v2e"}},
+                        {"share": 0.5, "value": {"emulator": "blender"}},
+                    ]
+                }
+            },
+            "events.emulator: in group 'a': unknown choice",
+        ),
+    ],
+)
 def test_bad_recipes(tmp_path, changes, message):
     with pytest.raises(ConfigError) as error:
         Plan.of(load(tmp_path, {**TREE, **changes}))
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("scene, message", [
-    ({"pool": {"primitives": [], "folders": []}}, "in group 'a': the pool of meshes is empty"),
-    ({"pool": {"primitives": ["cuboid"], "variants": 2, "test_fraction": 0.01}}, "in group 'b': none of the 2 meshes falls to split 'test'"),
-    ({"textures": {"procedural": ["checks"], "variants": 1, "photographs": False, "test_fraction": 0.0}}, "in group 'b': none of the 1 textures falls to split 'test'"),
-    ({"pool": {"folders": ["nowhere"]}}, "in group 'a': no such folder"),
-])
+@pytest.mark.parametrize(
+    "scene, message",
+    [
+        ({"pool": {"primitives": [], "folders": []}}, "in group 'a': the pool of meshes is empty"),
+        (
+            {"pool": {"primitives": ["cuboid"], "variants": 2, "test_fraction": 0.01}},
+            "in group 'b': none of the 2 meshes falls to split 'test'",
+        ),
+        (
+            {"textures": {"procedural": ["checks"], "variants": 1, "photographs": False, "test_fraction": 0.0}},
+            "in group 'b': none of the 1 textures falls to split 'test'",
+        ),
+        ({"pool": {"folders": ["nowhere"]}}, "in group 'a': no such folder"),
+    ],
+)
 def test_pools_that_cannot_serve_the_split(tmp_path, scene, message):
     with pytest.raises(ConfigError) as error:
         Plan.of(load(tmp_path, {**TREE, "scene": {"kind": "random", **scene}})).check_assets()
@@ -93,13 +163,22 @@ def test_pools_that_cannot_serve_the_split(tmp_path, scene, message):
 def test_shares_are_dealt_out():
     """Any stretch of n sequences has n * share of each, within two, for every seed; twice the
     same; independent of where it starts."""
-    tree = {"x": {"shares": [{"share": 0.5, "value": "a"}, {"share": 0.3, "value": "b"}, {"share": 0.2, "value": "c"}, {"share": 0.0, "value": "never"}]}}
+    tree = {
+        "x": {
+            "shares": [
+                {"share": 0.5, "value": "a"},
+                {"share": 0.3, "value": "b"},
+                {"share": 0.2, "value": "c"},
+                {"share": 0.0, "value": "never"},
+            ]
+        }
+    }
     worst = 0.0
     for seed in range(6):
         values = [draw(tree, seed, i)["x"] for i in range(400)]
         for n in (10, 40, 200):
             for begin in range(0, 400 - n, 37):
-                counted = Counter(values[begin:begin + n])
+                counted = Counter(values[begin : begin + n])
                 worst = max(worst, *(abs(counted[k] - n * s) for k, s in (("a", 0.5), ("b", 0.3), ("c", 0.2))))
         assert "never" not in values
     assert worst < 3
@@ -107,16 +186,21 @@ def test_shares_are_dealt_out():
     np.testing.assert_allclose([starts.count(k) / 600 for k in "abc"], [0.5, 0.3, 0.2], atol=0.07)  # 3.5 sigma
 
 
-@pytest.mark.parametrize("name, counts", [
-    ("blinkflow", {("train", "v2e"): 2689, ("train", "voltmeter"): 673, ("test", "voltmeter"): 205}),
-    ("blinkflow_mini", {("train", "v2e"): 13, ("train", "voltmeter"): 3, ("test", "voltmeter"): 4}),
-])
+@pytest.mark.parametrize(
+    "name, counts",
+    [
+        ("blinkflow", {("train", "v2e"): 2689, ("train", "voltmeter"): 673, ("test", "voltmeter"): 205}),
+        ("blinkflow_mini", {("train", "v2e"): 13, ("train", "voltmeter"): 3, ("test", "voltmeter"): 4}),
+    ],
+)
 def test_shipped_recipes(name, counts):
     plan = Plan.of(load_run(CONFIGS / f"{name}.yaml"))
     plan.check_assets()
     drawn = [plan.by_name[t.group].template for t in plan.tasks]
-    emulators = Counter((t.name.split("/")[0], draw({"events": template.tree["events"]}, template.seed, t.index)["events"]["emulator"])
-                        for t, template in zip(plan.tasks, drawn, strict=True))
+    emulators = Counter(
+        (t.name.split("/")[0], draw({"events": template.tree["events"]}, template.seed, t.index)["events"]["emulator"])
+        for t, template in zip(plan.tasks, drawn, strict=True)
+    )
     for key, expected in counts.items():
         assert abs(emulators[key] - expected) <= 2
     assert sum(emulators.values()) == sum(counts.values())

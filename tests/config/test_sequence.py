@@ -48,27 +48,47 @@ def test_resolved_yaml_makes_the_same_sequence(tmp_path):
 
 def test_overrides_reach_nested_keys_lists_and_absent_tables(tmp_path):
     path = write(tmp_path, "camera: {width: 64, height: 48}")
-    run = load_run(path, ["camera.width=32", "time.duration=0.5", "labels.flow=[forward, backward]", "labels.flow.1=forward",
-                          "timeline={kind: uniform, fps: 1e2}"], seed=9)
+    run = load_run(
+        path,
+        [
+            "camera.width=32",
+            "time.duration=0.5",
+            "labels.flow=[forward, backward]",
+            "labels.flow.1=forward",
+            "timeline={kind: uniform, fps: 1e2}",
+        ],
+        seed=9,
+    )
     config = run.sequence(0)
-    assert (config.camera.width, config.time.duration, config.labels.flow, config.seed) == (32, 0.5, ("forward", "forward"), 9)
+    assert (config.camera.width, config.time.duration, config.labels.flow, config.seed) == (
+        32,
+        0.5,
+        ("forward", "forward"),
+        9,
+    )
     assert config.timeline.kind == "uniform" and config.timeline.fps == 100.0
 
 
-@pytest.mark.parametrize("text, kind, changed", [
-    ("events: {contrast_threshold: 0.3}", "esim", ("events", "contrast_threshold", 0.3)),
-    ("timeline: {max_px: 1}", "displacement", ("timeline", "max_px", 1)),
-    ("scene: {background: 0.5}", "random", ("scene", "background", 0.5)),
-    ("quality: accurate\ntimeline: {max_step_us: 9000}", None, ("timeline", "max_step_us", 9000)),
-    ("sensor: davis346\nevents: {log_eps: 0.01}", "esim", ("events", "log_eps", 0.01)),
-    ("sensor: davis346\nreadout: {row_ns: 7}", None, ("readout", "row_ns", 7)),
-])
+@pytest.mark.parametrize(
+    "text, kind, changed",
+    [
+        ("events: {contrast_threshold: 0.3}", "esim", ("events", "contrast_threshold", 0.3)),
+        ("timeline: {max_px: 1}", "displacement", ("timeline", "max_px", 1)),
+        ("scene: {background: 0.5}", "random", ("scene", "background", 0.5)),
+        ("quality: accurate\ntimeline: {max_step_us: 9000}", None, ("timeline", "max_step_us", 9000)),
+        ("sensor: davis346\nevents: {log_eps: 0.01}", "esim", ("events", "log_eps", 0.01)),
+        ("sensor: davis346\nreadout: {row_ns: 7}", None, ("readout", "row_ns", 7)),
+    ],
+)
 def test_a_table_may_say_only_what_it_changes(tmp_path, text, kind, changed):
     config = load_run(write(tmp_path, text)).sequence(0)
     table, key, value = changed
     assert getattr(getattr(config, table), key) == value
     if kind is not None:
-        assert kind in (getattr(getattr(config, table), "kind", None), getattr(getattr(config, table), "emulator", None))
+        assert kind in (
+            getattr(getattr(config, table), "kind", None),
+            getattr(getattr(config, table), "emulator", None),
+        )
     assert load_run(write(tmp_path, "scene: {objects: {count: 3}}")).sequence(0).scene.objects.count == 3
 
 
@@ -85,9 +105,17 @@ def test_one_reading_of_the_seed(tmp_path, given):
     assert all_groups(run)[0].identity == all_groups(known)[0].identity
 
 
-@pytest.mark.parametrize("given, message", [("{integer: [1, 9]}", "seed: belongs to the whole run and cannot be drawn"), ("2.5", "seed: not a whole number"),
-                                            ("null", "seed: not a whole number"), ("0x" + "f" * 6000, "not valid YAML: a number of 6002 digits"),
-                                            ("'" + "9" * 5000 + "'", "seed: too many digits"), ("99999999999999999999", "seed: too large")])
+@pytest.mark.parametrize(
+    "given, message",
+    [
+        ("{integer: [1, 9]}", "seed: belongs to the whole run and cannot be drawn"),
+        ("2.5", "seed: not a whole number"),
+        ("null", "seed: not a whole number"),
+        ("0x" + "f" * 6000, "not valid YAML: a number of 6002 digits"),
+        ("'" + "9" * 5000 + "'", "seed: too many digits"),
+        ("99999999999999999999", "seed: too large"),
+    ],
+)
 def test_seeds_that_are_none(tmp_path, given, message):
     for text in (f"seed: {given}", f"groups: {{a: {{seed: {given}}}}}"):
         with pytest.raises(ConfigError) as caught:
@@ -95,13 +123,25 @@ def test_seeds_that_are_none(tmp_path, given, message):
         assert message.split(": ", 1)[1] in str(caught.value).replace("in group 'a': ", "")
 
 
-@pytest.mark.parametrize("time, message", [
-    ("{duration: 5000}", ("time.duration: with one label interval before and one after, 5000.1 s are more than the 4295.0 s "
-                          "(71.6 minutes)")),
-    ("{duration: 4000, label_rate: 0.001}", "time.duration: with one label interval"),
-    ("{duration: 100, label_rate: 1e5}", "time.label_rate: 10000000 labels (got 100000.0); expected duration * label_rate of at most 1000000"),
-    ("{start: 1.1e7}", "time.start: too large"), ("{start: 9e6}\nreadout: {events_per_second: 1e6}", "time.start: too late for the read-out"),
-])
+@pytest.mark.parametrize(
+    "time, message",
+    [
+        (
+            "{duration: 5000}",
+            (
+                "time.duration: with one label interval before and one after, 5000.1 s are more than the 4295.0 s "
+                "(71.6 minutes)"
+            ),
+        ),
+        ("{duration: 4000, label_rate: 0.001}", "time.duration: with one label interval"),
+        (
+            "{duration: 100, label_rate: 1e5}",
+            "time.label_rate: 10000000 labels (got 100000.0); expected duration * label_rate of at most 1000000",
+        ),
+        ("{start: 1.1e7}", "time.start: too large"),
+        ("{start: 9e6}\nreadout: {events_per_second: 1e6}", "time.start: too late for the read-out"),
+    ],
+)
 def test_what_no_file_can_hold_is_known_when_it_is_read(tmp_path, time, message):
     with pytest.raises(ConfigError) as caught:
         load_run(write(tmp_path, f"time: {time}"))
@@ -147,32 +187,71 @@ def test_field_of_view_is_horizontal_and_the_principal_point_the_centre():
     assert CameraConfig(focal=77, cx=3, near=2).model == PinHole(346, 260, 77, 77, 3, 129.5, 2)
 
 
-@pytest.mark.parametrize("text, message", [
-    ("camra: {width: 3}", "camra: unknown key; expected 'camera' (nearest)"),
-    ("camera: {widht: 3}", "camera.widht: unknown key; expected 'width' (nearest)"),
-    ("scene: {kind: random, objects: {cuont: 3}}", "scene.objects.cuont: unknown key; expected 'count' (nearest)"),
-    ("events: {emulator: esim, contrast_treshold: 0.2}", "events.contrast_treshold: unknown key; expected 'contrast_threshold' (nearest)"),
-    ("camera: {width: many}", "camera.width: not a whole number (got 'many'); expected a whole number from 1 to 16384"),
-    ("camera: {width: 0}", "camera.width: too small (got 0); expected a whole number from 1 to 16384"),
-    ("camera: 7", "camera: not a table of keys (got 7)"),
-    ("camera: {fov: 60, focal: 200}", "camera: give fov or focal, not both"),
-    ("camera: {fov: .nan}", ("camera.fov: not a finite number (got nan); expected a number greater than 0.01 and less than 179.9, "
-                             "or null")),
-    ("time: {duration: -1}", "time.duration: too small (got -1); expected a number greater than 0 and at most 172800"),
-    ("time: {duration: 0.01}", "time: duration * label_rate must be at least 1 label"),
-    ("timeline: {kind: regular}", "timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement'"),
-    ("timeline: {kind: budget}", "timeline: give max_time_error_us or max_time_error_px, one of the two"),
-    ("timeline: {reconstruction: pchip, kind: uniform}\nevents: {emulator: v2e}",
-     ("timeline.reconstruction: v2e follows straight lines alone (got 'pchip'); expected linear, or "
-     "events.emulator: esim")),
-    ("timeline: {kind: uniform, reconstruction: spline}", "timeline.reconstruction: unknown choice (got 'spline'); expected 'linear', 'pchip' or 'hermite'"),
-    ("timeline: {kind: displacement, min_step_us: 5, max_step_us: 4}", "timeline: min_step_us must not exceed max_step_us = 4.0"),
-    ("events: {emulator: easim}", "events.emulator: unknown choice (got 'easim')"),
-    ("labels: {flow: [sideways]}", "labels.flow.0: unknown choice (got 'sideways'); expected 'forward' or 'backward'"),
-    ("output: {name: ../escape}", "output.name: not a name for folders (got '../escape'); expected a letter or digit, then"),
-    ("seed: -1", "seed: too small (got -1)"),
-    ("events: {emulator: esim, contrast_threshold: {uniform: [0.1, 11]}}", "events.contrast_threshold: too large (got 11.0); expected a number from 0.001 to 10"),
-])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("camra: {width: 3}", "camra: unknown key; expected 'camera' (nearest)"),
+        ("camera: {widht: 3}", "camera.widht: unknown key; expected 'width' (nearest)"),
+        ("scene: {kind: random, objects: {cuont: 3}}", "scene.objects.cuont: unknown key; expected 'count' (nearest)"),
+        (
+            "events: {emulator: esim, contrast_treshold: 0.2}",
+            "events.contrast_treshold: unknown key; expected 'contrast_threshold' (nearest)",
+        ),
+        (
+            "camera: {width: many}",
+            "camera.width: not a whole number (got 'many'); expected a whole number from 1 to 16384",
+        ),
+        ("camera: {width: 0}", "camera.width: too small (got 0); expected a whole number from 1 to 16384"),
+        ("camera: 7", "camera: not a table of keys (got 7)"),
+        ("camera: {fov: 60, focal: 200}", "camera: give fov or focal, not both"),
+        (
+            "camera: {fov: .nan}",
+            (
+                "camera.fov: not a finite number (got nan); expected a number greater than 0.01 and less than 179.9, "
+                "or null"
+            ),
+        ),
+        (
+            "time: {duration: -1}",
+            "time.duration: too small (got -1); expected a number greater than 0 and at most 172800",
+        ),
+        ("time: {duration: 0.01}", "time: duration * label_rate must be at least 1 label"),
+        (
+            "timeline: {kind: regular}",
+            "timeline.kind: unknown choice (got 'regular'); expected one of 'uniform', 'displacement'",
+        ),
+        ("timeline: {kind: budget}", "timeline: give max_time_error_us or max_time_error_px, one of the two"),
+        (
+            "timeline: {reconstruction: pchip, kind: uniform}\nevents: {emulator: v2e}",
+            (
+                "timeline.reconstruction: v2e follows straight lines alone (got 'pchip'); expected linear, or "
+                "events.emulator: esim"
+            ),
+        ),
+        (
+            "timeline: {kind: uniform, reconstruction: spline}",
+            "timeline.reconstruction: unknown choice (got 'spline'); expected 'linear', 'pchip' or 'hermite'",
+        ),
+        (
+            "timeline: {kind: displacement, min_step_us: 5, max_step_us: 4}",
+            "timeline: min_step_us must not exceed max_step_us = 4.0",
+        ),
+        ("events: {emulator: easim}", "events.emulator: unknown choice (got 'easim')"),
+        (
+            "labels: {flow: [sideways]}",
+            "labels.flow.0: unknown choice (got 'sideways'); expected 'forward' or 'backward'",
+        ),
+        (
+            "output: {name: ../escape}",
+            "output.name: not a name for folders (got '../escape'); expected a letter or digit, then",
+        ),
+        ("seed: -1", "seed: too small (got -1)"),
+        (
+            "events: {emulator: esim, contrast_threshold: {uniform: [0.1, 11]}}",
+            "events.contrast_threshold: too large (got 11.0); expected a number from 0.001 to 10",
+        ),
+    ],
+)
 def test_bad_values_name_path_value_and_what_is_accepted(tmp_path, text, message):
     with pytest.raises(ConfigError) as caught:
         load_run(write(tmp_path, text))
@@ -180,12 +259,15 @@ def test_bad_values_name_path_value_and_what_is_accepted(tmp_path, text, message
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text, message", [
-    ("a: [1, 2", ":2:1: not valid YAML"),
-    ("camera: {width: 3}\ncamera: {width: 4}", ":2:1: not valid YAML: key 'camera' is given twice"),
-    ("- 1\n- 2", ": not a table of keys"),
-    ("a: !!python/object/apply:os.system [echo]", ":1:4: not valid YAML: could not determine a constructor"),
-])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("a: [1, 2", ":2:1: not valid YAML"),
+        ("camera: {width: 3}\ncamera: {width: 4}", ":2:1: not valid YAML: key 'camera' is given twice"),
+        ("- 1\n- 2", ": not a table of keys"),
+        ("a: !!python/object/apply:os.system [echo]", ":1:4: not valid YAML: could not determine a constructor"),
+    ],
+)
 def test_files_that_are_no_configuration(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(ConfigError) as caught:
@@ -207,12 +289,16 @@ def test_missing_binary_and_huge_files(tmp_path):
         load_run(tmp_path)
 
 
-@pytest.mark.parametrize("option, message", [
-    ("camera.width", "--set: not an override"), ("=3", "--set: not an override"),
-    ("camera.width.x=3", "--set camera.width: is a plain value and has no keys"),
-    ("labels.flow.5=forward", "--set labels.flow.5: no such list entry"),
-    ("camera.width=[", "--set camera.width:2:1: not valid YAML"),
-])
+@pytest.mark.parametrize(
+    "option, message",
+    [
+        ("camera.width", "--set: not an override"),
+        ("=3", "--set: not an override"),
+        ("camera.width.x=3", "--set camera.width: is a plain value and has no keys"),
+        ("labels.flow.5=forward", "--set labels.flow.5: no such list entry"),
+        ("camera.width=[", "--set camera.width:2:1: not valid YAML"),
+    ],
+)
 def test_bad_overrides(tmp_path, option, message):
     with pytest.raises(ConfigError) as caught:
         load_run(write(tmp_path, "camera: {width: 3}\nlabels: {flow: [forward]}"), [option])
@@ -225,7 +311,9 @@ def test_a_named_sensor_fills_in_what_is_not_said(tmp_path):
     assert config.events.contrast_threshold == 0.3, "what is said wins"
     assert config.events.refractory_us == 500 and config.events.leak_rate_hz == 0.1
     assert config.readout.events_per_second == 12e6
-    bare = load_run(write(tmp_path, "sensor: imx636\ncamera: {width: 320, height: 180, fov: 50}\nreadout: null")).sequence(0)
+    bare = load_run(
+        write(tmp_path, "sensor: imx636\ncamera: {width: 320, height: 180, fov: 50}\nreadout: null")
+    ).sequence(0)
     assert (bare.camera.width, bare.camera.fov, bare.readout) == (320, 50, None) and bare.events.emulator == "esim"
 
 

@@ -27,7 +27,10 @@ from blinkgl.labels import LABELS, asked_for
 from blinkgl.report import write_report
 from blinkgl.report.collect import collect
 
-LEFT_OUT = {label.heading: label.forms[0].folder + "/" for label in LABELS.values()} | {"occlusion masks": "occlusion/", "preview": "preview.mp4"}
+LEFT_OUT = {label.heading: label.forms[0].folder + "/" for label in LABELS.values()} | {
+    "occlusion masks": "occlusion/",
+    "preview": "preview.mp4",
+}
 """What explain says is left out -> how the names of its files would begin."""
 
 
@@ -49,17 +52,28 @@ def of_data_set(out: Path, made: dict[str, SequenceReport], scratch: Path) -> Fi
     found = Findings()
     verified = verify_dataset(out, deep=len(made))
     found.expect(verified.clean and not verified.notes, f"verify: {verified.problems} {verified.notes}")
-    found.same("sequences", run=sorted(made), verify=sorted(verified.deep), index=[line["path"] for line in read_index(out)])
+    found.same(
+        "sequences", run=sorted(made), verify=sorted(verified.deep), index=[line["path"] for line in read_index(out)]
+    )
     page = write_report(out, scratch / "report.html")
     told = collect(out)
-    found.expect(page.stat().st_size > 1000 and not told.unreadable and not told.failed, f"report: {told.unreadable} {told.failed}")
+    found.expect(
+        page.stat().st_size > 1000 and not told.unreadable and not told.failed,
+        f"report: {told.unreadable} {told.failed}",
+    )
     found.same("index", report=told.sequences, index=read_index(out))
     found.expect(verify_dataset(out).clean, "verify after the report")
     lines, costs = {line["path"]: line for line in told.sequences}, {line["name"]: line for line in told.costs}
     for name, report in made.items():
         manifest = read_manifest(out / name)
         for key in ("events", "labels", "frames"):
-            found.same(f"{name}: {key}", run=getattr(report, key), manifest=manifest[key], index=lines[name][key], costs=costs[name][key])
+            found.same(
+                f"{name}: {key}",
+                run=getattr(report, key),
+                manifest=manifest[key],
+                index=lines[name][key],
+                costs=costs[name][key],
+            )
         found += [f"{name}: {line}" for line in of_sequence(out / name, manifest)]
     rates = [1e6 * line["events"] / line["duration_us"] / (line["height"] * line["width"]) for line in told.sequences]
     found.expect(np.allclose(told.quantities["rate"], rates), "report: event rates")
@@ -75,22 +89,39 @@ def of_sequence(folder: Path, manifest: dict[str, Any]) -> Findings:
     with DsecEventReader(folder / "events.h5") as reader:
         chunks = list(reader.chunks())
         count = sum(map(len, chunks))
-        found.same("events", manifest=manifest["events"], file=count, window=len(reader.slice(manifest["t_offset_us"], end + 1)))
+        found.same(
+            "events",
+            manifest=manifest["events"],
+            file=count,
+            window=len(reader.slice(manifest["t_offset_us"], end + 1)),
+        )
         found.expect(count > 0, "no events: the row says nothing")
-        found.expect(all((c.t >= manifest["t_offset_us"]).all() and (c.t <= end).all() for c in chunks), "events outside the recording")
+        found.expect(
+            all((c.t >= manifest["t_offset_us"]).all() and (c.t <= end).all() for c in chunks),
+            "events outside the recording",
+        )
     lost = manifest["events_lost_in_readout"] + manifest["events_late_in_readout"]
     if config.readout is None or config.readout.events_per_second >= 1e6:
         found.expect(lost == 0, f"{lost} events lost without a limit")
     else:
-        found.expect(lost > 0 or 2e6 * count < config.readout.events_per_second * manifest["duration_us"], "a slow bus loses nothing")
+        found.expect(
+            lost > 0 or 2e6 * count < config.readout.events_per_second * manifest["duration_us"],
+            "a slow bus loses nothing",
+        )
     for direction in ("forward", "backward"):
         for path in sorted((folder / f"flow/{direction}").glob("*.png")):
             flow, valid = read_flow_png(path)
             if (npy := folder / f"flow/{direction}_npy/{path.stem}.npy").is_file():
                 exact = np.load(npy)
-                found.expect(np.abs(exact[..., :2] - flow)[valid].max(initial=0) <= 0.5 / 128 + 1e-5, f"{npy.name}: PNG and npy differ")
+                found.expect(
+                    np.abs(exact[..., :2] - flow)[valid].max(initial=0) <= 0.5 / 128 + 1e-5,
+                    f"{npy.name}: PNG and npy differ",
+                )
             if (flo := folder / f"flow/{direction}_flo/{path.stem}.flo").is_file():
-                found.expect(np.abs(read_flo(flo)[0] - flow)[valid].max(initial=0) <= 0.5 / 128 + 1e-5, f"{flo.name}: PNG and flo differ")
+                found.expect(
+                    np.abs(read_flo(flo)[0] - flow)[valid].max(initial=0) <= 0.5 / 128 + 1e-5,
+                    f"{flo.name}: PNG and flo differ",
+                )
     return found
 
 
@@ -114,19 +145,27 @@ def _readers(out: Path, shards: Path) -> Findings:
         sequence, entry = source.entry(number)
         given, shard = source[number], samples[f"{sequence.events.parent.name}_{entry.index:06d}"]
         about = json.loads(shard["json"])
-        found.same(f"{given.name}: interval", eflow=[entry.from_us, entry.to_us], export=[about["from_us"], about["to_us"]])
+        found.same(
+            f"{given.name}: interval", eflow=[entry.from_us, entry.to_us], export=[about["from_us"], about["to_us"]]
+        )
         for which, window in (("old", given.old), ("new", given.new)):
             with np.load(io.BytesIO(shard[f"{which}.npz"]), allow_pickle=False) as columns:
-                found.expect(all(np.array_equal(columns[k], getattr(window, k)) for k in "xytp"), f"{given.name}: {which} window")
+                found.expect(
+                    all(np.array_equal(columns[k], getattr(window, k)) for k in "xytp"), f"{given.name}: {which} window"
+                )
             spans = seen.setdefault(sequence.events, set())
             if (window.t0, window.t1) not in spans:
                 spans.add((window.t0, window.t1))
                 total[sequence.events] = total.get(sequence.events, 0) + len(window)
-        found.expect(given.flow.shape == (given.height, given.width, 2) and np.isfinite(given.flow).all(), f"{given.name}: flow")
+        found.expect(
+            given.flow.shape == (given.height, given.width, 2) and np.isfinite(given.flow).all(), f"{given.name}: flow"
+        )
     for events, count in total.items():
         manifest = read_manifest(events.parent)
         spans, end = sorted(seen[events]), manifest["t_offset_us"] + manifest["duration_us"]
-        whole = spans[0][0] <= manifest["t_offset_us"] and all(b[0] - a[1] in (0, -1) for a, b in itertools.pairwise(spans))
+        whole = spans[0][0] <= manifest["t_offset_us"] and all(
+            b[0] - a[1] in (0, -1) for a, b in itertools.pairwise(spans)
+        )
         with DsecEventReader(events) as reader:
             last = len(reader.slice(end, end + 1))
             twice = sum(len(reader.slice(b[0], a[1])) for a, b in itertools.pairwise(spans))
@@ -147,33 +186,52 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
             found.expect(not any(name.startswith(prefix) for name in files), f"frames: {prefix} are there")
             continue
         there = any(name.startswith(prefix) for name in files)
-        found.expect(there != (what in out), f"explain: {what} {'is' if what in out else 'is not'} left out, files {'are' if there else 'are not'} "
-                                             "there")
+        found.expect(
+            there != (what in out),
+            f"explain: {what} {'is' if what in out else 'is not'} left out, files {'are' if there else 'are not'} "
+            "there",
+        )
     found.expect(("the sensor's read-out" in out) == (config.readout is None), "explain: read-out")
     if recorded:
         found.same("emulator", explain=passes["frames and event kernel"].variants[0], manifest=manifest["emulator"])
-        found.same("size", explain=told.scene["frames"].split(", ")[1], manifest=f"{manifest['width']}x{manifest['height']}")
+        found.same(
+            "size", explain=told.scene["frames"].split(", ")[1], manifest=f"{manifest['width']}x{manifest['height']}"
+        )
         found.same("event frames", explain=told.frames, manifest=manifest["frames"])
         return found
     count = lambda prefix, ending: sum(n.startswith(prefix) and n.endswith(ending) for n in files)
     events = next(p for name, p in passes.items() if name.startswith("event frames"))
     wanted = asked_for(config.labels).without("images")
     found.same("images", explain=passes["colour"].count if "colour" in passes else 0, files=count("images/", ".png"))
-    found.same("labels", explain=passes["labels"].count if "labels" in passes else 0, manifest=manifest["labels"] if wanted else 0)
+    found.same(
+        "labels",
+        explain=passes["labels"].count if "labels" in passes else 0,
+        manifest=manifest["labels"] if wanted else 0,
+    )
     found.same("preview", explain="preview" in passes, files="preview.mp4" in files)
     found.same("triangles", explain=told.scene["triangles"].split()[0], manifest=f"{manifest['triangles']:,}")
-    found.expect(told.scene["camera"].startswith(f"{manifest['width']}x{manifest['height']},"), f"explain: camera {told.scene['camera']}")
+    found.expect(
+        told.scene["camera"].startswith(f"{manifest['width']}x{manifest['height']},"),
+        f"explain: camera {told.scene['camera']}",
+    )
     found.same("emulator", explain=passes["event kernel"].variants[0], manifest=manifest["emulator"])
     found.same("timeline", explain=events.why.split()[1].strip(","), manifest=manifest["timeline"]["kind"])
-    found.same("rates", explain="event frames with rates" in passes, manifest=manifest["timeline"]["reconstruction"] == "hermite")
+    found.same(
+        "rates",
+        explain="event frames with rates" in passes,
+        manifest=manifest["timeline"]["reconstruction"] == "hermite",
+    )
     if config.timeline.kind == "uniform":
         found.same("event frames", explain=told.frames, manifest=manifest["frames"])
     else:
         # An estimate, from the pace at a few moments of a clip of 40 ms.
         low, high = sorted((told.frames, manifest["frames"]))
         found.expect(high <= 10 + 6 * low, f"event frames: explain {told.frames}, made {manifest['frames']}")
-    for what, off in (("level of detail", not config.render.lod.enabled), ("anisotropic filtering", config.render.anisotropy == 1),
-                      ("anti-aliasing of event frames", config.render.antialiasing == "none"),
-                      ("rates of change in the event frames", config.timeline.reconstruction != "hermite")):
+    for what, off in (
+        ("level of detail", not config.render.lod.enabled),
+        ("anisotropic filtering", config.render.anisotropy == 1),
+        ("anti-aliasing of event frames", config.render.antialiasing == "none"),
+        ("rates of change in the event frames", config.timeline.reconstruction != "hermite"),
+    ):
         found.expect((what in out) == off, f"explain: {what}")
     return found

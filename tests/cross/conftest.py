@@ -38,7 +38,9 @@ def scene_file(path: Path) -> None:
     builder, rng = GltfBuilder(), np.random.default_rng(0)
     for n in range(6):
         colour = [*rng.uniform(0, 1, 3), 1]
-        builder.tree.setdefault("materials", []).append({"pbrMetallicRoughness": {"baseColorFactor": colour, "metallicFactor": 0}, "doubleSided": True})
+        builder.tree.setdefault("materials", []).append(
+            {"pbrMetallicRoughness": {"baseColorFactor": colour, "metallicFactor": 0}, "doubleSided": True}
+        )
         corners = rng.uniform(-1, 1, (3, 3)) * [0.3, 1, 1] + [0, rng.uniform(-1, 1), rng.uniform(-1, 1)]
         builder.node(mesh=builder.mesh(corners, [[0, 1, 2]], material=n))
     path.write_bytes(builder.glb())
@@ -50,16 +52,18 @@ def frame_folder(folder: Path, seed: int) -> None:
 
     for name in ("image_left", "flow", "flow_flo"):
         (folder / name).mkdir(parents=True)
-    texture = cv2.GaussianBlur(np.random.default_rng(seed).random((4 * HEIGHT, 4 * WIDTH)).astype(np.float32), (0, 0), 1.5)
+    texture = cv2.GaussianBlur(
+        np.random.default_rng(seed).random((4 * HEIGHT, 4 * WIDTH)).astype(np.float32), (0, 0), 1.5
+    )
     texture = (texture - texture.min()) / np.ptp(texture)
     for k in range(FRAMES):
         move = np.float32([[1, 0, k * SHIFT[0] - WIDTH], [0, 1, k * SHIFT[1] - HEIGHT]])
         image = cv2.warpAffine(texture, move, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR)
-        cv2.imwrite(str(folder / f"image_left/{k:06d}.png"), np.repeat((image * 255).astype(np.uint8)[..., None], 3, axis=2))
+        cv2.imwrite(
+            str(folder / f"image_left/{k:06d}.png"), np.repeat((image * 255).astype(np.uint8)[..., None], 3, axis=2)
+        )
     for k in range(FRAMES - 1):
         flow, valid = np.broadcast_to(np.float32(SHIFT), (HEIGHT, WIDTH, 2)), np.ones((HEIGHT, WIDTH), bool)
         np.save(folder / f"flow/{k:06d}.npy", flow)
         np.save(folder / f"flow/{k:06d}_mask.npy", np.eye(HEIGHT, WIDTH, dtype=np.uint8))
         (folder / f"flow_flo/{k:06d}.flo").write_bytes(encode_flo(flow, valid))
-
-

@@ -22,19 +22,41 @@ from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 
 WIDTH, HEIGHT, FPS = 32, 24, 100
-_POOLS = {"pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
-          "textures": {"procedural": ["checks", "fbm"], "variants": 8, "photographs": False, "max_size": 32, "test_fraction": 0.3}}
+_POOLS = {
+    "pool": {"primitives": ["cuboid", "sphere"], "variants": 8, "urdfs": False, "test_fraction": 0.3},
+    "textures": {
+        "procedural": ["checks", "fbm"],
+        "variants": 8,
+        "photographs": False,
+        "max_size": 32,
+        "test_fraction": 0.3,
+    },
+}
 _FAST = {"speed": [2, 5], "rotation_rate": [60, 200]}
-_RANDOM = {"kind": "random", **_POOLS, "objects": {"count": 3, "distance": [2, 5]}, "camera_motion": _FAST, "object_motion": _FAST}
+_RANDOM = {
+    "kind": "random",
+    **_POOLS,
+    "objects": {"count": 3, "distance": [2, 5]},
+    "camera_motion": _FAST,
+    "object_motion": _FAST,
+}
 _KEYED = {"keyframes": [{"time": t, "position": [0, 20 * t, 0.1]} for t in (0, 4)], "interpolation": "linear"}
 _CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * t, 0], "look_at": [0, 14 * t, 0]} for t in (0, 2, 4)]}
-_EXPLICIT = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
-             "materials": {"checks": {"procedural": "checks", "max_size": 32}},
-             "objects": [{"mesh": "box", "material": "checks", **_KEYED}, {"mesh": "ball", "position": [1, 0, 0]}], "camera": _CAMERA}
+_EXPLICIT = {
+    "kind": "explicit",
+    "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
+    "materials": {"checks": {"procedural": "checks", "max_size": 32}},
+    "objects": [{"mesh": "box", "material": "checks", **_KEYED}, {"mesh": "ball", "position": [1, 0, 0]}],
+    "camera": _CAMERA,
+}
 _FILE = {"kind": "file", "path": "scene.glb", "pose": _CAMERA}
 
-BASE = {"camera": {"width": WIDTH, "height": HEIGHT}, "time": {"duration": 0.03, "label_rate": FPS}, "scene": _RANDOM,
-        "preview": {"enabled": False}}
+BASE = {
+    "camera": {"width": WIDTH, "height": HEIGHT},
+    "time": {"duration": 0.03, "label_rate": FPS},
+    "scene": _RANDOM,
+    "preview": {"enabled": False},
+}
 
 
 def _frames(**more: Any) -> dict[str, Any]:
@@ -54,10 +76,20 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "emulator": {
         "esim": {"events": {"emulator": "esim"}},
-        "esim, noisy": {"events": {"emulator": "esim", "threshold_jitter": 0.05, "refractory_us": 50, "contrast_threshold_off": 0.3}},
+        "esim, noisy": {
+            "events": {"emulator": "esim", "threshold_jitter": 0.05, "refractory_us": 50, "contrast_threshold_off": 0.3}
+        },
         "v2e": {"events": {"emulator": "v2e"}},
         "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean"}},
-        "v2e, noisy": {"events": {"emulator": "v2e", "preset": "noisy", "photoreceptor_noise": True, "cutoff_hz": 200, "hot_pixel_fraction": 0.01}},
+        "v2e, noisy": {
+            "events": {
+                "emulator": "v2e",
+                "preset": "noisy",
+                "photoreceptor_noise": True,
+                "cutoff_hz": 200,
+                "hot_pixel_fraction": 0.01,
+            }
+        },
         "voltmeter": {"events": {"emulator": "voltmeter"}},
         "voltmeter, 240": {"events": {"emulator": "voltmeter", "preset": "DVS240"}},
     },
@@ -80,13 +112,26 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "ample": {"readout": {"events_per_second": 1e9}},
         "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
     },
-    "anti-aliasing": {name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")},
-    "images": {**{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")}, "no images": {"labels": {"images": False}}},
-    "textures": {"plain": NOTHING, "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}}, "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}}},
+    "anti-aliasing": {
+        name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")
+    },
+    "images": {
+        **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")},
+        "no images": {"labels": {"images": False}},
+    },
+    "textures": {
+        "plain": NOTHING,
+        "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}},
+        "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}},
+    },
     "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
     "light": {"lit": NOTHING, "unlit": {"scene": {"light": {"unlit": True}}}},
-    "flow": {"forward": NOTHING, "both": {"labels": {"flow": ["forward", "backward"]}}, "backward": {"labels": {"flow": ["backward"]}},
-             "none": {"labels": {"flow": []}}},
+    "flow": {
+        "forward": NOTHING,
+        "both": {"labels": {"flow": ["forward", "backward"]}},
+        "backward": {"labels": {"flow": ["backward"]}},
+        "none": {"labels": {"flow": []}},
+    },
     "float flow": {"none": NOTHING, **{name: {"labels": {"float_flow": [name]}} for name in ("npy", "flo", "h5")}},
     "labels": {
         "default": NOTHING,
@@ -100,7 +145,11 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "between microseconds": {"time": {"start": 7e-7, "label_rate": 90, "duration": 0.034}},
         "drawn": {"time": {"duration": {"uniform": [0.02, 0.03]}}},
     },
-    "camera": {"default": NOTHING, "odd": {"camera": {"width": WIDTH - 1, "height": HEIGHT - 1, "focal": 30, "cx": 12.3}}, "wide": {"camera": {"fov": 110, "near": 0.2}}},
+    "camera": {
+        "default": NOTHING,
+        "odd": {"camera": {"width": WIDTH - 1, "height": HEIGHT - 1, "focal": 30, "cx": 12.3}},
+        "wide": {"camera": {"fov": 110, "near": 0.2}},
+    },
     "output": {"train": NOTHING, "test": {"output": {"split": "test", "name": "probe", "first_index": 1}}},
     "seed": {"the group's": NOTHING, "its own": {"seed": 2**62 + 1}},
 }
@@ -110,20 +159,27 @@ RUN_LEVEL = {"gl": "one OpenGL for all groups of a run; tests/gl tries the backe
 Kind = tuple[str, str]
 _STRAIGHT_ONLY = [("emulator", kind) for kind in FEATURES["emulator"] if not kind.startswith("esim")]
 REFUSED: dict[tuple[Kind, Kind], str] = {
-    **{((("between frames", curve)), emulator): "timeline.reconstruction: " + emulator[1].split(",")[0] + " follows straight lines alone"
-       for curve in ("pchip", "hermite") for emulator in _STRAIGHT_ONLY},
+    **{
+        ((("between frames", curve)), emulator): "timeline.reconstruction: "
+        + emulator[1].split(",")[0]
+        + " follows straight lines alone"
+        for curve in ("pchip", "hermite")
+        for emulator in _STRAIGHT_ONLY
+    },
 }
 """Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there
 they are no contradiction."""
 
-TOO_SLOW: set[tuple[Kind, Kind]] = {(one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))}
+TOO_SLOW: set[tuple[Kind, Kind]] = {
+    (one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))
+}
 """Pairs that are accepted and left out of the rows: llvmpipe takes seconds for a picture of 32 x 24 px with
 multi-sampling and anisotropy (beside a triangle that ends at the horizon the footprint of a pixel is endless, and it
 adds up every texel of it)."""
 
 ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit and whether the "
-             "camera moves",
+    "camera moves",
     "gl": RUN_LEVEL["gl"],
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}
@@ -134,7 +190,11 @@ def merged(table: dict[str, Any], change: dict[str, Any]) -> dict[str, Any]:
     made = copy.deepcopy(table)
     for key, value in change.items():
         below = made.get(key)
-        if isinstance(value, dict) and isinstance(below, dict) and value.get("kind", below.get("kind")) == below.get("kind"):
+        if (
+            isinstance(value, dict)
+            and isinstance(below, dict)
+            and value.get("kind", below.get("kind")) == below.get("kind")
+        ):
             made[key] = merged(below, value)
         else:
             made[key] = copy.deepcopy(value)
@@ -185,8 +245,12 @@ def covering_rows(seed: int = 0, tries: int = 12) -> list[dict[str, str]]:
             rest = [f for f in FEATURES if f not in row]
             rng.shuffle(rest)
             for feature in rest:
+
                 def gain(kind: str) -> int:
-                    return sum(((f, k), (feature, kind)) in wanted or ((feature, kind), (f, k)) in wanted for f, k in row.items())
+                    return sum(
+                        ((f, k), (feature, kind)) in wanted or ((feature, kind), (f, k)) in wanted
+                        for f, k in row.items()
+                    )
 
                 fit = [kind for kind in FEATURES[feature] if fits({**row, feature: kind})]
                 most = max(map(gain, fit))

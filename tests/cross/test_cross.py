@@ -49,8 +49,11 @@ def recipe(assets: Path, name: str, groups: dict[str, dict]) -> Path:
 
 def tree(out: Path) -> dict[str, str]:
     """Hash of every file of a data set, its record left out."""
-    return {p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-            for p in sorted(out.rglob("*")) if p.is_file() and p.relative_to(out).parts[0] != ".run"}
+    return {
+        p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(out.rglob("*"))
+        if p.is_file() and p.relative_to(out).parts[0] != ".run"
+    }
 
 
 class Reports(dict):
@@ -76,8 +79,12 @@ class Reports(dict):
 def test_no_feature_is_without_a_row():
     """A new top-level key, a new emulator, timeline, sensor, label, anti-aliasing … has to be added to FEATURES."""
     told = {key for kinds in FEATURES.values() for change in kinds.values() for key in change} | RUN_LEVEL.keys()
-    assert told == set(SequenceConfig.model_fields), "features.py: top-level keys of the configuration without a kind, or the other way round"
-    assert options_of_the_schema() <= options_of_the_table(), f"no kind for {sorted(options_of_the_schema() - options_of_the_table(), key=str)}"
+    assert told == set(SequenceConfig.model_fields), (
+        "features.py: top-level keys of the configuration without a kind, or the other way round"
+    )
+    assert options_of_the_schema() <= options_of_the_table(), (
+        f"no kind for {sorted(options_of_the_schema() - options_of_the_table(), key=str)}"
+    )
     assert set(ELSEWHERE) <= set(SequenceConfig.model_fields)
 
 
@@ -87,7 +94,10 @@ def test_every_pair_of_kinds_is_in_a_row():
     assert len(ROWS) < 80 and covering_rows() == ROWS
 
 
-@pytest.mark.parametrize("pair, said", [pytest.param(pair, said, id=" + ".join(f"{f} {k}" for f, k in pair)) for pair, said in REFUSED.items()])
+@pytest.mark.parametrize(
+    "pair, said",
+    [pytest.param(pair, said, id=" + ".join(f"{f} {k}" for f, k in pair)) for pair, said in REFUSED.items()],
+)
 def test_what_contradicts_is_refused_in_one_line(assets, tmp_path, capsys, pair, said):
     path = assets / "refused.yaml"
     path.write_text(yaml.safe_dump(configuration(dict(pair))))
@@ -129,7 +139,10 @@ def test_all_agree(assets, tmp_path, batch):
     alone = assets / f"alone{batch}.yaml"
     shutil.copy(out / lost / "config.yaml", alone)
     list(generate_run(load_run(alone), tmp_path / "alone"))
-    found.expect(tree(tmp_path / "alone") == {k: v for k, v in tree(out).items() if k.startswith(lost + "/")}, f"{lost}: config.yaml makes other bytes")
+    found.expect(
+        tree(tmp_path / "alone") == {k: v for k, v in tree(out).items() if k.startswith(lost + "/")},
+        f"{lost}: config.yaml makes other bytes",
+    )
     assert not found, "\n".join([f"{len(found)} disagreements", *found, json.dumps(rows, indent=1)])
 
 
@@ -142,20 +155,36 @@ def test_a_read_out_neither_makes_nor_hides_events(assets, tmp_path, source):
     groups = {}
     for number, emulator in enumerate(FEATURES["emulator"]):
         for readout in ("unsaid", "slow"):
-            tree = configuration({"source": source, "emulator": emulator, "readout": readout, "timeline": "uniform", "images": "no images", "flow": "none"})
+            tree = configuration(
+                {
+                    "source": source,
+                    "emulator": emulator,
+                    "readout": readout,
+                    "timeline": "uniform",
+                    "images": "no images",
+                    "flow": "none",
+                }
+            )
             groups[f"e{number}_{readout}"] = {**tree, "seed": 9}
     run_dataset(load_run(recipe(assets, f"readout {source}", groups)), tmp_path / "out")
     for number, emulator in enumerate(FEATURES["emulator"]):
-        free, slow = (json.loads((tmp_path / f"out/train/e{number}_{r}_000000/manifest.json").read_text()) for r in ("unsaid", "slow"))
+        free, slow = (
+            json.loads((tmp_path / f"out/train/e{number}_{r}_000000/manifest.json").read_text())
+            for r in ("unsaid", "slow")
+        )
         assert slow["events_lost_in_readout"] + slow["events_late_in_readout"] > 0 < slow["events"], emulator
-        assert free["events"] == slow["events"] + slow["events_lost_in_readout"] + slow["events_late_in_readout"], emulator
+        assert free["events"] == slow["events"] + slow["events_lost_in_readout"] + slow["events_late_in_readout"], (
+            emulator
+        )
 
 
 def test_executors_and_resume_and_groups(assets, tmp_path):
     """Scenes, a scene file and frames by two workers, cut short and continued by other
     means: the bytes of one process."""
-    groups = {name: merged(configuration({"source": source, "timeline": "displacement"}), {"output": {"sequences": 2}})
-              for name, source in (("scene", "random"), ("file", "file"), ("recorded", "frames, motion"))}
+    groups = {
+        name: merged(configuration({"source": source, "timeline": "displacement"}), {"output": {"sequences": 2}})
+        for name, source in (("scene", "random"), ("file", "file"), ("recorded", "frames, motion"))
+    }
     template = load_run(recipe(assets, "executors", groups))
     run_dataset(template, tmp_path / "one")
     outcome = run_dataset(template, tmp_path / "two", Local(workers=2))

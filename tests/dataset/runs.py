@@ -14,13 +14,25 @@ RECIPE = {
     "camera": {"width": 64, "height": 48},
     "time": {"duration": 0.2, "label_rate": 20},
     "timeline": {"kind": "uniform", "fps": 300},
-    "scene": {"kind": "random", "objects": {"count": 3},
-              "pool": {"primitives": ["cuboid", "sphere"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
-              "textures": {"procedural": ["checks", "fbm"], "variants": 12, "photographs": False, "max_size": 64, "test_fraction": 0.3}},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 3},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
+        "textures": {
+            "procedural": ["checks", "fbm"],
+            "variants": 12,
+            "photographs": False,
+            "max_size": 64,
+            "test_fraction": 0.3,
+        },
+    },
     "labels": {"flow": ["forward"], "ids": True},
     "preview": {"enabled": False},
     "groups": {
-        "fly": {"output": {"sequences": 4}, "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.3]}}},
+        "fly": {
+            "output": {"sequences": 4},
+            "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.3]}},
+        },
         "probe": {"output": {"split": "test", "sequences": 2}, "events": {"emulator": "v2e"}},
     },
 }
@@ -35,8 +47,11 @@ def recipe_file(folder: Path, **changes) -> Path:
 
 def tree(out: Path) -> dict[str, str]:
     """Hash of every file of a data set but those of ``.run``, temporaries included."""
-    return {p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-            for p in sorted(out.rglob("*")) if p.is_file() and p.relative_to(out).parts[0] != ".run"}
+    return {
+        p.relative_to(out).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(out.rglob("*"))
+        if p.is_file() and p.relative_to(out).parts[0] != ".run"
+    }
 
 
 def command(*arguments) -> list[str]:

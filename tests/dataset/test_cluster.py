@@ -95,7 +95,9 @@ def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypat
     before = dict(os.environ)
     scan = Scan()
     try:
-        outcome = run_dataset(load_run(recipe_file(tmp_path, groups={"one": {}})), tmp_path / "out", RayCluster(1), listener=scan)
+        outcome = run_dataset(
+            load_run(recipe_file(tmp_path, groups={"one": {}})), tmp_path / "out", RayCluster(1), listener=scan
+        )
     finally:
         ray.shutdown()
     processes = {socket.process for socket in scan.found}
@@ -110,7 +112,9 @@ def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_a_ray_that_listens_to_everybody_is_refused(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("blinkgl.dataset.cluster._loopback_only", contextlib.nullcontext)  # as Ray would, left to itself
+    monkeypatch.setattr(
+        "blinkgl.dataset.cluster._loopback_only", contextlib.nullcontext
+    )  # as Ray would, left to itself
     assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray"]) == 2
     error = capsys.readouterr().err
     assert "listens to other machines: " in error and "raylet on " in error and error.count("\n") == 1
@@ -118,8 +122,13 @@ def test_a_ray_that_listens_to_everybody_is_refused(tmp_path, monkeypatch, capsy
 
 
 def test_listening_sockets_are_found_and_told_apart():
-    addresses = [(socket.AF_INET, "127.0.0.1", True), (socket.AF_INET, "0.0.0.0", False), (socket.AF_INET6, "::1", True),
-                 (socket.AF_INET6, "::", False), (socket.AF_INET6, "::ffff:127.0.0.1", True)]
+    addresses = [
+        (socket.AF_INET, "127.0.0.1", True),
+        (socket.AF_INET, "0.0.0.0", False),
+        (socket.AF_INET6, "::1", True),
+        (socket.AF_INET6, "::", False),
+        (socket.AF_INET6, "::ffff:127.0.0.1", True),
+    ]
     with contextlib.ExitStack() as stack:
         made = {}
         for family, address, loopback in addresses:
@@ -131,9 +140,13 @@ def test_listening_sockets_are_found_and_told_apart():
             server.listen()
             made[server.getsockname()[1]] = (ipaddress.ip_address(address), loopback)
         # a child's are found as well
-        code = ("import socket, sys; s = socket.socket(); s.bind(('0.0.0.0', 0)); s.listen(); print(s.getsockname()[1], "
-                "flush=True); sys.stdin.read()")
-        child = stack.enter_context(subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
+        code = (
+            "import socket, sys; s = socket.socket(); s.bind(('0.0.0.0', 0)); s.listen(); print(s.getsockname()[1], "
+            "flush=True); sys.stdin.read()"
+        )
+        child = stack.enter_context(
+            subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        )
         made[int(child.stdout.readline())] = (ipaddress.ip_address("0.0.0.0"), False)
         found = {s.port: (ipaddress.ip_address(s.address), s.loopback) for s in listening(os.getpid())}
         child.stdin.close()
@@ -176,12 +189,29 @@ def test_a_killed_worker_leaves_no_trace(reference, tmp_path):
     assert_same(tmp_path / "out", reference)
 
 
-@pytest.mark.parametrize("address, message", [
-    ("127.0.0.1:1", "--address: cannot be reached: "),
-    ("nowhere", "--address: not an address (got 'nowhere'); expected host:port"),
-])
+@pytest.mark.parametrize(
+    "address, message",
+    [
+        ("127.0.0.1:1", "--address: cannot be reached: "),
+        ("nowhere", "--address: not an address (got 'nowhere'); expected host:port"),
+    ],
+)
 def test_unreachable_address_is_one_line_and_nothing_is_written(tmp_path, capsys, address, message):
-    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray", "--address", address]) == 2
+    assert (
+        run(
+            [
+                "generate",
+                str(recipe_file(tmp_path)),
+                "--out",
+                str(tmp_path / "out"),
+                "--executor",
+                "ray",
+                "--address",
+                address,
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
 
@@ -191,7 +221,21 @@ def test_a_cluster_of_another_version_is_one_line_and_nothing_is_written(tmp_pat
     cluster, _ = two_nodes
     ray.shutdown()
     monkeypatch.setattr(ray, "__version__", "2.0.0")  # what this side says it is when it connects
-    assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray", "--address", cluster.address]) == 2
+    assert (
+        run(
+            [
+                "generate",
+                str(recipe_file(tmp_path)),
+                "--out",
+                str(tmp_path / "out"),
+                "--executor",
+                "ray",
+                "--address",
+                cluster.address,
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert "--address: Ray's or Python's version differs from the cluster's: " in error and "2.0.0" in error
     assert error.count("\n") == 1 and not (tmp_path / "out").exists()

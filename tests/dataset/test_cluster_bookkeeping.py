@@ -76,13 +76,21 @@ def with_tasks(*tasks: int, workers=None) -> RayCluster:
     return cluster
 
 
-@pytest.mark.parametrize("found, reason, error, lost", [
-    (NodeDiedError("node 7 is gone\nmore"), None, "the node was lost: node 7 is gone", True), (NodeDiedError("x"), "too slow", "the node was lost: x", True),
-    (WorkerCrashedError("boom"), None, "the worker was ended", False), (WorkerCrashedError("boom"), "took too long", "took too long", False),
-    (RayError("out of memory"), None, "out of memory", False), (RayError("out of memory"), "took too long", "took too long", False),
-    (RayError("the Node has DIED"), None, "the Node has DIED", True), (RayError("the node has died"), "took too long", "took too long", False),
-    (RayError("the node is well"), None, "the node is well", False), (RayError("the task died"), None, "the task died", False),
-])
+@pytest.mark.parametrize(
+    "found, reason, error, lost",
+    [
+        (NodeDiedError("node 7 is gone\nmore"), None, "the node was lost: node 7 is gone", True),
+        (NodeDiedError("x"), "too slow", "the node was lost: x", True),
+        (WorkerCrashedError("boom"), None, "the worker was ended", False),
+        (WorkerCrashedError("boom"), "took too long", "took too long", False),
+        (RayError("out of memory"), None, "out of memory", False),
+        (RayError("out of memory"), "took too long", "took too long", False),
+        (RayError("the Node has DIED"), None, "the Node has DIED", True),
+        (RayError("the node has died"), "took too long", "took too long", False),
+        (RayError("the node is well"), None, "the node is well", False),
+        (RayError("the task died"), None, "the task died", False),
+    ],
+)
 def test_what_became_of_a_task(ray, found, reason, error, lost):
     """A node that is lost is nobody's fault; a worker that was ended has the reason it was ended for."""
     cluster = with_tasks(3, 4)
@@ -90,7 +98,12 @@ def test_what_became_of_a_task(ray, found, reason, error, lost):
     if reason:
         cluster._reasons[3] = reason
     message = cluster._collect("r3")
-    assert message["task"] == 3 and error in message["error"] and bool(message.get("lost")) is lost and message["kind"] == "failed"
+    assert (
+        message["task"] == 3
+        and error in message["error"]
+        and bool(message.get("lost")) is lost
+        and message["kind"] == "failed"
+    )
     assert cluster._tasks == {"r4": 4} and 3 not in cluster._reasons
 
 
@@ -109,7 +122,11 @@ def test_polling(ray, monkeypatch):
     cluster.listener = heard.append
     monkeypatch.setattr(cluster, "_news", lambda: [{"task": 2, "n": 1}, {"task": 9, "n": 2}])
     ray.done, ray.results = ["r1", "r3"], {"r1": {"kind": "done", "task": 1}, "r3": {"kind": "done", "task": 3}}
-    assert [m["task"] for m in cluster.poll(0.1)] == [1, 3] and heard == [{"task": 2, "n": 1}] and ray.calls == [("wait", 1), ("wait", 3)]
+    assert (
+        [m["task"] for m in cluster.poll(0.1)] == [1, 3]
+        and heard == [{"task": 2, "n": 1}]
+        and ray.calls == [("wait", 1), ("wait", 3)]
+    )
     ray.done, ray.calls = [], []
     assert cluster.poll(0.1) == [] and len(ray.calls) == 2
     cluster._tasks = {}
@@ -118,7 +135,9 @@ def test_polling(ray, monkeypatch):
 
 
 def test_places_that_are_free(ray):
-    assert with_tasks(1, 2).free() == 4 and with_tasks(1, 2, workers=3).free() == 1 and with_tasks(workers=2).free() == 2
+    assert (
+        with_tasks(1, 2).free() == 4 and with_tasks(1, 2, workers=3).free() == 1 and with_tasks(workers=2).free() == 2
+    )
 
 
 def test_a_task_is_killed_once_and_for_its_first_reason(ray):
@@ -139,8 +158,15 @@ def test_closing(ray, tmp_path, done, forced, ours):
     (tmp_path / "ray").mkdir()
     ray.done = done
     cluster.close()
-    assert ray.calls == [("cancel", "r1", False), ("cancel", "r2", False), ("wait", 2), *(("cancel", r, True) for r in forced), *([("sleep", 1.0)] if forced else []),
-                         ("kill", "board"), *([("shutdown",)] if ours else [])]
+    assert ray.calls == [
+        ("cancel", "r1", False),
+        ("cancel", "r2", False),
+        ("wait", 2),
+        *(("cancel", r, True) for r in forced),
+        *([("sleep", 1.0)] if forced else []),
+        ("kill", "board"),
+        *([("shutdown",)] if ours else []),
+    ]
     assert not cluster._tasks and not (tmp_path / "ray").exists()
 
 

@@ -15,11 +15,17 @@ from blinkgl.dataset.generate import generate_run
 from blinkgl.errors import ConfigError
 
 SMALL = {
-    "camera": {"width": 64, "height": 48}, "time": {"duration": 0.2, "label_rate": 20},
+    "camera": {"width": 64, "height": 48},
+    "time": {"duration": 0.2, "label_rate": 20},
     "timeline": {"kind": "displacement", "max_px": 0.5},
-    "scene": {"kind": "random", "objects": {"count": 4}, "textures": {"photographs": False, "max_size": 64, "variants": 2},
-              "pool": {"primitives": ["cuboid"], "variants": 2}},
-    "labels": {"flow": ["forward"]}, "preview": {"enabled": False},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 4},
+        "textures": {"photographs": False, "max_size": 64, "variants": 2},
+        "pool": {"primitives": ["cuboid"], "variants": 2},
+    },
+    "labels": {"flow": ["forward"]},
+    "preview": {"enabled": False},
 }
 
 
@@ -42,8 +48,15 @@ def test_expected_frames_and_passes_are_those_of_the_run(tmp_path):
 def test_what_is_left_out_follows_the_configuration(tmp_path):
     out = dict(explain(template(tmp_path)).left_out)
     assert "depth" in out and "backward flow" in out and "preview" in out and "esim: refractory_us" in out
-    more = explain(template(tmp_path, timeline={"kind": "uniform", "fps": 100}, labels={"images": False, "depth": True, "flow": []},
-                            events={"emulator": "esim", "refractory_us": 50}, render={"antialiasing": "ssaa2"}))
+    more = explain(
+        template(
+            tmp_path,
+            timeline={"kind": "uniform", "fps": 100},
+            labels={"images": False, "depth": True, "flow": []},
+            events={"emulator": "esim", "refractory_us": 50},
+            render={"antialiasing": "ssaa2"},
+        )
+    )
     out = dict(more.left_out)
     assert "depth" not in out and "images" in out and "velocity pass" in out and "esim: refractory_us" not in out
     assert "anti-aliasing of event frames" not in out
@@ -59,7 +72,11 @@ def test_an_unlit_world_needs_no_normals(tmp_path):
 
 
 def test_passes_of_the_other_timelines(tmp_path):
-    result = explain(template(tmp_path, timeline={"kind": "brightness", "reconstruction": "hermite", "max_fraction_of_threshold": 2.0}))
+    result = explain(
+        template(
+            tmp_path, timeline={"kind": "brightness", "reconstruction": "hermite", "max_fraction_of_threshold": 2.0}
+        )
+    )
     passes = {p.name: p for p in result.passes}
     assert {"event frames with rates", "brightness"} <= set(passes) and "velocity" not in passes
     assert any("RATE" in v for v in passes["event frames with rates"].variants)
@@ -77,12 +94,20 @@ def test_recorded_frames_are_what_is_explained(tmp_path):
     for k in range(20):
         cv2.imwrite(str(tmp_path / f"P0/image_left/{k:03d}.png"), np.roll(image, k, axis=1))
     path = tmp_path / "run.yaml"
-    tree = {"frames": {"folders": ["P0"], "fps": 10, "flow": None, "interpolate": "linear", "first": 1}, "preview": {"enabled": False},
-            "camera": {"width": 99, "height": 99}, "gl": {"backend": "egl", "device": 4000}}
+    tree = {
+        "frames": {"folders": ["P0"], "fps": 10, "flow": None, "interpolate": "linear", "first": 1},
+        "preview": {"enabled": False},
+        "camera": {"width": 99, "height": 99},
+        "gl": {"backend": "egl", "device": 4000},
+    }
     path.write_text(yaml.safe_dump(tree))
     run = load_run(path)
     told = explain(run)
-    assert set(told.scene) == {"frames", "images", "flow", "not used"} and "40x24" in told.scene["frames"] and "19 of" in told.scene["frames"]
+    assert (
+        set(told.scene) == {"frames", "images", "flow", "not used"}
+        and "40x24" in told.scene["frames"]
+        and "19 of" in told.scene["frames"]
+    )
     made = list(generate_run(run, tmp_path / "out"))[0]
     assert told.frames == made.frames == 19 and [p.name for p in told.passes] == ["frames and event kernel"]
     assert told.seconds > 0 and "forward flow" in dict(told.left_out)
@@ -93,7 +118,11 @@ def test_recorded_frames_are_what_is_explained(tmp_path):
     assert not (tmp_path / "out2").exists()
 
 
-ENVIRONMENTS = [{"PYTHONIOENCODING": "ascii"}, {"LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}, {"PYTHONIOENCODING": "latin-1"}]
+ENVIRONMENTS = [
+    {"PYTHONIOENCODING": "ascii"},
+    {"LC_ALL": "POSIX", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"},
+    {"PYTHONIOENCODING": "latin-1"},
+]
 
 
 def command(arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess:
@@ -104,8 +133,10 @@ def command(arguments: list[str], environment: dict[str, str]) -> subprocess.Com
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 def test_output_that_cannot_show_every_character(environment):
     """In the one place that all commands go through; and an error's line that holds what the user typed."""
-    code = ("import sys; from blinkgl import cli; status = cli.run(['explain', '\\u00b5\\u2603.yaml']); print('1 "
-            "\\u00b5s \\u2026 2 px\\u00b2 \\u2603'); sys.exit(status)")
+    code = (
+        "import sys; from blinkgl import cli; status = cli.run(['explain', '\\u00b5\\u2603.yaml']); print('1 "
+        "\\u00b5s \\u2026 2 px\\u00b2 \\u2603'); sys.exit(status)"
+    )
     done = command(["-c", code], environment)
     assert done.returncode == 2 and done.stderr.startswith(b"error: ") and done.stderr.count(b"\n") == 1
     assert done.stdout in (b"1 us ... 2 px^2 ?\n", b"1 \xb5s ... 2 px\xb2 ?\n")

@@ -81,21 +81,42 @@ def caused(error: Exception, cause: BaseException) -> Exception:
         return made
 
 
-@pytest.mark.parametrize("error, again", [
-    (ConfigError("x"), False), (AssetError("x"), False), (EventDataError("x"), False), (BlinkGLError("x"), False),
-    (OutputError("x"), True), (GLError("x"), True), (MemoryError(), True), (OSError(5, "Input/output error"), True),
-    (FileNotFoundError(2, "gone"), True), (RuntimeError("driver"), True), (Exception("moderngl raises these"), True),
-    (ValueError("a bug"), False), (KeyError("a bug"), False), (ZeroDivisionError(), False),
-    (caused(AssetError("cannot read the mesh"), OSError(116, "Stale file handle")), True),
-    (caused(AssetError("cannot read the mesh"), FileNotFoundError(2, "gone")), False),
-    (caused(AssetError("does not fit"), MemoryError()), True),
-])
+@pytest.mark.parametrize(
+    "error, again",
+    [
+        (ConfigError("x"), False),
+        (AssetError("x"), False),
+        (EventDataError("x"), False),
+        (BlinkGLError("x"), False),
+        (OutputError("x"), True),
+        (GLError("x"), True),
+        (MemoryError(), True),
+        (OSError(5, "Input/output error"), True),
+        (FileNotFoundError(2, "gone"), True),
+        (RuntimeError("driver"), True),
+        (Exception("moderngl raises these"), True),
+        (ValueError("a bug"), False),
+        (KeyError("a bug"), False),
+        (ZeroDivisionError(), False),
+        (caused(AssetError("cannot read the mesh"), OSError(116, "Stale file handle")), True),
+        (caused(AssetError("cannot read the mesh"), FileNotFoundError(2, "gone")), False),
+        (caused(AssetError("does not fit"), MemoryError()), True),
+    ],
+)
 def test_what_may_pass_later(error, again):
     assert may_pass(error) is again
 
 
-@pytest.mark.parametrize("error, attempts", [(AssetError("the mesh is corrupt"), 1), (EventDataError("time goes back"), 1),
-                                             (ValueError("a bug"), 1), (GLError("lost"), 3), (MemoryError("no memory"), 3)])
+@pytest.mark.parametrize(
+    "error, attempts",
+    [
+        (AssetError("the mesh is corrupt"), 1),
+        (EventDataError("time goes back"), 1),
+        (ValueError("a bug"), 1),
+        (GLError("lost"), 3),
+        (MemoryError("no memory"), 3),
+    ],
+)
 def test_attempts(tmp_path, monkeypatch, error, attempts):
     """One sequence of three fails, always alike."""
     tried = []
@@ -136,7 +157,9 @@ def test_a_run_whose_only_sequence_cannot_be_made_leaves_nothing_but_what_was_pu
     (tmp_path / "out/of_the_user").mkdir()
     with pytest.raises(BlinkGLError, match="a.obj: the mesh is corrupt"):
         run_dataset(template(tmp_path), tmp_path / "out", num=1, resume=True)
-    left = sorted(p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if not any(p.glob("*")))
+    left = sorted(
+        p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if not any(p.glob("*"))
+    )
     assert "of_the_user" in left and ".run/damaged/train/fly_000000-0/mine.txt" in left
     assert not [p for p in left if "/damaged/" not in p and p != "of_the_user"]
 
@@ -189,13 +212,28 @@ def test_out_may_be_a_link_and_is_followed_once(reference, tmp_path):
 
 
 def test_tasks_know_their_numbers(tmp_path):
-    plan = Plan.of(template(tmp_path, groups={"a": {"output": {"sequences": 3, "first_index": 999_999}},
-                                              "b_1": {"output": {"sequences": 2, "split": "test"}}}))
+    plan = Plan.of(
+        template(
+            tmp_path,
+            groups={
+                "a": {"output": {"sequences": 3, "first_index": 999_999}},
+                "b_1": {"output": {"sequences": 2, "split": "test"}},
+            },
+        )
+    )
     names = [task.name for task in plan.tasks]
     assert names == ["train/a_999999", "train/a_1000000", "train/a_1000001", "test/b_1_000000", "test/b_1_000001"]
     assert [plan.tasks.number(name) for name in names] == list(range(5)) and plan.tasks[-1].name == names[-1]
     assert [t.name for t in plan.tasks[1:3]] == names[1:3]
-    for foreign in ("train/a_0999999", "train/a_999998", "train/a_1000002", "train/b_1_000000", "test/b_1_00000", "a_999999", "train/a"):
+    for foreign in (
+        "train/a_0999999",
+        "train/a_999998",
+        "train/a_1000002",
+        "train/b_1_000000",
+        "test/b_1_00000",
+        "a_999999",
+        "train/a",
+    ):
         assert plan.tasks.number(foreign) is None
     with pytest.raises(IndexError):
         plan.tasks[5]
@@ -227,8 +265,13 @@ def test_memory_does_not_grow_with_the_number_of_sequences(tmp_path):
 
         def act():
             with pytest.raises(Enough):
-                run_dataset(template(tmp_path, groups={"fly": {"output": {"sequences": sequences}}}), tmp_path / f"{sequences}", Nothing(),
-                            listener=When("silent", stop))
+                run_dataset(
+                    template(tmp_path, groups={"fly": {"output": {"sequences": sequences}}}),
+                    tmp_path / f"{sequences}",
+                    Nothing(),
+                    listener=When("silent", stop),
+                )
+
         return act
 
     begin(3)()
@@ -277,8 +320,11 @@ def test_a_stopped_worker_is_named_and_waited_for(reference, tmp_path, monkeypat
 
     display = Display("progress", stop)
     outcome = run_dataset(template(tmp_path), tmp_path / "out", executor, listener=display)
-    (name, silent), = [(n, m) for n, m in display.messages if m["kind"] == "silent"]
-    assert f"worker 0 (pid {silent['pid']}) is stopped: no word from it for" in silent["error"] and "--time-limit" in silent["error"]
+    ((name, silent),) = [(n, m) for n, m in display.messages if m["kind"] == "silent"]
+    assert (
+        f"worker 0 (pid {silent['pid']}) is stopped: no word from it for" in silent["error"]
+        and "--time-limit" in silent["error"]
+    )
     assert len(outcome.made) == 3 and not any(m["kind"] == "failed" for _, m in display.messages)
     assert "is stopped" in (tmp_path / "out/.run/logs" / f"{name}.log").read_text()
     assert_same(tmp_path / "out", reference)
@@ -321,7 +367,7 @@ def test_a_temporary_that_is_deleted_costs_an_attempt_and_no_half_sequence_appea
     out = tmp_path / "out"
 
     def delete(name, message):
-        folder, = temporaries(out)
+        (folder,) = temporaries(out)
         if what == "the folder":
             shutil.rmtree(folder)
         else:
@@ -330,8 +376,10 @@ def test_a_temporary_that_is_deleted_costs_an_attempt_and_no_half_sequence_appea
 
     display = When("progress", delete, NAMES[1])
     outcome = run_dataset(template(tmp_path), out, listener=display)
-    failed, = [m for _, m in display.messages if m["kind"] == "failed"]
-    assert NAMES[1] in failed["error"] and "tmp" not in failed["error"].replace(str(tmp_path), "") and failed["expected"]
+    (failed,) = [m for _, m in display.messages if m["kind"] == "failed"]
+    assert (
+        NAMES[1] in failed["error"] and "tmp" not in failed["error"].replace(str(tmp_path), "") and failed["expected"]
+    )
     assert len(outcome.made) == 3 and not outcome.set_aside
     assert_same(out, reference)
     assert verify_dataset(out).clean
@@ -343,7 +391,9 @@ def test_an_output_folder_that_is_deleted_stops_the_run(tmp_path, executor):
     with pytest.raises(OutputError, match="out: was deleted, moved or replaced while the run was at work in it"):
         run_dataset(template(tmp_path), out, executor, listener=When("done", lambda *_: shutil.rmtree(out)))
     assert not temporaries(out) and not (out / "index.jsonl").exists() and not (out / ".run/run.json").exists()
-    assert all(verify_dataset(manifest.parent).clean for manifest in out.rglob("manifest.json")), "what was made since is whole"
+    assert all(verify_dataset(manifest.parent).clean for manifest in out.rglob("manifest.json")), (
+        "what was made since is whole"
+    )
     run_dataset(template(tmp_path), out, resume=True)
     assert verify_dataset(out).clean
 

@@ -36,7 +36,10 @@ def tartan(tmp_path_factory) -> Path:
         for k in range(N):
             move = np.float32([[1, 0, k * SHIFT[0] - W], [0, 1, k * SHIFT[1] - H]])
             image = cv2.warpAffine(texture, move, (W, H), flags=cv2.INTER_LINEAR)
-            cv2.imwrite(str(root / trajectory / f"image_left/{k:06d}_left.png"), np.repeat((image * 255).astype(np.uint8)[..., None], 3, axis=2))
+            cv2.imwrite(
+                str(root / trajectory / f"image_left/{k:06d}_left.png"),
+                np.repeat((image * 255).astype(np.uint8)[..., None], 3, axis=2),
+            )
         for k in range(N - 1):
             flow = np.broadcast_to(np.float32(SHIFT), (H, W, 2)) * (1 + 0.1 * k)
             mask = np.zeros((H, W), np.uint8)
@@ -48,16 +51,31 @@ def tartan(tmp_path_factory) -> Path:
 
 def recipe(tmp_path, tartan, **frames):
     path = tmp_path / "recipe.yaml"
-    path.write_text(yaml.safe_dump({"seed": 1, "groups": {"tartan": {
-        "output": {"split": "test", "sequences": 2}, "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.2]}},
-        "preview": {"enabled": False}, "frames": {"folders": [f"{tartan}/P*"], "fps": 10, "max_px": 0.5, **frames}}}}))
+    path.write_text(
+        yaml.safe_dump(
+            {
+                "seed": 1,
+                "groups": {
+                    "tartan": {
+                        "output": {"split": "test", "sequences": 2},
+                        "events": {"emulator": "esim", "contrast_threshold": {"uniform": [0.1, 0.2]}},
+                        "preview": {"enabled": False},
+                        "frames": {"folders": [f"{tartan}/P*"], "fps": 10, "max_px": 0.5, **frames},
+                    }
+                },
+            }
+        )
+    )
     return load_run(path)
 
 
 def test_conversion(tmp_path, tartan):
     outcome = run_dataset(recipe(tmp_path, tartan), tmp_path / "out")
     assert len(outcome.made) == 2 and not outcome.set_aside
-    assert sorted(p.parent.name for p in (tmp_path / "out").glob("*/*/manifest.json")) == ["tartan_000000", "tartan_000001"]
+    assert sorted(p.parent.name for p in (tmp_path / "out").glob("*/*/manifest.json")) == [
+        "tartan_000000",
+        "tartan_000001",
+    ]
     folder = tmp_path / "out/test/tartan_000000"
     # Label k is the flow from frame k + 1, which has an interval of events before it; the last frame has no flow.
     assert (folder / "images/timestamps.txt").read_text().split() == ["100000", "200000", "300000", "400000", "500000"]
@@ -90,7 +108,10 @@ def test_a_read_out_holds_for_frames(tmp_path, tartan):
         assert verify_dataset(tmp_path / name, deep=1).clean
         made[name] = json.loads((tmp_path / name / "test/tartan_000000/manifest.json").read_text())
     free, slow = made["free"], made["slow"]
-    assert free["events"] > 3 * slow["events"] > 0 and free["events_lost_in_readout"] == free["events_late_in_readout"] == 0
+    assert (
+        free["events"] > 3 * slow["events"] > 0
+        and free["events_lost_in_readout"] == free["events_late_in_readout"] == 0
+    )
     assert slow["events_lost_in_readout"] > 100 and slow["events_late_in_readout"] > 0
     assert slow["events"] + slow["events_lost_in_readout"] + slow["events_late_in_readout"] == free["events"]
 
@@ -99,15 +120,20 @@ def test_a_part_of_the_frames_and_other_flow_files(tmp_path, tartan):
     run_dataset(recipe(tmp_path, tartan, first=1, count=4, interpolate="linear"), tmp_path / "out", num=1)
     folder = tmp_path / "out/test/tartan_000000"
     flow, _ = read_flow_png(folder / "flow/forward/000000.png")
-    assert flow[0, 0, 0] == pytest.approx(1.5 * 1.2, abs=0.01), "frame 2 -> 3: one frame left out, one for the events before"
+    assert flow[0, 0, 0] == pytest.approx(1.5 * 1.2, abs=0.01), (
+        "frame 2 -> 3: one frame left out, one for the events before"
+    )
     assert len(list((folder / "flow/forward").iterdir())) == 2
 
 
-@pytest.mark.parametrize("frames, error, message", [
-    ({"folders": ["nowhere*"]}, ConfigError, "frames.folders.0: in group 'tartan': no such folder"),
-    ({"folders": []}, ConfigError, "frames.folders: in group 'tartan': no folders of frames"),
-    ({"images": "image_right"}, ConfigError, "frames.images: in group 'tartan': no such folder"),
-])
+@pytest.mark.parametrize(
+    "frames, error, message",
+    [
+        ({"folders": ["nowhere*"]}, ConfigError, "frames.folders.0: in group 'tartan': no such folder"),
+        ({"folders": []}, ConfigError, "frames.folders: in group 'tartan': no folders of frames"),
+        ({"images": "image_right"}, ConfigError, "frames.images: in group 'tartan': no such folder"),
+    ],
+)
 def test_bad_folders_are_found_before_any_work(tmp_path, tartan, frames, error, message):
     with pytest.raises(error) as raised:
         run_dataset(recipe(tmp_path, tartan, **frames), tmp_path / "out")
@@ -121,13 +147,19 @@ def test_too_few_folders(tmp_path, tartan):
         run_dataset(template, tmp_path / "out")
 
 
-@pytest.mark.parametrize("damage, message", [
-    (lambda t: [p.unlink() for p in sorted((t / "image_left").iterdir())[2:]], "too few frames"),
-    (lambda t: (t / "flow/000001_000002_flow.npy").unlink(), "not one flow file per pair of frames"),
-    (lambda t: np.save(t / "flow/000002_000003_flow.npy", np.zeros((4, 4, 2), np.float32)), "flow and image differ in size"),
-    (lambda t: shutil.rmtree(t / "flow"), "no such folder"),
-    (lambda t: (t / "image_left/000003_left.png").write_bytes(b"no image"), "000003_left.png"),
-])
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        (lambda t: [p.unlink() for p in sorted((t / "image_left").iterdir())[2:]], "too few frames"),
+        (lambda t: (t / "flow/000001_000002_flow.npy").unlink(), "not one flow file per pair of frames"),
+        (
+            lambda t: np.save(t / "flow/000002_000003_flow.npy", np.zeros((4, 4, 2), np.float32)),
+            "flow and image differ in size",
+        ),
+        (lambda t: shutil.rmtree(t / "flow"), "no such folder"),
+        (lambda t: (t / "image_left/000003_left.png").write_bytes(b"no image"), "000003_left.png"),
+    ],
+)
 def test_a_folder_that_cannot_be_used_is_set_aside(tmp_path, tartan, damage, message):
     copy = Path(shutil.copytree(tartan, tmp_path / "copy"))
     damage(copy / "P001")
@@ -142,15 +174,42 @@ def test_a_folder_that_cannot_be_used_stops_its_preview_and_says_what_was_wrong(
     template = recipe(tmp_path, copy)
     template.tree["groups"]["tartan"]["preview"] = {"enabled": True}
     outcome = run_dataset(template, tmp_path / "out")
-    assert list(outcome.set_aside) == ["test/tartan_000001"] and "000003_left.png" in outcome.set_aside["test/tartan_000001"]
-    assert sorted(p.name for p in (tmp_path / "out/test").iterdir()) == ["tartan_000000"] and (tmp_path / "out/test/tartan_000000/preview.mp4").is_file()
+    assert (
+        list(outcome.set_aside) == ["test/tartan_000001"]
+        and "000003_left.png" in outcome.set_aside["test/tartan_000001"]
+    )
+    assert (
+        sorted(p.name for p in (tmp_path / "out/test").iterdir()) == ["tartan_000000"]
+        and (tmp_path / "out/test/tartan_000000/preview.mp4").is_file()
+    )
 
 
 def test_the_shipped_recipe_takes_frames(tmp_path, tartan):
     mini = Path(__file__).parents[2] / "configs/blinkflow_mini.yaml"
-    assert run(["generate", str(mini), "--out", str(tmp_path / "out"), "--num", "1", "--quiet", "--set", "groups.e_tartan.enabled=true",
-                "--set", f"groups.e_tartan.frames.folders=[{tartan}/P000]", "--set", "groups.flying_train.enabled=false",
-                "--set", "groups.flying_test.enabled=false", "--set", "groups.falling_dice.enabled=false"]) == 0
+    assert (
+        run(
+            [
+                "generate",
+                str(mini),
+                "--out",
+                str(tmp_path / "out"),
+                "--num",
+                "1",
+                "--quiet",
+                "--set",
+                "groups.e_tartan.enabled=true",
+                "--set",
+                f"groups.e_tartan.frames.folders=[{tartan}/P000]",
+                "--set",
+                "groups.flying_train.enabled=false",
+                "--set",
+                "groups.flying_test.enabled=false",
+                "--set",
+                "groups.falling_dice.enabled=false",
+            ]
+        )
+        == 0
+    )
     assert (tmp_path / "out/test/tartan_000000/events.h5").is_file()
 
 

@@ -32,9 +32,20 @@ SMALL = {
     "camera": {"width": 64, "height": 48},
     "time": {"duration": 0.2, "label_rate": 20, "start": 3.0},
     "timeline": {"kind": "uniform", "fps": 200},
-    "scene": {"kind": "random", "objects": {"count": 3}, "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
-              "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64}},
-    "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True, "ids": True, "normals": True, "velocity": True},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 3},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+        "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64},
+    },
+    "labels": {
+        "flow": ["forward", "backward"],
+        "float_flow": ["npy"],
+        "depth": True,
+        "ids": True,
+        "normals": True,
+        "velocity": True,
+    },
     "preview": {"enabled": False},
 }
 
@@ -50,8 +61,11 @@ def generate(tmp_path, out="out", num=None, **changes) -> list[Path]:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
-            for p in sorted(folder.rglob("*")) if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +125,10 @@ def test_images_labels_and_poses_fit_together(sequence):
     for k in range(4):
         image = cv2.imread(str(sequence / f"images/{k:06d}.png"))
         assert image.shape == (48, 64, 3) and 5 < image.mean() < 250
-        depth, ids = np.load(sequence / f"depth/{k:06d}.npy"), cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED)
+        depth, ids = (
+            np.load(sequence / f"depth/{k:06d}.npy"),
+            cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED),
+        )
         assert np.isfinite(depth[ids > 0]).all() and set(np.unique(ids)) <= {0, *poses["object_ids"]}
 
 
@@ -123,14 +140,21 @@ def test_flow_follows_from_depth_ids_and_poses(sequence):
     index = {int(i): n for n, i in enumerate(poses["object_ids"])}
     y, x = np.mgrid[0:48, 0:64].astype(np.float64)
     for k in range(4):
-        depth, ids = np.load(sequence / f"depth/{k:06d}.npy"), cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED)
+        depth, ids = (
+            np.load(sequence / f"depth/{k:06d}.npy"),
+            cv2.imread(str(sequence / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED),
+        )
         flow = np.load(sequence / f"flow/forward_npy/{k:06d}.npy")
         now, then = k + 1, k + 2
         errors = []
         for i in np.unique(ids[ids > 0]):
             at = (ids == i) & (flow[..., 2] > 0)
             rays = np.stack([(x[at] - K[0, 2]) / K[0, 0], (y[at] - K[1, 2]) / K[1, 1], np.ones(at.sum())])
-            local = np.linalg.inv(poses["T_world_obj"][index[i], now]) @ poses["T_world_cam"][now] @ np.vstack([rays * depth[at], np.ones(at.sum())])
+            local = (
+                np.linalg.inv(poses["T_world_obj"][index[i], now])
+                @ poses["T_world_cam"][now]
+                @ np.vstack([rays * depth[at], np.ones(at.sum())])
+            )
             moved = np.linalg.inv(poses["T_world_cam"][then]) @ poses["T_world_obj"][index[i], then] @ local
             pixel = K @ (moved[:3] / moved[2])
             errors.append(np.hypot(pixel[0] - x[at] - flow[at, 0], pixel[1] - y[at] - flow[at, 1]))
@@ -140,8 +164,12 @@ def test_flow_follows_from_depth_ids_and_poses(sequence):
 
 def test_the_poses_begin_with_the_first_frame(tmp_path):
     """A camera that moves 1 m/s along x on straight lines: its position is the clock, to the nanosecond."""
-    scene = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box", "position": [3, 0, 0]}],
-             "camera": {"interpolation": "linear", "keyframes": [{"time": t, "position": [t, 0, 0]} for t in (0, 10)]}}
+    scene = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box", "position": [3, 0, 0]}],
+        "camera": {"interpolation": "linear", "keyframes": [{"time": t, "position": [t, 0, 0]} for t in (0, 10)]},
+    }
     folder = generate(tmp_path, scene=scene, time={"duration": 0.2, "label_rate": 30, "start": 3.0000005})[0]
     poses = np.load(folder / "poses.npz", allow_pickle=False)
     start, interval = 3_000_000_500, 33_333_333
@@ -196,7 +224,16 @@ def test_same_seed_same_bytes_whatever_the_threads(sequence, tmp_path):
 def test_same_bytes_with_another_number_of_opengl_threads(sequence, tmp_path):
     """Software OpenGL reads LP_NUM_THREADS when it is loaded, hence the fresh process."""
     for threads in ("0", "2"):
-        command = [sys.executable, "-m", "blinkgl.cli", "generate", str(config_file(tmp_path)), "--out", str(tmp_path / threads), "--quiet"]
+        command = [
+            sys.executable,
+            "-m",
+            "blinkgl.cli",
+            "generate",
+            str(config_file(tmp_path)),
+            "--out",
+            str(tmp_path / threads),
+            "--quiet",
+        ]
         subprocess.run(command, check=True, env={**os.environ, "LP_NUM_THREADS": threads, "NUMBA_NUM_THREADS": "2"})
         assert digests(tmp_path / threads / "train/tiny_000000") == digests(sequence)
 
@@ -219,11 +256,22 @@ def test_resolved_configuration_reproduces_the_sequence(tmp_path):
 
 
 def test_a_still_camera_saves_work_and_changes_nothing(tmp_path, monkeypatch):
-    scene = {**SMALL["scene"], "camera_motion": {"kind": "static"},
-             "objects": {"count": 8, "distance": [2, 4]}, "object_motion": {"speed": [1, 2], "static_share": 0.2}}
-    for k, timeline in enumerate(({"kind": "uniform", "fps": 200}, {"kind": "displacement", "max_px": 0.3}, {"kind": "uniform", "fps": 200, "reconstruction": "hermite"},
-                                  {"kind": "displacement", "max_px": 0.5, "reconstruction": "pchip"}, {"kind": "brightness", "reconstruction": "hermite"},
-                                  {"kind": "budget", "max_time_error_us": 300, "reconstruction": "pchip"})):
+    scene = {
+        **SMALL["scene"],
+        "camera_motion": {"kind": "static"},
+        "objects": {"count": 8, "distance": [2, 4]},
+        "object_motion": {"speed": [1, 2], "static_share": 0.2},
+    }
+    for k, timeline in enumerate(
+        (
+            {"kind": "uniform", "fps": 200},
+            {"kind": "displacement", "max_px": 0.3},
+            {"kind": "uniform", "fps": 200, "reconstruction": "hermite"},
+            {"kind": "displacement", "max_px": 0.5, "reconstruction": "pchip"},
+            {"kind": "brightness", "reconstruction": "hermite"},
+            {"kind": "budget", "max_time_error_us": 300, "reconstruction": "pchip"},
+        )
+    ):
         quick = generate(tmp_path, out=f"quick {k}", scene=scene, timeline=timeline)[0]
         with monkeypatch.context() as patch:
             patch.setattr(Luminance, "still", False)
@@ -272,13 +320,16 @@ def test_preview_shows_the_sequence(tmp_path):
 # ---- the command line --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("option, message", [
-    ("camera.widht=3", "camera.widht: unknown key; expected 'width' (nearest)"),
-    ("scene.pool.folders=[nowhere]", "scene.pool.folders.0: "),
-    ("scene.pool={primitives: [], urdfs: false}", "scene.pool: "),
-    ("gl={backend: egl, device: 99}", "gl"),
-    ("events.emulator=blender", "events.emulator: unknown choice"),
-])
+@pytest.mark.parametrize(
+    "option, message",
+    [
+        ("camera.widht=3", "camera.widht: unknown key; expected 'width' (nearest)"),
+        ("scene.pool.folders=[nowhere]", "scene.pool.folders.0: "),
+        ("scene.pool={primitives: [], urdfs: false}", "scene.pool: "),
+        ("gl={backend: egl, device: 99}", "gl"),
+        ("events.emulator=blender", "events.emulator: unknown choice"),
+    ],
+)
 def test_bad_input_is_one_line_and_status_2(tmp_path, capsys, option, message):
     out = tmp_path / "out"
     assert run(["generate", str(config_file(tmp_path)), "--out", str(out), "--set", option]) == 2
@@ -287,21 +338,31 @@ def test_bad_input_is_one_line_and_status_2(tmp_path, capsys, option, message):
     assert not out.exists() or not any(p.is_file() for p in out.rglob("*"))
 
 
-@pytest.mark.parametrize("name, content, message", [
-    ("meshes/a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
-    ("meshes/a.obj", b"v 0 0 0\nv 1 0 0\n", "no faces"),
-    ("meshes/a.stl", bytes(80) + (10**9).to_bytes(4, "little") + bytes(50), "too many faces (got 1000000000)"),
-    ("images/a.jpg", b"\xff\xd8\xff\xe0 not an image", "corrupt"),
-])
+@pytest.mark.parametrize(
+    "name, content, message",
+    [
+        ("meshes/a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "NaN"),
+        ("meshes/a.obj", b"v 0 0 0\nv 1 0 0\n", "no faces"),
+        ("meshes/a.stl", bytes(80) + (10**9).to_bytes(4, "little") + bytes(50), "too many faces (got 1000000000)"),
+        ("images/a.jpg", b"\xff\xd8\xff\xe0 not an image", "corrupt"),
+    ],
+)
 def test_bad_assets_are_one_line_and_status_2_and_leave_nothing(tmp_path, capsys, name, content, message):
     """And a mended configuration may go to the same folder afterwards."""
     path = tmp_path / name
     path.parent.mkdir()
     path.write_bytes(content)
-    key = "scene.pool={primitives: [], folders: [%s]}" if name.startswith("meshes") else "scene.textures={procedural: false, photographs: false, folders: [%s]}"
+    key = (
+        "scene.pool={primitives: [], folders: [%s]}"
+        if name.startswith("meshes")
+        else "scene.textures={procedural: false, photographs: false, folders: [%s]}"
+    )
     out, config = tmp_path / "out", str(config_file(tmp_path))
     for count in ("1", "2"):
-        assert run(["generate", config, "--out", str(out), "--num", count, "--set", key % json.dumps(str(path.parent))]) == 2
+        assert (
+            run(["generate", config, "--out", str(out), "--num", count, "--set", key % json.dumps(str(path.parent))])
+            == 2
+        )
         error = capsys.readouterr().err
         assert error.startswith(f"error: {path}") and message in error and error.count("\n") == 1
         assert not out.exists()
@@ -317,7 +378,16 @@ def test_output_that_is_a_file(tmp_path, capsys):
 def test_table_names_every_stage(tmp_path, capsys):
     assert run(["generate", str(config_file(tmp_path)), "--out", str(tmp_path / "out"), "--num", "2"]) == 0
     shown = capsys.readouterr().out
-    for word in ("2 sequences", "event frames", "events", "render", "read-back", "write", "per simulated second", "tiny_000001"):
+    for word in (
+        "2 sequences",
+        "event frames",
+        "events",
+        "render",
+        "read-back",
+        "write",
+        "per simulated second",
+        "tiny_000001",
+    ):
         assert word in shown
 
 
@@ -327,13 +397,25 @@ def test_table_names_every_stage(tmp_path, capsys):
 def test_flying_objects_from_real_meshes_and_photographs(tmp_path):
     meshes, textures = shared("data/assets/models_cc0"), shared("data/assets/textures_cc0")
     shipped = Path(__file__).parents[2] / "configs/flying_objects.yaml"
-    template = load_run(shipped, [
-        f"scene.pool.folders=[{json.dumps(str(meshes))}]", f"scene.textures.folders=[{json.dumps(str(textures))}]",
-        "scene.pool.primitives=[]", "scene.textures.procedural=false", "camera.width=160", "camera.height=120",
-        "time.duration=0.2", "preview.enabled=false", "timeline={kind: uniform, fps: 100}"])
+    template = load_run(
+        shipped,
+        [
+            f"scene.pool.folders=[{json.dumps(str(meshes))}]",
+            f"scene.textures.folders=[{json.dumps(str(textures))}]",
+            "scene.pool.primitives=[]",
+            "scene.textures.procedural=false",
+            "camera.width=160",
+            "camera.height=120",
+            "time.duration=0.2",
+            "preview.enabled=false",
+            "timeline={kind: uniform, fps: 100}",
+        ],
+    )
     folder = list(generate_run(template, tmp_path / "out"))[0].path
     assert verify_sequence(folder) == []
-    names = [o["name"] for o in json.loads((folder / "manifest.json").read_text())["objects"] if o["category"] == "object"]
+    names = [
+        o["name"] for o in json.loads((folder / "manifest.json").read_text())["objects"] if o["category"] == "object"
+    ]
     assert len(names) >= 8
     with h5py.File(folder / "events.h5") as file:
         assert len(dsec_slice(file, 100_000, 300_000)["t"]) > 1000
@@ -351,10 +433,18 @@ def test_peak_memory_does_not_grow_with_the_sequence(tmp_path):
     """1 s against 20 s (2,000 frames, 20x the events), each in a process of its own."""
     peaks = {}
     for seconds in (1, 20):
-        path = config_file(tmp_path, time={"duration": seconds, "label_rate": 5}, timeline={"kind": "uniform", "fps": 100},
-                           labels={"flow": ["forward"]})
-        done = subprocess.run([sys.executable, "-c", _PEAK, "generate", str(path), "--out", str(tmp_path / str(seconds)), "--quiet"],
-                              check=True, capture_output=True, text=True)
+        path = config_file(
+            tmp_path,
+            time={"duration": seconds, "label_rate": 5},
+            timeline={"kind": "uniform", "fps": 100},
+            labels={"flow": ["forward"]},
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", _PEAK, "generate", str(path), "--out", str(tmp_path / str(seconds)), "--quiet"],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
         peaks[seconds] = int(done.stdout.split()[-1])
     assert peaks[20] < 1.05 * peaks[1] + 8_000, f"peak resident memory, KiB: {peaks}"
 

@@ -13,15 +13,26 @@ from blinkgl.show.generate import MAX_NOTES, Display, run
 from tests.scene.gltf_files import GltfBuilder, triangle
 
 LINE = "card.glb asks for what is not drawn: alpha BLEND (drawn opaque); metal and roughness (drawn matt)"
-SMALL = {"camera": {"width": 32, "height": 24}, "time": {"duration": 0.05, "label_rate": 20},
-         "timeline": {"kind": "uniform", "fps": 100},
-         "output": {"sequences": 3}, "preview": {"enabled": False}, "labels": {"flow": []}}
-EXPLICIT = {"kind": "explicit", "meshes": {"card": {"file": "assets/card.glb"}},
-            "objects": [{"mesh": "card"}, {"mesh": "card"}], "camera": {"position": [-3, 0, 1]}}
-RANDOM = {"kind": "random", "objects": {"count": 3},
-          "pool": {"primitives": [], "folders": ["assets"], "keep_materials": True, "test_fraction": 0},
-          "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 16,
-                       "test_fraction": 0}}
+SMALL = {
+    "camera": {"width": 32, "height": 24},
+    "time": {"duration": 0.05, "label_rate": 20},
+    "timeline": {"kind": "uniform", "fps": 100},
+    "output": {"sequences": 3},
+    "preview": {"enabled": False},
+    "labels": {"flow": []},
+}
+EXPLICIT = {
+    "kind": "explicit",
+    "meshes": {"card": {"file": "assets/card.glb"}},
+    "objects": [{"mesh": "card"}, {"mesh": "card"}],
+    "camera": {"position": [-3, 0, 1]},
+}
+RANDOM = {
+    "kind": "random",
+    "objects": {"count": 3},
+    "pool": {"primitives": [], "folders": ["assets"], "keep_materials": True, "test_fraction": 0},
+    "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 16, "test_fraction": 0},
+}
 
 
 def recipe(tmp_path, scene):
@@ -34,9 +45,14 @@ def recipe(tmp_path, scene):
     return tmp_path / "run.yaml"
 
 
-@pytest.mark.parametrize("scene, workers", [
-    (EXPLICIT, None), (RANDOM, None), pytest.param(EXPLICIT, 2, marks=pytest.mark.slow),
-])
+@pytest.mark.parametrize(
+    "scene, workers",
+    [
+        (EXPLICIT, None),
+        (RANDOM, None),
+        pytest.param(EXPLICIT, 2, marks=pytest.mark.slow),
+    ],
+)
 def test_a_run_says_it_once(tmp_path, capsys, scene, workers):
     path = recipe(tmp_path, scene)
     assert run(str(path), str(tmp_path / "out"), executor=workers and Local(workers)) == 0

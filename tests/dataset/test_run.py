@@ -73,7 +73,9 @@ def test_killed_workers_leave_no_trace(reference, tmp_path):
     costs = [json.loads(line) for line in (tmp_path / "out/.run/costs.jsonl").read_text().splitlines()]
     assert sorted(c["attempts"] for c in costs) == [1, 1, 1, 1, 1, 2] and all(c["peak_rss_kib"] > 1e4 for c in costs)
     assert [line["path"] for line in read_index(tmp_path / "out")] == sorted(NAMES)
-    assert "attempt 1 failed: the worker was ended by SIGKILL" in "".join(p.read_text() for p in (tmp_path / "out/.run/logs").rglob("*.log"))
+    assert "attempt 1 failed: the worker was ended by SIGKILL" in "".join(
+        p.read_text() for p in (tmp_path / "out/.run/logs").rglob("*.log")
+    )
     assert run(["verify", str(tmp_path / "out"), "--deep", "--sample", "2"]) == 0
 
 
@@ -103,8 +105,15 @@ def test_a_worker_that_hangs_is_replaced_and_a_hopeless_sequence_set_aside(refer
 
 
 def test_threads_are_divided_among_workers():
-    assert thread_environment(2, 2, {}) == {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "LP_NUM_THREADS": "0"}
-    assert thread_environment(1, 8, {})["NUMBA_NUM_THREADS"] == "8" and "LP_NUM_THREADS" not in thread_environment(1, 8, {})
+    assert thread_environment(2, 2, {}) == {
+        "NUMBA_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "LP_NUM_THREADS": "0",
+    }
+    assert thread_environment(1, 8, {})["NUMBA_NUM_THREADS"] == "8" and "LP_NUM_THREADS" not in thread_environment(
+        1, 8, {}
+    )
     assert thread_environment(4, 16, {})["LP_NUM_THREADS"] == "4"
     assert "LP_NUM_THREADS" not in thread_environment(2, 2, {"LP_NUM_THREADS": "3"}), "what the user says, goes"
 
@@ -152,7 +161,9 @@ def test_ctrl_c_stops_the_workers_and_leaves_only_whole_sequences(reference, tmp
     assert driver.returncode == 130 and "Traceback" not in said
     assert not any(alive(pid) for pid in workers) and temporaries(out) == []
     found = verify_dataset(out)
-    assert set(found.problems) and all(lines == ["missing: the recipe asks for it"] for lines in found.problems.values())
+    assert set(found.problems) and all(
+        lines == ["missing: the recipe asks for it"] for lines in found.problems.values()
+    )
     outcome = run_dataset(load_run(recipe), out, resume=True)
     assert outcome.found == found.sequences
     assert_same(out, reference)
@@ -175,8 +186,12 @@ def small_disk(tmp_path):
 
 def test_full_disk_stops_the_run_and_a_larger_one_goes_on(reference, small_disk, tmp_path, capsys):
     recipe, out = recipe_file(tmp_path), small_disk / "out"
-    pages = sum(-(-p.stat().st_size // 4096) for p in reference.rglob("*") if p.is_file())  # small files take a page each
-    subprocess.run(["mount", "-o", f"remount,size={pages * 2 // 3 * 4096}", small_disk], check=True)  # four of six, two at work
+    pages = sum(
+        -(-p.stat().st_size // 4096) for p in reference.rglob("*") if p.is_file()
+    )  # small files take a page each
+    subprocess.run(
+        ["mount", "-o", f"remount,size={pages * 2 // 3 * 4096}", small_disk], check=True
+    )  # four of six, two at work
     assert run(["generate", str(recipe), "--out", str(out), "--workers", "2", "--quiet"]) == 2
     error = capsys.readouterr().err
     assert "no space left" in error and "--resume" in error and error.count("\n") == 1
@@ -201,10 +216,22 @@ def mesh_recipe(tmp_path: Path) -> tuple[Path, list[Path]]:
     folder.mkdir(exist_ok=True)
     for k in range(8):
         mesh = primitives.cuboid(extents=(1.0, 1.0 + k, 1.0))
-        lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces]
+        lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices] + [
+            f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces
+        ]
         (folder / f"box{k}.obj").write_text("\n".join(lines) + "\n")
-    scene = {"kind": "random", "objects": {"count": 2}, "pool": {"primitives": [], "folders": ["meshes"], "test_fraction": 0.0},
-             "textures": {"procedural": ["checks"], "variants": 4, "photographs": False, "max_size": 64, "test_fraction": 0.0}}
+    scene = {
+        "kind": "random",
+        "objects": {"count": 2},
+        "pool": {"primitives": [], "folders": ["meshes"], "test_fraction": 0.0},
+        "textures": {
+            "procedural": ["checks"],
+            "variants": 4,
+            "photographs": False,
+            "max_size": 64,
+            "test_fraction": 0.0,
+        },
+    }
     return recipe_file(tmp_path, scene=scene, groups={"fly": {"output": {"sequences": 4}}}), sorted(folder.iterdir())
 
 
@@ -235,7 +262,9 @@ def test_an_asset_that_changes_during_a_run(tmp_path):
 def test_a_corrupt_asset_costs_the_sequences_that_need_it(tmp_path, capsys):
     recipe, files = mesh_recipe(tmp_path)
     files[0].write_text("v 0 0 0\nf 1 2 9\n")
-    status = run(["generate", str(recipe), "--out", str(tmp_path / "out"), "--quiet", "--set", "groups.fly.output.sequences=8"])
+    status = run(
+        ["generate", str(recipe), "--out", str(tmp_path / "out"), "--quiet", "--set", "groups.fly.output.sequences=8"]
+    )
     said = capsys.readouterr().err
     assert status == 3 and "set aside: train/fly_" in said and "box0.obj" in said
     failed = json.loads((tmp_path / "out/.run/failed.json").read_text())
@@ -255,7 +284,9 @@ def test_another_recipe_is_refused(tmp_path):
     before = tree(tmp_path / "out")
     other = load_run(recipe_file(tmp_path), ["groups.probe.camera.width=80"])
     for resume in (False, True):
-        with pytest.raises(OutputError, match=r"holds the run of another recipe \(different: probe\); expected .*--mixed"):
+        with pytest.raises(
+            OutputError, match=r"holds the run of another recipe \(different: probe\); expected .*--mixed"
+        ):
             run_dataset(other, tmp_path / "out", resume=resume)
     with pytest.raises(OutputError, match="exists; expected a new folder name, or --resume"):
         run_dataset(recipe, tmp_path / "out", num=1)
@@ -298,12 +329,15 @@ def test_damaged_sequence_is_put_away_and_made_again(reference, tmp_path):
     assert verify_dataset(tmp_path / "out").clean
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (["--executor", "slurm"], "--executor: unknown executor (got 'slurm'); expected local or ray"),
-    (["--address", "head:6379"], "--address: belongs to --executor ray"),
-    (["--devices", "a"], "--devices: not a list of device numbers"),
-    (["--workers", "0"], "--workers"),
-])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--executor", "slurm"], "--executor: unknown executor (got 'slurm'); expected local or ray"),
+        (["--address", "head:6379"], "--address: belongs to --executor ray"),
+        (["--devices", "a"], "--devices: not a list of device numbers"),
+        (["--workers", "0"], "--workers"),
+    ],
+)
 def test_bad_options(tmp_path, capsys, arguments, message):
     assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), *arguments]) == 2
     error = capsys.readouterr().err

@@ -15,8 +15,12 @@ ENVIRONMENT = {"numpy": "2.0", "opengl": "llvmpipe, 4.5"}
 
 
 def plan(identity: dict[str, str], base: str = "."):
-    return SimpleNamespace(identity=identity, template=SimpleNamespace(base=Path(base)), recipe_text=lambda: "seed: 1\n",
-                           tasks=SimpleNamespace(splits=["test", "train"], number=lambda name: None))
+    return SimpleNamespace(
+        identity=identity,
+        template=SimpleNamespace(base=Path(base)),
+        recipe_text=lambda: "seed: 1\n",
+        tasks=SimpleNamespace(splits=["test", "train"], number=lambda name: None),
+    )
 
 
 def begun(out: Path, identity=None, assets=None, environment=None) -> RunFolder:
@@ -26,12 +30,21 @@ def begun(out: Path, identity=None, assets=None, environment=None) -> RunFolder:
     return folder
 
 
-@pytest.mark.parametrize("before, now, said", [
-    ({"a": "1"}, {"a": "2"}, "a (changed)"), ({"a": "1", "b": "1"}, {"b": "1"}, "a (gone)"), ({"b": "1"}, {"a": "1", "b": "1"}, "a (new)"),
-    ({"a": "1", "b": "1", "c": "1"}, {"b": "2", "c": "2", "d": "1"}, "a (gone), b (changed), c (changed) …"),
-    ({"a": "1", "b": "1"}, {"b": "2", "c": "2"}, "a (gone), b (changed), c (new)"),
-    ({"x": "1", **{f"f{k}": "1" for k in range(5)}}, {f"f{k}": "2" for k in range(5)}, "f0 (changed), f1 (changed), f2 (changed) …"),
-])
+@pytest.mark.parametrize(
+    "before, now, said",
+    [
+        ({"a": "1"}, {"a": "2"}, "a (changed)"),
+        ({"a": "1", "b": "1"}, {"b": "1"}, "a (gone)"),
+        ({"b": "1"}, {"a": "1", "b": "1"}, "a (new)"),
+        ({"a": "1", "b": "1", "c": "1"}, {"b": "2", "c": "2", "d": "1"}, "a (gone), b (changed), c (changed) …"),
+        ({"a": "1", "b": "1"}, {"b": "2", "c": "2"}, "a (gone), b (changed), c (new)"),
+        (
+            {"x": "1", **{f"f{k}": "1" for k in range(5)}},
+            {f"f{k}": "2" for k in range(5)},
+            "f0 (changed), f1 (changed), f2 (changed) …",
+        ),
+    ],
+)
 def test_files_that_are_not_those_the_run_began_with(tmp_path, before, now, said):
     """The first three by name, each with what became of it; dots where there are more."""
     folder = begun(tmp_path / "out", assets=before)
@@ -39,13 +52,20 @@ def test_files_that_are_not_those_the_run_began_with(tmp_path, before, now, said
     folder.check(plan({"": "a"}), now, True)
     with pytest.raises(OutputError) as caught:
         folder.check(plan({"": "a"}), now, False)
-    assert f"the pools are not those the run began with: {said}; expected" in str(caught.value) or str(caught.value).split("began with: ")[1].startswith(said + ";")
+    assert f"the pools are not those the run began with: {said}; expected" in str(caught.value) or str(
+        caught.value
+    ).split("began with: ")[1].startswith(said + ";")
 
 
-@pytest.mark.parametrize("ours, theirs, names", [
-    ({"": "b"}, {"": "a"}, "the configuration"), ({"x": "1", "y": "2"}, {"x": "1", "y": "1"}, "y"), ({"x": "1"}, {"x": "1", "z": "1"}, "z"),
-    ({"x": "2", "y": "2"}, {"x": "1", "z": "1"}, "x, y, z"),
-])
+@pytest.mark.parametrize(
+    "ours, theirs, names",
+    [
+        ({"": "b"}, {"": "a"}, "the configuration"),
+        ({"x": "1", "y": "2"}, {"x": "1", "y": "1"}, "y"),
+        ({"x": "1"}, {"x": "1", "z": "1"}, "z"),
+        ({"x": "2", "y": "2"}, {"x": "1", "z": "1"}, "x, y, z"),
+    ],
+)
 def test_the_run_of_another_recipe(tmp_path, ours, theirs, names):
     folder = begun(tmp_path / "out", identity=theirs)
     folder.check(plan(ours), {}, True)
@@ -58,23 +78,36 @@ def test_another_installation(tmp_path):
     folder.check_environment(ENVIRONMENT, False)
     folder.check_environment({**ENVIRONMENT, "numba": "1"}, False)
     folder.check_environment({**ENVIRONMENT, "numpy": "1.0"}, True)
-    with pytest.raises(OutputError, match=r"the run began with another installation: numpy 2.0, now 1.0; opengl llvmpipe, 4.5, now Voodoo"):
+    with pytest.raises(
+        OutputError,
+        match=r"the run began with another installation: numpy 2.0, now 1.0; opengl llvmpipe, 4.5, now Voodoo",
+    ):
         folder.check_environment({"numpy": "1.0", "opengl": "Voodoo"}, False)
 
 
 def test_what_identifies_a_run_is_written_and_stays(tmp_path):
     folder = begun(tmp_path / "out", identity={"g": "1"}, assets={"m": "h"})
     record = json.loads((tmp_path / "out/.run/run.json").read_text())
-    assert record["groups"] == {"g": "1"} and record["environment"] == ENVIRONMENT and record["mixed"] == [] and record["num"] == 3
+    assert (
+        record["groups"] == {"g": "1"}
+        and record["environment"] == ENVIRONMENT
+        and record["mixed"] == []
+        and record["num"] == 3
+    )
     assert record["base"] == str(Path.cwd()) and folder.begun
-    assert (tmp_path / "out/.run/recipe.yaml").read_text() == "seed: 1\n" and json.loads((tmp_path / "out/.run/assets.json").read_text()) == {"m": "h"}
+    assert (tmp_path / "out/.run/recipe.yaml").read_text() == "seed: 1\n" and json.loads(
+        (tmp_path / "out/.run/assets.json").read_text()
+    ) == {"m": "h"}
     begun(tmp_path / "out", identity={"g": "1"}, assets={"m": "h"})
     assert json.loads((tmp_path / "out/.run/run.json").read_text())["mixed"] == []
     begun(tmp_path / "out", identity={"g": "2"}, assets={"m": "i"})
     begun(tmp_path / "out", identity={"g": "1"}, environment={"numpy": "3"})
     record = json.loads((tmp_path / "out/.run/run.json").read_text())
     assert record["groups"] == {"g": "1"} and record["environment"] == ENVIRONMENT, "the beginning stays"
-    assert record["mixed"] == [{"environment": ENVIRONMENT, "groups": {"g": "2"}}, {"environment": {"numpy": "3"}, "groups": {"g": "1"}}]
+    assert record["mixed"] == [
+        {"environment": ENVIRONMENT, "groups": {"g": "2"}},
+        {"environment": {"numpy": "3"}, "groups": {"g": "1"}},
+    ]
 
 
 def test_a_run_of_which_nothing_came_leaves_nothing(tmp_path):
@@ -86,7 +119,9 @@ def test_a_run_of_which_nothing_came_leaves_nothing(tmp_path):
         for name in ("index.jsonl", ".run/failed.json", ".run/costs.jsonl", ".run/logs/worker-1.log"):
             (out / name).write_text("")
         folder.forget(plan({}), keep)
-        assert sorted(p.relative_to(out).as_posix() for p in out.rglob("*")) == ([".run", ".run/logs", ".run/logs/worker-1.log"] if keep else [])
+        assert sorted(p.relative_to(out).as_posix() for p in out.rglob("*")) == (
+            [".run", ".run/logs", ".run/logs/worker-1.log"] if keep else []
+        )
 
 
 def test_what_lies_at_a_sequences_name(tmp_path):
@@ -96,9 +131,20 @@ def test_what_lies_at_a_sequences_name(tmp_path):
     (tmp_path / "train/link").symlink_to(tmp_path / "train/empty")
     (tmp_path / "train/odd").mkdir()
     (tmp_path / "train/odd/x").write_text("")
-    assert [folder.state(f"train/{name}") for name in ("nothing", "empty", "file", "link")] == [None, None, "not a folder", "not a folder"]
+    assert [folder.state(f"train/{name}") for name in ("nothing", "empty", "file", "link")] == [
+        None,
+        None,
+        "not a folder",
+        "not a folder",
+    ]
     assert "manifest" in folder.state("train/odd")
-    assert [folder.occupied(f"train/{name}") for name in ("nothing", "empty", "file", "link", "odd")] == [False, False, True, False, True]
+    assert [folder.occupied(f"train/{name}") for name in ("nothing", "empty", "file", "link", "odd")] == [
+        False,
+        False,
+        True,
+        False,
+        True,
+    ]
     for k in range(3):
         folder.put_away("train/odd")
         assert (tmp_path / f".run/damaged/train/odd-{k}/x").exists() and not (tmp_path / "train/odd").exists()
@@ -154,11 +200,26 @@ def test_logs_of_workers_that_began_nothing(tmp_path):
 
 def test_costs_are_the_last_of_each_sequence_and_a_line_cut_short_is_left_out(tmp_path):
     folder = begun(tmp_path)
-    report = {"name": "n", "seconds": {"render": 1.0}, "total_s": 2.0, "simulated_s": 0.5, "frames": 7, "path": "/x", "index": 3}
+    report = {
+        "name": "n",
+        "seconds": {"render": 1.0},
+        "total_s": 2.0,
+        "simulated_s": 0.5,
+        "frames": 7,
+        "path": "/x",
+        "index": 3,
+    }
     for seconds, attempt in ((2.0, 1), (3.0, 2)):
         message = {"report": {**report, "total_s": seconds}, "bytes": 100, "cpu_s": 1.5, "peak_rss_kib": 900}
         folder.add_cost(SimpleNamespace(name="train/a_000000", group="g"), message, attempt)
     with open(tmp_path / ".run/costs.jsonl", "a") as file:
         file.write('{"name": "train/a_000')
     [line] = folder.costs()
-    assert line["attempts"] == 2 and line["total_s"] == 3.0 and line["bytes"] == 100 and line["group"] == "g" and "path" not in line and "index" not in line
+    assert (
+        line["attempts"] == 2
+        and line["total_s"] == 3.0
+        and line["bytes"] == 100
+        and line["group"] == "g"
+        and "path" not in line
+        and "index" not in line
+    )

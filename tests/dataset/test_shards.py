@@ -67,7 +67,9 @@ def test_webdataset_reads_them(data, tmp_path):
     written = members(tmp_path / "a", "train")
     paths = [str(p) for p in sorted((tmp_path / "a").glob("train-*.tar"))]
     samples = list(webdataset.WebDataset(paths, shardshuffle=False))
-    assert len(paths) > 1 and [s["__key__"] for s in samples] == list(dict.fromkeys(name.partition(".")[0] for name, _ in written))
+    assert len(paths) > 1 and [s["__key__"] for s in samples] == list(
+        dict.fromkeys(name.partition(".")[0] for name, _ in written)
+    )
     assert {f"{s['__key__']}.{ending}": s[ending] for s in samples for ending in s if ending[0] != "_"} == dict(written)
 
 
@@ -92,7 +94,9 @@ def test_the_same_bytes_again_and_shards_of_the_size_asked_for(data, tmp_path):
     counts = export_shards(data, tmp_path / "a", shard_bytes=60_000)
     assert len(counts["train"]) > 1 and sum(counts["train"]) == 8
     export_shards(data, tmp_path / "b", shard_bytes=60_000)
-    assert [p.read_bytes() for p in sorted((tmp_path / "a").iterdir())] == [p.read_bytes() for p in sorted((tmp_path / "b").iterdir())]
+    assert [p.read_bytes() for p in sorted((tmp_path / "a").iterdir())] == [
+        p.read_bytes() for p in sorted((tmp_path / "b").iterdir())
+    ]
 
 
 def test_bad_input(data, tmp_path):

@@ -63,6 +63,7 @@ def store(sequence: Path, name: str, data: np.ndarray) -> None:
 @contextlib.contextmanager
 def no_longer_than(seconds: int):
     """A test that would wait for ever fails instead."""
+
     def stop(*_):
         raise TimeoutError("it hangs")
 
@@ -99,6 +100,7 @@ def set_last(value):
     def change(column):
         column[-1] = value
         return column
+
     return change
 
 
@@ -122,45 +124,77 @@ def test_missing_sequences_get_a_line_each_up_to_a_limit(data, monkeypatch):
     assert problems["."] == [f"and {gone - 1} more sequences that the recipe asks for are missing"]
 
 
-@pytest.mark.parametrize("damage, message", [
-    (lambda s: flip(s / "events.h5"), "events.h5: checksum differs"),
-    (lambda s: flip(s / "flow/forward/000001.png"), "flow/forward/000001.png: checksum differs"),
-    (lambda s: (s / "images/000000.png").write_bytes((s / "images/000000.png").read_bytes()[:-10]), "images/000000.png: "),
-    (lambda s: (s / "poses.npz").unlink(), "poses.npz: missing"),
-    (lambda s: (s / "flow/forward/notes.txt").write_text("x"), "flow/forward/notes.txt: not in the manifest"),
-    (lambda s: (s / "manifest.json").write_text("{"), "damaged manifest"),
-    (lambda s: edit_events(s, t=swap_times), "events.h5: times decrease after event"),
-    (lambda s: edit_events(s, x=set_last(64)), "events.h5: an event outside 64x48 px"),
-    (lambda s: edit_events(s, p=set_last(2)), "events.h5: a polarity other than 0 and 1"),
-    (lambda s: edit_events(s, t=set_last(9_000_000)), "events.h5: last event at 9000000 µs, the sequence ends at 250000 µs"),
-    (lambda s: edit_events(s, ms_to_idx=set_last(1)), "events.h5: ms_to_idx[250] is 1, expected"),
-    (lambda s: forge(s, "", events=3), "events.h5: columns of"),
-    (lambda s: forge(s, "", labels=9), "manifest.json: labels is 9, config.yaml says 4"),
-    (lambda s: ((s / "flow/forward_timestamps.txt").write_text("50000, 100000\n"), forge(s, "flow/forward_timestamps.txt")),
-     "flow/forward: 4 files, 1 time stamps, manifest says 4 labels"),
-    (lambda s: drop(s, "ids/000002.png"), "ids/000002.png: missing, config.yaml asks for it"),
-    (lambda s: ((s / "depth").mkdir(), (s / "depth/000000.npy").write_text("x"), forge(s, "depth/000000.npy")), "depth/000000.npy: config.yaml does not ask for it"),
-    (lambda s: (os.symlink("events.h5", s / "also.h5")), "also.h5: a symbolic link"),
-    (lambda s: (os.symlink("flow", s / "more")), "more: a symbolic link"),
-    (lambda s: ((s / "poses.npz").rename(s / "p"), os.symlink("p", s / "poses.npz")), "p: not in the manifest"),
-    (lambda s: ((s / "events.h5").unlink(), os.mkfifo(s / "events.h5")), "events.h5: a special file"),
-    (lambda s: ((s / "config.yaml").unlink(), os.mkfifo(s / "config.yaml")), "config.yaml: a special file"),
-    (lambda s: ((s / "manifest.json").unlink(), os.mkfifo(s / "manifest.json")), "manifest.json: not a regular file"),
-    (lambda s: (s / "images/more").mkdir(), "images/more: an empty folder"),
-    (lambda s: (s / os.fsdecode(b"caf\xe9\x1b[31m")).write_text("x"), "caf\\udce9\\x1b[31m: not in the manifest"),
-    (lambda s: forge(s, "", sequence=1), "manifest.json: sequence is 1, config.yaml says 0"),
-    (lambda s: forge(s, "", seed=3), "manifest.json: seed is 3, config.yaml says"),
-    (lambda s: forge(s, "", split="test"), "manifest.json: split is test, config.yaml says train"),
-    (lambda s: forge(s, "", duration_us=200_000), "manifest.json: duration_us is 200000, config.yaml says 250000"),
-    (lambda s: ((s / "config.yaml").write_text("seed: ["), forge(s, "config.yaml")), "not valid YAML"),
-    (lambda s: store(s, "ms_to_idx", np.zeros(9, np.uint64)), "events.h5: ms_to_idx has 9 entries, 251 are needed"),
-    (lambda s: store(s, "events/x", np.array(["a", "b"], "S1")), "events.h5: "),
-    (lambda s: store(s, "t_offset", np.zeros(3)), "events.h5: "),
-    (lambda s: ((s / "images/timestamps.txt").write_text("5\nfive\n"), forge(s, "images/timestamps.txt")), "cannot be checked: ValueError"),
-    (lambda s: forge(s, "", seed=None), "manifest.json: 'seed' is missing or no int"),
-    (lambda s: ((s / "images/timestamps.txt").write_text("5\n4\n3\n2\n1\n"), forge(s, "images/timestamps.txt")), "images/timestamps.txt: times are not in order"),
-    (lambda s: (cv2.imwrite(str(s / "images/000000.png"), np.zeros((4, 4, 3), np.uint8)), forge(s, "images/000000.png")), "images/000000.png: not 64x48 px"),
-])
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        (lambda s: flip(s / "events.h5"), "events.h5: checksum differs"),
+        (lambda s: flip(s / "flow/forward/000001.png"), "flow/forward/000001.png: checksum differs"),
+        (
+            lambda s: (s / "images/000000.png").write_bytes((s / "images/000000.png").read_bytes()[:-10]),
+            "images/000000.png: ",
+        ),
+        (lambda s: (s / "poses.npz").unlink(), "poses.npz: missing"),
+        (lambda s: (s / "flow/forward/notes.txt").write_text("x"), "flow/forward/notes.txt: not in the manifest"),
+        (lambda s: (s / "manifest.json").write_text("{"), "damaged manifest"),
+        (lambda s: edit_events(s, t=swap_times), "events.h5: times decrease after event"),
+        (lambda s: edit_events(s, x=set_last(64)), "events.h5: an event outside 64x48 px"),
+        (lambda s: edit_events(s, p=set_last(2)), "events.h5: a polarity other than 0 and 1"),
+        (
+            lambda s: edit_events(s, t=set_last(9_000_000)),
+            "events.h5: last event at 9000000 µs, the sequence ends at 250000 µs",
+        ),
+        (lambda s: edit_events(s, ms_to_idx=set_last(1)), "events.h5: ms_to_idx[250] is 1, expected"),
+        (lambda s: forge(s, "", events=3), "events.h5: columns of"),
+        (lambda s: forge(s, "", labels=9), "manifest.json: labels is 9, config.yaml says 4"),
+        (
+            lambda s: (
+                (s / "flow/forward_timestamps.txt").write_text("50000, 100000\n"),
+                forge(s, "flow/forward_timestamps.txt"),
+            ),
+            "flow/forward: 4 files, 1 time stamps, manifest says 4 labels",
+        ),
+        (lambda s: drop(s, "ids/000002.png"), "ids/000002.png: missing, config.yaml asks for it"),
+        (
+            lambda s: ((s / "depth").mkdir(), (s / "depth/000000.npy").write_text("x"), forge(s, "depth/000000.npy")),
+            "depth/000000.npy: config.yaml does not ask for it",
+        ),
+        (lambda s: os.symlink("events.h5", s / "also.h5"), "also.h5: a symbolic link"),
+        (lambda s: os.symlink("flow", s / "more"), "more: a symbolic link"),
+        (lambda s: ((s / "poses.npz").rename(s / "p"), os.symlink("p", s / "poses.npz")), "p: not in the manifest"),
+        (lambda s: ((s / "events.h5").unlink(), os.mkfifo(s / "events.h5")), "events.h5: a special file"),
+        (lambda s: ((s / "config.yaml").unlink(), os.mkfifo(s / "config.yaml")), "config.yaml: a special file"),
+        (
+            lambda s: ((s / "manifest.json").unlink(), os.mkfifo(s / "manifest.json")),
+            "manifest.json: not a regular file",
+        ),
+        (lambda s: (s / "images/more").mkdir(), "images/more: an empty folder"),
+        (lambda s: (s / os.fsdecode(b"caf\xe9\x1b[31m")).write_text("x"), "caf\\udce9\\x1b[31m: not in the manifest"),
+        (lambda s: forge(s, "", sequence=1), "manifest.json: sequence is 1, config.yaml says 0"),
+        (lambda s: forge(s, "", seed=3), "manifest.json: seed is 3, config.yaml says"),
+        (lambda s: forge(s, "", split="test"), "manifest.json: split is test, config.yaml says train"),
+        (lambda s: forge(s, "", duration_us=200_000), "manifest.json: duration_us is 200000, config.yaml says 250000"),
+        (lambda s: ((s / "config.yaml").write_text("seed: ["), forge(s, "config.yaml")), "not valid YAML"),
+        (lambda s: store(s, "ms_to_idx", np.zeros(9, np.uint64)), "events.h5: ms_to_idx has 9 entries, 251 are needed"),
+        (lambda s: store(s, "events/x", np.array(["a", "b"], "S1")), "events.h5: "),
+        (lambda s: store(s, "t_offset", np.zeros(3)), "events.h5: "),
+        (
+            lambda s: ((s / "images/timestamps.txt").write_text("5\nfive\n"), forge(s, "images/timestamps.txt")),
+            "cannot be checked: ValueError",
+        ),
+        (lambda s: forge(s, "", seed=None), "manifest.json: 'seed' is missing or no int"),
+        (
+            lambda s: ((s / "images/timestamps.txt").write_text("5\n4\n3\n2\n1\n"), forge(s, "images/timestamps.txt")),
+            "images/timestamps.txt: times are not in order",
+        ),
+        (
+            lambda s: (
+                cv2.imwrite(str(s / "images/000000.png"), np.zeros((4, 4, 3), np.uint8)),
+                forge(s, "images/000000.png"),
+            ),
+            "images/000000.png: not 64x48 px",
+        ),
+    ],
+)
 def test_damage_inside_a_sequence(data, damage, message):
     damage(data / NAMES[0])
     (data / "index.jsonl").unlink()
@@ -169,28 +203,71 @@ def test_damage_inside_a_sequence(data, damage, message):
     assert list(problems) == [NAMES[0]] and len(problems[NAMES[0]]) <= 2 and message in problems[NAMES[0]][0]
 
 
-@pytest.mark.parametrize("damage, message", [
-    (lambda d: shutil.rmtree(d / NAMES[0]), "missing: the recipe asks for it"),
-    (lambda d: (d / "train/readme.txt").write_text("x"), "train/readme.txt: belongs to no sequence"),
-    (lambda d: (d / "train/.fly_000000.blinkgl-tmp-0123456789ab-1-0").mkdir() or
-        (d / "train/.fly_000000.blinkgl-tmp-0123456789ab-1-0/events.h5").write_text(""), "left by a run that was cut off"),
-    (lambda d: (d / "index.jsonl").write_text((d / "index.jsonl").read_text().replace('"events": ', '"events": 1')), "index.jsonl: out of date for"),
-    (lambda d: (d / "index.jsonl").write_text('{"path": "../x"}\n'), "index.jsonl: damaged index"),
-    (lambda d: (d / ".run/run.json").write_text("["), "the run's record is damaged"),
-    (lambda d: (d / "index.jsonl").write_text(2 * (d / "index.jsonl").read_text()), "index.jsonl: damaged index: test/probe_000000 is listed twice"),
-    (lambda d: pipe(d / "index.jsonl"), "index.jsonl: not a regular file"),
-    (lambda d: pipe(d / ".run/run.json"), "run.json: the run's record is damaged: not a regular file"),
-    (lambda d: pipe(d / ".run/recipe.yaml"), "recipe.yaml: not a regular file"),
-    (lambda d: swap(d / NAMES[0], d / NAMES[1]), f"{NAMES[0]}: the folder is called {NAMES[0]}, but holds {NAMES[1]}"),
-    (lambda d: shutil.copytree(d / NAMES[0], d / "train/fly_000002"), "train/fly_000002: the folder is called train/fly_000002, but holds train/fly_000000"),
-    (lambda d: (d / NAMES[0]).rename(d / "test/fly_000000"), "test/fly_000000: the folder is called test/fly_000000, but holds train/fly_000000"),
-    (lambda d: ((d / NAMES[1]).rename(d / "x"), (d / NAMES[1]).symlink_to(d / "x")), f"{NAMES[1]}: a symbolic link, not a folder"),
-    (lambda d: renumber(shutil.copytree(d / NAMES[0], d / "train/fly_000002"), 2), "train/fly_000002: events.h5: the same as in train/fly_000000"),
-    (lambda d: renumber(shutil.copytree(d / NAMES[0], d / "train/fly_000002"), 2), "train/fly_000002: poses.npz: the same as in train/fly_000000"),
-    (lambda d: configure(d / NAMES[0], "contrast_threshold", 0.25), f"{NAMES[0]}: config.yaml: the recipe draws another value for events.contrast_threshold"),
-    (lambda d: configure(d / NAMES[0], "name", "gnu") or (d / NAMES[0]).rename(d / "train/gnu_000000"), "train/gnu_000000: no group of the recipe makes it"),
-    (lambda d: forge(d / NAMES[0], "", opengl={"renderer": "Voodoo", "version": "1"}), "made with opengl Voodoo, 1, the run's record says"),
-])
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        (lambda d: shutil.rmtree(d / NAMES[0]), "missing: the recipe asks for it"),
+        (lambda d: (d / "train/readme.txt").write_text("x"), "train/readme.txt: belongs to no sequence"),
+        (
+            lambda d: (
+                (d / "train/.fly_000000.blinkgl-tmp-0123456789ab-1-0").mkdir()
+                or (d / "train/.fly_000000.blinkgl-tmp-0123456789ab-1-0/events.h5").write_text("")
+            ),
+            "left by a run that was cut off",
+        ),
+        (
+            lambda d: (d / "index.jsonl").write_text(
+                (d / "index.jsonl").read_text().replace('"events": ', '"events": 1')
+            ),
+            "index.jsonl: out of date for",
+        ),
+        (lambda d: (d / "index.jsonl").write_text('{"path": "../x"}\n'), "index.jsonl: damaged index"),
+        (lambda d: (d / ".run/run.json").write_text("["), "the run's record is damaged"),
+        (
+            lambda d: (d / "index.jsonl").write_text(2 * (d / "index.jsonl").read_text()),
+            "index.jsonl: damaged index: test/probe_000000 is listed twice",
+        ),
+        (lambda d: pipe(d / "index.jsonl"), "index.jsonl: not a regular file"),
+        (lambda d: pipe(d / ".run/run.json"), "run.json: the run's record is damaged: not a regular file"),
+        (lambda d: pipe(d / ".run/recipe.yaml"), "recipe.yaml: not a regular file"),
+        (
+            lambda d: swap(d / NAMES[0], d / NAMES[1]),
+            f"{NAMES[0]}: the folder is called {NAMES[0]}, but holds {NAMES[1]}",
+        ),
+        (
+            lambda d: shutil.copytree(d / NAMES[0], d / "train/fly_000002"),
+            "train/fly_000002: the folder is called train/fly_000002, but holds train/fly_000000",
+        ),
+        (
+            lambda d: (d / NAMES[0]).rename(d / "test/fly_000000"),
+            "test/fly_000000: the folder is called test/fly_000000, but holds train/fly_000000",
+        ),
+        (
+            lambda d: ((d / NAMES[1]).rename(d / "x"), (d / NAMES[1]).symlink_to(d / "x")),
+            f"{NAMES[1]}: a symbolic link, not a folder",
+        ),
+        (
+            lambda d: renumber(shutil.copytree(d / NAMES[0], d / "train/fly_000002"), 2),
+            "train/fly_000002: events.h5: the same as in train/fly_000000",
+        ),
+        (
+            lambda d: renumber(shutil.copytree(d / NAMES[0], d / "train/fly_000002"), 2),
+            "train/fly_000002: poses.npz: the same as in train/fly_000000",
+        ),
+        (
+            lambda d: configure(d / NAMES[0], "contrast_threshold", 0.25),
+            f"{NAMES[0]}: config.yaml: the recipe draws another value for events.contrast_threshold",
+        ),
+        (
+            lambda d: configure(d / NAMES[0], "name", "gnu") or (d / NAMES[0]).rename(d / "train/gnu_000000"),
+            "train/gnu_000000: no group of the recipe makes it",
+        ),
+        (
+            lambda d: forge(d / NAMES[0], "", opengl={"renderer": "Voodoo", "version": "1"}),
+            "made with opengl Voodoo, 1, the run's record says",
+        ),
+    ],
+)
 def test_damage_between_sequences(data, capsys, damage, message):
     damage(data)
     for command in ("verify", "report"):
@@ -228,15 +305,53 @@ def renumber(sequence: Path, number: int) -> None:
 DEEP = "[" * 100_000
 LONG = "n" * 5000
 MANIFESTS = [
-    DEEP, '{"files": ' + DEEP, "[]", "null", "7", '"x"', "\x00", "{}", '{"a": 1, "a": 2}', "\ud800", {"files": []}, {"files": None}, {"files": {"a\x00b": None}},
-    {"format": "other"}, {"format_version": 2}, {"sequence": -1}, {"sequence": 1.5}, {"sequence": 10**30}, {"events": -1}, {"events": "many"},
-    {"events": True}, {"height": 0}, {"width": 1e9}, {"t_offset_us": None}, {"duration_us": -5}, {"labels": [4]}, {"split": 3}, {"split": "x" * 5000}, {"seed": "11"},
-    {"emulator": {"a": 1}}, {"opengl": "none"}, {"opengl": {"renderer": 3}}, {"versions": 5}, {"frames": DEEP[:900]}, '{"seed": ' + "9" * 6000 + "}",
+    DEEP,
+    '{"files": ' + DEEP,
+    "[]",
+    "null",
+    "7",
+    '"x"',
+    "\x00",
+    "{}",
+    '{"a": 1, "a": 2}',
+    "\ud800",
+    {"files": []},
+    {"files": None},
+    {"files": {"a\x00b": None}},
+    {"format": "other"},
+    {"format_version": 2},
+    {"sequence": -1},
+    {"sequence": 1.5},
+    {"sequence": 10**30},
+    {"events": -1},
+    {"events": "many"},
+    {"events": True},
+    {"height": 0},
+    {"width": 1e9},
+    {"t_offset_us": None},
+    {"duration_us": -5},
+    {"labels": [4]},
+    {"split": 3},
+    {"split": "x" * 5000},
+    {"seed": "11"},
+    {"emulator": {"a": 1}},
+    {"opengl": "none"},
+    {"opengl": {"renderer": 3}},
+    {"versions": 5},
+    {"frames": DEEP[:900]},
+    '{"seed": ' + "9" * 6000 + "}",
 ]
 FILES = ["", "/etc/passwd", "../x", "a/../b", "a//b", ".", "x\x00y", LONG, "d/" * 600 + "f", "\udce9"]
 
 
-ENTRIES = [{}, 5, {"bytes": "1", "sha256": "0" * 64}, {"bytes": -1, "sha256": "0" * 64}, {"bytes": 1, "sha256": LONG}, {"bytes": 1, "sha256": None}]
+ENTRIES = [
+    {},
+    5,
+    {"bytes": "1", "sha256": "0" * 64},
+    {"bytes": -1, "sha256": "0" * 64},
+    {"bytes": 1, "sha256": LONG},
+    {"bytes": 1, "sha256": None},
+]
 
 
 def test_no_manifest_stops_it(data, capsys):
@@ -247,7 +362,11 @@ def test_no_manifest_stops_it(data, capsys):
     path = data / NAMES[0] / "manifest.json"
     manifest = json.loads(path.read_text())
     files = manifest["files"]
-    changes = MANIFESTS + [{"files": {**files, name: files["events.h5"]}} for name in FILES] + [{"files": {**files, "events.h5": e}} for e in ENTRIES]
+    changes = (
+        MANIFESTS
+        + [{"files": {**files, name: files["events.h5"]}} for name in FILES]
+        + [{"files": {**files, "events.h5": e}} for e in ENTRIES]
+    )
     for number, change in enumerate(changes):
         text = change if isinstance(change, str) else json.dumps({**manifest, **change})
         path.write_bytes(text.encode("utf-8", "surrogatepass"))
@@ -257,7 +376,11 @@ def test_no_manifest_stops_it(data, capsys):
         assert "damaged manifest: " in line or "manifest.json" in line, line
         assert len(line) < 500 and line.isprintable()
         if number % 8 == 0:
-            for command in (["verify", str(data)], ["report", str(data)], ["export", str(data), "--out", str(data / f"x{number}")]):
+            for command in (
+                ["verify", str(data)],
+                ["report", str(data)],
+                ["export", str(data), "--out", str(data / f"x{number}")],
+            ):
                 assert run(command) in (0, 2) and "Traceback" not in capsys.readouterr().err
 
 
@@ -265,11 +388,33 @@ _RUN = {"format": "blinkgl-run", "format_version": 1, "groups": {}, "environment
 RECORDS = [DEEP, "[]", "null", "7", '{"path": 5}', '{"path": -1}', '{"path": ["a"]}', "\udce9", '{"a": ']
 
 
-@pytest.mark.parametrize("name, contents", [
-    ("index.jsonl", [*RECORDS, '{"path": "a\\u0000"}', json.dumps({"path": LONG}), '{"path": "/etc"}', '{"path": ".."}']),
-    (".run/failed.json", RECORDS),
-    (".run/run.json", RECORDS + [json.dumps({**_RUN, **change}) for change in (
-        {"base": 5}, {"base": "a\x00"}, {"base": LONG}, {"num": "x"}, {"num": -1}, {"environment": [1]}, {"mixed": 7}, {"groups": {"a": 1}})])])
+@pytest.mark.parametrize(
+    "name, contents",
+    [
+        (
+            "index.jsonl",
+            [*RECORDS, '{"path": "a\\u0000"}', json.dumps({"path": LONG}), '{"path": "/etc"}', '{"path": ".."}'],
+        ),
+        (".run/failed.json", RECORDS),
+        (
+            ".run/run.json",
+            RECORDS
+            + [
+                json.dumps({**_RUN, **change})
+                for change in (
+                    {"base": 5},
+                    {"base": "a\x00"},
+                    {"base": LONG},
+                    {"num": "x"},
+                    {"num": -1},
+                    {"environment": [1]},
+                    {"mixed": 7},
+                    {"groups": {"a": 1}},
+                )
+            ],
+        ),
+    ],
+)
 def test_no_record_stops_it(data, capsys, name, contents):
     shutil.rmtree(data / "test")
     for number, content in enumerate(contents):
@@ -278,7 +423,10 @@ def test_no_record_stops_it(data, capsys, name, contents):
         assert "damaged" in line or "not a text file" in line, line
         assert len(line) < 500 and line.isprintable()
         if number % 6 == 0:
-            assert run(["verify", str(data), "--deep", "--sample", "1"]) == 2 and "Traceback" not in capsys.readouterr().err
+            assert (
+                run(["verify", str(data), "--deep", "--sample", "1"]) == 2
+                and "Traceback" not in capsys.readouterr().err
+            )
         if number % 6 == 0 and name != "index.jsonl":  # which a report makes anew
             assert run(["report", str(data)]) == 0 and "Traceback" not in capsys.readouterr().err
 
@@ -294,9 +442,14 @@ def test_nothing_is_passed_over_in_silence(data, capsys):
     assert run(["verify", str(data), "--deep", "--sample", "9"]) == 0
     said = capsys.readouterr().out
     assert "note: no record of the run here" in said
-    assert f"note: {NAMES[0]}: made with opengl Voodoo, 1, this machine has" in said and "the bytes were not compared: events.h5" in said
-    assert ("4 sequences, 2 made again and compared bit by bit, 2 made again and compared in part: no problem found in "
-            "what could be compared") in said
+    assert (
+        f"note: {NAMES[0]}: made with opengl Voodoo, 1, this machine has" in said
+        and "the bytes were not compared: events.h5" in said
+    )
+    assert (
+        "4 sequences, 2 made again and compared bit by bit, 2 made again and compared in part: no problem found in "
+        "what could be compared"
+    ) in said
     # What no renderer decides
     shutil.copy(data / NAMES[1] / "flow/forward/000001.png", data / NAMES[0] / "flow/forward/000001.png")
     forge(data / NAMES[0], "flow/forward/000001.png")
@@ -312,13 +465,22 @@ def test_nothing_is_passed_over_in_silence(data, capsys):
 def test_twins_that_were_asked_for(tmp_path):
     """The same scene twice through an emulator that draws nothing, and one seed through two
     emulators: notes, no problems."""
-    scene = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box", "position": [3, 0, 0]}],
-             "camera": {"keyframes": [{"time": t, "position": [0, t, 0]} for t in (0, 1)]}}
-    groups = {"own": {"scene": scene, "output": {"sequences": 2}, "events": {"emulator": "esim", "threshold_sigma": 0}},
-              "one": {"seed": 5, "events": {"emulator": "esim"}}, "other": {"seed": 5, "events": {"emulator": "v2e"}}}
+    scene = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box", "position": [3, 0, 0]}],
+        "camera": {"keyframes": [{"time": t, "position": [0, t, 0]} for t in (0, 1)]},
+    }
+    groups = {
+        "own": {"scene": scene, "output": {"sequences": 2}, "events": {"emulator": "esim", "threshold_sigma": 0}},
+        "one": {"seed": 5, "events": {"emulator": "esim"}},
+        "other": {"seed": 5, "events": {"emulator": "v2e"}},
+    }
     run_dataset(load_run(recipe_file(tmp_path, groups=groups)), tmp_path / "out")
     result = verify_dataset(tmp_path / "out")
-    assert result.clean and result.notes == ["train/own_000001: the same events as train/own_000000, as their configurations have it"]
+    assert result.clean and result.notes == [
+        "train/own_000001: the same events as train/own_000000, as their configurations have it"
+    ]
 
 
 def test_deep_finds_what_checksums_cannot(data, capsys):

@@ -18,7 +18,12 @@ from blinkgl.io.flow_png import write_flow_png
 
 WIDTH, HEIGHT, END = 20, 10, 5_000
 MANIFEST = {"events": 6, "t_offset_us": 700, "duration_us": END, "width": WIDTH, "height": HEIGHT, "labels": 2}
-GOOD = {"x": [0, 19, 3, 3, 4, 5], "y": [0, 9, 2, 2, 2, 2], "t": [0, 999, 1000, 1000, 3500, 5000], "p": [0, 1, 0, 1, 1, 0]}
+GOOD = {
+    "x": [0, 19, 3, 3, 4, 5],
+    "y": [0, 9, 2, 2, 2, 2],
+    "t": [0, 999, 1000, 1000, 3500, 5000],
+    "p": [0, 1, 0, 1, 1, 0],
+}
 
 
 def table(t, entries: int = 6) -> np.ndarray:
@@ -36,31 +41,53 @@ def events_file(path: Path, offset: int = 700, ms_to_idx=None, **columns) -> Pat
 
 
 @pytest.mark.parametrize("block", [1, 2, 3, 4, 1 << 20])
-@pytest.mark.parametrize("changes, problem", [
-    ({}, None), ({"ms_to_idx": table(GOOD["t"], 7)}, None),
-    ({"offset": 701}, "t_offset is 701, manifest says 700"),
-    ({"ms_to_idx": table(GOOD["t"], 5)}, "ms_to_idx has 5 entries, 6 are needed"), ({"ms_to_idx": table(GOOD["t"], 8)}, "ms_to_idx has 8 entries, 6 are needed"),
-    ({"t": [0, 999, 1000, 998, 3500, 5000]}, "times decrease after event 3"), ({"t": [0, 999, 1000, 1000, 900, 5000]}, "times decrease after event 4"),
-    ({"t": [-1, 999, 1000, 1000, 3500, 5000]}, "times decrease after event 0"),
-    ({"t": [0, 999, 1000, 1000, 3500, 5001]}, "last event at 5001 µs, the sequence ends at 5000 µs"),
-    ({"x": [0, 20, 3, 3, 4, 5]}, "an event outside 20x10 px"), ({"y": [0, 10, 2, 2, 2, 2]}, "an event outside 20x10 px"),
-    ({"p": [0, 1, 0, 2, 1, 0]}, "a polarity other than 0 and 1"), ({"p": [0, 1, 0, -1, 1, 0]}, "a polarity other than 0 and 1"),
-    ({"ms_to_idx": [0, 2, 4, 4, 5, 6]}, "ms_to_idx[5] is 6, expected 5"), ({"ms_to_idx": [0, 1, 4, 4, 5, 5]}, "ms_to_idx[1] is 1, expected 2"),
-    ({"x": [1, 2, 3], "y": [1, 2, 3], "t": [1, 2, 3], "p": [0, 0, 0]}, "columns of [3] events, manifest says 6"),
-])
+@pytest.mark.parametrize(
+    "changes, problem",
+    [
+        ({}, None),
+        ({"ms_to_idx": table(GOOD["t"], 7)}, None),
+        ({"offset": 701}, "t_offset is 701, manifest says 700"),
+        ({"ms_to_idx": table(GOOD["t"], 5)}, "ms_to_idx has 5 entries, 6 are needed"),
+        ({"ms_to_idx": table(GOOD["t"], 8)}, "ms_to_idx has 8 entries, 6 are needed"),
+        ({"t": [0, 999, 1000, 998, 3500, 5000]}, "times decrease after event 3"),
+        ({"t": [0, 999, 1000, 1000, 900, 5000]}, "times decrease after event 4"),
+        ({"t": [-1, 999, 1000, 1000, 3500, 5000]}, "times decrease after event 0"),
+        ({"t": [0, 999, 1000, 1000, 3500, 5001]}, "last event at 5001 µs, the sequence ends at 5000 µs"),
+        ({"x": [0, 20, 3, 3, 4, 5]}, "an event outside 20x10 px"),
+        ({"y": [0, 10, 2, 2, 2, 2]}, "an event outside 20x10 px"),
+        ({"p": [0, 1, 0, 2, 1, 0]}, "a polarity other than 0 and 1"),
+        ({"p": [0, 1, 0, -1, 1, 0]}, "a polarity other than 0 and 1"),
+        ({"ms_to_idx": [0, 2, 4, 4, 5, 6]}, "ms_to_idx[5] is 6, expected 5"),
+        ({"ms_to_idx": [0, 1, 4, 4, 5, 5]}, "ms_to_idx[1] is 1, expected 2"),
+        ({"x": [1, 2, 3], "y": [1, 2, 3], "t": [1, 2, 3], "p": [0, 0, 0]}, "columns of [3] events, manifest says 6"),
+    ],
+)
 def test_events(tmp_path, monkeypatch, block, changes, problem):
     """In blocks of any size: what is wrong, and that it is the only thing said."""
     monkeypatch.setattr(verify, "_BLOCK", block)
-    assert check_events(events_file(tmp_path / "events.h5", **changes), MANIFEST) == ([f"events.h5: {problem}"] if problem else [])
+    assert check_events(events_file(tmp_path / "events.h5", **changes), MANIFEST) == (
+        [f"events.h5: {problem}"] if problem else []
+    )
 
 
 def test_events_of_nothing_and_of_less_than_a_millisecond(tmp_path):
     nothing = {**{k: [] for k in "xytp"}, "ms_to_idx": np.zeros(6)}
     assert check_events(events_file(tmp_path / "a.h5", **nothing), {**MANIFEST, "events": 0}) == []
     for end, entries in ((0, 1), (1, 2), (999, 2), (1000, 2), (1001, 3)):
-        assert check_events(events_file(tmp_path / "b.h5", **{**nothing, "ms_to_idx": np.zeros(entries)}), {**MANIFEST, "events": 0, "duration_us": end}) == []
-        assert "entries" in check_events(events_file(tmp_path / "b.h5", **{**nothing, "ms_to_idx": np.zeros(entries - 1)}),
-                                         {**MANIFEST, "events": 0, "duration_us": end})[0]
+        assert (
+            check_events(
+                events_file(tmp_path / "b.h5", **{**nothing, "ms_to_idx": np.zeros(entries)}),
+                {**MANIFEST, "events": 0, "duration_us": end},
+            )
+            == []
+        )
+        assert (
+            "entries"
+            in check_events(
+                events_file(tmp_path / "b.h5", **{**nothing, "ms_to_idx": np.zeros(entries - 1)}),
+                {**MANIFEST, "events": 0, "duration_us": end},
+            )[0]
+        )
 
 
 @pytest.mark.parametrize("x", [-1, 5])
@@ -75,8 +102,18 @@ def test_columns_that_are_signed(tmp_path, x):
 # --- labels -----------------------------------------------------------------------------------------------------------
 
 
-def labels_folder(folder: Path, images="700\n3200\n5700\n", forward="700, 3200\n3200, 5700\n", backward="3200, 700\n5700, 3200\n", size=(HEIGHT, WIDTH)) -> dict:
-    for name, text in (("images/timestamps.txt", images), ("flow/forward_timestamps.txt", "# from, to\n" + forward), ("flow/backward_timestamps.txt", backward)):
+def labels_folder(
+    folder: Path,
+    images="700\n3200\n5700\n",
+    forward="700, 3200\n3200, 5700\n",
+    backward="3200, 700\n5700, 3200\n",
+    size=(HEIGHT, WIDTH),
+) -> dict:
+    for name, text in (
+        ("images/timestamps.txt", images),
+        ("flow/forward_timestamps.txt", "# from, to\n" + forward),
+        ("flow/backward_timestamps.txt", backward),
+    ):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text)
     for k in range(3):
@@ -88,43 +125,70 @@ def labels_folder(folder: Path, images="700\n3200\n5700\n", forward="700, 3200\n
     return {**MANIFEST, "files": {p.relative_to(folder).as_posix(): {} for p in folder.rglob("*") if p.is_file()}}
 
 
-@pytest.mark.parametrize("changes, problems", [
-    ({}, []),
-    ({"images": "700\n5700\n"}, ["images: 3 files, 2 time stamps"]),
-    ({"images": "699\n3200\n5700\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
-    ({"images": "700\n3200\n5701\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
-    ({"images": "700\n700\n5700\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
-    ({"images": "700\n5700\n3200\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
-    ({"images": ""}, ["images: 3 files, 0 time stamps"]),
-    ({"forward": "700, 3200\n"}, ["flow/forward: 2 files, 1 time stamps, manifest says 2 labels"]),
-    ({"forward": "699, 3200\n3200, 5700\n"}, ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"]),
-    ({"forward": "700, 3200\n3200, 5701\n"}, ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"]),
-    ({"forward": "3200, 700\n3200, 5700\n"}, ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"]),
-    ({"backward": "700, 3200\n5700, 3200\n"}, ["flow/backward_timestamps.txt: an interval leaves the sequence or runs the wrong way"]),
-    ({"backward": "700, 700\n5700, 3200\n"}, []),
-    ({"forward": "700, 700\n3200, 5700\n"}, ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"]),
-])
+@pytest.mark.parametrize(
+    "changes, problems",
+    [
+        ({}, []),
+        ({"images": "700\n5700\n"}, ["images: 3 files, 2 time stamps"]),
+        ({"images": "699\n3200\n5700\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
+        ({"images": "700\n3200\n5701\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
+        ({"images": "700\n700\n5700\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
+        ({"images": "700\n5700\n3200\n"}, ["images/timestamps.txt: times are not in order inside 700 … 5700 µs"]),
+        ({"images": ""}, ["images: 3 files, 0 time stamps"]),
+        ({"forward": "700, 3200\n"}, ["flow/forward: 2 files, 1 time stamps, manifest says 2 labels"]),
+        (
+            {"forward": "699, 3200\n3200, 5700\n"},
+            ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"],
+        ),
+        (
+            {"forward": "700, 3200\n3200, 5701\n"},
+            ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"],
+        ),
+        (
+            {"forward": "3200, 700\n3200, 5700\n"},
+            ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"],
+        ),
+        (
+            {"backward": "700, 3200\n5700, 3200\n"},
+            ["flow/backward_timestamps.txt: an interval leaves the sequence or runs the wrong way"],
+        ),
+        ({"backward": "700, 700\n5700, 3200\n"}, []),
+        (
+            {"forward": "700, 700\n3200, 5700\n"},
+            ["flow/forward_timestamps.txt: an interval leaves the sequence or runs the wrong way"],
+        ),
+    ],
+)
 def test_labels(tmp_path, changes, problems):
     assert verify._check_labels(tmp_path, labels_folder(tmp_path, **changes)) == problems
 
 
 def test_labels_of_another_size_and_number(tmp_path):
     manifest = labels_folder(tmp_path)
-    for kind, value in {"depth": np.ones((HEIGHT, WIDTH)), "velocity": np.zeros((HEIGHT, WIDTH, 2)), "normals": np.tile([0, 0, 1], (HEIGHT, WIDTH, 1))}.items():
+    for kind, value in {
+        "depth": np.ones((HEIGHT, WIDTH)),
+        "velocity": np.zeros((HEIGHT, WIDTH, 2)),
+        "normals": np.tile([0, 0, 1], (HEIGHT, WIDTH, 1)),
+    }.items():
         (tmp_path / kind).mkdir()
         for k in range(3):
             np.save(tmp_path / f"{kind}/{k:06d}.npy", value.astype(np.float32))
         two = {**manifest, "files": {**manifest["files"], f"{kind}/000000.npy": {}, f"{kind}/000001.npy": {}}}
         assert verify._check_labels(tmp_path, two) == []
-        assert verify._check_labels(tmp_path, {**two, "files": {**two["files"], f"{kind}/000002.npy": {}}}) == [f"{kind}: 3 files, manifest says 2 labels"]
+        assert verify._check_labels(tmp_path, {**two, "files": {**two["files"], f"{kind}/000002.npy": {}}}) == [
+            f"{kind}: 3 files, manifest says 2 labels"
+        ]
     assert verify._check_labels(tmp_path, {**manifest, "labels": 3}) == [
-        f"flow/{direction}: 2 files, 2 time stamps, manifest says 3 labels" for direction in ("forward", "backward")]
+        f"flow/{direction}: 2 files, 2 time stamps, manifest says 3 labels" for direction in ("forward", "backward")
+    ]
     for name in ("images/000000.png", "images/000002.png"):
         cv2.imwrite(str(tmp_path / name), np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8))
         [line] = verify._check_labels(tmp_path, manifest)
         assert line.startswith(f"{name}: not 20x10 px")
         cv2.imwrite(str(tmp_path / name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    write_flow_png(tmp_path / "flow/backward/000001.png", np.zeros((HEIGHT + 1, WIDTH, 2)), np.ones((HEIGHT + 1, WIDTH), bool))
+    write_flow_png(
+        tmp_path / "flow/backward/000001.png", np.zeros((HEIGHT + 1, WIDTH, 2)), np.ones((HEIGHT + 1, WIDTH), bool)
+    )
     [line] = verify._check_labels(tmp_path, manifest)
     assert line.startswith("flow/backward/000001.png: not 20x10 px")
 
@@ -142,7 +206,10 @@ def pair(tmp_path, name: str) -> tuple[Path, Path]:
     return tmp_path / "a", tmp_path / "b"
 
 
-@pytest.mark.parametrize("moved, share, agree", [(0.0, 1.0, True), (2 / 128, 1.0, True), (3 / 128, 1.0, False), (50.0, 0.05, True), (50.0, 0.06, False)])
+@pytest.mark.parametrize(
+    "moved, share, agree",
+    [(0.0, 1.0, True), (2 / 128, 1.0, True), (3 / 128, 1.0, False), (50.0, 0.05, True), (50.0, 0.06, False)],
+)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_flow_agrees_to_two_quanta_in_nearly_all_pixels(tmp_path, moved, share, agree, axis):
     a, b = pair(tmp_path, name := "flow/forward/000003.png")
@@ -165,7 +232,9 @@ def test_flow_that_is_valid_elsewhere_or_of_another_size_does_not_agree(tmp_path
     assert not verify._agrees(name, a, b)
 
 
-@pytest.mark.parametrize("factor, share, agree", [(1.00009, 1.0, True), (1.0002, 1.0, False), (2.0, 0.05, True), (2.0, 0.06, False)])
+@pytest.mark.parametrize(
+    "factor, share, agree", [(1.00009, 1.0, True), (1.0002, 1.0, False), (2.0, 0.05, True), (2.0, 0.06, False)]
+)
 def test_depth_agrees_to_a_ten_thousandth_in_nearly_all_pixels(tmp_path, factor, share, agree):
     a, b = pair(tmp_path, name := "depth/000000.npy")
     depth = np.random.default_rng(0).uniform(1, 9, (10, 20)).astype(np.float32)
@@ -177,10 +246,19 @@ def test_depth_agrees_to_a_ten_thousandth_in_nearly_all_pixels(tmp_path, factor,
     assert verify._agrees(name, a, b) is False
 
 
-@pytest.mark.parametrize("change, agree", [
-    (lambda p: p, True), (lambda p: {**p, "K": p["K"] * (1 + 1e-11)}, True), (lambda p: {**p, "K": p["K"] * (1 + 1e-6)}, False),
-    (lambda p: {**p, "times_ns": p["times_ns"] + 1}, False), (lambda p: {**p, "more": np.zeros(1)}, False), (lambda p: {"K": p["K"]}, False),
-    (lambda p: {**p, "times_ns": p["times_ns"][:2]}, False), (lambda p: {**p, "K": p["K"][:1]}, False)])
+@pytest.mark.parametrize(
+    "change, agree",
+    [
+        (lambda p: p, True),
+        (lambda p: {**p, "K": p["K"] * (1 + 1e-11)}, True),
+        (lambda p: {**p, "K": p["K"] * (1 + 1e-6)}, False),
+        (lambda p: {**p, "times_ns": p["times_ns"] + 1}, False),
+        (lambda p: {**p, "more": np.zeros(1)}, False),
+        (lambda p: {"K": p["K"]}, False),
+        (lambda p: {**p, "times_ns": p["times_ns"][:2]}, False),
+        (lambda p: {**p, "K": p["K"][:1]}, False),
+    ],
+)
 def test_poses_agree_to_rounding_and_times_exactly(tmp_path, change, agree):
     a, b = pair(tmp_path, "poses.npz")
     poses = {"K": np.arange(9.0).reshape(3, 3), "times_ns": np.arange(4) * 10**9}
@@ -189,7 +267,12 @@ def test_poses_agree_to_rounding_and_times_exactly(tmp_path, change, agree):
 
 
 def test_times_never_differ_and_what_a_codec_decides_always_may(tmp_path):
-    for name, agree in (("images/timestamps.txt", False), ("flow/forward_timestamps.txt", False), ("preview.mp4", True), ("events.h5", True)):
+    for name, agree in (
+        ("images/timestamps.txt", False),
+        ("flow/forward_timestamps.txt", False),
+        ("preview.mp4", True),
+        ("events.h5", True),
+    ):
         a, b = pair(tmp_path, name)
         (a / name).write_text("1"), (b / name).write_text("2")
         assert verify._agrees(name, a, b) is agree
@@ -203,9 +286,13 @@ def test_what_sets_two_machines_apart():
     here = {"blinkgl": "1.0", "versions": {"numpy": "2"}, "opengl": {"renderer": "llvmpipe", "version": "4.5"}}
     assert verify._apart(here, dict(here)) == ""
     assert verify._apart({**here, "blinkgl": "0.9"}, here) == "made with BlinkGL 0.9, this machine has 1.0"
-    assert verify._apart({**here, "opengl": {"renderer": "Voodoo", "version": "1"}}, here) == "made with opengl Voodoo, 1, this machine has llvmpipe, 4.5"
+    assert (
+        verify._apart({**here, "opengl": {"renderer": "Voodoo", "version": "1"}}, here)
+        == "made with opengl Voodoo, 1, this machine has llvmpipe, 4.5"
+    )
     assert verify._apart({**here, "versions": {"numpy": "1", "numba": "3"}}, here) == (
-        "made with numba 3, this machine has None; made with numpy 1, this machine has 2")
+        "made with numba 3, this machine has None; made with numpy 1, this machine has 2"
+    )
     assert verify._made_with({"versions": None, "opengl": None}) == {}
 
 
@@ -219,9 +306,18 @@ def test_files_in_which_folders_differ(tmp_path):
     assert differences(a, a) == []
 
 
-@pytest.mark.parametrize("a, b, where", [
-    ({"a": 1}, {"a": 1}, ""), ({"a": 1}, {"a": 2}, "a"), ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, "a.b"), ({"a": {"b": 1}, "c": 1}, {"a": {"b": 1}, "c": 2}, "c"),
-    ({"a": 1}, {"a": 1, "b": 0}, "b"), ({"b": 1, "a": 1}, {"b": 2, "a": 2}, "a"), ({"a": {}}, {"a": 3}, "a")])
+@pytest.mark.parametrize(
+    "a, b, where",
+    [
+        ({"a": 1}, {"a": 1}, ""),
+        ({"a": 1}, {"a": 2}, "a"),
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, "a.b"),
+        ({"a": {"b": 1}, "c": 1}, {"a": {"b": 1}, "c": 2}, "c"),
+        ({"a": 1}, {"a": 1, "b": 0}, "b"),
+        ({"b": 1, "a": 1}, {"b": 2, "a": 2}, "a"),
+        ({"a": {}}, {"a": 3}, "a"),
+    ],
+)
 def test_where_two_configurations_differ(a, b, where):
     assert verify._first_difference(a, b) == where
 
@@ -240,36 +336,99 @@ def test_what_belongs_to_no_sequence(tmp_path):
     (tmp_path / "train/index.jsonl").write_text("")
     (tmp_path / "train/nothing/x").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "train")
-    assert verify._between(tmp_path, folders) == ["link: belongs to no sequence", "train/.c_000001.blinkgl-tmp-0123456789ab-1-0: left by a run that was cut off",
-                                                  "train/index.jsonl: belongs to no sequence", "train/nothing: belongs to no sequence"]
+    assert verify._between(tmp_path, folders) == [
+        "link: belongs to no sequence",
+        "train/.c_000001.blinkgl-tmp-0123456789ab-1-0: left by a run that was cut off",
+        "train/index.jsonl: belongs to no sequence",
+        "train/nothing: belongs to no sequence",
+    ]
 
 
-def known(name: str, seed: int, sequence: int, events: int = 5, sha: str = "e", poses: str = "p", kind: str = "random", frames=None, **noise):
-    config = SimpleNamespace(frames=frames, scene=SimpleNamespace(kind=kind), seed=seed, events=SimpleNamespace(**noise))
-    return name, verify._Known(Path(name), {"files": {"events.h5": {"sha256": sha}, "poses.npz": {"sha256": poses}}, "events": events, "sequence": sequence}, config)
+def known(
+    name: str,
+    seed: int,
+    sequence: int,
+    events: int = 5,
+    sha: str = "e",
+    poses: str = "p",
+    kind: str = "random",
+    frames=None,
+    **noise,
+):
+    config = SimpleNamespace(
+        frames=frames, scene=SimpleNamespace(kind=kind), seed=seed, events=SimpleNamespace(**noise)
+    )
+    return name, verify._Known(
+        Path(name),
+        {
+            "files": {"events.h5": {"sha256": sha}, "poses.npz": {"sha256": poses}},
+            "events": events,
+            "sequence": sequence,
+        },
+        config,
+    )
 
 
-@pytest.mark.parametrize("first, second, problems, notes", [
-    (known("a", 1, 0), known("b", 1, 1), {"b": ["events.h5: the same as in a, a sequence of another draw", "poses.npz: the same as in a, a sequence of another draw"]}, []),
-    (known("a", 1, 0), known("b", 1, 1, sha="f"), {"b": ["poses.npz: the same as in a, a sequence of another draw"]}, []),
-    (known("a", 1, 0), known("b", 2, 0, sha="f", poses="q"), {}, []),
-    (known("a", 1, 0), known("b", 1, 0), {}, ["b: the same events as a, as their configurations have it"]),
-    (known("a", 1, 0, events=0), known("b", 1, 1, events=0, poses="q"), {}, []),
-    (known("a", 1, 0, kind="explicit"), known("b", 1, 1, kind="explicit"), {}, ["b: the same events as a, as their configurations have it"]),
-    (known("a", 1, 0, kind="explicit", threshold_sigma=0.1), known("b", 1, 1, kind="explicit", threshold_sigma=0.1),
-     {"b": ["events.h5: the same as in a, a sequence of another draw"]}, []),
-    (known("a", 1, 0, frames="film"), known("b", 1, 1, frames="film"), {}, ["b: the same events as a, as their configurations have it"]),
-])
+@pytest.mark.parametrize(
+    "first, second, problems, notes",
+    [
+        (
+            known("a", 1, 0),
+            known("b", 1, 1),
+            {
+                "b": [
+                    "events.h5: the same as in a, a sequence of another draw",
+                    "poses.npz: the same as in a, a sequence of another draw",
+                ]
+            },
+            [],
+        ),
+        (
+            known("a", 1, 0),
+            known("b", 1, 1, sha="f"),
+            {"b": ["poses.npz: the same as in a, a sequence of another draw"]},
+            [],
+        ),
+        (known("a", 1, 0), known("b", 2, 0, sha="f", poses="q"), {}, []),
+        (known("a", 1, 0), known("b", 1, 0), {}, ["b: the same events as a, as their configurations have it"]),
+        (known("a", 1, 0, events=0), known("b", 1, 1, events=0, poses="q"), {}, []),
+        (
+            known("a", 1, 0, kind="explicit"),
+            known("b", 1, 1, kind="explicit"),
+            {},
+            ["b: the same events as a, as their configurations have it"],
+        ),
+        (
+            known("a", 1, 0, kind="explicit", threshold_sigma=0.1),
+            known("b", 1, 1, kind="explicit", threshold_sigma=0.1),
+            {"b": ["events.h5: the same as in a, a sequence of another draw"]},
+            [],
+        ),
+        (
+            known("a", 1, 0, frames="film"),
+            known("b", 1, 1, frames="film"),
+            {},
+            ["b: the same events as a, as their configurations have it"],
+        ),
+    ],
+)
 def test_twins(first, second, problems, notes):
     result = Verification()
     assert verify._twins(dict([first, second]), result) == problems and result.notes == notes
 
 
-@pytest.mark.parametrize("key", ["threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6"])
+@pytest.mark.parametrize(
+    "key",
+    ["threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6"],
+)
 def test_what_makes_two_seeds_differ(key):
     assert verify._noisy(SimpleNamespace(events=SimpleNamespace(**{key: 0.1})))
-    assert not verify._noisy(SimpleNamespace(events=SimpleNamespace(**{key: 0.0}))) and not verify._noisy(SimpleNamespace(events=SimpleNamespace()))
+    assert not verify._noisy(SimpleNamespace(events=SimpleNamespace(**{key: 0.0}))) and not verify._noisy(
+        SimpleNamespace(events=SimpleNamespace())
+    )
 
 
 def test_a_check_that_stops_is_a_line():
-    assert verify._guarded(lambda: 1 / 0) == ["cannot be checked: ZeroDivisionError: division by zero"] and verify._guarded(lambda: ["x"]) == ["x"]
+    assert verify._guarded(lambda: 1 / 0) == [
+        "cannot be checked: ZeroDivisionError: division by zero"
+    ] and verify._guarded(lambda: ["x"]) == ["x"]

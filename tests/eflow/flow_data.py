@@ -17,7 +17,9 @@ from blinkgl.labels import Flow
 SPAN = 100_000
 
 
-def moving_events(height: int, width: int, t0: int, t1: int, velocity=(40.0, -20.0), n: int = 4000, seed: int = 0) -> Events:
+def moving_events(
+    height: int, width: int, t0: int, t1: int, velocity=(40.0, -20.0), n: int = 4000, seed: int = 0
+) -> Events:
     """Events of [t0, t1): points of a fixed texture carried along at ``velocity`` px/s, wrapped round the sensor."""
     rng = np.random.default_rng(seed)
     points, polarity = rng.random((300, 2)) * (width, height), rng.integers(0, 2, 300)
@@ -31,24 +33,42 @@ def constant_flow(height: int, width: int, velocity=(40.0, -20.0), sign: int = 1
     return np.broadcast_to(np.float32(velocity) * np.float32(sign * SPAN * 1e-6), (height, width, 2)).copy()
 
 
-def blinkgl_set(root: Path, sequences: int = 2, labels: int = 3, height: int = 128, width: int = 144, backward: bool = True, events: int = 4000) -> Path:
+def blinkgl_set(
+    root: Path,
+    sequences: int = 2,
+    labels: int = 3,
+    height: int = 128,
+    width: int = 144,
+    backward: bool = True,
+    events: int = 4000,
+) -> Path:
     """BlinkGL sequences as the generator writes them: one interval of pre-roll, then ``labels`` labels."""
     for s in range(sequences):
         velocity = (40.0 + 10 * s, -20.0)
         with SequenceWriter(root / "train" / f"seq_{s:06d}", height, width, config_yaml="seed: 0\n") as writer:
-            writer.append_events(moving_events(height, width, 0, SPAN * (labels + 1), velocity, events * (labels + 1), s))
+            writer.append_events(
+                moving_events(height, width, 0, SPAN * (labels + 1), velocity, events * (labels + 1), s)
+            )
             for k in range(labels):
                 t = SPAN * (k + 1)
                 valid = np.ones((height, width), bool)
                 valid[:4] = False
                 writer.label("flow_forward", k, Flow(constant_flow(height, width, velocity), valid), t, t + SPAN)
                 if backward:
-                    writer.label("flow_backward", k, Flow(constant_flow(height, width, velocity, -1), valid), t, t - SPAN)
+                    writer.label(
+                        "flow_backward", k, Flow(constant_flow(height, width, velocity, -1), valid), t, t - SPAN
+                    )
             writer.t_end_us = SPAN * (labels + 1)
     return root
 
 
-def dsec_set(root: Path, sequences: tuple[str, ...] = ("thun_00_a",), labels: int = 2, test: bool = False, offset: int = 49_000_000_000) -> Path:
+def dsec_set(
+    root: Path,
+    sequences: tuple[str, ...] = ("thun_00_a",),
+    labels: int = 2,
+    test: bool = False,
+    offset: int = 49_000_000_000,
+) -> Path:
     """DSEC: 480x640, ``t_offset`` beyond 32 bits, flow every other image, or the test split's CSV."""
     height, width = 480, 640
     for s, name in enumerate(sequences):
@@ -61,13 +81,19 @@ def dsec_set(root: Path, sequences: tuple[str, ...] = ("thun_00_a",), labels: in
         times = [(offset + SPAN * (k + 1), offset + SPAN * (k + 2)) for k in range(labels)]
         if test:
             lines = [f"{a}, {b}, {2 * k + 2}" for k, (a, b) in enumerate(times)]
-            (root / name / "test_forward_flow_timestamps.csv").write_text("# from_timestamp_us, to_timestamp_us, file_index\n" + "\n".join(lines) + "\n")
+            (root / name / "test_forward_flow_timestamps.csv").write_text(
+                "# from_timestamp_us, to_timestamp_us, file_index\n" + "\n".join(lines) + "\n"
+            )
             continue
         flow = root / name / "flow"
         (flow / "forward").mkdir(parents=True)
-        (flow / "forward_timestamps.txt").write_text("# from_timestamp_us, to_timestamp_us\n" + "".join(f"{a}, {b}\n" for a, b in times))
+        (flow / "forward_timestamps.txt").write_text(
+            "# from_timestamp_us, to_timestamp_us\n" + "".join(f"{a}, {b}\n" for a, b in times)
+        )
         for k in range(labels):
-            write_flow_png(flow / "forward" / f"{2 * k + 2:06d}.png", constant_flow(height, width), np.ones((height, width), bool))
+            write_flow_png(
+                flow / "forward" / f"{2 * k + 2:06d}.png", constant_flow(height, width), np.ones((height, width), bool)
+            )
     return root
 
 
@@ -83,7 +109,10 @@ def blinkflow_set(root: Path, labels: int = 3, height: int = 480, width: int = 6
         last_ms = int(e.t[-1]) // 1000
         file["ms_to_idx"] = np.searchsorted(e.t, np.arange(last_ms) * 1000).astype(np.uint64)
     for k in range(labels):
-        np.save(folder / "forward_flow" / f"{k:06d}.npy", np.dstack([constant_flow(height, width), np.ones((height, width), np.float32)]))
+        np.save(
+            folder / "forward_flow" / f"{k:06d}.npy",
+            np.dstack([constant_flow(height, width), np.ones((height, width), np.float32)]),
+        )
     (folder / "config.yaml").write_text("duration: 0.3\nfps: 10\n")
     return root
 

@@ -21,10 +21,23 @@ def sample(rectified=False) -> RawSample:
         x, y = rng.integers(0, W, n).astype(np.uint16), rng.integers(0, H, n).astype(np.uint16)
         if rectified:
             x, y = x.astype(np.float32) + np.float32(0.25), y.astype(np.float32) - np.float32(0.5)
-        return Window(x, y, np.sort(rng.integers(t0, t0 + SPAN, n)), rng.integers(0, 2, n).astype(np.uint8), t0, t0 + SPAN)
+        return Window(
+            x, y, np.sort(rng.integers(t0, t0 + SPAN, n)), rng.integers(0, 2, n).astype(np.uint8), t0, t0 + SPAN
+        )
 
     flow, back = rng.normal(size=(2, H, W, 2)).astype(np.float32)
-    return RawSample(window(7 * SPAN), window(8 * SPAN), H, W, "s/0", "s", flow, rng.random((H, W)) > 0.3, back, rng.random((H, W)) > 0.3)
+    return RawSample(
+        window(7 * SPAN),
+        window(8 * SPAN),
+        H,
+        W,
+        "s/0",
+        "s",
+        flow,
+        rng.random((H, W)) > 0.3,
+        back,
+        rng.random((H, W)) > 0.3,
+    )
 
 
 def grids(s: RawSample) -> np.ndarray:
@@ -37,7 +50,12 @@ def same(a: RawSample, b: RawSample) -> None:
         np.testing.assert_array_equal(getattr(a, k), getattr(b, k))
 
 
-OPERATIONS = {"x": lambda s: s.flip("x"), "y": lambda s: s.flip("y"), "polarity": RawSample.invert, "time": RawSample.reverse}
+OPERATIONS = {
+    "x": lambda s: s.flip("x"),
+    "y": lambda s: s.flip("y"),
+    "polarity": RawSample.invert,
+    "time": RawSample.reverse,
+}
 
 
 @pytest.mark.parametrize("rectified", [False, True])
@@ -95,7 +113,15 @@ def test_nothing_is_edited_in_place():
     s = sample()
     before = [getattr(w, k).copy() for w in (s.old, s.new) for k in "xytp"] + [s.flow.copy()]
     rng = np.random.default_rng(0)
-    for out in (s.flip("x"), s.flip("y"), s.invert(), s.reverse(), s.drop(0.5, rng), s.hot_pixels(3, 1e4, rng), s.noise(100, rng)):
+    for out in (
+        s.flip("x"),
+        s.flip("y"),
+        s.invert(),
+        s.reverse(),
+        s.drop(0.5, rng),
+        s.hot_pixels(3, 1e4, rng),
+        s.noise(100, rng),
+    ):
         grids(out)
     for a, b in zip(before, [getattr(w, k) for w in (s.old, s.new) for k in "xytp"] + [s.flow]):
         np.testing.assert_array_equal(a, b)

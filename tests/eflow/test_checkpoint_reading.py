@@ -13,9 +13,13 @@ from eflow.checkpoint import load_model, metadata_of, read_state, write_tensors 
 from eflow.models import build_model, model_config  # noqa: E402
 
 
-@pytest.mark.parametrize("change, message", [
-    (lambda t: t.reshape(-1).__setitem__(0, float("nan")), "holds NaN or infinity"), (lambda t: t.reshape(-1).__setitem__(0, float("inf")), "holds NaN or infinity"),
-])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (lambda t: t.reshape(-1).__setitem__(0, float("nan")), "holds NaN or infinity"),
+        (lambda t: t.reshape(-1).__setitem__(0, float("inf")), "holds NaN or infinity"),
+    ],
+)
 def test_weights_that_are_not_numbers(tmp_path, change, message):
     model = build_model(model_config({"name": "ev_flownet", "width": 4}))
     tensors = {k: v.clone() for k, v in model.state_dict().items()}

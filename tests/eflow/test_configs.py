@@ -32,15 +32,23 @@ def test_generation_configurations(name):
     """Backward flow for time reversal; train and test differ in trajectories (each group has its own seed) and, by
     content hash, in meshes and textures."""
     groups = [g for g in all_groups(load_run(REPOSITORY / "configs" / name)) if g.enabled]
-    sides = {side: [g.template.check() for g in groups if g.template.tree["output"].get("split", "train") == side] for side in ("train", "test")}
-    seeds = {side: {g.template.seed for g in groups if g.template.tree["output"].get("split", "train") == side} for side in sides}
+    sides = {
+        side: [g.template.check() for g in groups if g.template.tree["output"].get("split", "train") == side]
+        for side in ("train", "test")
+    }
+    seeds = {
+        side: {g.template.seed for g in groups if g.template.tree["output"].get("split", "train") == side}
+        for side in sides
+    }
     assert sides["train"] and sides["test"] and not seeds["train"] & seeds["test"]
     for first in sides["train"]:
         assert set(first.labels.flow) == {"forward", "backward"}
         assert first.scene.pool.test_fraction > 0 and first.scene.textures.test_fraction > 0
 
 
-@pytest.mark.parametrize("text", [*(f"configs/eflow/{n}" for n in TRAINING), *(f"configs/{n}" for n in DATA), "docs/eflow.md", "README.md"])
+@pytest.mark.parametrize(
+    "text", [*(f"configs/eflow/{n}" for n in TRAINING), *(f"configs/{n}" for n in DATA), "docs/eflow.md", "README.md"]
+)
 def test_documented_commands_do_not_refuse_each_other(text):
     """One folder takes one recipe; a training configuration reads the folders that its own commands make."""
     content = (REPOSITORY / text).read_text(encoding="utf-8")

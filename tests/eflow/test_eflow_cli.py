@@ -71,7 +71,9 @@ def test_evaluate_other_data_sets(network, make, tmp_path, capsys):
     assert "1 samples" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("ending, format", [("h5", None), ("raw", "evt2"), ("raw", "evt3"), ("txt", None), ("npz", None), ("aedat4", None)])
+@pytest.mark.parametrize(
+    "ending, format", [("h5", None), ("raw", "evt2"), ("raw", "evt3"), ("txt", None), ("npz", None), ("aedat4", None)]
+)
 def test_predict_any_event_file(network, tmp_path, ending, format, capsys):
     if ending == "aedat4":
         pytest.importorskip("dv_processing")
@@ -79,7 +81,9 @@ def test_predict_any_event_file(network, tmp_path, ending, format, capsys):
     file = tmp_path / f"events.{ending}"
     write_events(file, events, 180, 240, **({"format": format} if format else {}))
     out = tmp_path / "flow"
-    assert run(["predict", network, str(file), "--out", str(out), "--npy", "--size", "240x180"]) == 0, capsys.readouterr().err
+    assert run(["predict", network, str(file), "--out", str(out), "--npy", "--size", "240x180"]) == 0, (
+        capsys.readouterr().err
+    )
     # from the first event on: [t0 + 1, t0 + 2) and so on as long as both windows lie inside
     times = [line for line in (out / "timestamps.txt").read_text().splitlines() if line[0] != "#"]
     t0 = int(events.t[0])
@@ -102,16 +106,37 @@ def test_predict_streams_the_same_windows_as_a_slice(tmp_path):
     for w in got:
         for part, a, b in ((w.old, w.t_us - 90_000, w.t_us), (w.new, w.t_us, w.t_us + 90_000)):
             expected = events.window(a, b)
-            assert (part.t0, part.t1) == (a, b) and np.array_equal(part.t, expected.t) and np.array_equal(part.x, expected.x)
+            assert (
+                (part.t0, part.t1) == (a, b)
+                and np.array_equal(part.t, expected.t)
+                and np.array_equal(part.x, expected.x)
+            )
 
 
 def test_predict_whole_file_with_truth(refined, tmp_path, capsys):
     truth = np.broadcast_to(np.float32([[[8.0]], [[-4.0]]]), (1, 2, 128, 144)).copy()  # 2 intervals at (40, -20) px/s
     np.save(tmp_path / "truth.npy", truth)
     write_events(tmp_path / "e.txt", moving_events(128, 144, 0, 2 * SPAN), 128, 144)
-    assert run(["predict", refined, str(tmp_path / "e.txt"), "--whole", "--truth", str(tmp_path / "truth.npy"), "--size", "144x128"]) == 0
+    assert (
+        run(
+            [
+                "predict",
+                refined,
+                str(tmp_path / "e.txt"),
+                "--whole",
+                "--truth",
+                str(tmp_path / "truth.npy"),
+                "--size",
+                "144x128",
+            ]
+        )
+        == 0
+    )
     out = capsys.readouterr().out
-    assert re.search(r"all pixels: AEE [\d.]+ px, cosine -?[\d.]+; zero flow AEE 8\.944 px", out) and "pixels with events" in out
+    assert (
+        re.search(r"all pixels: AEE [\d.]+ px, cosine -?[\d.]+; zero flow AEE 8\.944 px", out)
+        and "pixels with events" in out
+    )
 
 
 def test_warm_start_runs(refined, tmp_path, capsys):
@@ -126,7 +151,21 @@ def test_warm_start_runs(refined, tmp_path, capsys):
 @pytest.mark.parametrize("burst", ["boxes_rotation", "shapes_rotation"])
 def test_predict_on_real_events(refined, burst, capsys):
     folder = shared(f"data/events/ecd_rotation/{burst}")
-    assert run(["predict", refined, str(folder / "events.txt"), "--size", "240x180", "--whole", "--truth", str(folder / "flow.npy")]) == 0
+    assert (
+        run(
+            [
+                "predict",
+                refined,
+                str(folder / "events.txt"),
+                "--size",
+                "240x180",
+                "--whole",
+                "--truth",
+                str(folder / "flow.npy"),
+            ]
+        )
+        == 0
+    )
     assert "cosine" in capsys.readouterr().out
 
 
@@ -168,8 +207,11 @@ def test_submission_check_finds_what_is_wrong(tmp_path):
         return tmp_path / "a.zip"
 
     submit.check_dsec(zipped(a=good, b=good), {"a.png", "b.png"}, (4, 6))
-    for path, message in ((lambda: zipped(a=good), "does not match the CSV"), (lambda: zipped(a=good, b=bad), "wrong image"),
-                          (lambda: zipped(a=good, b=b"junk"), "wrong image")):
+    for path, message in (
+        (lambda: zipped(a=good), "does not match the CSV"),
+        (lambda: zipped(a=good, b=bad), "wrong image"),
+        (lambda: zipped(a=good, b=b"junk"), "wrong image"),
+    ):
         with pytest.raises(OutputError, match=message):
             submit.check_dsec(path(), {"a.png", "b.png"}, (4, 6))
     with pytest.raises(OutputError, match="cannot hold"):
@@ -179,7 +221,12 @@ def test_submission_check_finds_what_is_wrong(tmp_path):
 @pytest.mark.parametrize("full", [False, True])
 def test_submit_blinkflow(network, tmp_path, full, capsys):
     root, out = blinkflow_set(tmp_path / "set", labels=2), tmp_path / "sub.zip"
-    assert run(["submit", network, str(root), "--benchmark", "blinkflow", "--out", str(out)] + (["--full"] if full else [])) == 0
+    assert (
+        run(
+            ["submit", network, str(root), "--benchmark", "blinkflow", "--out", str(out)] + (["--full"] if full else [])
+        )
+        == 0
+    )
     with zipfile.ZipFile(out) as archive:
         assert sorted(archive.namelist()) == ["scene_a/seq_0/100_200.flo"]
         data = archive.read("scene_a/seq_0/100_200.flo")
@@ -190,32 +237,62 @@ def test_submit_blinkflow(network, tmp_path, full, capsys):
 
 
 def test_bench_reports_every_row(tmp_path, capsys):
-    assert run(["bench", "-m", "ev_flownet", "--size", "64x48", "--repeats", "1", "--no-training", "--json", str(tmp_path / "b.json")]) == 0
+    assert (
+        run(
+            [
+                "bench",
+                "-m",
+                "ev_flownet",
+                "--size",
+                "64x48",
+                "--repeats",
+                "1",
+                "--no-training",
+                "--json",
+                str(tmp_path / "b.json"),
+            ]
+        )
+        == 0
+    )
     rows = json.loads((tmp_path / "b.json").read_text())["rows"]
-    assert [r["mode"] for r in rows] == ["forward"] and all(r["ms"] > 0 and r["peak_mib"] > 50 and r["gmacs"] > 0.3 for r in rows)
+    assert [r["mode"] for r in rows] == ["forward"] and all(
+        r["ms"] > 0 and r["peak_mib"] > 50 and r["gmacs"] > 0.3 for r in rows
+    )
 
 
 def test_bench_of_a_training_step():
     from eflow.bench import measure
 
     step, forward = (measure("ev_flownet", 48, 64, training=t, repeats=1, warmup=0) for t in (True, False))
-    assert (step["mode"], forward["mode"]) == ("train", "forward") and step["gmacs"] == forward["gmacs"] and step["ms"] > 0
+    assert (
+        (step["mode"], forward["mode"]) == ("train", "forward") and step["gmacs"] == forward["gmacs"] and step["ms"] > 0
+    )
 
 
-@pytest.mark.parametrize("arguments, message", [
-    (["evaluate", "{tmp}/none", "{data}"], "none: no such checkpoint"),
-    (["evaluate", "{net}", "{tmp}/none"], "none: no such data set"),
-    (["evaluate", "{net}", "{bare}"], "thun_00_a/000002: no ground truth"),
-    (["evaluate", "{net}", "{data}", "--format", "kitti"], "--format: unknown choice"),
-    (["predict", "{net}", "{tmp}/none.h5"], "none.h5: no such file"),
-    (["predict", "{net}", "{tmp}/x.docx"], "unknown event file ending"),
-    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--window-ms", "900"], "shorter than two windows"),
-    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--iterations", "3"], "--iterations: this network has no iterations"),
-    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--size", "big"], "--size: not a size"),
-    (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--precision", "fp8"], "--precision: unknown choice"),
-    (["submit", "{net}", "{data}", "--benchmark", "kitti", "--out", "{tmp}/a.zip"], "--benchmark: unknown choice"),
-    (["bench", "-m", "raft"], "--model: unknown model"),
-    (["train", "{tmp}/none.yaml", "--out", "{tmp}/o"], "none.yaml: no such file")])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["evaluate", "{tmp}/none", "{data}"], "none: no such checkpoint"),
+        (["evaluate", "{net}", "{tmp}/none"], "none: no such data set"),
+        (["evaluate", "{net}", "{bare}"], "thun_00_a/000002: no ground truth"),
+        (["evaluate", "{net}", "{data}", "--format", "kitti"], "--format: unknown choice"),
+        (["predict", "{net}", "{tmp}/none.h5"], "none.h5: no such file"),
+        (["predict", "{net}", "{tmp}/x.docx"], "unknown event file ending"),
+        (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--window-ms", "900"], "shorter than two windows"),
+        (
+            ["predict", "{net}", "{data}/train/seq_000000/events.h5", "--iterations", "3"],
+            "--iterations: this network has no iterations",
+        ),
+        (["predict", "{net}", "{data}/train/seq_000000/events.h5", "--size", "big"], "--size: not a size"),
+        (
+            ["predict", "{net}", "{data}/train/seq_000000/events.h5", "--precision", "fp8"],
+            "--precision: unknown choice",
+        ),
+        (["submit", "{net}", "{data}", "--benchmark", "kitti", "--out", "{tmp}/a.zip"], "--benchmark: unknown choice"),
+        (["bench", "-m", "raft"], "--model: unknown model"),
+        (["train", "{tmp}/none.yaml", "--out", "{tmp}/o"], "none.yaml: no such file"),
+    ],
+)
 def test_one_clear_line(network, data, tmp_path, arguments, message, capsys):
     bare = dsec_set(tmp_path / "bare", labels=1, test=True) if "{bare}" in arguments else ""
     filled = [a.format(tmp=tmp_path, data=data, net=network, bare=bare) for a in arguments]

@@ -32,7 +32,9 @@ PUBLISHED = [  # million parameters, GMACs at 480x640 with 12 and with 6 iterati
 ]
 
 
-@pytest.mark.parametrize("tree, parameters, gmacs, gmacs_6", PUBLISHED, ids=lambda v: "-".join(v.values()) if isinstance(v, dict) else "")
+@pytest.mark.parametrize(
+    "tree, parameters, gmacs, gmacs_6", PUBLISHED, ids=lambda v: "-".join(v.values()) if isinstance(v, dict) else ""
+)
 def test_parameters_and_arithmetic_within_one_percent(tree, parameters, gmacs, gmacs_6):
     found, macs = count(model_config(tree))
     assert found / 1e6 == pytest.approx(parameters, rel=0.01)
@@ -52,7 +54,9 @@ def test_without_layers_and_from_zero_it_is_eraft():
         assert len(a.flows) == len(b.flows) and not a.has_match and not b.has_match
         assert all(torch.equal(x, y) for x, y in zip(a.flows, b.flows))
     same_seed = build(name="eflowformer", layers=0, init="zero")
-    assert all(torch.equal(a, b) for a, b in zip(build(name="eraft").state_dict().values(), same_seed.state_dict().values()))
+    assert all(
+        torch.equal(a, b) for a, b in zip(build(name="eraft").state_dict().values(), same_seed.state_dict().values())
+    )
 
 
 @pytest.mark.parametrize("name", ["eraft", "eflowformer"])
@@ -97,7 +101,11 @@ def test_training_gradients_of_fast_and_plain_agree():
 def test_match_is_supervised_detached_and_first():
     model = build(name="eflowformer", variant="small", train_iterations=2, context_norm="instance").train()
     prediction = model(batch_for(model))
-    assert prediction.has_match and len(prediction.flows) == 3 and all(f.shape == (1, 2, 128, 128) for f in prediction.flows)
+    assert (
+        prediction.has_match
+        and len(prediction.flows) == 3
+        and all(f.shape == (1, 2, 128, 128) for f in prediction.flows)
+    )
     # nothing of the refinement reaches the enhancement layers through V0 itself: only through the volume's lookups
     first = torch.autograd.grad(prediction.flows[0].sum(), model.layers[0].local.qkv.weight, retain_graph=True)[0]
     assert first.abs().max() > 0
@@ -109,8 +117,12 @@ def test_match_is_supervised_detached_and_first():
 def test_iteration_checkpointing_changes_no_gradient():
     gradients = []
     for checkpointing in (False, True):
-        model = build(name="eraft", train_iterations=2, context_norm="instance", checkpoint_iterations=checkpointing).train()
-        sequence_loss(model(batch_for(model)), torch.ones(1, 2, 128, 128), torch.ones(1, 128, 128, dtype=torch.bool)).backward()
+        model = build(
+            name="eraft", train_iterations=2, context_norm="instance", checkpoint_iterations=checkpointing
+        ).train()
+        sequence_loss(
+            model(batch_for(model)), torch.ones(1, 2, 128, 128), torch.ones(1, 128, 128, dtype=torch.bool)
+        ).backward()
         gradients.append([p.grad for p in model.parameters()])
     assert all(torch.allclose(a, b, rtol=1e-4, atol=1e-6) for a, b in zip(*gradients))
 
@@ -154,9 +166,15 @@ def test_spikes_are_binary_and_conserve_charge():
     assert x.grad.tolist() == [2.0, 2.0]
 
 
-@pytest.mark.parametrize("name, size, message", [
-    ("eraft", (130, 128), "Eraft: height and width are not multiples"), ("eflowformer", (120, 128), "EFlowFormer: input is too small"),
-    ("ev_flownet", (40, 64), "EvFlowNet: height and width are not multiples"), ("ste_flownet", (16, 64), "SteFlowNet: input is too small")])
+@pytest.mark.parametrize(
+    "name, size, message",
+    [
+        ("eraft", (130, 128), "Eraft: height and width are not multiples"),
+        ("eflowformer", (120, 128), "EFlowFormer: input is too small"),
+        ("ev_flownet", (40, 64), "EvFlowNet: height and width are not multiples"),
+        ("ste_flownet", (16, 64), "SteFlowNet: input is too small"),
+    ],
+)
 def test_refused_sizes(name, size, message):
     model = build(name=name)
     with pytest.raises(BlinkGLError, match=message):

@@ -130,12 +130,14 @@ def test_window_attention_with_masked_padding_equals_unpadded(size):
     expected = torch.empty_like(x)
     for top in range(0, size[0], 10):
         for left in range(0, size[1], 10):
-            part = x[:, top:top + 10, left:left + 10]
+            part = x[:, top : top + 10, left : left + 10]
             tokens = part.reshape(2, -1, 32)
             q, k, v = layer.qkv(tokens).chunk(3, -1)
             heads = lambda t: t.view(2, -1, 4, 8).transpose(1, 2)
             p = (heads(q) @ heads(k).transpose(-1, -2) / np.sqrt(8)).softmax(-1)
-            expected[:, top:top + 10, left:left + 10] = layer.proj((p @ heads(v)).transpose(1, 2).reshape(2, -1, 32)).view(part.shape)
+            expected[:, top : top + 10, left : left + 10] = layer.proj(
+                (p @ heads(v)).transpose(1, 2).reshape(2, -1, 32)
+            ).view(part.shape)
     assert (layer(x) - expected).abs().max() < 1e-5
 
 

@@ -13,7 +13,14 @@ from eflow.data.representation import VoxelGrid  # noqa: E402
 from eflow.data.sources import open_source  # noqa: E402
 from flow_data import blinkflow_set, blinkgl_set, dsec_set  # noqa: E402
 
-STRONG = AugmentConfig(vertical_flip=0.5, time_reversal=0.5, drop_probability=1, hot_probability=1, noise_probability=1, scale_probability=0.5)
+STRONG = AugmentConfig(
+    vertical_flip=0.5,
+    time_reversal=0.5,
+    drop_probability=1,
+    hot_probability=1,
+    noise_probability=1,
+    scale_probability=0.5,
+)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +94,9 @@ def test_augmented_flow_still_explains_the_events(source):
     from eflow.data.dataset import augmented
 
     rng = np.random.default_rng(0)
-    moves = AugmentConfig(vertical_flip=0.5, time_reversal=0.5, drop_probability=0, hot_probability=0, noise_probability=0)
+    moves = AugmentConfig(
+        vertical_flip=0.5, time_reversal=0.5, drop_probability=0, hot_probability=0, noise_probability=0
+    )
     raw = source[1]
     for _ in range(8):
         s = augmented(raw, moves, rng)
@@ -109,7 +118,13 @@ def test_scale_scales_flow_by_the_true_factor():
     valid = torch.ones(h, w, dtype=torch.bool)
     valid[:10] = False
     flow[:, :10] = 1e6
-    sample = {"old": torch.rand(15, h, w), "new": torch.rand(15, h, w), "flow": flow, "valid": valid, "mask": torch.ones(h, w, dtype=torch.bool)}
+    sample = {
+        "old": torch.rand(15, h, w),
+        "new": torch.rand(15, h, w),
+        "flow": flow,
+        "valid": valid,
+        "mask": torch.ones(h, w, dtype=torch.bool),
+    }
     out = scaled(sample, 1.31)
     assert out["new"].shape == (15, 52, 79)
     got = out["flow"][:, out["valid"]]
@@ -145,7 +160,13 @@ def test_windows_without_events(tmp_path):
     with SequenceWriter(tmp_path / "still", 128, 128, config_yaml="") as writer:
         writer.append_events(moving_events(128, 128, 0, 2 * SPAN))
         for k in range(3):
-            writer.label("flow_forward", k, Flow(constant_flow(128, 128), np.ones((128, 128), bool)), SPAN * (k + 1), SPAN * (k + 2))
+            writer.label(
+                "flow_forward",
+                k,
+                Flow(constant_flow(128, 128), np.ones((128, 128), bool)),
+                SPAN * (k + 1),
+                SPAN * (k + 2),
+            )
         writer.t_end_us = 4 * SPAN
     source = open_source(tmp_path)
     with pytest.raises(BlinkGLError, match=r"still/000001: no events in the new window \[200000, 300000\) µs"):

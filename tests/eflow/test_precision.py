@@ -16,14 +16,23 @@ from test_train import config_file, data, log  # noqa: E402, F401
 CPU, CUDA = torch.device("cpu"), torch.device("cuda", 0)
 
 
-@pytest.mark.parametrize(("text", "found"), [("flags\t\t: fpu avx2 avx512f avx512_bf16 amx_bf16\n", "AVX-512 BF16, AMX"), ("flags : fpu avx2 avx512f\n", ""),
-                                             ("Features\t: fp asimd bf16\n", "Arm BF16"), ("model name : x\n", "")])
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("flags\t\t: fpu avx2 avx512f avx512_bf16 amx_bf16\n", "AVX-512 BF16, AMX"),
+        ("flags : fpu avx2 avx512f\n", ""),
+        ("Features\t: fp asimd bf16\n", "Arm BF16"),
+        ("model name : x\n", ""),
+    ],
+)
 def test_instructions_are_read_from_the_kernel(text, found, tmp_path, monkeypatch):
     (tmp_path / "cpuinfo").write_text("processor : 0\n" + text)
     flags = cpu.cpu_flags(str(tmp_path / "cpuinfo"))
     monkeypatch.setattr(cpu, "cpu_flags", lambda: flags)
     assert cpu.bf16_instructions() == found
-    assert cpu.cpu_flags is not None and {c.name: c.value for c in doctor._numba()}["bf16"].startswith(found or "no instructions")
+    assert cpu.cpu_flags is not None and {c.name: c.value for c in doctor._numba()}["bf16"].startswith(
+        found or "no instructions"
+    )
 
 
 def test_bf16_where_it_is_and_fp32_elsewhere(monkeypatch, capsys):
@@ -33,7 +42,9 @@ def test_bf16_where_it_is_and_fp32_elsewhere(monkeypatch, capsys):
     assert precision_on(CPU, "fp32") == "fp32" and capsys.readouterr().err == ""
     assert precision_on(CPU, "bf16") == "fp32"
     err = capsys.readouterr().err
-    assert err.count("\n") == 1 and err.startswith("precision: fp32 instead of bf16: this CPU has neither AVX-512 BF16 nor AMX")
+    assert err.count("\n") == 1 and err.startswith(
+        "precision: fp32 instead of bf16: this CPU has neither AVX-512 BF16 nor AMX"
+    )
     assert precision_on(CPU, "bf16", quiet=True) == "fp32" and capsys.readouterr().err == ""
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: including_emulation)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "Old Card")
@@ -56,8 +67,16 @@ def test_training_falls_back_says_so_and_records_it(tmp_path, data, monkeypatch,
 
 
 def test_a_training_that_its_clock_ends_is_validated(tmp_path, data):  # noqa: F811
-    config = load_train_config(config_file(tmp_path, data, steps=50, run__time_limit=1e-9, data__validate_on=[{"path": str(data)}],
-                                           data__validate_samples=1))
+    config = load_train_config(
+        config_file(
+            tmp_path,
+            data,
+            steps=50,
+            run__time_limit=1e-9,
+            data__validate_on=[{"path": str(data)}],
+            data__validate_samples=1,
+        )
+    )
     result = train(config, tmp_path / "run", quiet=True)
     assert (result.step, result.reason) == (1, "time limit")
     assert [line["kind"] for line in log(tmp_path / "run")].count("validation") == 1
@@ -82,7 +101,9 @@ def test_progress_tells_rate_and_time_left_by_steps_and_by_clock(capsys):
         assert lines() == ["training: 50 steps of 4 samples on cpu, fp32, 0:00:50 at most"]
         now[0] += 2.0
         progress.update(51, 3.0, 5.0)
-        assert lines() == ["step 51/100  loss 3.00  EPE 5.00 px  2.00 samples/s  0:00:48 left, the time limit, at about step 75"]
+        assert lines() == [
+            "step 51/100  loss 3.00  EPE 5.00 px  2.00 samples/s  0:00:48 left, the time limit, at about step 75"
+        ]
         now[0] += 60.0
         progress.note(51, {"set/AEE": 2.0})
         assert lines() == ["step 51  set/AEE 2.000"]

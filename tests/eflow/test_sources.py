@@ -12,8 +12,12 @@ from flow_data import SPAN, blinkflow_set, blinkgl_set, constant_flow, dsec_set,
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory):
     root = tmp_path_factory.mktemp("sets")
-    return {"blinkgl": blinkgl_set(root / "blinkgl"), "dsec": dsec_set(root / "dsec"), "blinkflow": blinkflow_set(root / "blinkflow"),
-            "mvsec": mvsec_set(root / "mvsec")}
+    return {
+        "blinkgl": blinkgl_set(root / "blinkgl"),
+        "dsec": dsec_set(root / "dsec"),
+        "blinkflow": blinkflow_set(root / "blinkflow"),
+        "mvsec": mvsec_set(root / "mvsec"),
+    }
 
 
 @pytest.mark.parametrize("name", ["blinkgl", "dsec", "blinkflow", "mvsec"])
@@ -67,7 +71,13 @@ def test_mvsec(tmp_path, dt, compressed):
     assert s.name == f"indoor_flying1/{dt:06d}"
     e = moving_events(260, 346, 0, int(12 / 31 * 1e6), n=20000)
     assert abs(len(s.new) - len(e.window(s.new.t0, s.new.t1))) <= 1  # float64 seconds since 1970 resolve 0.2 µs
-    inside = s.valid & (np.arange(346)[None] > 40) & (np.arange(260)[:, None] > 40) & (np.arange(260)[:, None] < 200) & (np.arange(346)[None] < 300)
+    inside = (
+        s.valid
+        & (np.arange(346)[None] > 40)
+        & (np.arange(260)[:, None] > 40)
+        & (np.arange(260)[:, None] < 200)
+        & (np.arange(346)[None] < 300)
+    )
     span = (s.new.t1 - s.new.t0) * 20e-6
     np.testing.assert_allclose(s.flow[inside], np.broadcast_to((span, -0.5 * span), (inside.sum(), 2)), rtol=1e-4)
     assert not s.valid[:18, :18].any()

@@ -31,8 +31,13 @@ def data(tmp_path_factory) -> Path:
 
 
 def config_file(folder: Path, data: Path, model=FAST, steps=6, crop=(64, 64), **changes) -> Path:
-    tree = {"seed": 5, "model": model, "data": {"train": [{"path": str(data)}], "batch": 2, "crop": list(crop), "augment": {"time_reversal": 0.3}},
-            "optim": {"steps": steps, "lr": 1e-3}, "run": {"device": "cpu", "log_every": 1}}
+    tree = {
+        "seed": 5,
+        "model": model,
+        "data": {"train": [{"path": str(data)}], "batch": 2, "crop": list(crop), "augment": {"time_reversal": 0.3}},
+        "optim": {"steps": steps, "lr": 1e-3},
+        "run": {"device": "cpu", "log_every": 1},
+    }
     for dotted, value in changes.items():
         part, key = dotted.split("__")
         tree[part][key] = value
@@ -78,17 +83,33 @@ def test_it_learns_a_constant_flow(tmp_path, data):
 
 
 def test_a_run_folder_is_complete_and_not_overwritten(tmp_path, data, capsys):
-    path = config_file(tmp_path, data, steps=2, run__picture_every=2, run__validate_every=2, data__validate_on=[{"path": str(data)}],
-                       data__validate_samples=2)
+    path = config_file(
+        tmp_path,
+        data,
+        steps=2,
+        run__picture_every=2,
+        run__validate_every=2,
+        data__validate_on=[{"path": str(data)}],
+        data__validate_samples=2,
+    )
     out = tmp_path / "run"
     assert run(["train", str(path), "--out", str(out)]) == 0
     err = capsys.readouterr().err
     assert "step 2/2" in err and "samples/s" in err and "left" in err and "finished at step 2" in err
-    assert (out / "config.yaml").is_file() and list((out / "tb").glob("events.*")) and (out / "pictures/000000002.png").is_file()
+    assert (
+        (out / "config.yaml").is_file()
+        and list((out / "tb").glob("events.*"))
+        and (out / "pictures/000000002.png").is_file()
+    )
     kinds = [r["kind"] for r in log(out)]
     assert kinds == ["train", "train", "validation"]
     assert {f"{data.name}/AEE", f"{data.name}/zero"} <= log(out)[-1].keys()
-    assert sorted(p.name for p in ckpt.newest(out).iterdir()) == ["ema.safetensors", "optimizer.safetensors", "state.json", "weights.safetensors"]
+    assert sorted(p.name for p in ckpt.newest(out).iterdir()) == [
+        "ema.safetensors",
+        "optimizer.safetensors",
+        "state.json",
+        "weights.safetensors",
+    ]
     before = (out / "log.jsonl").read_bytes()
     assert run(["train", str(path), "--out", str(out)]) == 2
     assert "output folder exists" in capsys.readouterr().err and (out / "log.jsonl").read_bytes() == before
@@ -115,16 +136,26 @@ def test_resume_from_the_command_line_and_only_from_whole_checkpoints(tmp_path, 
 def test_resuming_with_another_configuration_names_the_key(tmp_path, data):
     path = config_file(tmp_path, data, steps=4)
     train(load_train_config(path), tmp_path / "run", stop_after=1, quiet=True)
-    for option, key in (("optim.lr=0.5", r"optim\.lr"), ("model.bins=7", r"model\.bins"), ("data.batch=1", r"data\.batch")):
+    for option, key in (
+        ("optim.lr=0.5", r"optim\.lr"),
+        ("model.bins=7", r"model\.bins"),
+        ("data.batch=1", r"data\.batch"),
+    ):
         with pytest.raises(ConfigError, match=f"^{key}: differs from the run"):
             train(load_train_config(path, [option]), tmp_path / "run", resume=True, quiet=True)
-    train(load_train_config(path, ["run.log_every=2"]), tmp_path / "run", resume=True, stop_after=1, quiet=True)  # how it runs may change
+    train(
+        load_train_config(path, ["run.log_every=2"]), tmp_path / "run", resume=True, stop_after=1, quiet=True
+    )  # how it runs may change
     with pytest.raises(BlinkGLError, match="no checkpoint to resume from"):
         train(load_train_config(path), tmp_path / "other", resume=True, quiet=True)
 
 
 def test_old_checkpoints_are_deleted(tmp_path, data):
-    train(load_train_config(config_file(tmp_path, data, steps=4, run__checkpoint_every=1, run__keep_checkpoints=2)), tmp_path / "run", quiet=True)
+    train(
+        load_train_config(config_file(tmp_path, data, steps=4, run__checkpoint_every=1, run__keep_checkpoints=2)),
+        tmp_path / "run",
+        quiet=True,
+    )
     assert sorted(p.name for p in (tmp_path / "run/checkpoints").iterdir()) == ["000000003", "000000004"]
 
 
@@ -133,10 +164,16 @@ def test_fine_tuning_starts_from_the_weights(tmp_path, data):
     path = config_file(tmp_path, data, steps=3, optim__lr=1e-12)
     config = load_train_config(path, [f"init_from={first.checkpoint}"])
     tuned = train(config, tmp_path / "tuned", stop_after=1, quiet=True)
-    a, b = (load_file(c / f) for c, f in ((first.checkpoint, "ema.safetensors"), (tuned.checkpoint, "weights.safetensors")))
+    a, b = (
+        load_file(c / f) for c, f in ((first.checkpoint, "ema.safetensors"), (tuned.checkpoint, "weights.safetensors"))
+    )
     assert all(torch.allclose(a[k], b[k], atol=1e-6) for k in a)
     with pytest.raises(BlinkGLError, match="checkpoint of another model"):
-        train(load_train_config(path, [f"init_from={first.checkpoint}", "model={name: spike_flownet}"]), tmp_path / "x", quiet=True)
+        train(
+            load_train_config(path, [f"init_from={first.checkpoint}", "model={name: spike_flownet}"]),
+            tmp_path / "x",
+            quiet=True,
+        )
 
 
 def test_nan_stops_and_names_the_samples(tmp_path, data, monkeypatch):
@@ -154,7 +191,9 @@ def test_nan_stops_and_names_the_samples(tmp_path, data, monkeypatch):
     with pytest.raises(TrainingError, match="nan_batch.json: loss or gradient is not finite at step 1"):
         train(config, tmp_path / "run", quiet=True)
     saved = json.loads((tmp_path / "run/nan_batch.json").read_text())
-    assert saved["step"] == 1 and len(saved["samples"]) == 2 and all(s.startswith("train/seq_") for s in saved["samples"])
+    assert (
+        saved["step"] == 1 and len(saved["samples"]) == 2 and all(s.startswith("train/seq_") for s in saved["samples"])
+    )
     weights = load_file(ckpt.newest(tmp_path / "run") / "weights.safetensors")
     assert ckpt.newest(tmp_path / "run").name == "000000001" and all(v.isfinite().all() for v in weights.values())
 
@@ -181,7 +220,9 @@ def test_a_signal_writes_a_checkpoint_and_exits_0(tmp_path, data, number, monkey
 
 
 def test_time_limit(tmp_path, data):
-    result = train(load_train_config(config_file(tmp_path, data, steps=1000, run__time_limit=1e-6)), tmp_path / "run", quiet=True)
+    result = train(
+        load_train_config(config_file(tmp_path, data, steps=1000, run__time_limit=1e-6)), tmp_path / "run", quiet=True
+    )
     assert (result.step, result.reason) == (1, "time limit")
 
 
@@ -199,8 +240,27 @@ def test_data_parallel_equals_one_process(tmp_path, data):
     path = config_file(tmp_path, data, steps=2, optim__ema=0)
     train(load_train_config(path), tmp_path / "one", quiet=True)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MASTER_ADDR": "127.0.0.1"}
-    done = subprocess.run([sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "eflow.cli", "train",
-                           str(path), "--out", str(tmp_path / "two"), "--quiet"], capture_output=True, text=True, timeout=300, env=environment)
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "torch.distributed.run",
+            "--standalone",
+            "--nproc-per-node",
+            "2",
+            "-m",
+            "eflow.cli",
+            "train",
+            str(path),
+            "--out",
+            str(tmp_path / "two"),
+            "--quiet",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=environment,
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     a, b = tensors(tmp_path / "one"), tensors(tmp_path / "two")
     weights = [k for k in a if k.startswith("weights/")]
@@ -210,10 +270,17 @@ def test_data_parallel_equals_one_process(tmp_path, data):
 # ---- configurations and checkpoints that cannot be used --------------------------------------------------------------
 
 
-@pytest.mark.parametrize("override, message", [
-    ("optim.stepz=3", r"optim\.stepz: unknown key; expected 'steps'"), ("model.name=raft", r"model\.name: unknown choice"),
-    ("data.augment.horizontal_flip=2", r"data\.augment\.horizontal_flip"), ("model.variant=base", r"variant: unknown key"),
-    ("data.train=[]", r"data\.train"), ("optim.lr=fast", r"optim\.lr")])
+@pytest.mark.parametrize(
+    "override, message",
+    [
+        ("optim.stepz=3", r"optim\.stepz: unknown key; expected 'steps'"),
+        ("model.name=raft", r"model\.name: unknown choice"),
+        ("data.augment.horizontal_flip=2", r"data\.augment\.horizontal_flip"),
+        ("model.variant=base", r"variant: unknown key"),
+        ("data.train=[]", r"data\.train"),
+        ("optim.lr=fast", r"optim\.lr"),
+    ],
+)
 def test_bad_configurations(tmp_path, data, override, message, capsys):
     assert run(["train", str(config_file(tmp_path, data)), "--out", str(tmp_path / "run"), "--set", override]) == 2
     err = capsys.readouterr().err
@@ -224,13 +291,24 @@ def test_bad_configurations(tmp_path, data, override, message, capsys):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("model, crop, message", [
-    (TINY, [120, 128], r"data\.crop: a size the network cannot train on \(got \(120, 128\)\); expected multiples of 8, at least"),
-    (TINY, [132, 128], "multiples of 8"), (FAST, [64, 72], "multiples of 16"),
-    (TINY, None, r"data\.crop is not set, train/seq_000000/000000: a size .* \(got \(128, 132\)\)")])
+@pytest.mark.parametrize(
+    "model, crop, message",
+    [
+        (
+            TINY,
+            [120, 128],
+            r"data\.crop: a size the network cannot train on \(got \(120, 128\)\); expected multiples of 8, at least",
+        ),
+        (TINY, [132, 128], "multiples of 8"),
+        (FAST, [64, 72], "multiples of 16"),
+        (TINY, None, r"data\.crop is not set, train/seq_000000/000000: a size .* \(got \(128, 132\)\)"),
+    ],
+)
 def test_sizes_are_refused_before_anything_is_written(tmp_path, model, crop, message):
     small = blinkgl_set(tmp_path / "small", sequences=1, labels=1, width=132)
-    path = config_file(tmp_path, small, model, crop=crop or (128, 128), **({} if crop else {"data__crop": None, "data__augment": None}))
+    path = config_file(
+        tmp_path, small, model, crop=crop or (128, 128), **({} if crop else {"data__crop": None, "data__augment": None})
+    )
     with pytest.raises(ConfigError, match=message):
         train(load_train_config(path), tmp_path / "run", quiet=True)
     assert not (tmp_path / "run").exists()
@@ -245,7 +323,9 @@ def test_scaling_needs_a_crop(tmp_path, data):
 def test_a_compiled_update_step_computes_the_same(tmp_path, data):
     losses = []
     for name in ("eager", "compiled"):
-        config = load_train_config(config_file(tmp_path, data, TINY, steps=2, crop=(128, 128), run__compile=name == "compiled"))
+        config = load_train_config(
+            config_file(tmp_path, data, TINY, steps=2, crop=(128, 128), run__compile=name == "compiled")
+        )
         train(config, tmp_path / name, quiet=True)
         losses.append([r["loss"] for r in log(tmp_path / name)])
     assert losses[1] == pytest.approx(losses[0], rel=1e-3)
@@ -262,7 +342,9 @@ def test_a_compiler_that_fails_is_one_line(tmp_path, data, monkeypatch):
             raise dynamo.InternalTorchDynamoError("no C++ compiler\nand pages more")
 
     monkeypatch.setattr(module, "_forward", broken)
-    with pytest.raises(ConfigError, match="^run.compile: torch.compile does not work here: no C.. compiler .got True.; expected false$"):
+    with pytest.raises(
+        ConfigError, match="^run.compile: torch.compile does not work here: no C.. compiler .got True.; expected false$"
+    ):
         train(load_train_config(config_file(tmp_path, data, steps=1)), tmp_path / "run", quiet=True)
 
 
@@ -281,7 +363,9 @@ def test_checkpoint_reads_back(trained):
     a = ckpt.load_model(trained)
     b = ckpt.load_model(trained.parent.parent)  # the run folder
     c = ckpt.load_model(trained / "ema.safetensors")
-    assert all(torch.equal(x, y) and torch.equal(x, z) for x, y, z in zip(*(m.state_dict().values() for m in (a, b, c))))
+    assert all(
+        torch.equal(x, y) and torch.equal(x, z) for x, y, z in zip(*(m.state_dict().values() for m in (a, b, c)))
+    )
     raw = ckpt.load_model(trained, averaged=False)
     assert not all(torch.equal(x, y) for x, y in zip(a.state_dict().values(), raw.state_dict().values()))
 
@@ -310,7 +394,9 @@ def test_a_pickle_is_refused_and_never_opened(tmp_path):
 def test_checkpoint_of_another_model(trained, tmp_path):
     from eflow.models import build_model, model_config
 
-    with pytest.raises(BlinkGLError, match=r"checkpoint of another model: model\.name differs \(got 'ev_flownet'\); expected 'eraft'"):
+    with pytest.raises(
+        BlinkGLError, match=r"checkpoint of another model: model\.name differs \(got 'ev_flownet'\); expected 'eraft'"
+    ):
         ckpt.load_model(trained, expected=model_config({"name": "eraft"}))
     tensors_, metadata = ckpt.read_tensors(trained / "weights.safetensors")
     forged = {**metadata, "model": json.dumps({**FAST, "bins": 7})}

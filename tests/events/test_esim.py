@@ -71,7 +71,9 @@ def test_cubics_pass_the_levels_of_the_straight_line(reconstruction):
     a, b = (np.lexsort((np.arange(len(e)), e.x, e.y)) for e in (straight, cubic))
     for name in "xyp":
         np.testing.assert_array_equal(getattr(straight, name)[a], getattr(cubic, name)[b])
-    np.testing.assert_array_equal(np.searchsorted(times // 1000, straight.t[a]), np.searchsorted(times // 1000, cubic.t[b]))
+    np.testing.assert_array_equal(
+        np.searchsorted(times // 1000, straight.t[a]), np.searchsorted(times // 1000, cubic.t[b])
+    )
     assert (straight.t[a] != cubic.t[b]).mean() > 0.5 and (np.diff(cubic.t) >= 0).all()
 
 
@@ -94,7 +96,9 @@ def test_pchip_is_one_frame_late_and_goes_on_after_a_flush():
     chunks = []
     for k, (frame, t) in enumerate(zip(clip, times)):
         chunks.append(esim.step(frame, int(t)))
-        assert esim.done_ns == times[max(k - 1, 0)] and (len(chunks[-1]) == 0 or chunks[-1].t.max() <= esim.done_ns // 1000)
+        assert esim.done_ns == times[max(k - 1, 0)] and (
+            len(chunks[-1]) == 0 or chunks[-1].t.max() <= esim.done_ns // 1000
+        )
         if k in (4, 5):
             chunks.append(esim.flush())
             assert esim.done_ns == t and len(esim.flush()) == 0
@@ -117,8 +121,10 @@ def test_rates_that_are_not_finite_count_as_zero():
     esim, twin = (Esim(2, 3, EsimConfig(**PLAIN), 1, "hermite") for _ in range(2))
     frames = [np.full((2, 3), v, np.float32) for v in (0.1, 5.0)]
     bad = np.array([[np.nan, np.inf, -np.inf], [0, 0, 0]], np.float32)
-    a, b = (Events.concatenate([e.step(f, 10**6 * k, None, r) for k, f in enumerate(frames)])
-            for e, r in ((esim, bad), (twin, np.zeros((2, 3), np.float32))))
+    a, b = (
+        Events.concatenate([e.step(f, 10**6 * k, None, r) for k, f in enumerate(frames)])
+        for e, r in ((esim, bad), (twin, np.zeros((2, 3), np.float32)))
+    )
     keep = a.x != 1  # +inf is a slope beyond the limit
     np.testing.assert_array_equal(a.t[keep], b.t[b.x != 1])
     assert len(a) == len(b)
@@ -142,8 +148,11 @@ def test_ramp_closed_form():
     """exp(a t) with no epsilon to speak of: an event every C/a seconds, to the microsecond."""
     rate, c, dt = 40.0, 0.2, 1_000_000
     esim = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-9))
-    events = run(esim, [np.full((1, 1), 1e-3 * np.exp(rate * k * dt * 1e-9), np.float32) for k in range(101)],
-                 range(0, 101 * dt, dt))
+    events = run(
+        esim,
+        [np.full((1, 1), 1e-3 * np.exp(rate * k * dt * 1e-9), np.float32) for k in range(101)],
+        range(0, 101 * dt, dt),
+    )
     expected = np.arange(1, 20) * c / rate * 1e6
     assert len(events) in (19, 20) and (events.p == 1).all()
     assert np.abs(events.t[:19] - expected).max() <= 2
@@ -162,7 +171,9 @@ def test_slow_ramp_fires():
     """3e-7 per frame: each step is far below what a float32 reference could follow."""
     frames, rate = 4000, 3e-7
     esim = Esim(1, 4, EsimConfig(contrast_threshold=0.001, threshold_sigma=0, log_eps=1e-9))
-    events = run(esim, (np.full((1, 4), np.exp(rate * k), np.float32) for k in range(frames)), range(0, frames * 10**6, 10**6))
+    events = run(
+        esim, (np.full((1, 4), np.exp(rate * k), np.float32) for k in range(frames)), range(0, frames * 10**6, 10**6)
+    )
     assert len(events) == 4 and (events.p == 1).all()
     assert np.abs(events.t - 0.001 / rate * 1000).max() < 1e-3 * events.t.max() + 1000
 
@@ -211,8 +222,11 @@ def test_event_times_converge_with_order_two(scene):
     spacings, errors = [], []
     for n in (64, 128, 256, 512):
         esim = Esim(1, 1, EsimConfig(contrast_threshold=c, threshold_sigma=0, log_eps=1e-9))
-        events = run(esim, [np.full((1, 1), intensity(k / n), np.float32) for k in range(n + 1)],
-                     [round(k / n * period * 1e9) for k in range(n + 1)])
+        events = run(
+            esim,
+            [np.full((1, 1), intensity(k / n), np.float32) for k in range(n + 1)],
+            [round(k / n * period * 1e9) for k in range(n + 1)],
+        )
         assert len(events) == len(truth)
         spacings.append(1 / n)
         errors.append(np.sqrt(np.mean((events.t * 1e-6 / period - truth) ** 2)))
@@ -245,8 +259,15 @@ def test_event_count_does_not_depend_on_frame_rate_with_spread():
     counts = []
     for n in (10, 1000):
         esim = Esim(20, 20, EsimConfig(threshold_sigma=0.05, log_eps=1e-9))
-        counts.append(len(run(esim, [np.full((20, 20), np.exp(3 * k / n), np.float32) for k in range(n + 1)],
-                              [round(k / n * 1e9) for k in range(n + 1)])))
+        counts.append(
+            len(
+                run(
+                    esim,
+                    [np.full((20, 20), np.exp(3 * k / n), np.float32) for k in range(n + 1)],
+                    [round(k / n * 1e9) for k in range(n + 1)],
+                )
+            )
+        )
     assert abs(counts[0] - counts[1]) <= 4
 
 
@@ -327,7 +348,9 @@ def test_cubics_converge_faster_than_the_straight_line(reconstruction, order, in
     slope = lambda s: 2 * np.pi * np.cos(2 * np.pi * s - 1.0)
     end = 0.3
     spacings, errors = [], []
-    truth = (np.arcsin(np.sin(-1.0) + c * np.arange(1, 200).clip(max=int((signal(end) - signal(0)) / c))) + 1.0) / (2 * np.pi)
+    truth = (np.arcsin(np.sin(-1.0) + c * np.arange(1, 200).clip(max=int((signal(end) - signal(0)) / c))) + 1.0) / (
+        2 * np.pi
+    )
     truth = np.unique(truth)
     for n in intervals:
         s = np.linspace(0, end, n + 1)
@@ -336,7 +359,9 @@ def test_cubics_converge_faster_than_the_straight_line(reconstruction, order, in
         rates = [f * np.float32(slope(u) / period) for f, u in zip(frames, s)]
         events = run_cubic(emulator, frames, [round(u * period * 1e9) for u in s], rates)
         assert len(events) == len(truth)
-        inner = (truth > end / 6) & (truth < end * 5 / 6) | (reconstruction == "hermite")  # pchip's outer intervals have one neighbour only
+        inner = (truth > end / 6) & (truth < end * 5 / 6) | (
+            reconstruction == "hermite"
+        )  # pchip's outer intervals have one neighbour only
         spacings.append(end / n)
         errors.append(np.sqrt(np.mean((events.t * 1e-6 / period - truth)[inner] ** 2)))
     found = np.polyfit(np.log(spacings), np.log(errors), 1)[0]

@@ -13,12 +13,18 @@ from blinkgl.events.philox import normal2, philox4x32, pixel_counters, uniform2
 U = np.uint64
 
 
-@pytest.mark.parametrize("counter, key, expected", [  # Random123's kat_vectors, philox4x32 10 rounds
-    ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
-    ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
-    ((0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344), (0xA4093822, 0x299F31D0),
-     (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1)),
-])
+@pytest.mark.parametrize(
+    "counter, key, expected",
+    [  # Random123's kat_vectors, philox4x32 10 rounds
+        ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+        (
+            (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+            (0xA4093822, 0x299F31D0),
+            (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+        ),
+    ],
+)
 def test_philox_known_answers(counter, key, expected):
     assert tuple(int(w[0]) for w in philox4x32(*(np.array([v], U) for v in counter + key))) == expected
 
@@ -47,9 +53,15 @@ def test_uniform_normal_and_independent_across_keys():
         assert u.min() > 0 and u.max() < 1
     for n in normal2(U(1), pixels, U(0), U(0)):
         assert stats.kstest(n, "norm").pvalue > 1e-3
-    others = [uniform2(U(2), pixels, U(0), U(0))[0], uniform2(U(1) << U(32), pixels, U(0), U(0))[0],
-              uniform2(U(1), pixels, U(1), U(0))[0], uniform2(U(1), pixels, U(0), U(1))[0],
-              uniform2(U(1), pixels, U(0), U(1) << U(32))[0], base[1], np.roll(base[0], 1)]
+    others = [
+        uniform2(U(2), pixels, U(0), U(0))[0],
+        uniform2(U(1) << U(32), pixels, U(0), U(0))[0],
+        uniform2(U(1), pixels, U(1), U(0))[0],
+        uniform2(U(1), pixels, U(0), U(1))[0],
+        uniform2(U(1), pixels, U(0), U(1) << U(32))[0],
+        base[1],
+        np.roll(base[0], 1),
+    ]
     cells = 16
     for other in others:  # joint histogram uniform on the square
         table = np.histogram2d(base[0], other, bins=cells, range=[[0, 1], [0, 1]])[0]
@@ -83,8 +95,9 @@ def test_arithmetic_is_accurate_and_the_same_compiled():
     assert (np.abs(arith.log_f32(v) - exact) / (1.3e-7 + np.spacing(np.abs(exact).astype(np.float32)))).max() < 1.5
     w = rng.uniform(-86, 80, 200_000).astype(np.float32)
     assert np.abs(arith.exp_f32(w) / np.exp(w.astype(float)) - 1).max() < 2e-7
-    for name, (f, x, dtype) in enumerate([(arith.log_q25, v, np.int32), (arith.log_f32, v, np.float32),
-                                          (arith.exp_f32, w, np.float32)]):
+    for name, (f, x, dtype) in enumerate(
+        [(arith.log_q25, v, np.int32), (arith.log_f32, v, np.float32), (arith.exp_f32, w, np.float32)]
+    ):
         out = np.empty(len(x), dtype)
         _apply(name, x, out)
         np.testing.assert_array_equal(out, f(x))
@@ -96,7 +109,10 @@ def test_arithmetic_is_accurate_and_the_same_compiled():
     np.testing.assert_array_equal(out, [arith.log_f64(d), arith.exp_f64(50.0 - d), *turns])
     assert np.abs(out[0] - np.log(d)).max() < 4e-15
     assert np.abs(out[1] / np.exp(50.0 - d) - 1).max() < 1e-15
-    assert np.abs(cos - np.cos(2 * np.pi * (d % 1))).max() < 2e-15 and np.abs(sin - np.sin(2 * np.pi * (d % 1))).max() < 2e-15
+    assert (
+        np.abs(cos - np.cos(2 * np.pi * (d % 1))).max() < 2e-15
+        and np.abs(sin - np.sin(2 * np.pi * (d % 1))).max() < 2e-15
+    )
 
 
 def test_log_is_monotone_to_a_unit_and_bounded_at_the_ends():

@@ -20,7 +20,7 @@ def clip():
     for k in range(12):
         y0 = 5 * k % 40
         frame = background.copy()
-        frame[y0:y0 + 6, 10:40] *= np.float32(2.5)
+        frame[y0 : y0 + 6, 10:40] *= np.float32(2.5)
         frames.append(frame)
         places.append((y0, y0 + 6))
     rows = [None] + [(min(a[0], b[0]), max(a[1], b[1])) for a, b in itertools.pairwise(places)]
@@ -30,9 +30,16 @@ def clip():
     return frames, rows
 
 
-@pytest.mark.parametrize("config", [
-    EsimConfig(), EsimConfig(threshold_sigma=0.0), EsimConfig(threshold_jitter=0.05, refractory_us=300.0),
-    V2eConfig(preset="noisy"), VoltmeterConfig()])
+@pytest.mark.parametrize(
+    "config",
+    [
+        EsimConfig(),
+        EsimConfig(threshold_sigma=0.0),
+        EsimConfig(threshold_jitter=0.05, refractory_us=300.0),
+        V2eConfig(preset="noisy"),
+        VoltmeterConfig(),
+    ],
+)
 def test_same_events_and_state(config):
     frames, rows = clip()
     told, untold = (make_emulator(config, H, W, seed=9) for _ in range(2))
@@ -56,7 +63,10 @@ def test_same_events_on_cubics(config, reconstruction):
     for k, (frame, changed) in enumerate(zip(frames, rows)):
         rate = rng.normal(0, 500, (H, W)).astype(np.float32)
         first, stop = changed or (0, H)
-        rate[:first], rate[stop:] = 0, 0  # that is all the contract asks for: what moved in the frame before may stand still in this one
+        rate[:first], rate[stop:] = (
+            0,
+            0,
+        )  # that is all the contract asks for: what moved in the frame before may stand still in this one
         chunks.append((told.step(frame, k * 1_000_000, changed, rate), untold.step(frame, k * 1_000_000, None, rate)))
     chunks.append((told.flush(), untold.flush()))
     for a, b in chunks:

@@ -41,8 +41,14 @@ def slow_bus(events, config):
     return Events(events.x[index], events.y[index], np.ascontiguousarray(t), events.p[index])
 
 
-@pytest.mark.parametrize("config", [ReadoutConfig(events_per_second=2e6, queue_events=50), ReadoutConfig(events_per_second=1e8),
-                                    ReadoutConfig(events_per_second=1e7, row_ns=400, queue_events=7)])
+@pytest.mark.parametrize(
+    "config",
+    [
+        ReadoutConfig(events_per_second=2e6, queue_events=50),
+        ReadoutConfig(events_per_second=1e8),
+        ReadoutConfig(events_per_second=1e7, row_ns=400, queue_events=7),
+    ],
+)
 def test_bus_equals_slow_twin_at_any_chunking(config):
     events = random_events(np.random.default_rng(0), 5000, 1000)
     readout = Readout(config)
@@ -59,7 +65,9 @@ def test_an_idle_bus_pays_for_the_row_again():
     times = np.array([10, 10, 50, 50, 50, 90], np.int64)
     rows = np.array([3, 3, 3, 3, 7, 7], np.uint16)
     events = Events(np.arange(6, dtype=np.uint16), rows, times, np.zeros(6, np.uint8))
-    readout = Readout(ReadoutConfig(events_per_second=1e6 / 0.6, row_ns=600, queue_events=100))  # 0.6 us an event, 0.6 us a row
+    readout = Readout(
+        ReadoutConfig(events_per_second=1e6 / 0.6, row_ns=600, queue_events=100)
+    )  # 0.6 us an event, 0.6 us a row
     assert readout.step(events).t.tolist() == [11, 11, 51, 51, 53, 91]
     lone = Events(*(c[[2]] for c in (events.x, rows, times, events.p)))
     fresh = Readout(ReadoutConfig(events_per_second=1e7, row_ns=5000, queue_events=100))

@@ -20,7 +20,10 @@ from blinkgl.events.packing import PackedBuffer
 
 
 @pytest.mark.parametrize("span_us", [0, 1, 255, 2**14 - 1, 2**14, 2**22 - 1, 2**22, 2**30 - 1])
-@pytest.mark.parametrize("counts, threads", [([7], 1), ([0, 900, 0, 2, 1100], 1), ([9_000, 30_000, 0, 33_000, 40_000], 2), ([1, 120_000, 5, 4], 3)])
+@pytest.mark.parametrize(
+    "counts, threads",
+    [([7], 1), ([0, 900, 0, 2, 1100], 1), ([9_000, 30_000, 0, 33_000, 40_000], 2), ([1, 120_000, 5, 4], 3)],
+)
 def test_sorted_by_time_and_within_a_microsecond_in_the_order_of_the_rows(span_us, counts, threads):
     rng = np.random.default_rng(span_us % 1000 + len(counts))
     buffer, counts = PackedBuffer(), np.array(counts)
@@ -37,7 +40,12 @@ def test_sorted_by_time_and_within_a_microsecond_in_the_order_of_the_rows(span_u
         order = np.argsort(t, kind="stable")
         for got, wanted in ((events.x, x), (events.y, y), (events.t, t + base), (events.p, p)):
             np.testing.assert_array_equal(got, wanted[order])
-        assert (events.x.dtype, events.y.dtype, events.t.dtype, events.p.dtype) == (np.uint16, np.uint16, np.int64, np.uint8)
+        assert (events.x.dtype, events.y.dtype, events.t.dtype, events.p.dtype) == (
+            np.uint16,
+            np.uint16,
+            np.int64,
+            np.uint8,
+        )
     assert len(buffer.to_events(np.zeros(len(counts), np.int64), 0, span_us, threads)) == 0
 
 
@@ -58,7 +66,11 @@ def test_rows_keep_what_is_in_them_when_they_grow():
     buffer.grow(3, 10, np.array([4, 0, 2]))
     grown = buffer.rows(3, 10)
     assert grown.shape == (3, 10) and grown[0, :4].tolist() == [0, 1, 2, 3] and grown[2, :2].tolist() == [8, 9]
-    assert buffer.rows(5, 2).shape == (5, 6) and buffer.rows(5, 7).shape == (5, 7) and PackedBuffer().rows(2, 0).shape == (2, 1)
+    assert (
+        buffer.rows(5, 2).shape == (5, 6)
+        and buffer.rows(5, 7).shape == (5, 7)
+        and PackedBuffer().rows(2, 0).shape == (2, 1)
+    )
 
 
 # --- blocks ---------------------------------------------------------------------------------------------------------
@@ -124,13 +136,27 @@ def test_slopes_are_those_of_the_parabola_through_three_frames():
         assert slope_at_end(secant[0], secant[1], a, b) == pytest.approx(parabola(zip(t[:3], v[:3]))(0))
         cut = lambda slope: min(max(slope / secant[1], 0.0), 3.0)
         before, after = parabola(zip(t[:3], v[:3])), parabola(zip(t[1:], v[1:]))
-        for older, newer, alpha, beta in ((a, c, before(a), after(a + b)), (0.0, c, after(a), after(a + b)), (a, 0.0, before(a), before(a + b))):
+        for older, newer, alpha, beta in (
+            (a, c, before(a), after(a + b)),
+            (0.0, c, after(a), after(a + b)),
+            (a, 0.0, before(a), before(a + b)),
+        ):
             assert end_slopes(v[0], v[1], v[2], v[3], b, older, newer) == pytest.approx((cut(alpha), cut(beta)))
         assert end_slopes(v[0], v[1], v[2], v[3], b, 0.0, 0.0) == (1.0, 1.0)
 
 
 def test_slopes_are_cut_to_what_is_monotone():
-    assert [limited(v) for v in (-1.0, 0.0, 0.5, 1.0, 3.0, 3.1, np.inf, -np.inf, np.nan)] == [0, 0, 0.5, 1, 3, 3, 3, 0, 0]
+    assert [limited(v) for v in (-1.0, 0.0, 0.5, 1.0, 3.0, 3.1, np.inf, -np.inf, np.nan)] == [
+        0,
+        0,
+        0.5,
+        1,
+        3,
+        3,
+        3,
+        0,
+        0,
+    ]
 
 
 def test_rates_become_fixed_point_slopes():
@@ -166,7 +192,9 @@ def test_the_size_of_noise_is_what_a_simulated_comparator_needs(k):
     for size in (0.5, 0.7, 0.85, 1.0, 1.5, 2.0, 2.5):
         rate = simulated_rate(size, k)
         if rate * 3000 * 350 * k > 600:
-            assert noise_size(k, rate) == pytest.approx(size, rel=0.08 if size in (0.85, 2.0) or k in (0.055, 1.7) else 0.03), size
+            assert noise_size(k, rate) == pytest.approx(
+                size, rel=0.08 if size in (0.85, 2.0) or k in (0.055, 1.7) else 0.03
+            ), size
 
 
 def test_the_size_of_noise_is_smooth_and_grows_with_the_rate():
@@ -185,7 +213,9 @@ def test_the_size_of_noise_is_smooth_and_grows_with_the_rate():
 
 def test_beyond_the_table_of_noise():
     assert noise_size(1e-5, 0.1) == noise_size(0.003, 0.1), "finer frames see nothing new"
-    assert noise_size(100.0, 0.01) == pytest.approx(noise_size(10.0, 0.1)), "samples are independent: the rate per frame counts"
+    assert noise_size(100.0, 0.01) == pytest.approx(noise_size(10.0, 0.1)), (
+        "samples are independent: the rate per frame counts"
+    )
     assert noise_size(1.0, 1e9) == pytest.approx(2.5) and 0 < noise_size(1.0, 0.0) < 0.05
     assert noise_size(np.array([0.1, 1.0]), 0.2).shape == (2,)
 
@@ -196,7 +226,9 @@ def test_the_tables_of_an_interval_and_of_the_start():
     k = np.exp(np.linspace(np.log(1e-6), np.log(1e3), 255))  # the entry after the last is there to be interpolated to
     np.testing.assert_allclose(table[:255], 0.2 * noise_size(k, 5.0 * 1e-3 / k), rtol=1e-5)
     corners = np.random.default_rng(0).uniform(3, 300, 200)
-    np.testing.assert_allclose(start_sizes(5.0, corners, 0.2), 0.2 * noise_size(np.full(200, 0.003), 5.0 / (2 * np.pi * corners)), rtol=2e-3)
+    np.testing.assert_allclose(
+        start_sizes(5.0, corners, 0.2), 0.2 * noise_size(np.full(200, 0.003), 5.0 / (2 * np.pi * corners)), rtol=2e-3
+    )
 
 
 @pytest.mark.parametrize("k", [1e-8, 1e-6, 3e-4, 0.7, 900.0, 1e3, 1e5])
@@ -212,11 +244,15 @@ def test_noise_is_stationary_and_forgets_by_its_time_constant(k):
     rng = np.random.default_rng(0)
     first = np.float32(0.3) * rng.normal(size=100_000).astype(np.float32)
     second = v2e_model.next_noise(first, np.float32(k), np.float32(0.3), rng.normal(size=100_000).astype(np.float32))
-    assert second.std() == pytest.approx(0.3, rel=0.01) and np.corrcoef(first, second)[0, 1] == pytest.approx(np.exp(-k), abs=0.01)
+    assert second.std() == pytest.approx(0.3, rel=0.01) and np.corrcoef(first, second)[0, 1] == pytest.approx(
+        np.exp(-k), abs=0.01
+    )
 
 
 def test_noise_at_the_first_frame():
-    config = V2eConfig(shot_noise_rate_hz=20.0, photoreceptor_noise=True, leak_rate_hz=0.0, cutoff_hz=30.0, contrast_threshold=0.2)
+    config = V2eConfig(
+        shot_noise_rate_hz=20.0, photoreceptor_noise=True, leak_rate_hz=0.0, cutoff_hz=30.0, contrast_threshold=0.2
+    )
     light = np.repeat(np.float32([0, 100, 255]), 20_000)
     noise = v2e_model.draw_start_noise(light, config, np.uint64(3)).reshape(3, -1)
     for row, level in zip(noise, (0, 100, 255)):
@@ -260,12 +296,17 @@ def test_tables_of_who_makes_noise():
 
 def test_leaks():
     on = np.full(40_000, 0.2, np.float32)
-    draw = lambda **keys: v2e_model.draw_leaks(200, 200, V2eConfig(**{**dict(leak_rate_hz=0.0, leak_cov_decades=0.0), **keys}), on, np.uint64(1))
+    draw = lambda **keys: v2e_model.draw_leaks(
+        200, 200, V2eConfig(**{**dict(leak_rate_hz=0.0, leak_cov_decades=0.0), **keys}), on, np.uint64(1)
+    )
     assert draw().shape == (0,) and draw().dtype == np.float32
     np.testing.assert_allclose(draw(leak_rate_hz=2.0), 0.4, rtol=1e-6)
     hot = draw(leak_rate_hz=2.0, hot_pixel_fraction=0.1, hot_pixel_rate_hz=50.0)
     is_hot = np.abs(hot - 0.4) > 1e-6
-    assert is_hot.mean() == pytest.approx(0.1, abs=0.01) and stats.kstest(hot[is_hot] / 0.2, "expon", (0, 50.0)).pvalue > 1e-3
+    assert (
+        is_hot.mean() == pytest.approx(0.1, abs=0.01)
+        and stats.kstest(hot[is_hot] / 0.2, "expon", (0, 50.0)).pvalue > 1e-3
+    )
     only = draw(hot_pixel_fraction=0.1, hot_pixel_rate_hz=50.0)
     assert (only > 0).mean() == pytest.approx(0.1, abs=0.01) and (only[only > 0] == hot[only > 0]).all()
     wild = draw(leak_rate_hz=100.0, leak_cov_decades=3.0)
@@ -275,14 +316,28 @@ def test_leaks():
 # --- what every emulator checks --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size, fits", [((1, 1), True), ((65_535, 1), True), ((1, 65_535), True), ((65_536, 1), False), ((1, 65_536), False),
-                                        ((0, 5), False), ((5, 0), False), ((46_341, 46_341), False)])
+@pytest.mark.parametrize(
+    "size, fits",
+    [
+        ((1, 1), True),
+        ((65_535, 1), True),
+        ((1, 65_535), True),
+        ((65_536, 1), False),
+        ((1, 65_536), False),
+        ((0, 5), False),
+        ((5, 0), False),
+        ((46_341, 46_341), False),
+    ],
+)
 def test_sizes_of_frames(size, fits):
     """Coordinates are 16 bits; a side of 65,536 would still fit them, but not a count of columns."""
     if fits:
         assert (Esim(*size, EsimConfig(), 0).height, Esim(*size, EsimConfig(), 0).width) == size
     else:
-        with pytest.raises(EventDataError, match=rf"frame size out of range .got \({size[0]}, {size[1]}\).; expected 1 to 65535 rows and columns"):
+        with pytest.raises(
+            EventDataError,
+            match=rf"frame size out of range .got \({size[0]}, {size[1]}\).; expected 1 to 65535 rows and columns",
+        ):
             Esim(*size, EsimConfig(), 0)
 
 
@@ -298,7 +353,9 @@ def test_times_that_an_emulator_takes():
     assert esim.done_ns == -(2**61) + 1
     longest = (2**30 - 1) * 1000
     esim.step(frame, esim.done_ns + longest)
-    with pytest.raises(EventDataError, match="frame 2: time stamp out of range .*at most 17 minutes between two frames"):
+    with pytest.raises(
+        EventDataError, match="frame 2: time stamp out of range .*at most 17 minutes between two frames"
+    ):
         esim.step(frame, esim.done_ns + longest + 1)
 
 
@@ -310,7 +367,9 @@ def test_the_largest_intensity():
     assert caught.value.pixel == (1, 0)
 
 
-@pytest.mark.parametrize("table", [np.ones(255), np.full(256, -1.0), np.full(256, np.nan), np.full(256, 2.0**31), np.ones((2, 256))])
+@pytest.mark.parametrize(
+    "table", [np.ones(255), np.full(256, -1.0), np.full(256, np.nan), np.full(256, 2.0**31), np.ones((2, 256))]
+)
 def test_tables_of_luminance_that_are_refused(table):
     with pytest.raises(EventDataError, match="decode table must hold 256 finite values >= 0"):
         Esim(2, 2, EsimConfig(), 0).set_decode(table)
@@ -338,8 +397,13 @@ def test_a_saved_state_is_refused_by_another_emulator_and_says_how_large_it_is()
     assert state["clock"].tolist() == [1, 5, 1, 0] and state["shape"].tolist() == [3, 4]
     assert one.state_bytes_per_pixel == sum(v.nbytes for k, v in state.items() if k not in ("clock", "shape")) / 12
     name = next(k for k in state if k not in ("clock", "shape"))
-    for wrong in ({**state, "more": np.zeros(1)}, {k: v for k, v in state.items() if k != name}, {**state, "shape": np.array([4, 3])},
-                  {**state, name: state[name].astype(np.float64)}, {**state, name: state[name][1:]}):
+    for wrong in (
+        {**state, "more": np.zeros(1)},
+        {k: v for k, v in state.items() if k != name},
+        {**state, "shape": np.array([4, 3])},
+        {**state, name: state[name].astype(np.float64)},
+        {**state, name: state[name][1:]},
+    ):
         with pytest.raises(EventDataError, match="saved state is of another emulator"):
             Esim(3, 4, EsimConfig(threshold_sigma=0.0), 0).load_state_dict(wrong)
     fresh = Esim(3, 4, EsimConfig(threshold_sigma=0.0), 0)

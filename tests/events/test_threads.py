@@ -94,7 +94,11 @@ def test_a_forked_child_has_threads_of_its_own():
     assert os.waitpid(child, 0)[1] == 0
 
 
-@pytest.mark.parametrize("config", [EsimConfig(threshold_sigma=0.05), V2eConfig(preset="noisy"), VoltmeterConfig()], ids=["esim", "v2e", "voltmeter"])
+@pytest.mark.parametrize(
+    "config",
+    [EsimConfig(threshold_sigma=0.05), V2eConfig(preset="noisy"), VoltmeterConfig()],
+    ids=["esim", "v2e", "voltmeter"],
+)
 def test_events_do_not_depend_on_the_number_of_threads(config, monkeypatch):
     """Large enough for several threads in the kernel and in the sort; more threads than cores,
     so that they get in each other's way."""

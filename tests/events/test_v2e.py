@@ -22,11 +22,14 @@ VARIANTS = {
     "default": {},
     "noisy": dict(preset="noisy"),
     "filter only": dict(preset="clean", cutoff_hz=40.0),
-    "long dead time, noise, hot pixels": dict(shot_noise_rate_hz=50.0, leak_rate_hz=3.0, hot_pixel_fraction=0.05,
-                                              refractory_us=20_000.0),
+    "long dead time, noise, hot pixels": dict(
+        shot_noise_rate_hz=50.0, leak_rate_hz=3.0, hot_pixel_fraction=0.05, refractory_us=20_000.0
+    ),
     "photoreceptor noise": dict(shot_noise_rate_hz=20.0, photoreceptor_noise=True, leak_rate_hz=0.0, cutoff_hz=30.0),
     "photoreceptor noise, leak": dict(preset="noisy", shot_noise_rate_hz=30.0, photoreceptor_noise=True),
-    "noise without dead time": dict(shot_noise_rate_hz=80.0, leak_rate_hz=2.0, refractory_us=0.0, contrast_threshold_off=0.3),
+    "noise without dead time": dict(
+        shot_noise_rate_hz=80.0, leak_rate_hz=2.0, refractory_us=0.0, contrast_threshold_off=0.3
+    ),
 }
 
 
@@ -42,7 +45,9 @@ def test_equals_slow_twin(variant, dtype, threads):  # noqa: F811
 
 def test_resumes_bit_identically():
     clip, times = random_clip(2, frames=8)
-    config = V2eConfig(shot_noise_rate_hz=50.0, leak_rate_hz=30.0, refractory_us=9_000.0)  # 30 Hz: the leak clock restarts
+    config = V2eConfig(
+        shot_noise_rate_hz=50.0, leak_rate_hz=30.0, refractory_us=9_000.0
+    )  # 30 Hz: the leak clock restarts
     whole = run(V2e(37, 45, config, 3), clip, times)
     first, second = V2e(37, 45, config, 3), V2e(37, 45, config, 3)
     head = run(first, clip[:3], times[:3])
@@ -71,7 +76,9 @@ def test_crossing_is_on_the_exact_curve(k):
     rng = np.random.default_rng(0)
     for _ in range(40):
         base, dx, lag, drift = rng.normal(0, 1, 4) * [1, 1, 0.5, 0.05]
-        ode = solve_ivp(lambda s, y: k * (base + dx * s - y), (0, 1), [base + lag], rtol=1e-10, atol=1e-12, method="LSODA")
+        ode = solve_ivp(
+            lambda s, y: k * (base + dx * s - y), (0, 1), [base + lag], rtol=1e-10, atol=1e-12, method="LSODA"
+        )
         curve = v2e.curve_of(base, drift, dx, lag, k)
         z = lambda s: v2e.signal_at(s, *curve, k)
         assert abs(z(1.0) - drift - ode.y[0, -1]) < 1e-7
@@ -97,7 +104,9 @@ def test_amplitude_and_phase_response(ratio):
         emulator.step(np.full((1, 1), intensity / 255 * np.exp(s), np.float32), round(t[k] * 1e9))
         y.append(float(emulator._x[0]) + float(emulator._lag[0]))
     last = slice(-4 * n, None)
-    response = 2 * np.mean((np.array(y)[last] - np.log(intensity)) * np.exp(-2j * np.pi * f * t[last])) / (amplitude / 1j)
+    response = (
+        2 * np.mean((np.array(y)[last] - np.log(intensity)) * np.exp(-2j * np.pi * f * t[last])) / (amplitude / 1j)
+    )
     assert abs(abs(response) - 1 / np.hypot(1, ratio)) < 0.01
     assert abs(np.angle(response) + np.arctan(ratio)) < 0.02
 
@@ -130,11 +139,16 @@ def test_step_response_times():
 
 def test_event_times_converge_with_order_two():
     """Filtered sinusoid: event times against those of a very fine run."""
+
     def times(n):
         emulator = V2e(1, 1, V2eConfig(**QUIET, cutoff_hz=3.0, contrast_threshold=0.1))
         s = np.linspace(0, 1, n + 1)
         intensity = 90 * np.exp(0.9 * np.sin(2 * np.pi * 0.9 * s + 0.4)) / 255
-        return run(emulator, [np.full((1, 1), v, np.float32) for v in intensity], np.round(s * 4e9).astype(np.int64)).t * 1e-6
+        return (
+            run(emulator, [np.full((1, 1), v, np.float32) for v in intensity], np.round(s * 4e9).astype(np.int64)).t
+            * 1e-6
+        )
+
     truth = times(20_000)
     spacings = np.array([64, 128, 256, 512])
     errors = []
@@ -160,7 +174,11 @@ def test_shot_noise_rate(frame_ms, level):
     rate, seconds = 20.0, 1.0
     emulator = V2e(40, 40, V2eConfig(**{**QUIET, "shot_noise_rate_hz": rate}, cutoff_hz=0.0), seed=5)
     frame = np.full((40, 40), level, np.float32)
-    events = run(emulator, [frame] * (round(seconds * 1000 / frame_ms) + 1), range(0, round(1e9 * seconds) + 1, round(frame_ms * 1e6)))
+    events = run(
+        emulator,
+        [frame] * (round(seconds * 1000 / frame_ms) + 1),
+        range(0, round(1e9 * seconds) + 1, round(frame_ms * 1e6)),
+    )
     counts = np.bincount(events.y.astype(int) * 40 + events.x, minlength=1600)
     assert poisson_consistent(counts, seconds * rate * (1 - 0.75 * (255 * level + 20) / 275)) > 1e-3
     assert abs(events.p.mean() - 0.5) < 2.5 / np.sqrt(len(events))
@@ -171,10 +189,14 @@ def test_shot_noise_rate(frame_ms, level):
 def test_leak_rate_and_jitter(frame_ms):
     """Leak events are ON, at the configured rate, and their intervals have the configured jitter at any frame rate."""
     rate, jitter = 4.0, 0.2
-    emulator = V2e(20, 20, V2eConfig(**{**QUIET, "leak_rate_hz": rate}, leak_jitter=jitter, leak_cov_decades=0.0, cutoff_hz=0.0))
+    emulator = V2e(
+        20, 20, V2eConfig(**{**QUIET, "leak_rate_hz": rate}, leak_jitter=jitter, leak_cov_decades=0.0, cutoff_hz=0.0)
+    )
     seconds = 6
     frame = np.full((20, 20), 0.5, np.float32)
-    events = run(emulator, [frame] * (round(seconds * 1000 / frame_ms) + 1), range(0, seconds * 10**9 + 1, round(frame_ms * 1e6)))
+    events = run(
+        emulator, [frame] * (round(seconds * 1000 / frame_ms) + 1), range(0, seconds * 10**9 + 1, round(frame_ms * 1e6))
+    )
     assert (events.p == 1).all()
     assert abs(len(events) / (400 * seconds * rate) - 1) < 0.01
     pixel = events.y.astype(int) * 20 + events.x
@@ -183,7 +205,9 @@ def test_leak_rate_and_jitter(frame_ms):
     # Long gaps are a little under-represented in a finite window.
     assert abs(gaps.mean() * rate - 1) < 0.01 and abs(gaps.std() * rate / jitter - 1) < 0.1
     counts = np.bincount(pixel, minlength=400)
-    assert stats.chi2.sf(((counts - seconds * rate) ** 2).sum() / (seconds * rate), 400) > 0.99  # far more regular than Poisson
+    assert (
+        stats.chi2.sf(((counts - seconds * rate) ** 2).sum() / (seconds * rate), 400) > 0.99
+    )  # far more regular than Poisson
 
 
 @pytest.mark.parametrize("frame_ms", [0.1, 1, 10, 100])
@@ -194,14 +218,19 @@ def test_photoreceptor_noise_holds_its_rate_at_any_frame_rate(frame_ms):
     config = V2eConfig(**{**QUIET, "shot_noise_rate_hz": rate}, photoreceptor_noise=True, cutoff_hz=30.0)
     emulator = V2e(pixels, pixels, config, seed=1)
     frame = np.full((pixels, pixels), 0.4, np.float32)
-    events = run(emulator, [frame] * (round(seconds * 1000 / frame_ms) + 1),
-                 [round(k * frame_ms * 1e6) for k in range(round(seconds * 1000 / frame_ms) + 1)])
+    events = run(
+        emulator,
+        [frame] * (round(seconds * 1000 / frame_ms) + 1),
+        [round(k * frame_ms * 1e6) for k in range(round(seconds * 1000 / frame_ms) + 1)],
+    )
     assert abs(len(events) / (seconds * pixels**2) / rate - 1) < 0.1
     assert abs(events.p.mean() - 0.5) < 0.03
 
 
 def test_leak_spread_over_pixels():
-    leaks = v2e.draw_leaks(200, 200, V2eConfig(leak_rate_hz=2.0, leak_cov_decades=0.3), np.full(40_000, 0.2, np.float32), np.uint64(1))
+    leaks = v2e.draw_leaks(
+        200, 200, V2eConfig(leak_rate_hz=2.0, leak_cov_decades=0.3), np.full(40_000, 0.2, np.float32), np.uint64(1)
+    )
     decades = np.log10(leaks / 0.4)
     assert stats.kstest(decades / 0.3, "norm").pvalue > 1e-3
 
@@ -220,7 +249,9 @@ def test_refractory_dead_time_on_a_ramp():
     config = V2eConfig(**{**QUIET, "refractory_us": dead}, cutoff_hz=0.0, contrast_threshold=theta)
     s = np.arange(0, 60) * 1e-4
     emulator = V2e(1, 1, config)
-    events = run(emulator, [np.full((1, 1), 25 / 255 * np.exp(slope * v), np.float32) for v in s], np.round(s * 1e9).astype(int))
+    events = run(
+        emulator, [np.full((1, 1), 25 / 255 * np.exp(slope * v), np.float32) for v in s], np.round(s * 1e9).astype(int)
+    )
     gaps = np.diff(events.t)
     assert len(gaps) >= 3 and np.abs(gaps - (dead + theta / slope * 1e6)).max() <= 2
 
@@ -228,7 +259,9 @@ def test_refractory_dead_time_on_a_ramp():
 def test_refractory_histogram_and_no_backlog():
     """With dead time, gaps of noise events are dead time + exponential; a step inside the dead time never comes out."""
     dead, rate = 5_000.0, 200.0
-    emulator = V2e(30, 30, V2eConfig(**{**QUIET, "shot_noise_rate_hz": rate, "refractory_us": dead}, cutoff_hz=0.0), seed=3)
+    emulator = V2e(
+        30, 30, V2eConfig(**{**QUIET, "shot_noise_rate_hz": rate, "refractory_us": dead}, cutoff_hz=0.0), seed=3
+    )
     events = run(emulator, [np.zeros((30, 30), np.float32)] * 201, range(0, 201 * 5 * MS, 5 * MS))
     pixel = events.y.astype(int) * 30 + events.x
     order = np.lexsort((events.t, pixel))
@@ -238,7 +271,9 @@ def test_refractory_histogram_and_no_backlog():
 
     emulator = V2e(1, 1, V2eConfig(**{**QUIET, "refractory_us": 10_000.0}, cutoff_hz=0.0))
     frames = [0.2, 0.25, 0.9, 0.9, 0.9, 0.9]  # one event, then a large step while dead, then nothing
-    events = run(emulator, [np.full((1, 1), v, np.float32) for v in frames], [0, 2 * MS, 4 * MS, 20 * MS, 40 * MS, 60 * MS])
+    events = run(
+        emulator, [np.full((1, 1), v, np.float32) for v in frames], [0, 2 * MS, 4 * MS, 20 * MS, 40 * MS, 60 * MS]
+    )
     assert len(events) == 1
 
 

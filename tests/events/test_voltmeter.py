@@ -51,7 +51,11 @@ def test_on_first_against_fifty_digits():
     mpmath.mp.dps = 50
     rng = np.random.default_rng(0)
     for _ in range(400):
-        v, mu, sigma = rng.uniform(-0.999, 0.999), rng.choice([-1, 1]) * 10 ** rng.uniform(-12, 1), 10 ** rng.uniform(-4, 1)
+        v, mu, sigma = (
+            rng.uniform(-0.999, 0.999),
+            rng.choice([-1, 1]) * 10 ** rng.uniform(-12, 1),
+            10 ** rng.uniform(-4, 1),
+        )
         a, b = 1 - v, 1 + v
         r = 2 * mpmath.mpf(float(mu)) / mpmath.mpf(float(sigma)) ** 2
         exact = (mpmath.exp(r * b) - 1) / (mpmath.exp(r * b) - mpmath.exp(-r * a))
@@ -79,7 +83,9 @@ def _hitting_times(n, distance, mu, sigma):
 N = 200_000
 
 
-@pytest.mark.parametrize("distance, mu, sigma", [(1.0, 2.0, 0.5), (0.3, 1e-3, 0.2), (1.7, -0.4, 3.0), (1.0, 5e-4, 1e-3)])
+@pytest.mark.parametrize(
+    "distance, mu, sigma", [(1.0, 2.0, 0.5), (0.3, 1e-3, 0.2), (1.7, -0.4, 3.0), (1.0, 5e-4, 1e-3)]
+)
 def test_hitting_times_are_inverse_gaussian(distance, mu, sigma):
     t = _hitting_times(N, distance, mu, sigma)
     mean, shape = distance / abs(mu), (distance / sigma) ** 2
@@ -139,8 +145,9 @@ def test_dead_time_and_burst(threads):  # noqa: F811
     config = VoltmeterConfig(refractory_us=700.0)
     emulator = DvsVoltmeter(30, 30, config)
     emulator.step(np.zeros((30, 30), np.float32), 0)
-    events = Events.concatenate([emulator.step(np.ones((30, 30), np.float32), 2 * MS),
-                                 emulator.step(np.zeros((30, 30), np.float32), 3 * MS)])
+    events = Events.concatenate(
+        [emulator.step(np.ones((30, 30), np.float32), 2 * MS), emulator.step(np.zeros((30, 30), np.float32), 3 * MS)]
+    )
     pixel = events.y.astype(int) * 30 + events.x
     order = np.lexsort((events.t, pixel))
     assert np.diff(events.t[order])[np.diff(pixel[order]) == 0].min() >= 699

@@ -20,8 +20,13 @@ def promise(request):
 def pytest_terminal_summary(terminalreporter, config):
     if config.get_verbosity() < 1:
         return
-    rows = [value for reports in terminalreporter.stats.values() for report in reports
-            for key, value in getattr(report, "user_properties", ()) if key == "promise" and report.when == "call"]
+    rows = [
+        value
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        for key, value in getattr(report, "user_properties", ())
+        if key == "promise" and report.when == "call"
+    ]
     if rows:
         terminalreporter.section("measured against promised")
         for name, measured, bound, unit in rows:

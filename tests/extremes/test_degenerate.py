@@ -72,9 +72,24 @@ def nasty() -> np.ndarray:
     through = np.array([[-1.0, -2, -0.5], [1.0, 3, -0.5], [0.5, 4, 0.5]])
     in_plane = np.array([[-1.0, 0, -0.5], [1.0, 0, -0.5], [0.0, 0, 0.5]])
     at_near = np.array([[-1.0, 0.05, -0.5], [1.0, 0.05, -0.5], [0.0, 0.05, 0.5]])
-    upright = np.array([[0.0, 2, -0.5], [0.0, 4, -0.5], [0.0, 3, 0.5]])  # exactly edge-on where the principal point lies on x = 0
+    upright = np.array(
+        [[0.0, 2, -0.5], [0.0, 4, -0.5], [0.0, 3, 0.5]]
+    )  # exactly edge-on where the principal point lies on x = 0
     point = np.full((3, 3), 2.0)
-    shapes = [line, needle, through, in_plane, at_near, upright, point, line[[0, 1, 1]], 1e6 * line, 1e-6 * line + (0, 2, 0), 1e6 * needle, 1e-4 * through]
+    shapes = [
+        line,
+        needle,
+        through,
+        in_plane,
+        at_near,
+        upright,
+        point,
+        line[[0, 1, 1]],
+        1e6 * line,
+        1e-6 * line + (0, 2, 0),
+        1e6 * needle,
+        1e-4 * through,
+    ]
     return np.concatenate([np.stack(shapes), slivers(rng, 300), slivers(rng, 300, (-0.5, 0.5)), edge_on(rng, 300)])
 
 
@@ -82,8 +97,15 @@ def raw_buffers(renderer) -> dict[str, np.ndarray]:
     """Everything that every pass writes at 0, as it leaves the fragment shaders."""
     buffers = renderer.draw(RAW, 0, {"forward": 100 * MS, "backward": -100 * MS})
     both = renderer.luminance(0, rate=True)
-    return {**{name: buffers.read(name) for name in buffers.names}, "luminance": renderer.luminance(0).read(), "with rate": both.read(),
-            "rate": both.read("rate"), "colour": renderer.colour(0).read(), "brightness": renderer.brightness(0, 3).read(), "motion": renderer.velocity(0, 3).read()}
+    return {
+        **{name: buffers.read(name) for name in buffers.names},
+        "luminance": renderer.luminance(0).read(),
+        "with rate": both.read(),
+        "rate": both.read("rate"),
+        "colour": renderer.colour(0).read(),
+        "brightness": renderer.brightness(0, 3).read(),
+        "motion": renderer.velocity(0, 3).read(),
+    }
 
 
 @pytest.mark.parametrize("antialiasing", ["none", "taps4", "msaa4", "ssaa2"])
@@ -99,8 +121,18 @@ def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, tex
         for double_sided in (True, False):
             paint = Material(texture=smooth_texture(1) if textured else None, unlit=not lit, double_sided=double_sided)
             whole = replace(sheet(corners), closed=not double_sided)  # closed: culled, not two-sided
-            world.append(scene([thing("nasty", 1, whole, drift((0, 0, 0), (0.1, 0.05, -0.3)), paint)], rig(80, 60, 75.0, still(rotation=LEVEL))))
-    world.append(replace(world[0], rig=rig(81, 61, 64.0, drift((0, 0, 0), (0.1, 0.2, 0), LEVEL, LEVEL * Rotation.from_rotvec([0.1, 0, 0])))))
+            world.append(
+                scene(
+                    [thing("nasty", 1, whole, drift((0, 0, 0), (0.1, 0.05, -0.3)), paint)],
+                    rig(80, 60, 75.0, still(rotation=LEVEL)),
+                )
+            )
+    world.append(
+        replace(
+            world[0],
+            rig=rig(81, 61, 64.0, drift((0, 0, 0), (0.1, 0.2, 0), LEVEL, LEVEL * Rotation.from_rotvec([0.1, 0, 0]))),
+        )
+    )
     for one in world:
         with Renderer(gl, one, RenderConfig(antialiasing=antialiasing, image_antialiasing="none")) as renderer:
             for name, buffer in raw_buffers(renderer).items():
@@ -110,7 +142,14 @@ def test_every_pass_of_a_nasty_mesh_is_finite(gl, monkeypatch, antialiasing, tex
 @pytest.mark.parametrize("seed", range(4))
 def test_slivers_have_the_depth_and_the_light_of_what_they_are(gl, seed):
     corners = slivers(np.random.default_rng(seed), 1000)
-    world = scene([thing("slivers", 1, sheet(corners), drift((0, 0, 0), (0.02, 0.01, 0.03)), Material(texture=smooth_texture(1)))], rig(near=0.01))
+    world = scene(
+        [
+            thing(
+                "slivers", 1, sheet(corners), drift((0, 0, 0), (0.02, 0.01, 0.03)), Material(texture=smooth_texture(1))
+            )
+        ],
+        rig(near=0.01),
+    )
     with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
         buffers = raw_buffers(renderer)
     hit = buffers["ids"] > 0
@@ -140,7 +179,13 @@ def test_a_neighbour_on_the_horizon_has_no_texture_coordinates(gl, antialiasing,
     ground = mesh(vertices, [[2, 1, 0]], np.tile([0, 0, 1.0], (3, 1)), vertices[:, :2] / 4)
     eye = Rig.alone(PinHole(128, 128, 64.0, 64.0, 64.0, 32.0, near=0.25), drift((0, 0, 0), (0, 0.1, 0), LEVEL))
     paint = smooth_texture(1)
-    with Renderer(gl, scene([thing("ground", 1, ground, still(), Material(texture=paint, unlit=unlit))], eye, Light(sun=0.0, sky=1.0)), RenderConfig(antialiasing=antialiasing)) as renderer:
+    with Renderer(
+        gl,
+        scene(
+            [thing("ground", 1, ground, still(), Material(texture=paint, unlit=unlit))], eye, Light(sun=0.0, sky=1.0)
+        ),
+        RenderConfig(antialiasing=antialiasing),
+    ) as renderer:
         buffers = raw_buffers(renderer)
     last = buffers["ids"][33] > 0
     assert last.sum() > 100 and not buffers["ids"][:33].any()
@@ -170,7 +215,14 @@ def test_lines_are_dropped_and_slivers_are_not(size, offset):
 
 
 def test_models_keep_their_faces():
-    for shape in (primitives.cuboid(), primitives.sphere(), primitives.torus(), primitives.icosphere(subdivisions=5), quad(1e5, 1e5, 32), cube(1e-6)):
+    for shape in (
+        primitives.cuboid(),
+        primitives.sphere(),
+        primitives.torus(),
+        primitives.icosphere(subdivisions=5),
+        quad(1e5, 1e5, 32),
+        cube(1e-6),
+    ):
         assert faces_in_float32(shape).all()
 
 
@@ -180,7 +232,13 @@ def test_the_renderer_drops_lines_and_says_so(gl, lod):
     a, b = ball.vertices[ball.faces[0, :2]]
     vertices = np.concatenate([ball.vertices, [(a + b) / 2]])
     faces = np.concatenate([ball.faces, [[ball.faces[0, 0], ball.faces[0, 1], len(ball.vertices)]]]).astype(np.int32)
-    split = replace(ball, vertices=vertices, faces=faces, normals=np.concatenate([ball.normals, ball.normals[:1]]), uvs=np.concatenate([ball.uvs, ball.uvs[:1]]))
+    split = replace(
+        ball,
+        vertices=vertices,
+        faces=faces,
+        normals=np.concatenate([ball.normals, ball.normals[:1]]),
+        uvs=np.concatenate([ball.uvs, ball.uvs[:1]]),
+    )
     line = sheet(slivers(np.random.default_rng(0), 1) * 0 + np.array([[0, 0, 0], [1, 1, 1], [2, 2, 2.0]]))
     two = SceneObject("ball", 1, (Part(line, Material()), Part(split, Material())), still((0, 4, 0)))
     world = scene([two, thing("other", 2, split, still((1, 5, 0)))])
@@ -188,7 +246,9 @@ def test_the_renderer_drops_lines_and_says_so(gl, lod):
         assert [len(o.parts) for o in renderer.scene.objects] == [1, 1]
         assert renderer.scene.objects[0].parts[0].mesh is renderer.scene.objects[1].parts[0].mesh or lod
         assert all(faces_in_float32(p.mesh).all() for o in renderer.scene.objects for p in o.parts)
-        assert "without width in float32" in renderer.scene.log[-1] and (lod or renderer.scene.log[-1].startswith("3 triangles"))
+        assert "without width in float32" in renderer.scene.log[-1] and (
+            lod or renderer.scene.log[-1].startswith("3 triangles")
+        )
         assert set(np.unique(renderer.labels(0, LabelRequest("ids")).ids)) == {0, 1, 2}
     with Renderer(gl, scene([thing("ball", 1, ball, still((0, 4, 0)))]), RenderConfig()) as renderer:
         assert not renderer.scene.log
@@ -203,7 +263,10 @@ def test_a_texture_with_a_number_that_is_none_is_refused(gl, bad):
     image[2, 5] = bad
     world = scene([thing("wall", 1, quad(), still((0, 3, 0), FACING), Material(texture=Texture(image, "poster")))])
     for draw in (lambda r: r.luminance(0).read(), lambda r: r.colour(0).read()):
-        with Renderer(gl, world, RenderConfig()) as renderer, pytest.raises(AssetError, match=r"^poster: texel x=5, y=2 cannot be drawn .*linear light from 0"):
+        with (
+            Renderer(gl, world, RenderConfig()) as renderer,
+            pytest.raises(AssetError, match=r"^poster: texel x=5, y=2 cannot be drawn .*linear light from 0"),
+        ):
             draw(renderer)
 
 
@@ -213,12 +276,21 @@ def test_a_mesh_with_a_number_that_is_none_is_refused(gl):
         values = getattr(plain, name).copy()
         values[2, 0] = np.nan
         world = scene([thing("wall", 1, replace(plain, **{name: values}), still((0, 3, 0), FACING))])
-        with Renderer(gl, world, RenderConfig()) as renderer, pytest.raises(AssetError, match="^quad: vertex 2 has a .* finite numbers$"):
+        with (
+            Renderer(gl, world, RenderConfig()) as renderer,
+            pytest.raises(AssetError, match="^quad: vertex 2 has a .* finite numbers$"),
+        ):
             renderer.luminance(0).read()
 
 
-@pytest.mark.parametrize("color, background, seen", [((np.nan, 1.0, 1.0), 0.0, r"object 'wall' \(id 7\)"), ((-1.0, -1.0, -1.0), 0.0, r"object 'wall' \(id 7\)"),
-                                                     ((0.5, 0.5, 0.5), np.inf, "the background")])
+@pytest.mark.parametrize(
+    "color, background, seen",
+    [
+        ((np.nan, 1.0, 1.0), 0.0, r"object 'wall' \(id 7\)"),
+        ((-1.0, -1.0, -1.0), 0.0, r"object 'wall' \(id 7\)"),
+        ((0.5, 0.5, 0.5), np.inf, "the background"),
+    ],
+)
 def test_the_message_names_what_is_seen_where_and_when(gl, color, background, seen):
     from blinkgl.config.events import EsimConfig
     from blinkgl.config.sequence import SequenceConfig
@@ -228,9 +300,18 @@ def test_the_message_names_what_is_seen_where_and_when(gl, color, background, se
     wall = thing("wall", 7, quad(0.5, 0.5), still((0, 3, 0), FACING), Material(base_color=color, unlit=True))
     world = replace(scene([wall], background=background), t0_ns=250 * MS, t1_ns=500 * MS)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        with pytest.raises(EventDataError, match=rf"^frame 0 at 0\.25 s: intensity at pixel x=\d+, y=\d+ cannot be used: it shows {seen} \(got .*\); "
-                                                 r"expected a finite value") as caught:
-            list(simulate_sequence(SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()), labels=False, renderer=renderer))
+        with pytest.raises(
+            EventDataError,
+            match=rf"^frame 0 at 0\.25 s: intensity at pixel x=\d+, y=\d+ cannot be used: it shows {seen} \(got .*\); "
+            r"expected a finite value",
+        ) as caught:
+            list(
+                simulate_sequence(
+                    SequenceConfig(timeline=UniformTimeline(fps=100), events=EsimConfig()),
+                    labels=False,
+                    renderer=renderer,
+                )
+            )
     assert "\n" not in str(caught.value)
     x, y = caught.value.pixel
     assert (abs(x - 78) < 27 and abs(y - 60) < 27) == (background == 0.0)
@@ -242,11 +323,30 @@ def test_a_sequence_of_81_small_models(gl, tmp_path, seed, count):
     """640x480, 200 frames and every label, of 81 files, in some of which faces are lines: the
     first was lost to one NaN pixel in frame 117."""
     folder = shared("data/assets/models_cc0")
-    tree = {"seed": seed, "camera": {"width": 640, "height": 480}, "time": {"duration": 0.5, "label_rate": 10}, "timeline": {"kind": "uniform", "fps": 199 / 0.6},
-            "scene": {"kind": "random", "objects": {"count": count}, "pool": {"primitives": [], "folders": [str(folder)], "keep_materials": True, "test_fraction": 0}},
-            "labels": {"flow": ["forward", "backward"], "depth": True, "ids": True, "normals": True, "velocity": True, "occlusion": True}, "preview": {"enabled": False}}
+    tree = {
+        "seed": seed,
+        "camera": {"width": 640, "height": 480},
+        "time": {"duration": 0.5, "label_rate": 10},
+        "timeline": {"kind": "uniform", "fps": 199 / 0.6},
+        "scene": {
+            "kind": "random",
+            "objects": {"count": count},
+            "pool": {"primitives": [], "folders": [str(folder)], "keep_materials": True, "test_fraction": 0},
+        },
+        "labels": {
+            "flow": ["forward", "backward"],
+            "depth": True,
+            "ids": True,
+            "normals": True,
+            "velocity": True,
+            "occlusion": True,
+        },
+        "preview": {"enabled": False},
+    }
     report = generate_sequence(RunTemplate(tree, Path(".")).sequence(0), 0, tmp_path, gl)
     assert report.frames == 200 and verify_sequence(report.path) == []
     for k in range(report.labels):
-        depth, normals, velocity = (np.load(report.path / f"{name}/{k:06d}.npy") for name in ("depth", "normals", "velocity"))
+        depth, normals, velocity = (
+            np.load(report.path / f"{name}/{k:06d}.npy") for name in ("depth", "normals", "velocity")
+        )
         assert np.isfinite(depth).mean() > 0.9 and np.isfinite(normals).all() and np.isfinite(velocity).all()

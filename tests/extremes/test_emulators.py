@@ -16,7 +16,11 @@ from tests.render.render_scenes import SECOND
 DAY = 86_400 * SECOND
 LONGEST = 1000 * SECOND  # below the emulators' limit of 17 minutes
 EVERY = {"esim": EsimConfig(), "v2e": V2eConfig(), "voltmeter": VoltmeterConfig()}
-QUIET = {"esim": EsimConfig(threshold_sigma=0.02), "v2e": V2eConfig(preset="clean"), "voltmeter": VoltmeterConfig(k3=0, k4=0, k5=0, k6=0)}
+QUIET = {
+    "esim": EsimConfig(threshold_sigma=0.02),
+    "v2e": V2eConfig(preset="clean"),
+    "voltmeter": VoltmeterConfig(k3=0, k4=0, k5=0, k6=0),
+}
 
 
 def picture(seed=0, shape=(12, 16), low=0.05, high=1.0):
@@ -71,7 +75,9 @@ def test_times_are_exact_at_any_clock(promise):
     for shift in (0, 10**6 * SECOND, 10**9 * SECOND):
         esim = Esim(12, 16, EsimConfig(threshold_jitter=0.02, refractory_us=100), seed=5)
         events = [esim.step(f, int(t) + shift) for f, t in zip(frames, times)]
-        runs.append([np.concatenate([getattr(e, k) for e in events]) - (shift // 1000 if k == "t" else 0) for k in "xytp"])
+        runs.append(
+            [np.concatenate([getattr(e, k) for e in events]) - (shift // 1000 if k == "t" else 0) for k in "xytp"]
+        )
     for other in runs[1:]:
         for a, b in zip(runs[0], other):
             np.testing.assert_array_equal(a, b)
@@ -89,7 +95,9 @@ def test_ten_thousand_events_per_pixel(promise):
     promise("10^4 events per pixel: too many or few", np.abs(per_pixel - 10_000).max(), 1)
     mine = events.t[(events.x == 1) & (events.y == 2)]
     expected = np.arange(1, len(mine) + 1) * 1e-3 / 10.0005 * 1e6
-    promise("10^4 events per pixel: event times over 1 s", np.abs(mine - expected).max(), 18.0, "us")  # 10^4 x 1.5e-8 / 10 of 1 s, + 1 us + ends
+    promise(
+        "10^4 events per pixel: event times over 1 s", np.abs(mine - expected).max(), 18.0, "us"
+    )  # 10^4 x 1.5e-8 / 10 of 1 s, + 1 us + ends
     assert esim.saturated == 0 and (np.diff(events.t) >= 0).all()
     back = esim.step(low, 2 * SECOND)
     assert len(back) == len(events)
@@ -125,8 +133,17 @@ def test_references_do_not_drift(promise, frames):
     net, first, _ = soak(frames, esim)
     assert net.sum() > 50 * frames
     reference = esim._upper.astype(np.int64) - esim._on
-    expected = log_q25(first + np.float32(1e-3)).ravel().astype(np.int64) + net[1].ravel() * esim._on - net[0].ravel() * esim._off
-    promise(f"ESIM, {frames:.0e} frames, {net.sum():.0e} events: drift of the reference", np.abs(reference - expected).max() / Q_ONE, 0.0, "ln")
+    expected = (
+        log_q25(first + np.float32(1e-3)).ravel().astype(np.int64)
+        + net[1].ravel() * esim._on
+        - net[0].ravel() * esim._off
+    )
+    promise(
+        f"ESIM, {frames:.0e} frames, {net.sum():.0e} events: drift of the reference",
+        np.abs(reference - expected).max() / Q_ONE,
+        0.0,
+        "ln",
+    )
 
 
 @pytest.mark.parametrize("frames", [5_000, pytest.param(200_000, marks=pytest.mark.slow)])
@@ -141,7 +158,12 @@ def test_v2e_reference_drift(promise, frames):
     start = run._x.astype(np.float64)  # the last frame is the first one
     expected = start + (net[1] - net[0]).ravel() * np.float64(np.float32(0.2))
     drift = np.abs(run._upper.astype(np.float64) - np.float64(np.float32(0.2)) - expected).max()
-    promise(f"V2E, {frames:.0e} frames, {net.sum():.0e} events: drift of the reference", drift, 4e-8 * net.sum(0).max(), "ln")
+    promise(
+        f"V2E, {frames:.0e} frames, {net.sum():.0e} events: drift of the reference",
+        drift,
+        4e-8 * net.sum(0).max(),
+        "ln",
+    )
 
 
 @pytest.mark.parametrize("emulator", QUIET)
@@ -168,8 +190,15 @@ def test_a_still_day_makes_no_event(promise, emulator, interval):
 def test_a_still_day_of_v2e_noise_keeps_its_rate(promise):
     """Leak and shot noise over 24 h at their configured rates, to the counting error: nothing accumulates in float32
     (the leak's epoch moves along)."""
-    config = V2eConfig(leak_rate_hz=0.02, leak_cov_decades=0.0, leak_jitter=0.1, shot_noise_rate_hz=0.01, threshold_sigma=0.0,
-                       cutoff_hz=0.0, refractory_us=0.0)
+    config = V2eConfig(
+        leak_rate_hz=0.02,
+        leak_cov_decades=0.0,
+        leak_jitter=0.1,
+        shot_noise_rate_hz=0.01,
+        threshold_sigma=0.0,
+        cutoff_hz=0.0,
+        refractory_us=0.0,
+    )
     run, frame = make_emulator(config, 8, 8, 4), np.zeros((8, 8), np.float32)
     run.step(frame, 0)
     halves = np.zeros((2, 2))
@@ -178,11 +207,19 @@ def test_a_still_day_of_v2e_noise_keeps_its_rate(promise):
         halves[(k - 1) // 144] += (events.p == 0).sum(), (events.p == 1).sum()
     off, on = halves.sum(0)
     pixels, seconds = 64, 86_400
-    expected_off = 0.5 * 0.01 * (1 - 0.75 * 20 / 275) * pixels * seconds  # half of the shot noise, v2e's rate at intensity 0
-    promise("V2E, a still day: OFF noise against its rate, sigmas", abs(off - expected_off) / np.sqrt(expected_off), 4.0)
+    expected_off = (
+        0.5 * 0.01 * (1 - 0.75 * 20 / 275) * pixels * seconds
+    )  # half of the shot noise, v2e's rate at intensity 0
+    promise(
+        "V2E, a still day: OFF noise against its rate, sigmas", abs(off - expected_off) / np.sqrt(expected_off), 4.0
+    )
     # A shot-noise ON resets the leak's progress, an OFF too: the leak's own count is below its rate; the two halves
     # agree.
-    promise("V2E, a still day: ON events, second half against first, sigmas", abs(halves[1, 1] - halves[0, 1]) / np.sqrt(2 * halves[0, 1]), 4.0)
+    promise(
+        "V2E, a still day: ON events, second half against first, sigmas",
+        abs(halves[1, 1] - halves[0, 1]) / np.sqrt(2 * halves[0, 1]),
+        4.0,
+    )
     assert on > 0.5 * 0.02 * pixels * seconds
     assert stats.norm.sf(4.0) < 1e-4
 

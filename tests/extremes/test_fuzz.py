@@ -19,8 +19,13 @@ from blinkgl.io.sequence_dir import verify_sequence
 from tests.extremes.configurations import esim, runs, v2e, voltmeter
 
 # No explain phase: it re-runs a failing sequence hundreds of times to say which of its values matter.
-COMMON = dict(deadline=None, suppress_health_check=list(HealthCheck), database=None, print_blob=False,
-              phases=(Phase.explicit, Phase.generate, Phase.shrink))
+COMMON = dict(
+    deadline=None,
+    suppress_health_check=list(HealthCheck),
+    database=None,
+    print_blob=False,
+    phases=(Phase.explicit, Phase.generate, Phase.shrink),
+)
 
 
 def check_sequence(folder: Path, config) -> int:
@@ -32,7 +37,9 @@ def check_sequence(folder: Path, config) -> int:
         offset, index = int(file["t_offset"][()]), file["ms_to_idx"][:]
     t = t.astype(np.int64)
     assert (np.diff(t) >= 0).all() and (np.diff(index.astype(np.int64)) >= 0).all()
-    assert not len(t) or (t.min() >= 0 and offset + t.max() <= config.time.t1_ns // 1000 and x.max() < width and y.max() < height)
+    assert not len(t) or (
+        t.min() >= 0 and offset + t.max() <= config.time.t1_ns // 1000 and x.max() < width and y.max() < height
+    )
     assert set(np.unique(p)) <= {0, 1}
     for direction in ("forward", "backward"):
         for k in range(config.time.label_count):
@@ -41,7 +48,9 @@ def check_sequence(folder: Path, config) -> int:
             assert (flow[flow[..., 2] == 0] == 0).all()
     for k in range(config.time.label_count):
         ids = cv2.imread(str(folder / f"ids/{k:06d}.png"), cv2.IMREAD_UNCHANGED)
-        depth, normals, velocity = (np.load(folder / f"{name}/{k:06d}.npy") for name in ("depth", "normals", "velocity"))
+        depth, normals, velocity = (
+            np.load(folder / f"{name}/{k:06d}.npy") for name in ("depth", "normals", "velocity")
+        )
         np.testing.assert_array_equal(np.isinf(depth), ids == 0)
         assert (depth > 0).all() and np.isfinite(normals).all() and not np.isnan(velocity).any()
         np.testing.assert_allclose(np.linalg.norm(normals, axis=-1)[ids > 0], 1, atol=1e-3)

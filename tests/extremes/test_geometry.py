@@ -40,7 +40,14 @@ def test_sizes_of_nine_decades_in_one_scene(gl, promise):
     objects = []
     for k, s in enumerate(sizes):
         x = 0.54 * (k - 2) * s
-        objects.append(thing(f"ball{k}", k + 1, sphere(0.25 * s, 3), drift((x, 3 * s, 0), (x + 0.02 * s, 3 * s, 0.01 * s), TURN, TURN * SPIN)))
+        objects.append(
+            thing(
+                f"ball{k}",
+                k + 1,
+                sphere(0.25 * s, 3),
+                drift((x, 3 * s, 0), (x + 0.02 * s, 3 * s, 0.01 * s), TURN, TURN * SPIN),
+            )
+        )
     eye = rig(near=1e-5, path=drift((0, 0, 0), (1e-6, 0, -1e-6), LEVEL, LEVEL * SPIN))
     e = compare(gl, scene(objects, eye))
     assert set(np.unique(e.frame.ids)) == {0, 1, 2, 3, 4, 5} and e.wrong_ids == 0
@@ -52,7 +59,10 @@ def test_depth_ratio_of_nine_decades(gl, promise):
     """Reversed-Z in float32 with the far plane at infinity: depth = near / Z has the same
     relative resolution everywhere."""
     depths = np.logspace(-3, 6, 10) * 1.2
-    objects = [thing(f"q{k}", k + 1, quad(*[0.5 * z * (k + 1) / 10] * 2), drift((0, z, 0), (1e-3 * z, 1.001 * z, 0), FACING)) for k, z in enumerate(depths)]
+    objects = [
+        thing(f"q{k}", k + 1, quad(*[0.5 * z * (k + 1) / 10] * 2), drift((0, z, 0), (1e-3 * z, 1.001 * z, 0), FACING))
+        for k, z in enumerate(depths)
+    ]
     e = compare(gl, scene(objects, rig(near=1e-3, path=drift((0, 0, 0), (1e-6, 0, 0), LEVEL, LEVEL * SPIN))))
     assert len(np.unique(e.frame.ids)) == 11 and e.wrong_ids == 0
     promise("depth 1e-3 to 1e6: flow, largest, relative", e.worst, WORST)
@@ -64,7 +74,10 @@ def test_order_of_surfaces_close_behind_one_another(gl, promise):
     depth is off by a few 2^-24 = 6e-8, so that 1e-6 is safe and 1e-7 is not."""
     tilt, wrong = FACING * Rotation.from_euler("xy", [30, 20], degrees=True), 0
     for z in (1e-2, 1.0, 1e2, 1e4, 1e6):
-        pair = [thing("far", 1, quad(z, z, 3), still((0, z * (1 + 1e-6), 0), tilt)), thing("near", 2, quad(z, z, 5), still((0, z, 0), tilt))]
+        pair = [
+            thing("far", 1, quad(z, z, 3), still((0, z * (1 + 1e-6), 0), tilt)),
+            thing("near", 2, quad(z, z, 5), still((0, z, 0), tilt)),
+        ]
         world = scene(pair, rig(96, 72, 90.0, near=1e-3))
         with Renderer(gl, world, RenderConfig()) as renderer:
             ids = renderer.labels(0, LabelRequest("ids")).ids
@@ -77,7 +90,9 @@ def test_a_ground_of_200_km(gl, promise, splits, median, worst):
     """The local position is interpolated over the triangle: its error is eps times the *triangle*. Two triangles of 2e5
     units seen from 1.5 units cost two digits; 32 x 32 cells cost nothing (the shipped
     ground and sky are subdivided for that)."""
-    e = compare(gl, scene([thing("ground", 1, quad(1e5, 1e5, splits), drift((0, 0, -1.5), (0.1, 0, -1.5)))], moving_camera()))
+    e = compare(
+        gl, scene([thing("ground", 1, quad(1e5, 1e5, splits), drift((0, 0, -1.5), (0.1, 0, -1.5)))], moving_camera())
+    )
     promise(f"ground of 2e5 units, {splits} x {splits} cells: flow, median, relative", e.relative, median)
     promise(f"ground of 2e5 units, {splits} x {splits} cells: flow, largest, relative", e.worst, worst)
 
@@ -102,7 +117,13 @@ def test_a_hundred_thousand_repeats_of_a_texture(gl, promise, away, median, wors
 def test_triangles_far_below_a_pixel(gl, promise, distance, area):
     """41 000 visible triangles on 4 500 or 80 pixels: corners snap to 1/256 px, yet
     attributes come from the exact plane."""
-    e = compare(gl, scene([thing("ball", 1, sphere(1.0, 6), drift((0, distance, 0), (0.2, distance, 0.1), TURN, TURN * SPIN))], moving_camera()))
+    e = compare(
+        gl,
+        scene(
+            [thing("ball", 1, sphere(1.0, 6), drift((0, distance, 0), (0.2, distance, 0.1), TURN, TURN * SPIN))],
+            moving_camera(),
+        ),
+    )
     assert e.wrong_ids == 0
     promise(f"triangles of {area:g} px²: flow, largest, relative", e.worst, WORST)
 
@@ -114,7 +135,9 @@ def test_slivers_and_degenerate_triangles(gl, promise):
     below, above = np.sort(rng.uniform(-2, 2, n)), np.sort(rng.uniform(-2, 2, n))
     vertices = np.concatenate([np.stack([x, np.full(n, y), np.zeros(n)], 1) for x, y in ((below, -1.5), (above, 1.5))])
     i = np.arange(n - 1)
-    faces = np.concatenate([np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + 1 + n, i + n], 1), [[0, 0, 1], [3, 3, 3], [0, 1, 0]]])
+    faces = np.concatenate(
+        [np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + 1 + n, i + n], 1), [[0, 0, 1], [3, 3, 3], [0, 1, 0]]]
+    )
     sheet = mesh(vertices, faces, np.tile([0.0, 0, 1], (2 * n, 1)))
     for slant in (20, 80):
         path = drift((0, 4, 0), (0.2, 4, 0.1), LEVEL * Rotation.from_euler("x", 180 - slant, degrees=True))
@@ -129,7 +152,11 @@ def test_meshes_without_area_or_normals(gl):
     line = mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], np.zeros((3, 3)))
     plain = quad(3, 3)
     dark = mesh(plain.vertices, plain.faces, np.zeros((4, 3)))
-    things = [thing("point", 1, point, still((0, 2, 0))), thing("line", 2, line, still((0, 2, 0))), thing("dark", 3, dark, still((0, 3, 0), FACING))]
+    things = [
+        thing("point", 1, point, still((0, 2, 0))),
+        thing("line", 2, line, still((0, 2, 0))),
+        thing("dark", 3, dark, still((0, 3, 0), FACING)),
+    ]
     world = scene(things)
     with Renderer(gl, world, RenderConfig()) as renderer:
         labels = renderer.labels(0, replace(MOTION, normals=True, colour=True), MS)
@@ -172,7 +199,11 @@ def test_images_of_a_few_pixels(gl, promise, width, height):
         assert renderer.velocity(300 * MS, 4).read().shape == (max(1, height // 4), max(1, width // 4), 2)
     same = labels.ids == true.instance
     assert same.mean() > 0.7
-    promise(f"image of {width} x {height}: flow, largest, relative", (length(labels.forward.flow - true.forward.flow) / length(true.forward.flow))[same].max(), WORST)
+    promise(
+        f"image of {width} x {height}: flow, largest, relative",
+        (length(labels.forward.flow - true.forward.flow) / length(true.forward.flow))[same].max(),
+        WORST,
+    )
 
 
 @pytest.mark.parametrize("side", [2048, pytest.param(4096, marks=pytest.mark.slow)])
@@ -195,5 +226,8 @@ def test_large_images(gl, promise, side):
 
 def test_an_image_beyond_opengl_is_refused(gl):
     for width, antialiasing in ((5000, "ssaa4"), (16384, "ssaa2")):
-        with Renderer(gl, sized(width, 2), RenderConfig(antialiasing=antialiasing)) as renderer, pytest.raises(GLError, match="beyond this OpenGL's limit"):
+        with (
+            Renderer(gl, sized(width, 2), RenderConfig(antialiasing=antialiasing)) as renderer,
+            pytest.raises(GLError, match="beyond this OpenGL's limit"),
+        ):
             renderer.luminance(0).read()

@@ -78,8 +78,12 @@ def test_far_from_the_origin(gl, promise, offset):
     assert (~same).mean() < 1e-3
     change = length(here.forward.flow - e.frame.forward.flow)[same]
     # silhouettes inside one object (the box's edges) may fall on the other side of a pixel's centre: hence a quantile
-    promise(f"{offset:g} units from the origin: flow against the scene at the origin", np.quantile(change, 0.999),
-            max(1e-4, 10 * offset * 2.0**-53 * world.camera.fx), "px")
+    promise(
+        f"{offset:g} units from the origin: flow against the scene at the origin",
+        np.quantile(change, 0.999),
+        max(1e-4, 10 * offset * 2.0**-53 * world.camera.fx),
+        "px",
+    )
 
 
 @pytest.mark.parametrize("interval_ns", [1, 1000, 100 * SECOND])
@@ -88,8 +92,12 @@ def test_intervals_from_a_nanosecond_to_100_seconds(gl, promise, interval_ns):
     reference sees the same rounded poses; the velocity does not."""
     seconds = interval_ns / SECOND
     pan = LEVEL * Rotation.from_rotvec([0.0, 0.01, 0.02])
-    path = drift((0, 4, 0), (1.0, 4.5, -0.4), FACING, FACING * Rotation.from_rotvec([0.1, 0.2, 0.1]), seconds=max(seconds, 1.0))
-    world = scene([thing("wall", 1, quad(9, 9, 4), path)], rig(path=drift((0, 0, 0), (0.1, 0, 0), LEVEL, pan, max(seconds, 1.0))))
+    path = drift(
+        (0, 4, 0), (1.0, 4.5, -0.4), FACING, FACING * Rotation.from_rotvec([0.1, 0.2, 0.1]), seconds=max(seconds, 1.0)
+    )
+    world = scene(
+        [thing("wall", 1, quad(9, 9, 4), path)], rig(path=drift((0, 0, 0), (0.1, 0, 0), LEVEL, pan, max(seconds, 1.0)))
+    )
     e = compare(gl, world, 0, interval_ns)
     name = f"flow over {seconds:g} s"
     promise(f"{name}: largest, relative", e.worst, WORST)
@@ -103,7 +111,11 @@ def test_a_clock_at_a_million_seconds_changes_no_bit(gl, promise):
 
     def world(t0):
         keys = np.array([0, SECOND // 3, SECOND]) + t0
-        path = KeyframePath(keys, [(0, 4, 0), (0.3, 4.4, 0.1), (0.5, 4.2, -0.3)], Rotation.from_rotvec([[0, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.4]]))
+        path = KeyframePath(
+            keys,
+            [(0, 4, 0), (0.3, 4.4, 0.1), (0.5, 4.2, -0.3)],
+            Rotation.from_rotvec([[0, 0, 0], [0.2, 0.1, 0], [0.3, 0, 0.4]]),
+        )
         return scene([thing("ball", 1, sphere(1.0, 3), path)])
 
     both = []
@@ -137,7 +149,12 @@ def test_a_million_pixels_per_second(gl, promise, speed):
 
 def test_frame_times_at_both_ends():
     assert list(uniform_times(1e9, 5, 9)) == [5, 6, 7, 8, 9]
-    assert list(uniform_times(0.01, 10**15, 10**15 + 250 * SECOND)) == [10**15, 10**15 + 100 * SECOND, 10**15 + 200 * SECOND, 10**15 + 250 * SECOND]
+    assert list(uniform_times(0.01, 10**15, 10**15 + 250 * SECOND)) == [
+        10**15,
+        10**15 + 100 * SECOND,
+        10**15 + 200 * SECOND,
+        10**15 + 250 * SECOND,
+    ]
     day = list(uniform_times(1 / 3600, 0, 86_400 * SECOND))
     assert len(day) == 25 and np.abs(np.diff(day) - 3600 * SECOND).max() <= 3600 * SECOND * 1e-6
     still_day = list(displacement_times(0.5, 200_000, 10**12, 0, 86_400 * SECOND, lambda t: 0.0))
@@ -151,15 +168,34 @@ def test_surfaces_crossing_the_camera_plane(gl, promise, name):
     turn, tip = Rotation.from_rotvec([0.3, 0.5, -0.2]), Rotation.from_rotvec([0.3, 0.2, 0])
     room = cube(3.0)
     room = type(room)(room.vertices, room.faces, room.normals, room.uvs, closed=False)
-    world = scene([{
-        "ground": thing("ground", 1, quad(40, 40), drift((0, 0, -0.3), (0.1, 0, -0.3))),
-        "close ground": thing("ground", 1, quad(40, 40), drift((0, 0, -0.051), (0.1, 0, -0.051))),
-        "wall comes through": thing("wall", 1, quad(3, 3, 4), drift((0, 1.5, -0.3), (0, -1, -0.3), tip, tip * Rotation.from_rotvec([0, 0, 0.2]))),
-        "inside a box": thing("box", 1, room, drift((0, 0, 0), (0.3, -2.5, 0.1), turn, turn * Rotation.from_rotvec([0.01, -0.02, 0.03]))),
-    }[name]], moving_camera())
+    world = scene(
+        [
+            {
+                "ground": thing("ground", 1, quad(40, 40), drift((0, 0, -0.3), (0.1, 0, -0.3))),
+                "close ground": thing("ground", 1, quad(40, 40), drift((0, 0, -0.051), (0.1, 0, -0.051))),
+                "wall comes through": thing(
+                    "wall",
+                    1,
+                    quad(3, 3, 4),
+                    drift((0, 1.5, -0.3), (0, -1, -0.3), tip, tip * Rotation.from_rotvec([0, 0, 0.2])),
+                ),
+                "inside a box": thing(
+                    "box",
+                    1,
+                    room,
+                    drift((0, 0, 0), (0.3, -2.5, 0.1), turn, turn * Rotation.from_rotvec([0.01, -0.02, 0.03])),
+                ),
+            }[name]
+        ],
+        moving_camera(),
+    )
     e = compare(gl, world)  # valid (in front of the camera then) agrees pixel by pixel, or compare() fails
     assert e.wrong_ids == 0
-    promise(f"crossing the camera plane, {name}: error / (flow (1 + Z/Z'))", (e.flow / (e.size * (1 + e.approach))).max(), 5e-6)
+    promise(
+        f"crossing the camera plane, {name}: error / (flow (1 + Z/Z'))",
+        (e.flow / (e.size * (1 + e.approach))).max(),
+        5e-6,
+    )
     promise(f"crossing the camera plane, {name}: velocity, largest, relative", e.velocity.max(), WORST)
 
 
@@ -178,4 +214,9 @@ def test_no_motion_is_exactly_no_flow(gl, promise):
     for offset in (0, 1e6):
         with Renderer(gl, moved_scene(world, np.full(3, offset)), RenderConfig()) as renderer:
             flow = renderer.labels(5 * SECOND, MOTION, 9 * SECOND)  # both after the last key frame: the pose is held
-        promise(f"no motion, {offset:g} units from the origin: flow and velocity", length(flow.forward.flow).max() + length(flow.velocity).max(), 0.0, "px")
+        promise(
+            f"no motion, {offset:g} units from the origin: flow and velocity",
+            length(flow.forward.flow).max() + length(flow.velocity).max(),
+            0.0,
+            "px",
+        )

@@ -23,7 +23,10 @@ RADIANCES = [0.0, 1e-12, 1e-9, 1e-6, 1e-3, 1.0, 1e3, 1e6, 1e9]
 
 def bars(**keys):
     """One upright bar per radiance, side by side before a LEVEL camera."""
-    return [thing(f"bar{k}", k + 1, quad(0.4, 2), still((k - 4, 8, 0), FACING), Material(base_color=(v, v, v), **keys)) for k, v in enumerate(RADIANCES)]
+    return [
+        thing(f"bar{k}", k + 1, quad(0.4, 2), still((k - 4, 8, 0), FACING), Material(base_color=(v, v, v), **keys))
+        for k, v in enumerate(RADIANCES)
+    ]
 
 
 @pytest.mark.parametrize("antialiasing", ["none", "msaa4", "ssaa4"])
@@ -54,7 +57,11 @@ def test_suns_from_nothing_to_1e9(gl, promise, sun, sky):
         luminance = renderer.luminance(0).read()
     assert np.isfinite(luminance).all()
     scale = np.abs(true.luminance).max()
-    promise(f"sun {sun:g}, sky {sky:g}: luminance, relative", np.abs(luminance - true.luminance).max() / max(scale, 1e-300), 1e-6)
+    promise(
+        f"sun {sun:g}, sky {sky:g}: luminance, relative",
+        np.abs(luminance - true.luminance).max() / max(scale, 1e-300),
+        1e-6,
+    )
 
 
 def test_a_hot_texel_among_black_ones(gl, promise):
@@ -64,14 +71,28 @@ def test_a_hot_texel_among_black_ones(gl, promise):
     image[20, 30] = 1e9
     paint = Material(texture=Texture(image), unlit=True)
     world = scene([thing("sky", 1, quad(4, 4), still((0, 8, 0), FACING), paint)], rig(32, 32, 40.0))
-    wide = scene([thing("sky", 1, quad(40, 40), still((0, 4, 0), FACING), Material(texture=Texture(image), unlit=True, uv_scale=(1600.0, 1600.0)))],
-                 rig(32, 32, 30.0))  # every pixel holds 2.7 x 2.7 whole textures
+    wide = scene(
+        [
+            thing(
+                "sky",
+                1,
+                quad(40, 40),
+                still((0, 4, 0), FACING),
+                Material(texture=Texture(image), unlit=True, uv_scale=(1600.0, 1600.0)),
+            )
+        ],
+        rig(32, 32, 30.0),
+    )  # every pixel holds 2.7 x 2.7 whole textures
     with Renderer(gl, world, RenderConfig()) as renderer:
         near = renderer.luminance(0).read()
         assert np.isfinite(near).all() and near.min() == 0 and near.max() > 1e8
     with Renderer(gl, wide, RenderConfig()) as renderer:
         luminance = renderer.luminance(0).read()
-    promise("a texel of 1e9 among 4095 black ones, minified: mean, relative", np.abs(luminance.mean() / (1e9 / 4096) - 1), 1e-5)
+    promise(
+        "a texel of 1e9 among 4095 black ones, minified: mean, relative",
+        np.abs(luminance.mean() / (1e9 / 4096) - 1),
+        1e-5,
+    )
 
 
 @pytest.mark.parametrize("low, high", [(0.0, 1e9), (1e-12, 1e9), (1e-9, 1e-3), (1e3, 1e9), (0.0, 1e-12)])
@@ -99,7 +120,11 @@ def test_the_logarithm_against_float64(promise):
 def test_more_light_than_the_emulators_take_is_refused(gl):
     """2^30 is where fixed-point logarithms end: the pass draws 1e12 well, the emulator says
     what it cannot use, and where."""
-    world = scene([thing("wall", 1, quad(9, 9), still((0, 4, 0), FACING), Material(base_color=(1e6,) * 3))], rig(8, 6, 8.0), Light((0, -1, 0), 1e6, 0.0))
+    world = scene(
+        [thing("wall", 1, quad(9, 9), still((0, 4, 0), FACING), Material(base_color=(1e6,) * 3))],
+        rig(8, 6, 8.0),
+        Light((0, -1, 0), 1e6, 0.0),
+    )
     with Renderer(gl, world, RenderConfig()) as renderer:
         luminance = renderer.luminance(0).read()
     np.testing.assert_allclose(luminance, 1e12, rtol=1e-6)
@@ -109,7 +134,18 @@ def test_more_light_than_the_emulators_take_is_refused(gl):
 
 def test_a_moving_dark_thing_before_a_black_sky_fires_nothing(gl):
     """Radiances below log_eps are the same darkness: 1e-12 against 0 is a change of 1e-9 in the logarithm."""
-    world = scene([thing("ghost", 1, quad(0.5, 0.5), drift((-1, 4, 0), (1, 4, 0), FACING), Material(base_color=(1e-12,) * 3, unlit=True))], rig(40, 30, 40.0))
+    world = scene(
+        [
+            thing(
+                "ghost",
+                1,
+                quad(0.5, 0.5),
+                drift((-1, 4, 0), (1, 4, 0), FACING),
+                Material(base_color=(1e-12,) * 3, unlit=True),
+            )
+        ],
+        rig(40, 30, 40.0),
+    )
     esim, events = Esim(30, 40, EsimConfig(contrast_threshold=0.001)), 0
     with Renderer(gl, world, RenderConfig()) as renderer:
         for k in range(11):

@@ -26,13 +26,21 @@ BOX = {
 
 
 def moving(seconds: float, distance: float, start: float = 0.0) -> dict:
-    keys = [{"time": start, "position": [3.0, -distance / 2, 0.0]}, {"time": start + seconds, "position": [3.0, distance / 2, 0.0]}]
+    keys = [
+        {"time": start, "position": [3.0, -distance / 2, 0.0]},
+        {"time": start + seconds, "position": [3.0, distance / 2, 0.0]},
+    ]
     return {**BOX, "objects": [{"mesh": "box", "material": "paint", "keyframes": keys, "interpolation": "linear"}]}
 
 
 def generate(gl, out: Path, **tree):
-    defaults = {"camera": {"width": 32, "height": 24}, "scene": BOX, "preview": {"enabled": False}, "timeline": {"kind": "uniform", "fps": 20},
-                "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True}}
+    defaults = {
+        "camera": {"width": 32, "height": 24},
+        "scene": BOX,
+        "preview": {"enabled": False},
+        "timeline": {"kind": "uniform", "fps": 20},
+        "labels": {"flow": ["forward", "backward"], "float_flow": ["npy"], "depth": True},
+    }
     config = RunTemplate({**defaults, **tree}, Path(".")).sequence(0)
     report = generate_sequence(config, 0, out, gl)
     assert verify_sequence(report.path) == []
@@ -41,7 +49,11 @@ def generate(gl, out: Path, **tree):
 
 def events_of(path: Path) -> tuple[np.ndarray, int, h5py.Dataset]:
     with h5py.File(path / "events.h5") as file:
-        return file["events/t"][:].astype(np.int64) + int(file["t_offset"][()]), int(file["t_offset"][()]), file["ms_to_idx"].shape[0]
+        return (
+            file["events/t"][:].astype(np.int64) + int(file["t_offset"][()]),
+            int(file["t_offset"][()]),
+            file["ms_to_idx"].shape[0],
+        )
 
 
 def test_the_longest_still_sequence(gl, tmp_path, promise):
@@ -60,13 +72,27 @@ def test_the_longest_still_sequence(gl, tmp_path, promise):
 def test_longer_than_the_event_format_can_hold(gl, tmp_path):
     """DSEC's u4 of microseconds ends after 71.6 minutes: known when the configuration is read."""
     with pytest.raises(ConfigError, match=r"time.duration: .* 10800 s are more than the 4295.0 s \(71.6 minutes\)"):
-        generate(gl, tmp_path, time={"duration": 7200, "label_rate": 1 / 3600}, scene=moving(10_800, 1.0), timeline={"kind": "uniform", "fps": 0.01})
+        generate(
+            gl,
+            tmp_path,
+            time={"duration": 7200, "label_rate": 1 / 3600},
+            scene=moving(10_800, 1.0),
+            timeline={"kind": "uniform", "fps": 0.01},
+        )
     assert not any(tmp_path.rglob("*.h5"))
 
 
 def test_a_start_at_a_million_seconds_shifts_the_clock_and_nothing_else(gl, tmp_path, promise):
-    runs = [generate(gl, tmp_path / str(start), time={"duration": 0.2, "label_rate": 10, "start": start}, scene=moving(0.5, 2.0, start),
-                     timeline={"kind": "displacement"}) for start in (0, 1_000_000)]
+    runs = [
+        generate(
+            gl,
+            tmp_path / str(start),
+            time={"duration": 0.2, "label_rate": 10, "start": start},
+            scene=moving(0.5, 2.0, start),
+            timeline={"kind": "displacement"},
+        )
+        for start in (0, 1_000_000)
+    ]
     (a, _, _), (b, offset, _) = (events_of(run.path) for run in runs)
     assert offset == 10**12 and len(a) == len(b) > 300
     promise("a run from 1e6 s on: shift of any event time, less 1e6 s", np.abs(b - a - 10**12).max(), 0, "us")
@@ -74,11 +100,27 @@ def test_a_start_at_a_million_seconds_shifts_the_clock_and_nothing_else(gl, tmp_
         np.testing.assert_array_equal(*(np.load(run.path / f"flow/forward_npy/{k:06d}.npy") for run in runs))
 
 
-@pytest.mark.parametrize("camera", [{"width": 1, "height": 1}, {"width": 1, "height": 30}, {"width": 30, "height": 1}, {"width": 24, "height": 16, "fov": 170},
-                                    {"width": 24, "height": 16, "fov": 1}])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"width": 1, "height": 1},
+        {"width": 1, "height": 30},
+        {"width": 30, "height": 1},
+        {"width": 24, "height": 16, "fov": 170},
+        {"width": 24, "height": 16, "fov": 1},
+    ],
+)
 def test_images_and_lenses(gl, tmp_path, camera):
-    report = generate(gl, tmp_path, camera=camera, time={"duration": 0.2, "label_rate": 10}, scene=moving(0.4, 2.0), timeline={"kind": "displacement"},
-                      preview={"enabled": True}, render={"antialiasing": "ssaa4"})
+    report = generate(
+        gl,
+        tmp_path,
+        camera=camera,
+        time={"duration": 0.2, "label_rate": 10},
+        scene=moving(0.4, 2.0),
+        timeline={"kind": "displacement"},
+        preview={"enabled": True},
+        render={"antialiasing": "ssaa4"},
+    )
     assert report.labels == 2 and (report.path / "preview.mp4").stat().st_size > 500
 
 
@@ -86,10 +128,23 @@ def test_a_million_pixels_per_second(gl, tmp_path, promise):
     """Two labels 1 ms apart, 1000 px of motion between them: exact in float, out of range and counted in DSEC's PNG."""
     speed, focal = 1e6, 27.7  # 32 px wide, 60 degrees
     wide = {**moving(0.004, 0.004 * speed * 3 / focal)}
-    wide["objects"] = [{**wide["objects"][0], "scale": 1e4, "keyframes": [{**k, "position": [k["position"][0] + 5e3, *k["position"][1:]]} for k in
-                                                                      wide["objects"][0]["keyframes"]]}]  # a wall 3 units ahead
-    report = generate(gl, tmp_path, time={"duration": 0.001, "label_rate": 1000}, scene=wide, camera={"width": 32, "height": 24, "near": 0.01},
-                      timeline={"kind": "displacement", "min_step_us": 0.5, "max_px": 1.0})
+    wide["objects"] = [
+        {
+            **wide["objects"][0],
+            "scale": 1e4,
+            "keyframes": [
+                {**k, "position": [k["position"][0] + 5e3, *k["position"][1:]]} for k in wide["objects"][0]["keyframes"]
+            ],
+        }
+    ]  # a wall 3 units ahead
+    report = generate(
+        gl,
+        tmp_path,
+        time={"duration": 0.001, "label_rate": 1000},
+        scene=wide,
+        camera={"width": 32, "height": 24, "near": 0.01},
+        timeline={"kind": "displacement", "min_step_us": 0.5, "max_px": 1.0},
+    )
     flow = np.load(report.path / "flow/forward_npy/000000.npy")
     assert flow[..., 2].all()
     exact = -0.001 * speed * (32 / 2 / np.tan(np.pi / 6)) / focal
@@ -99,22 +154,25 @@ def test_a_million_pixels_per_second(gl, tmp_path, promise):
     assert not valid.any() and (png == 0).all() and manifest["flow_pixels_out_of_range"]["forward"] == 32 * 24
 
 
-@pytest.mark.parametrize("change, message", [
-    ({"camera": {"near": 0.0}}, "camera.near"),
-    ({"camera": {"near": 1e-40}}, "camera.near"),
-    ({"camera": {"fov": 180}}, "camera.fov"),
-    ({"camera": {"focal": 1e12}}, "camera.focal"),
-    ({"camera": {"width": 0}}, "camera.width"),
-    ({"time": {"duration": 1e9}}, "time.duration"),
-    ({"time": {"start": 1e300}}, "time.start"),
-    ({"events": {"emulator": "esim", "contrast_threshold": 1e-4}}, "events.contrast_threshold"),
-    ({"timeline": {"kind": "uniform", "fps": 1e12}}, "timeline.fps"),
-    ({"scene": {**BOX, "camera": {"position": [1e300, 0, 0]}}}, "scene.camera.position"),
-    ({"scene": {**BOX, "light": {"sun": 1e39}}}, "scene.light.sun"),
-    ({"scene": {**BOX, "background": 1e39}}, "scene.background"),
-    ({"scene": {**BOX, "objects": [{"mesh": "box", "scale": 1e300}]}}, "scene.objects.0.scale"),
-    ({"camera": {"near": 5.0, "fov": 179}, "scene": {"kind": "random"}}, "scene.region.height"),
-])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"camera": {"near": 0.0}}, "camera.near"),
+        ({"camera": {"near": 1e-40}}, "camera.near"),
+        ({"camera": {"fov": 180}}, "camera.fov"),
+        ({"camera": {"focal": 1e12}}, "camera.focal"),
+        ({"camera": {"width": 0}}, "camera.width"),
+        ({"time": {"duration": 1e9}}, "time.duration"),
+        ({"time": {"start": 1e300}}, "time.start"),
+        ({"events": {"emulator": "esim", "contrast_threshold": 1e-4}}, "events.contrast_threshold"),
+        ({"timeline": {"kind": "uniform", "fps": 1e12}}, "timeline.fps"),
+        ({"scene": {**BOX, "camera": {"position": [1e300, 0, 0]}}}, "scene.camera.position"),
+        ({"scene": {**BOX, "light": {"sun": 1e39}}}, "scene.light.sun"),
+        ({"scene": {**BOX, "background": 1e39}}, "scene.background"),
+        ({"scene": {**BOX, "objects": [{"mesh": "box", "scale": 1e300}]}}, "scene.objects.0.scale"),
+        ({"camera": {"near": 5.0, "fov": 179}, "scene": {"kind": "random"}}, "scene.region.height"),
+    ],
+)
 def test_beyond_the_ranges_there_is_a_message(gl, tmp_path, change, message):
     with pytest.raises(ConfigError, match=message.replace(".", "\\.")) as caught:
         generate(gl, tmp_path, **change)
@@ -123,12 +181,17 @@ def test_beyond_the_ranges_there_is_a_message(gl, tmp_path, change, message):
 
 def test_light_beyond_the_emulators_is_refused_where_it_is_seen(gl, tmp_path):
     bright = {**BOX, "materials": {"paint": {"color": [1e6, 1e6, 1e6]}}, "light": {"sky": 1e6}}
-    with pytest.raises(BlinkGLError, match="frame 0 at 0 s: intensity at pixel .* it shows object .* a finite value from 0 to 1.07e\\+09"):
+    with pytest.raises(
+        BlinkGLError,
+        match="frame 0 at 0 s: intensity at pixel .* it shows object .* a finite value from 0 to 1.07e\\+09",
+    ):
         generate(gl, tmp_path, scene=bright)
     assert not any(tmp_path.rglob("*.h5"))
 
 
 def test_frames_further_apart_than_17_minutes_are_refused(gl, tmp_path):
     with pytest.raises(ConfigError, match=r"timeline.fps: .* expected a number from 0.001"):
-        generate(gl, tmp_path, time={"duration": 2400, "label_rate": 1 / 1200}, timeline={"kind": "uniform", "fps": 1 / 1200})
+        generate(
+            gl, tmp_path, time={"duration": 2400, "label_rate": 1 / 1200}, timeline={"kind": "uniform", "fps": 1 / 1200}
+        )
     assert not any(tmp_path.rglob("*.h5"))

@@ -59,7 +59,9 @@ def test_backend_draws_and_is_released(backend):
     assert 0.3 < covered.mean() < 0.6
     assert np.all(colour[~covered] == [9, 8, 7, 6])
     y, x = np.nonzero(covered)
-    np.testing.assert_allclose(colour[y, x, :2], np.stack([x + 0.5, y + 0.5], 1) * 0.1, rtol=1e-6)  # row 0 is GL's row 0
+    np.testing.assert_allclose(
+        colour[y, x, :2], np.stack([x + 0.5, y + 0.5], 1) * 0.1, rtol=1e-6
+    )  # row 0 is GL's row 0
     np.testing.assert_allclose(colour[y, x, 3], depth[y, x], rtol=1e-6)  # zero-to-one: no 0.5 * z + 0.5 anywhere
     gl.release()  # twice is harmless
 
@@ -125,7 +127,12 @@ def test_two_processes_at_once_draw_the_same():
     import os
 
     folder = os.path.dirname(__file__)
-    workers = [subprocess.Popen([sys.executable, "-c", WORKER, folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-c", WORKER, folder], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
     outputs = [worker.communicate(timeout=120) for worker in workers]
     assert [worker.returncode for worker in workers] == [0, 0], outputs
     assert all(stderr == "" for _, stderr in outputs)
@@ -138,7 +145,9 @@ def test_two_processes_at_once_draw_the_same():
 def test_device_out_of_range():
     needs("egl")
     for backend in ("egl", "auto"):  # auto must not hide that the chosen device does not exist
-        with pytest.raises(GLError, match=r"^gl.device: no such EGL device \(got 99\); expected one of those `blinkgl doctor` lists$"):
+        with pytest.raises(
+            GLError, match=r"^gl.device: no such EGL device \(got 99\); expected one of those `blinkgl doctor` lists$"
+        ):
             create_context(backend, device=99)
 
 
@@ -175,12 +184,15 @@ def test_neither_is_one_line_with_the_remedy(monkeypatch):
             create_context(backend)
 
 
-@pytest.mark.parametrize("raw, translated", [
-    ("eglInitialize failed (0x3001)", "no working DRI driver"),
-    ("requested device index 0, but found 0 devices", "no driver"),
-    ("libGL.so not loaded", "libGL.so not loaded"),
-    ("eglCreateContext failed (0x3009)", "no OpenGL 4.3 core"),
-])
+@pytest.mark.parametrize(
+    "raw, translated",
+    [
+        ("eglInitialize failed (0x3001)", "no working DRI driver"),
+        ("requested device index 0, but found 0 devices", "no driver"),
+        ("libGL.so not loaded", "libGL.so not loaded"),
+        ("eglCreateContext failed (0x3009)", "no OpenGL 4.3 core"),
+    ],
+)
 def test_glcontext_errors_are_translated(monkeypatch, raw, translated):
     needs("egl")  # the library is opened before glcontext is called
     from glcontext import egl
@@ -244,8 +256,12 @@ def test_config():
 
 
 def test_devices_are_listed_without_a_context():
-    done = subprocess.run([sys.executable, "-c", "import json; from blinkgl.gl import egl_devices; print(json.dumps(egl_devices()))"],
-                          capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", "import json; from blinkgl.gl import egl_devices; print(json.dumps(egl_devices()))"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert all(isinstance(text, str) and text for text in json.loads(done.stdout))
 
 
@@ -314,8 +330,10 @@ def forked(opened: bool, *how: str) -> list[str]:
 def test_a_process_forked_after_a_context_is_told_so_and_does_not_hang():
     new, old, parent = forked(True, "new", "inherited")
     for line in (new, old):
-        assert ("this process was forked from one that had opened OpenGL, and would hang; use "
-                "multiprocessing.get_context('spawn')") in line
+        assert (
+            "this process was forked from one that had opened OpenGL, and would hang; use "
+            "multiprocessing.get_context('spawn')"
+        ) in line
     assert parent == "parent 2", "the parent goes on"
 
 

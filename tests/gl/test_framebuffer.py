@@ -26,7 +26,13 @@ def expected(name: str, height: int, width: int) -> np.ndarray:
     """Distinct values for every pixel and component that the format holds exactly."""
     pixel = FORMATS[name]
     n = np.arange(height * width * pixel.components).reshape(height, width, pixel.components)
-    values = {"f1": n % 256, "f2": n % 2048 - 1024, "f4": (n - 7) * 1.25e-3, "u4": n + 4_000_000_000, "i4": n - 2_000_000_000}[pixel.gl]
+    values = {
+        "f1": n % 256,
+        "f2": n % 2048 - 1024,
+        "f4": (n - 7) * 1.25e-3,
+        "u4": n + 4_000_000_000,
+        "i4": n - 2_000_000_000,
+    }[pixel.gl]
     values = values.astype(pixel.numpy)
     return values[..., 0] if pixel.components == 1 else values
 
@@ -38,8 +44,11 @@ def test_what_is_drawn_is_read(gl, name):
     source = gl.ctx.texture((width, height), pixel.components, wanted.tobytes(), dtype=pixel.gl, alignment=1)
     source.filter = (gl.ctx.NEAREST, gl.ctx.NEAREST)
     prefix = {"u": "u", "i": "i"}.get(pixel.gl[0], "")
-    program, vertices = full_screen(gl, f"uniform {prefix}sampler2D source; out {prefix}vec4 value;"
-                                        "void main() { value = texelFetch(source, ivec2(gl_FragCoord.xy), 0); }")
+    program, vertices = full_screen(
+        gl,
+        f"uniform {prefix}sampler2D source; out {prefix}vec4 value;"
+        "void main() { value = texelFetch(source, ivec2(gl_FragCoord.xy), 0); }",
+    )
     with gl.framebuffer(width, height, (name,), depth=False) as target:
         target.clear()
         source.use(0)
@@ -113,8 +122,11 @@ def test_nearer_surface_wins_whatever_the_order(gl, kind):
 
 
 def test_depth_texture_can_be_sampled(gl):
-    program, vertices = full_screen(gl, "uniform sampler2D depths; out float value;"
-                                        "void main() { value = texelFetch(depths, ivec2(gl_FragCoord.xy), 0).r; }")
+    program, vertices = full_screen(
+        gl,
+        "uniform sampler2D depths; out float value;"
+        "void main() { value = texelFetch(depths, ivec2(gl_FragCoord.xy), 0).r; }",
+    )
     with gl.framebuffer(5, 4, (), depth="texture") as first, gl.framebuffer(5, 4, ("R32F",), depth=False) as second:
         first.clear(depth=1.2345e-6)
         second.clear()

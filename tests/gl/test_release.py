@@ -34,6 +34,7 @@ def test_names_of_another_context_survive(gl):
 
 def test_an_abandoned_generator_leaves_the_current_context_current(gl):
     """The garbage collector may close it, and release its context, in the middle of somebody else's drawing."""
+
     def suspended():
         with create_context("egl") as other:
             other.program("downsample.glsl", {"FACTOR": 3})

@@ -29,13 +29,18 @@ void main() {
 #endif
 """
 VALUE = '#include "twice.glsl"\nfloat value() {\n    return twice(GAIN);\n}\n'
-TWICE = "/* not\n#include \"missing.glsl\"\nhere */ float twice(float x) { return 2.0 * x; }\n// #include \"missing.glsl\"\n"
+TWICE = (
+    '/* not\n#include "missing.glsl"\nhere */ float twice(float x) { return 2.0 * x; }\n// #include "missing.glsl"\n'
+)
 
 
 @pytest.fixture
 def folder(tmp_path):
     (tmp_path / "include").mkdir()
-    write(tmp_path, {"program.glsl": PROGRAM.replace("BROKEN", ""), "include/value.glsl": VALUE, "include/twice.glsl": TWICE})
+    write(
+        tmp_path,
+        {"program.glsl": PROGRAM.replace("BROKEN", ""), "include/value.glsl": VALUE, "include/twice.glsl": TWICE},
+    )
     return tmp_path
 
 
@@ -129,31 +134,44 @@ def test_error_inside_a_define_points_at_its_use(loader):
 
 
 def test_link_error_names_the_program(loader, folder):
-    write(folder, {"program.glsl": "#ifdef VERTEX_SHADER\nout vec2 a; void main() { a = vec2(0); gl_Position = vec4(0); "
-                                   "}\n#endif\n#ifdef FRAGMENT_SHADER\nin vec3 a; out vec4 c; void main() { c = vec4(a, 1); }\n#endif\n"})
+    write(
+        folder,
+        {
+            "program.glsl": "#ifdef VERTEX_SHADER\nout vec2 a; void main() { a = vec2(0); gl_Position = vec4(0); "
+            "}\n#endif\n#ifdef FRAGMENT_SHADER\nin vec3 a; out vec4 c; void main() { c = vec4(a, 1); }\n#endif\n"
+        },
+    )
     with pytest.raises(ShaderError, match=r"^program\.glsl: .*[Ll]inker"):
         loader.program("program.glsl")
 
 
-@pytest.mark.parametrize("message", [
-    "0:{line}(24): error: `nothing' undeclared",  # Mesa
-    "0({line}) : error C1503: undefined variable \"nothing\"",  # NVIDIA
-    "ERROR: 0:{line}: 'nothing' : undeclared identifier",  # AMD, Apple, ANGLE
-])
+@pytest.mark.parametrize(
+    "message",
+    [
+        "0:{line}(24): error: `nothing' undeclared",  # Mesa
+        '0({line}) : error C1503: undefined variable "nothing"',  # NVIDIA
+        "ERROR: 0:{line}: 'nothing' : undeclared identifier",  # AMD, Apple, ANGLE
+    ],
+)
 def test_error_formats_of_all_drivers(folder, message):
     sources = {stage: expand("program.glsl", stage, {"GAIN": 1.0}, folder) for stage in ("vertex", "fragment")}
     line = sources["fragment"].origin.index(("include/value.glsl", 3)) + 1
     log = f"GLSL Compiler failed\n\nfragment_shader\n===============\n{message.format(line=line)}\n"
     error = translate(log, sources)
-    assert str(error).startswith("include/value.glsl:3: ") and "nothing" in str(error) and "[fragment stage]" in str(error)
+    assert (
+        str(error).startswith("include/value.glsl:3: ") and "nothing" in str(error) and "[fragment stage]" in str(error)
+    )
     assert ">    3 |     return twice(GAIN);" in error.detail
 
 
 def test_warnings_before_the_error_do_not_hide_it(folder):
     sources = {stage: expand("program.glsl", stage, {"GAIN": 1.0}, folder) for stage in ("vertex", "fragment")}
     line = sources["vertex"].origin.index(("program.glsl", 8)) + 1
-    error = translate(f"GLSL Compiler failed\n\nvertex_shader\n=====\n0({line - 1}) : warning C7050: unused\n0({line}) : error "
-                      "C0000: bad\n", sources)
+    error = translate(
+        f"GLSL Compiler failed\n\nvertex_shader\n=====\n0({line - 1}) : warning C7050: unused\n0({line}) : error "
+        "C0000: bad\n",
+        sources,
+    )
     assert str(error) == "program.glsl:8: C0000: bad [vertex stage]"
     assert "program.glsl:7: warning: C7050: unused" in error.detail
 
@@ -175,19 +193,30 @@ def test_error_in_a_generated_line_shows_it(folder):
 
 def test_include_cycle(folder):
     write(folder, {"include/twice.glsl": '#include "value.glsl"\n'})
-    with pytest.raises(ShaderError, match=r"^include/twice\.glsl:1: include cycle: include/value\.glsl -> include/twice\.glsl -> "
-                                          r"include/value\.glsl$"):
+    with pytest.raises(
+        ShaderError,
+        match=r"^include/twice\.glsl:1: include cycle: include/value\.glsl -> include/twice\.glsl -> "
+        r"include/value\.glsl$",
+    ):
         expand("program.glsl", "vertex", folder=folder)
 
 
-@pytest.mark.parametrize("line, message", [
-    ('#include "absent.glsl"', (r"program\.glsl:2: no such shader file \(got 'include/absent\.glsl'\); expected one of twice\.glsl, "
-                               r"value\.glsl")),
-    ("#include <value.glsl>", r"program\.glsl:2: malformed #include \(got '<value\.glsl>'\)"),
-    ("#include", r"program\.glsl:2: malformed #include"),
-    ('#include "../program.glsl"', r"program\.glsl:2: include outside the shader folder"),
-    ('#include "/etc/passwd"', r"program\.glsl:2: include outside the shader folder"),
-])
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        (
+            '#include "absent.glsl"',
+            (
+                r"program\.glsl:2: no such shader file \(got 'include/absent\.glsl'\); expected one of twice\.glsl, "
+                r"value\.glsl"
+            ),
+        ),
+        ("#include <value.glsl>", r"program\.glsl:2: malformed #include \(got '<value\.glsl>'\)"),
+        ("#include", r"program\.glsl:2: malformed #include"),
+        ('#include "../program.glsl"', r"program\.glsl:2: include outside the shader folder"),
+        ('#include "/etc/passwd"', r"program\.glsl:2: include outside the shader folder"),
+    ],
+)
 def test_bad_includes(folder, line, message):
     write(folder, {"program.glsl": f"\n{line}\n"})
     with pytest.raises(ShaderError, match="^" + message):

@@ -27,7 +27,9 @@ def dsec(path, **columns):
 def mvsec(path, **columns):
     rows = {**GOOD, **columns}
     with h5py.File(path, "w") as file:
-        file["davis/left/events"] = np.stack([np.asarray(rows[k], float) * (1e-6 if k == "t" else 1) for k in "xytp"], axis=1)
+        file["davis/left/events"] = np.stack(
+            [np.asarray(rows[k], float) * (1e-6 if k == "t" else 1) for k in "xytp"], axis=1
+        )
     return path
 
 
@@ -40,10 +42,15 @@ MAKERS = {"dsec": (dsec, "e.h5"), "mvsec": (mvsec, "e.hdf5"), "npz": (npz, "e.np
 
 
 @pytest.mark.parametrize("kind", MAKERS)
-@pytest.mark.parametrize("columns, message", [
-    ({"x": [1, 70000, 3]}, r"x of event 1 \(got 70000"), ({"y": [4, 5, -1]}, r"y of event 2 \(got -1"),
-    ({"p": [0, 2, 1]}, r"(p|polarity) of event 1 \(got 2"), ({"t": [10, 30, 20]}, r"backwards at event 2 \(got \(30, 20\)\)"),
-])
+@pytest.mark.parametrize(
+    "columns, message",
+    [
+        ({"x": [1, 70000, 3]}, r"x of event 1 \(got 70000"),
+        ({"y": [4, 5, -1]}, r"y of event 2 \(got -1"),
+        ({"p": [0, 2, 1]}, r"(p|polarity) of event 1 \(got 2"),
+        ({"t": [10, 30, 20]}, r"backwards at event 2 \(got \(30, 20\)\)"),
+    ],
+)
 def test_what_events_cannot_hold_is_refused(tmp_path, kind, columns, message):
     make, name = MAKERS[kind]
     assert len(open_events(make(tmp_path / name)).read()) == 3
@@ -51,24 +58,44 @@ def test_what_events_cannot_hold_is_refused(tmp_path, kind, columns, message):
         open_events(make(tmp_path / name, **columns)).read()
 
 
-@pytest.mark.parametrize("columns, message", [
-    ({"x": [1.0, 1.5, 2.0]}, r"x of event 1 \(got 1.5\); expected whole numbers"), ({"t": [10.0, np.nan, 30.0]}, r"time of event 1 \(got nan"),
-    ({"t": [1.0, 2.0, 1e300]}, r"time of event 2"), ({"y": [1.0, np.nan, 2.0]}, r"y of event 1 \(got nan"),
-    ({"t": np.array([1, 2, 2**64 - 1], np.uint64)}, r"t of event 2 \(got 18446744073709551615"), ({"x": ["a", "b", "c"]}, "holds no numbers"),
-    ({"x": np.zeros((3, 2))}, "differ in length"), ({"height": [1, 2], "width": [1, 2]}, "'height' is no integer"),
-    ({"height": 0, "width": 5}, "impossible sensor size"), ({"height": 70000, "width": 5}, "impossible sensor size"),
-])
+@pytest.mark.parametrize(
+    "columns, message",
+    [
+        ({"x": [1.0, 1.5, 2.0]}, r"x of event 1 \(got 1.5\); expected whole numbers"),
+        ({"t": [10.0, np.nan, 30.0]}, r"time of event 1 \(got nan"),
+        ({"t": [1.0, 2.0, 1e300]}, r"time of event 2"),
+        ({"y": [1.0, np.nan, 2.0]}, r"y of event 1 \(got nan"),
+        ({"t": np.array([1, 2, 2**64 - 1], np.uint64)}, r"t of event 2 \(got 18446744073709551615"),
+        ({"x": ["a", "b", "c"]}, "holds no numbers"),
+        ({"x": np.zeros((3, 2))}, "differ in length"),
+        ({"height": [1, 2], "width": [1, 2]}, "'height' is no integer"),
+        ({"height": 0, "width": 5}, "impossible sensor size"),
+        ({"height": 70000, "width": 5}, "impossible sensor size"),
+    ],
+)
 def test_npz_columns(tmp_path, columns, message):
     with pytest.raises(BlinkGLError, match=message):
         open_events(npz(tmp_path / "e.npz", **columns)).read()
 
 
-@pytest.mark.parametrize("kind, name", [("dsec", "e.h5"), ("evt3", "e.raw"), ("evt2", "e.raw"), ("npz", "e.npz"), ("csv", "e.csv"), ("aedat4", "e.aedat4")])
+@pytest.mark.parametrize(
+    "kind, name",
+    [
+        ("dsec", "e.h5"),
+        ("evt3", "e.raw"),
+        ("evt2", "e.raw"),
+        ("npz", "e.npz"),
+        ("csv", "e.csv"),
+        ("aedat4", "e.aedat4"),
+    ],
+)
 def test_events_outside_the_declared_sensor(tmp_path, kind, name):
     """The files say 20x20; they are patched, or their reader is told, to be smaller than the events."""
     if kind == "aedat4":
         pytest.importorskip("dv_processing", reason="optional extra [formats]")
-    events = Events(np.array([3, 9], np.uint16), np.array([4, 4], np.uint16), np.array([1, 2]), np.array([0, 1], np.uint8))
+    events = Events(
+        np.array([3, 9], np.uint16), np.array([4, 4], np.uint16), np.array([1, 2]), np.array([0, 1], np.uint8)
+    )
     path = tmp_path / name
     write_events(path, events, 20, 20, format=kind, time_unit="us" if kind == "csv" else "s")
     with open_events(path) as file:
@@ -84,15 +111,22 @@ def test_events_outside_the_declared_sensor(tmp_path, kind, name):
     elif kind == "aedat4":
         return
     else:
-        path.write_bytes(path.read_bytes().replace(b"20x20", b"08x20").replace(b"width=20", b"width=08").replace(b"x@20", b"x@08"))
+        path.write_bytes(
+            path.read_bytes().replace(b"20x20", b"08x20").replace(b"width=20", b"width=08").replace(b"x@20", b"x@08")
+        )
     with pytest.raises(EventDataError, match=r"event 1 is outside the sensor \(got \(9, 4\)\)"):
         open_events(path).read()
 
 
 @pytest.mark.parametrize("name", ["e.h5", "e.raw", "e.txt", "e.csv", "e.npz", "e.npy"])
-@pytest.mark.parametrize("x, t, p, message", [(9, 2, 1, "event 1 is outside the sensor"), (3, 0, 1, "backwards at event 1"), (3, 2, 7, "polarity of event 1")])
+@pytest.mark.parametrize(
+    "x, t, p, message",
+    [(9, 2, 1, "event 1 is outside the sensor"), (3, 0, 1, "backwards at event 1"), (3, 2, 7, "polarity of event 1")],
+)
 def test_no_writer_takes_them_either(tmp_path, name, x, t, p, message):
-    events = Events(np.array([3, x], np.uint16), np.array([4, 4], np.uint16), np.array([1, t]), np.array([0, p], np.uint8))
+    events = Events(
+        np.array([3, x], np.uint16), np.array([4, 4], np.uint16), np.array([1, t]), np.array([0, p], np.uint8)
+    )
     with pytest.raises(EventDataError, match=message):
         write_events(tmp_path / name, events, 8, 8)
     assert not list(tmp_path.iterdir())
@@ -101,17 +135,25 @@ def test_no_writer_takes_them_either(tmp_path, name, x, t, p, message):
 def test_slices_are_checked_too(tmp_path):
     rng = np.random.default_rng(0)
     n = 5000
-    events = Events(rng.integers(0, 64, n).astype(np.uint16), rng.integers(0, 48, n).astype(np.uint16), np.sort(rng.integers(0, 90_000, n)),
-                    rng.integers(0, 2, n).astype(np.uint8))
+    events = Events(
+        rng.integers(0, 64, n).astype(np.uint16),
+        rng.integers(0, 48, n).astype(np.uint16),
+        np.sort(rng.integers(0, 90_000, n)),
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
     path = tmp_path / "e.h5"
     write_events(path, events, 48, 64)
     for change, message in (
-            (lambda f: f["events/x"].__setitem__(3000, 64), r"event 3000 is outside the sensor"),
-            (lambda f: f["events/t"].__setitem__(3000, 5), r"backwards at event 3000"),
-            (lambda f: f["ms_to_idx"].__setitem__(40, 2900), r"'ms_to_idx' does not lead to the events of \[40000, 60000\) µs"),
-            (lambda f: f["ms_to_idx"].__setitem__(60, 2900), r"'ms_to_idx' does not lead"),
-            (lambda f: f["ms_to_idx"].__setitem__(40, 2**63), r"'ms_to_idx' does not lead"),
-            (lambda f: f.attrs.__setitem__("height", "many"), "attribute 'height' is no integer")):
+        (lambda f: f["events/x"].__setitem__(3000, 64), r"event 3000 is outside the sensor"),
+        (lambda f: f["events/t"].__setitem__(3000, 5), r"backwards at event 3000"),
+        (
+            lambda f: f["ms_to_idx"].__setitem__(40, 2900),
+            r"'ms_to_idx' does not lead to the events of \[40000, 60000\) µs",
+        ),
+        (lambda f: f["ms_to_idx"].__setitem__(60, 2900), r"'ms_to_idx' does not lead"),
+        (lambda f: f["ms_to_idx"].__setitem__(40, 2**63), r"'ms_to_idx' does not lead"),
+        (lambda f: f.attrs.__setitem__("height", "many"), "attribute 'height' is no integer"),
+    ):
         write_events(path, events, 48, 64)
         with DsecEventReader(path) as reader:
             assert len(reader.slice(40_000, 60_000))
@@ -121,14 +163,22 @@ def test_slices_are_checked_too(tmp_path):
             reader.slice(40_000, 60_000)
 
 
-@pytest.mark.parametrize("text, message", [
-    ("the quick brown fox\njumps over\n", "line 1 is not an event, and does not name the columns"),
-    ("# fine\n{\"a\": 1}\n", "line 2 is not an event"), ("\x00\x01\x02\x03", "line 1 is not an event"), ("x,y,p,t\n1,2,1,5\n", "line 1.*expected t x y p, in this order"),
-    ("t,x,y,p\nt,x,y,p\n1,2,3,1\n", "line 2 is not an event"), ("# " + "c" * 70_000 + "\n1 2 3 1\n", "line 1 is longer than 65536 bytes"),
-    ("0 480\n1 2 3 1\n", "impossible sensor size"),
-    ("1 2 3 1\n0.000002 2 3 1\n", "line 2 has its time in another unit"), ("t_us,x,y,p\n0.5,2,3,1\n", "line 2 has its time in another unit"),
-    ("4 4\n1 2 3 1\n2 4 3 1\n", r"event 1 is outside the sensor \(got \(4, 3\)\)"), ("t_ns,x,y,p\n5,2,3,1\n", "line 1"),
-])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("the quick brown fox\njumps over\n", "line 1 is not an event, and does not name the columns"),
+        ('# fine\n{"a": 1}\n', "line 2 is not an event"),
+        ("\x00\x01\x02\x03", "line 1 is not an event"),
+        ("x,y,p,t\n1,2,1,5\n", "line 1.*expected t x y p, in this order"),
+        ("t,x,y,p\nt,x,y,p\n1,2,3,1\n", "line 2 is not an event"),
+        ("# " + "c" * 70_000 + "\n1 2 3 1\n", "line 1 is longer than 65536 bytes"),
+        ("0 480\n1 2 3 1\n", "impossible sensor size"),
+        ("1 2 3 1\n0.000002 2 3 1\n", "line 2 has its time in another unit"),
+        ("t_us,x,y,p\n0.5,2,3,1\n", "line 2 has its time in another unit"),
+        ("4 4\n1 2 3 1\n2 4 3 1\n", r"event 1 is outside the sensor \(got \(4, 3\)\)"),
+        ("t_ns,x,y,p\n5,2,3,1\n", "line 1"),
+    ],
+)
 def test_text_that_is_no_events(tmp_path, text, message):
     (tmp_path / "e.txt").write_text(text)
     with pytest.raises(BlinkGLError, match=message):
@@ -137,13 +187,19 @@ def test_text_that_is_no_events(tmp_path, text, message):
 
 def test_no_line_of_text_vanishes_behind_a_long_comment(tmp_path):
     lines = [f"{i} {i} 2 1\n" for i in range(10)]
-    (tmp_path / "e.txt").write_text("# " + "c" * 9000 + "\n" + "".join(lines[:5]) + "% " + "d" * 9000 + "\n" + "".join(lines[5:]))
+    (tmp_path / "e.txt").write_text(
+        "# " + "c" * 9000 + "\n" + "".join(lines[:5]) + "% " + "d" * 9000 + "\n" + "".join(lines[5:])
+    )
     for size in (50, 9500, 1 << 20):
         from blinkgl.io.text import TextReader
+
         assert Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(size))).x.tolist() == list(range(10))
 
 
-@pytest.mark.parametrize("head", ["t,x@640,y@480,on\n", "t,x,y,p\n", "\ufefft,x,y,p\n", "timestamp [us], x, y, polarity\n", "ts x y pol\n", ""])
+@pytest.mark.parametrize(
+    "head",
+    ["t,x@640,y@480,on\n", "t,x,y,p\n", "\ufefft,x,y,p\n", "timestamp [us], x, y, polarity\n", "ts x y pol\n", ""],
+)
 def test_names_of_columns(tmp_path, head):
     (tmp_path / "e.csv").write_text(head + "5,1,2,0\n7,3,4,1\n")
     file = open_events(tmp_path / "e.csv")
@@ -152,7 +208,12 @@ def test_names_of_columns(tmp_path, head):
 
 
 def test_csv_in_microseconds_is_faerys(tmp_path):
-    events = Events(np.array([1, 639], np.uint16), np.array([2, 479], np.uint16), np.array([5, 1_500_000]), np.array([0, 1], np.uint8))
+    events = Events(
+        np.array([1, 639], np.uint16),
+        np.array([2, 479], np.uint16),
+        np.array([5, 1_500_000]),
+        np.array([0, 1], np.uint8),
+    )
     write_events(tmp_path / "a.csv", events, 480, 640)
     convert(tmp_path / "a.csv", tmp_path / "b.csv", size=(480, 640), time_unit="us")
     assert (tmp_path / "b.csv").read_text() == "t,x@640,y@480,on\n5,1,2,0\n1500000,639,479,1\n"
@@ -168,11 +229,20 @@ def test_csv_in_microseconds_is_faerys(tmp_path):
     assert open_events(tmp_path / "f.csv").read().t.tolist() == [5, 1_500_000]
 
 
-@pytest.mark.parametrize("version, words, message", [
-    ("3.0", [0x8000, 0x6001, 0x2001, 0x1001, 0x2002], r"damaged at byte 22: no EVT3 word can stand here \(got '0x1001'\)"),
-    ("3.0", [0x8000, 0x3FFE, 0x4FFF], "damaged at byte 20: no EVT3 word"), ("3.0", [0x2001, 0x2002, 0x3000, 0x5003], "4 events and no TIME_HIGH"),
-    ("2.0", [8 << 28, 1 << 28, 9 << 28], r"damaged at byte 24: no EVT2 word can stand here \(got '0x90000000'\)"), ("2.0", [1 << 28, 0], "2 events and no TIME_HIGH"),
-])
+@pytest.mark.parametrize(
+    "version, words, message",
+    [
+        (
+            "3.0",
+            [0x8000, 0x6001, 0x2001, 0x1001, 0x2002],
+            r"damaged at byte 22: no EVT3 word can stand here \(got '0x1001'\)",
+        ),
+        ("3.0", [0x8000, 0x3FFE, 0x4FFF], "damaged at byte 20: no EVT3 word"),
+        ("3.0", [0x2001, 0x2002, 0x3000, 0x5003], "4 events and no TIME_HIGH"),
+        ("2.0", [8 << 28, 1 << 28, 9 << 28], r"damaged at byte 24: no EVT2 word can stand here \(got '0x90000000'\)"),
+        ("2.0", [1 << 28, 0], "2 events and no TIME_HIGH"),
+    ],
+)
 def test_words_that_evt_has_not(tmp_path, version, words, message):
     head = f"% evt {version}\n% end\n".encode()
     assert len(head) == 16
@@ -193,11 +263,17 @@ def test_headers_of_evt(tmp_path):
 def test_a_decoder_that_crashes_or_hangs_is_an_error_of_one_line(tmp_path, monkeypatch):
     """dv-processing does both on damaged files. Here it is replaced by something that does so at once."""
     monkeypatch.setattr("importlib.util.find_spec", lambda name: True)
-    (tmp_path / "dv_processing.py").write_text("import os, signal\nclass io:\n  def MonoCameraRecording(path):\n    text = open(path).read()\n"
-                                               "    if 'loop' in text: signal.setitimer(signal.ITIMER_PROF, 0.05)\n    while 'loop' in text: pass\n"
-                                               "    if 'crash' in text: os.kill(os.getpid(), signal.SIGSEGV)\n    raise RuntimeError('no\\nstream')\n")
+    (tmp_path / "dv_processing.py").write_text(
+        "import os, signal\nclass io:\n  def MonoCameraRecording(path):\n    text = open(path).read()\n"
+        "    if 'loop' in text: signal.setitimer(signal.ITIMER_PROF, 0.05)\n    while 'loop' in text: pass\n"
+        "    if 'crash' in text: os.kill(os.getpid(), signal.SIGSEGV)\n    raise RuntimeError('no\\nstream')\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
-    for text, message in (("crash", "crashed on it"), ("loop", "does not come to an end"), ("else", "damaged AEDAT4 file: no stream")):
+    for text, message in (
+        ("crash", "crashed on it"),
+        ("loop", "does not come to an end"),
+        ("else", "damaged AEDAT4 file: no stream"),
+    ):
         (tmp_path / "e.aedat4").write_bytes(b"#!AER-DAT4.0\r\n" + text.encode())
         with pytest.raises(AssetError, match=f"e.aedat4: damaged AEDAT4 file: .*{message}|{message}"):
             open_events(tmp_path / "e.aedat4")
@@ -205,6 +281,7 @@ def test_a_decoder_that_crashes_or_hangs_is_an_error_of_one_line(tmp_path, monke
 
 def test_the_command_writes_microseconds(tmp_path, capsys):
     from blinkgl.cli import run
+
     (tmp_path / "a.txt").write_text("0.000005 1 2 0\n")
     assert run(["convert", str(tmp_path / "a.txt"), str(tmp_path / "b.csv"), "--time-unit", "us"]) == 0
     assert (tmp_path / "b.csv").read_text() == "t,x@240,y@180,on\n5,1,2,0\n"
@@ -214,14 +291,27 @@ def test_the_command_writes_microseconds(tmp_path, capsys):
 
 def test_times_with_and_without_names(tmp_path):
     from blinkgl.io.frames import read_timestamps
+
     (tmp_path / "t.txt").write_text("0 a.png\n10000\n")
     with pytest.raises(EventDataError, match="t.txt: times with a name and times without one"):
         read_timestamps(tmp_path / "t.txt")
 
 
 def test_every_value_that_fits_comes_through():
-    edge = events_of(np.array([0, 65535.0]), np.array([True, False]), np.array([-(1 << 62), 1 << 62]), np.array([-1, 1]), "f", signed=True)
-    assert edge.x.tolist() == [0, 65535] and edge.y.tolist() == [1, 0] and edge.p.tolist() == [0, 1] and edge.t.tolist() == [-(1 << 62), 1 << 62]
+    edge = events_of(
+        np.array([0, 65535.0]),
+        np.array([True, False]),
+        np.array([-(1 << 62), 1 << 62]),
+        np.array([-1, 1]),
+        "f",
+        signed=True,
+    )
+    assert (
+        edge.x.tolist() == [0, 65535]
+        and edge.y.tolist() == [1, 0]
+        and edge.p.tolist() == [0, 1]
+        and edge.t.tolist() == [-(1 << 62), 1 << 62]
+    )
     assert events_of(*(np.empty(0, d) for d in ("u2", "f4", "f8", "?")), "f").t.dtype == np.int64
     assert microseconds(np.array([1.0000004, -2.5]), "f").tolist() == [1000000, -2500000]
     with pytest.raises(EventDataError, match="t of event 7"):

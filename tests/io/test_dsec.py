@@ -15,8 +15,12 @@ from blinkgl.io.dsec import DsecEventReader, DsecEventWriter
 
 def random_events(n: int, duration_us: int, seed: int = 0, t0: int = 0, height: int = 48, width: int = 64) -> Events:
     rng = np.random.default_rng(seed)
-    return Events(rng.integers(0, width, n).astype(np.uint16), rng.integers(0, height, n).astype(np.uint16),
-                  np.sort(rng.integers(t0, t0 + duration_us, n)).astype(np.int64), rng.integers(0, 2, n).astype(np.uint8))
+    return Events(
+        rng.integers(0, width, n).astype(np.uint16),
+        rng.integers(0, height, n).astype(np.uint16),
+        np.sort(rng.integers(t0, t0 + duration_us, n)).astype(np.int64),
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
 
 
 def write(path, events: Events, sizes, t_offset_us=0, t_end_us=None, **kw):
@@ -24,7 +28,7 @@ def write(path, events: Events, sizes, t_offset_us=0, t_end_us=None, **kw):
     start = 0
     while start < len(events):
         n = next(sizes)
-        writer.append(Events(*(getattr(events, k)[start:start + n] for k in "xytp")))
+        writer.append(Events(*(getattr(events, k)[start : start + n] for k in "xytp")))
         start += n
     writer.close(t_end_us)
 
@@ -86,7 +90,11 @@ def test_slices_agree_with_the_independent_slicer(tmp_path, monkeypatch):
             assert all(np.array_equal(reference[k], getattr(ours, k)) for k in "xytp")
             assert same(ours, events.window(a, b))
         assert same(Events.concatenate(list(reader.chunks(7777))), events)
-        for a, b in [(offset - 10_000, offset + 5), (offset + duration - 5, offset + 10**7), (offset + 10**7, offset + 2 * 10**7)]:
+        for a, b in [
+            (offset - 10_000, offset + 5),
+            (offset + duration - 5, offset + 10**7),
+            (offset + 10**7, offset + 2 * 10**7),
+        ]:
             assert same(reader.slice(a, b), events.window(a, b))
 
 
@@ -112,11 +120,20 @@ def one(x=0, y=0, t=0, p=0) -> Events:
     return Events(np.array([x], np.uint16), np.array([y], np.uint16), np.array([t], np.int64), np.array([p], np.uint8))
 
 
-@pytest.mark.parametrize("second, message", [
-    (one(t=9), r"run backwards at event 1 .*10, 9"), (one(t=10, x=64), r"outside the sensor.*x < 64"), (one(t=10, y=48), "outside the sensor"),
-    (one(t=10, p=2), "polarity"), (one(t=10 + 2**32), "71.6 minutes"),
-    (Events(*(np.array(v, d) for v, d in (([1, 1], "u2"), ([1, 1], "u2"), ([30, 20], "i8"), ([0, 0], "u1")))), "run backwards at event 2"),
-])
+@pytest.mark.parametrize(
+    "second, message",
+    [
+        (one(t=9), r"run backwards at event 1 .*10, 9"),
+        (one(t=10, x=64), r"outside the sensor.*x < 64"),
+        (one(t=10, y=48), "outside the sensor"),
+        (one(t=10, p=2), "polarity"),
+        (one(t=10 + 2**32), "71.6 minutes"),
+        (
+            Events(*(np.array(v, d) for v, d in (([1, 1], "u2"), ([1, 1], "u2"), ([30, 20], "i8"), ([0, 0], "u1")))),
+            "run backwards at event 2",
+        ),
+    ],
+)
 def test_events_outside_the_contract_are_refused(tmp_path, second, message):
     with pytest.raises(EventDataError, match=message):
         with DsecEventWriter(tmp_path / "e.h5", 48, 64) as writer:
@@ -143,6 +160,7 @@ def test_last_representable_microsecond(tmp_path):
 def test_error_in_the_background_thread_reaches_the_caller(tmp_path, monkeypatch):
     def full(self, block):
         raise OSError(28, "No space left on device")
+
     monkeypatch.setattr(DsecEventWriter, "_store", full)
     events = random_events(500_000, 1000)
     with pytest.raises(OutputError, match="e.h5: cannot write: no space left"):
@@ -151,8 +169,15 @@ def test_error_in_the_background_thread_reaches_the_caller(tmp_path, monkeypatch
                 writer.append(Events(events.x, events.y, np.full_like(events.t, 1000), events.p))
 
 
-@pytest.mark.parametrize("damage, message", [("missing", "no such file"), ("truncated", "truncated HDF5"), ("text", "not an HDF5"),
-                                             ("foreign", "no dataset 'events/x'")])
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        ("missing", "no such file"),
+        ("truncated", "truncated HDF5"),
+        ("text", "not an HDF5"),
+        ("foreign", "no dataset 'events/x'"),
+    ],
+)
 def test_unreadable_files(tmp_path, damage, message):
     path = tmp_path / "e.h5"
     if damage == "truncated":

@@ -15,8 +15,14 @@ WORD = {"evt2": "<u4", "evt3": "<u2"}
 
 
 def decoded(path, version: str, words, block: int = 1 << 17, header: bytes = b"") -> list[tuple[int, int, int, int]]:
-    path.write_bytes(b"% evt " + version[-1].encode() + b".0\n" + header + b"% end\n" + np.array(words, WORD[version]).tobytes())
-    return [row for e in EvtReader(path).chunks(block) for row in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist())]
+    path.write_bytes(
+        b"% evt " + version[-1].encode() + b".0\n" + header + b"% end\n" + np.array(words, WORD[version]).tobytes()
+    )
+    return [
+        row
+        for e in EvtReader(path).chunks(block)
+        for row in zip(e.x.tolist(), e.y.tolist(), e.t.tolist(), e.p.tolist())
+    ]
 
 
 def slow_evt2(words) -> list[tuple[int, int, int, int]]:
@@ -73,14 +79,21 @@ def test_random_words_of_evt3(tmp_path, block):
     rng = np.random.default_rng(2)
     words = [0x2005, 0x3003, 0x4FFF]
     for _ in range(600):
-        kind = int(rng.choice([0, 2, 3, 4, 5, 6, 8, 7, 10, 14, 15], p=[0.1, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.025, 0.025, 0.025, 0.025]))
+        kind = int(
+            rng.choice(
+                [0, 2, 3, 4, 5, 6, 8, 7, 10, 14, 15], p=[0.1, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.025, 0.025, 0.025, 0.025]
+            )
+        )
         rest = int(rng.integers(0, 1 << 12))
         words.append(kind << 12 | (rest % 512 | rest & 0x800 if kind == 3 else rest & 0xFF if kind == 5 else rest))
     rows = decoded(tmp_path / "e.raw", "evt3", words, block)
     assert rows == slow_evt3(words) and len(rows) > 400
 
 
-@pytest.mark.parametrize("before, after, turns", [(2047, 0, 0), (2048, 0, 0), (2049, 0, 1), (4095, 0, 1), (4095, 2047, 0), (4095, 2046, 1), (0, 4095, 0)])
+@pytest.mark.parametrize(
+    "before, after, turns",
+    [(2047, 0, 0), (2048, 0, 0), (2049, 0, 1), (4095, 0, 1), (4095, 2047, 0), (4095, 2046, 1), (0, 4095, 0)],
+)
 def test_evt3s_counter_has_turned_when_it_falls_by_more_than_half(tmp_path, before, after, turns):
     rows = decoded(tmp_path / "e.raw", "evt3", [0x8000 | before, 0x8000 | after, 0x2001])
     assert rows == [(1, 0, (turns << 24) + (after << 12), 0)]
@@ -92,13 +105,26 @@ def test_evt2s_counter_has_turned_when_it_falls_by_more_than_half(tmp_path, fall
     assert rows == [(3, 4, (turns << 34) + 5, 1)]
 
 
-@pytest.mark.parametrize("words, bad", [([0x8000, 0x3000 | 2047, 0x4001, 0x4001], 3), ([0x8000, 0x3000 | 2046, 0x4006], 2), ([0x8000, 0x3000 | 2041, 0x5080], 2)])
+@pytest.mark.parametrize(
+    "words, bad",
+    [
+        ([0x8000, 0x3000 | 2047, 0x4001, 0x4001], 3),
+        ([0x8000, 0x3000 | 2046, 0x4006], 2),
+        ([0x8000, 0x3000 | 2041, 0x5080], 2),
+    ],
+)
 def test_a_vector_may_not_leave_the_row(tmp_path, words, bad):
     """The last pixel is 2047; a bit beyond it is damage, a clear one is nothing."""
-    with pytest.raises(AssetError, match=rf"damaged at byte {len(b'% evt 3.0' + b'% end') + 2 + 2 * bad}: no EVT3 word can stand here .got "
-                                         rf"'0x{words[bad]:04x}'"):
+    with pytest.raises(
+        AssetError,
+        match=rf"damaged at byte {len(b'% evt 3.0' + b'% end') + 2 + 2 * bad}: no EVT3 word can stand here .got "
+        rf"'0x{words[bad]:04x}'",
+    ):
         decoded(tmp_path / "e.raw", "evt3", words)
-    assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3800 | 2046, 0x4003, 0x4000]) == [(2046, 0, 0, 1), (2047, 0, 0, 1)]
+    assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3800 | 2046, 0x4003, 0x4000]) == [
+        (2046, 0, 0, 1),
+        (2047, 0, 0, 1),
+    ]
     assert decoded(tmp_path / "e.raw", "evt3", [0x8000, 0x3000 | 2040, 0x5080]) == [(2047, 0, 0, 0)]
 
 
@@ -122,7 +148,12 @@ def some_events() -> Events:
     """Times that stay, go on by 1, cross 64 and 4096 µs and leap; rows that stay and change."""
     t = np.array([0, 0, 1, 63, 64, 64, 4095, 4096, 4096, 50_000, 16_777_215, 16_777_216, 16_777_300])
     n = len(t)
-    return Events((np.arange(n) * 57 % 640).astype(np.uint16), np.repeat([3, 3, 9, 479], 4)[:n].astype(np.uint16), t, (np.arange(n) % 3 == 0).astype(np.uint8))
+    return Events(
+        (np.arange(n) * 57 % 640).astype(np.uint16),
+        np.repeat([3, 3, 9, 479], 4)[:n].astype(np.uint16),
+        t,
+        (np.arange(n) % 3 == 0).astype(np.uint8),
+    )
 
 
 def written(path, version: str, chunks: list[Events]) -> list[int]:
@@ -133,7 +164,7 @@ def written(path, version: str, chunks: list[Events]) -> list[int]:
 
 
 def cut(events: Events, size: int) -> list[Events]:
-    return [Events(*(getattr(events, k)[i:i + size] for k in "xytp")) for i in range(0, len(events), size)]
+    return [Events(*(getattr(events, k)[i : i + size] for k in "xytp")) for i in range(0, len(events), size)]
 
 
 @pytest.mark.parametrize("size", [1, 3, 100])
@@ -169,7 +200,10 @@ def test_evt3_as_written(tmp_path, size):
 def test_the_writers_limits(tmp_path):
     one = lambda t: Events(np.zeros(1, np.uint16), np.zeros(1, np.uint16), np.array([t]), np.ones(1, np.uint8))
     for t, said in ((-1, "-1"), (1 << 34, str(1 << 34))):
-        with contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640, "evt2")) as writer, pytest.raises(EventDataError, match=f"got {said}.; expected 0 to less"):
+        with (
+            contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640, "evt2")) as writer,
+            pytest.raises(EventDataError, match=f"got {said}.; expected 0 to less"),
+        ):
             writer.append(one(t))
     with contextlib.closing(EvtWriter(tmp_path / "e.raw", 480, 640, "evt2")) as writer:
         writer.append(one((1 << 34) - 1))
@@ -181,9 +215,17 @@ def test_the_writers_limits(tmp_path):
             EvtWriter(tmp_path / "f.raw", *size)
 
 
-@pytest.mark.parametrize("header, size", [
-    (b"% geometry 640x480\n", (480, 640)), (b"% format EVT3;height=480;width=640\n", (480, 640)), (b"% geometry 640x480\n% format EVT3;height=1;width=2\n", (480, 640)),
-    (b"% height=480\n", (480, None)), (b"% width=640\n", (None, 640)), (b"% anything else\n", (None, None))])
+@pytest.mark.parametrize(
+    "header, size",
+    [
+        (b"% geometry 640x480\n", (480, 640)),
+        (b"% format EVT3;height=480;width=640\n", (480, 640)),
+        (b"% geometry 640x480\n% format EVT3;height=1;width=2\n", (480, 640)),
+        (b"% height=480\n", (480, None)),
+        (b"% width=640\n", (None, 640)),
+        (b"% anything else\n", (None, None)),
+    ],
+)
 def test_the_size_in_the_header(tmp_path, header, size):
     decoded(tmp_path / "e.raw", "evt3", [0x8000], header=header)
     reader = EvtReader(tmp_path / "e.raw")
@@ -194,7 +236,9 @@ def test_headers_without_an_end_and_with_lines_too_long(tmp_path):
     path, word = tmp_path / "e.raw", np.array([0x8000, 0x2001], "<u2").tobytes()
     path.write_bytes(b"% evt 3.0\n% camera x\n" + word)
     assert [len(e) for e in EvtReader(path).chunks()] == [1]
-    path.write_bytes(b"% evt 3.0\n" + np.array([0x8000 | 0x25, 0x2001], "<u2").tobytes())  # a word that begins with the byte of '%'
+    path.write_bytes(
+        b"% evt 3.0\n" + np.array([0x8000 | 0x25, 0x2001], "<u2").tobytes()
+    )  # a word that begins with the byte of '%'
     assert [e.t.tolist() for e in EvtReader(path).chunks()] == [[0x25 << 12]]
     path.write_bytes(b"% evt 3.0\n% " + b"x" * 4000 + b"\n% end\n" + word)
     assert [len(e) for e in EvtReader(path).chunks()] == [1]

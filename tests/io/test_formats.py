@@ -16,22 +16,39 @@ from blinkgl.io.formats import convert, event_writer, open_events, write_events
 from tests.shared_data import shared
 
 H, W = 480, 640
-FILES = {"dsec": "e.h5", "evt3": "e.raw", "evt2": "e.raw", "text": "e.txt", "csv": "e.csv", "npz": "e.npz", "npy": "e.npy", "aedat4": "e.aedat4"}
+FILES = {
+    "dsec": "e.h5",
+    "evt3": "e.raw",
+    "evt2": "e.raw",
+    "text": "e.txt",
+    "csv": "e.csv",
+    "npz": "e.npz",
+    "npy": "e.npy",
+    "aedat4": "e.aedat4",
+}
 
 
 def random_events(n=20_000, duration_us=40_000_000, t0=0, seed=0, height=H, width=W) -> Events:
     """Bursts, equal times and gaps longer than EVT3's 16.8 s counter."""
     rng = np.random.default_rng(seed)
-    t = np.sort(np.concatenate([rng.integers(0, 50_000, n // 2), rng.integers(0, 2_000_000, n - n // 2 - 3), [duration_us - 2] * 3]))
-    return Events(rng.integers(0, width, n).astype(np.uint16), rng.integers(0, height, n).astype(np.uint16), t + t0,
-                  rng.integers(0, 2, n).astype(np.uint8))
+    t = np.sort(
+        np.concatenate(
+            [rng.integers(0, 50_000, n // 2), rng.integers(0, 2_000_000, n - n // 2 - 3), [duration_us - 2] * 3]
+        )
+    )
+    return Events(
+        rng.integers(0, width, n).astype(np.uint16),
+        rng.integers(0, height, n).astype(np.uint16),
+        t + t0,
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
 
 
 def pieces(events: Events, seed=0):
     rng, i = np.random.default_rng(seed), 0
     while i < len(events):
         n = int(rng.choice([1, 10, 5000]))
-        yield Events(*(getattr(events, k)[i:i + n] for k in "xytp"))
+        yield Events(*(getattr(events, k)[i : i + n] for k in "xytp"))
         i += n
 
 
@@ -95,13 +112,16 @@ def test_we_read_what_faery_writes(tmp_path, version):
     assert file.format == version and same(file.read(), events)
 
 
-@pytest.mark.parametrize("name, kind, size, count", [
-    ("prophesee/faery_evt2_gen3vga.raw", "evt2", (480, 640), 521_252),
-    ("prophesee/expelliarmus_evt3_gen41hd.raw", "evt3", (720, 1280), 219_596),
-    ("aedat4/davis346_events_frames_imu.aedat4", "aedat4", (260, 346), 6_676),
-    ("slider_depth/events_chunk.txt", "text", (180, 240), 50_000),
-    ("ecd_rotation/boxes_rotation/events.txt", "text", (180, 240), 30_000),
-])
+@pytest.mark.parametrize(
+    "name, kind, size, count",
+    [
+        ("prophesee/faery_evt2_gen3vga.raw", "evt2", (480, 640), 521_252),
+        ("prophesee/expelliarmus_evt3_gen41hd.raw", "evt3", (720, 1280), 219_596),
+        ("aedat4/davis346_events_frames_imu.aedat4", "aedat4", (260, 346), 6_676),
+        ("slider_depth/events_chunk.txt", "text", (180, 240), 50_000),
+        ("ecd_rotation/boxes_rotation/events.txt", "text", (180, 240), 30_000),
+    ],
+)
 def test_real_recordings(tmp_path, name, kind, size, count):
     path = shared(f"data/events/{name}")
     need(kind)
@@ -125,20 +145,47 @@ def test_real_recordings(tmp_path, name, kind, size, count):
 
 
 def test_evt3_vectors_and_counter_wrap(tmp_path):
-    words = [0x2005, 0x8000 | 0xFFE, 0x6123, 0x0007, 0x3803 + 0, 0x4000 | 0b100000000001, 0x5000 | 0b10000001, 0x2805, 0x8FFF, 0x6001, 0x2001,
-             0x8000, 0x6002, 0x0800 | 3, 0x2002, 0xA000, 0x7123, 0xE000, 0xF001]
+    words = [
+        0x2005,
+        0x8000 | 0xFFE,
+        0x6123,
+        0x0007,
+        0x3803 + 0,
+        0x4000 | 0b100000000001,
+        0x5000 | 0b10000001,
+        0x2805,
+        0x8FFF,
+        0x6001,
+        0x2001,
+        0x8000,
+        0x6002,
+        0x0800 | 3,
+        0x2002,
+        0xA000,
+        0x7123,
+        0xE000,
+        0xF001,
+    ]
     (tmp_path / "e.raw").write_bytes(b"% evt 3.0\n% end\n" + np.array(words, "<u2").tobytes())
     for block in (1, 3, 1 << 17):
         e = Events.concatenate(list(EvtReader(tmp_path / "e.raw").chunks(block)))
         # the first word precedes any TIME_HIGH and is dropped; vectors advance the base by 12, then 8
-        assert e.x.tolist() == [3, 14, 15, 22, 5, 1, 2] and e.y.tolist() == [7] * 6 + [3] and e.p.tolist() == [1, 1, 1, 1, 1, 0, 0]
+        assert (
+            e.x.tolist() == [3, 14, 15, 22, 5, 1, 2]
+            and e.y.tolist() == [7] * 6 + [3]
+            and e.p.tolist() == [1, 1, 1, 1, 1, 0, 0]
+        )
         high = 0xFFE << 12
         assert e.t.tolist() == [high + 0x123] * 5 + [(0xFFF << 12) + 1, (1 << 24) + 2]
 
 
 def test_evt2_word_layout(tmp_path):
     with contextlib.closing(EvtWriter(tmp_path / "e.raw", H, W, "evt2")) as writer:
-        writer.append(Events(np.array([600], np.uint16), np.array([400], np.uint16), np.array([1_000_003]), np.array([1], np.uint8)))
+        writer.append(
+            Events(
+                np.array([600], np.uint16), np.array([400], np.uint16), np.array([1_000_003]), np.array([1], np.uint8)
+            )
+        )
     words = np.frombuffer((tmp_path / "e.raw").read_bytes().split(b"% end\n")[1], "<u4")
     assert words.tolist() == [(8 << 28) | (1_000_003 >> 6), (1 << 28) | ((1_000_003 & 63) << 22) | (600 << 11) | 400]
 
@@ -151,6 +198,7 @@ def test_blinkflow_and_mvsec(tmp_path):
         file["ms_to_idx"] = np.searchsorted(events.t, np.arange(0, events.t[-1] // 1000) * 1000).astype(np.uint64)
     assert same(open_events(tmp_path / "blinkflow.h5").read(), events)
     from blinkgl.io.dsec import DsecEventReader
+
     with DsecEventReader(tmp_path / "blinkflow.h5") as reader:
         assert same(reader.slice(1_000_000, 3_000_000), events.window(1_000_000, 3_000_000))
         assert same(reader.slice(2_999_500, 3_000_000), events.window(2_999_500, 3_000_000))
@@ -184,14 +232,17 @@ def test_zero_time(tmp_path):
     assert np.array_equal(open_events(tmp_path / "b.raw").read().t, events.t - events.t[0])
 
 
-@pytest.mark.parametrize("text, expected", [
-    ("0.000001 1 2 0\n0.0000025 3 4 1\n", [(1, 1, 2, 0), (3, 3, 4, 1)]),
-    ("# comment\n\n5 1 2 -1\n6\t3\t4\t1", [(5, 1, 2, 0), (6, 3, 4, 1)]),
-    ("t,x,y,p\r\n1.5,1,2,0\r\n", [(1_500_000, 1, 2, 0)]),
-    ("640 480\n1e-3 1 2 1\n1.25E-3 1.0 2.000 1.0\n", [(1000, 1, 2, 1), (1250, 1, 2, 1)]),
-    ("1506117887.123456789 7 8 1\n", [(1506117887123457, 7, 8, 1)]),
-    ("1.000000000000000000e+00 1.000000000000000000e+00 2.0 1.0\n", [(10**6, 1, 2, 1)]),
-])
+@pytest.mark.parametrize(
+    "text, expected",
+    [
+        ("0.000001 1 2 0\n0.0000025 3 4 1\n", [(1, 1, 2, 0), (3, 3, 4, 1)]),
+        ("# comment\n\n5 1 2 -1\n6\t3\t4\t1", [(5, 1, 2, 0), (6, 3, 4, 1)]),
+        ("t,x,y,p\r\n1.5,1,2,0\r\n", [(1_500_000, 1, 2, 0)]),
+        ("640 480\n1e-3 1 2 1\n1.25E-3 1.0 2.000 1.0\n", [(1000, 1, 2, 1), (1250, 1, 2, 1)]),
+        ("1506117887.123456789 7 8 1\n", [(1506117887123457, 7, 8, 1)]),
+        ("1.000000000000000000e+00 1.000000000000000000e+00 2.0 1.0\n", [(10**6, 1, 2, 1)]),
+    ],
+)
 def test_text_dialects(tmp_path, text, expected):
     (tmp_path / "e.txt").write_bytes(text.encode())
     file = open_events(tmp_path / "e.txt")
@@ -204,12 +255,27 @@ def test_text_blocks_of_any_size(tmp_path):
     events = random_events(500)
     write_events(tmp_path / "e.txt", events, H, W)
     from blinkgl.io.text import TextReader
+
     for size in (50, 97, 4096):
         assert same(Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(size))), events)
 
 
-@pytest.mark.parametrize("line", ["0.1 1 2", "0.1 1 2 3 4", "0.1 1 2 7", "0.1 a 2 1", "0.1 -1 2 1", "0.1 1.5 2 1", "nan 1 2 1", "0.1 70000 2 1",
-                                  "99999999999999999999 1 2 1", "1e30 1 2 1", "0.1 1 2 1x"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "0.1 1 2",
+        "0.1 1 2 3 4",
+        "0.1 1 2 7",
+        "0.1 a 2 1",
+        "0.1 -1 2 1",
+        "0.1 1.5 2 1",
+        "nan 1 2 1",
+        "0.1 70000 2 1",
+        "99999999999999999999 1 2 1",
+        "1e30 1 2 1",
+        "0.1 1 2 1x",
+    ],
+)
 def test_bad_text_lines_are_named(tmp_path, line):
     (tmp_path / "e.txt").write_text(f"0.1 1 2 1\n0.1 1 2 1\n{line}\n0.2 1 2 1\n")
     with pytest.raises(AssetError, match=r"e.txt: line 3 is not an event .*expected t x y p"):
@@ -227,12 +293,22 @@ def _bad(tmp_path, name, data):
     return tmp_path / name
 
 
-@pytest.mark.parametrize("name, data, message", [
-    ("e.raw", b"\x00\x01" * 100, "without '% evt'"), ("e.raw", b"% evt 2.1\n% end\n", "unsupported EVT version"),
-    ("e.raw", b"% format EVT21;width=1\n% end\n", "unsupported EVT version"), ("e.raw", b"% evt 4.0\n% end\n", "unsupported EVT version"), ("e.raw", b"% evt 2.0\n% end\n" + b"\0" * 7, "truncated: 3 stray bytes"),
-    ("e.aedat4", b"#!AER-DAT3.1\r\n", "wrong magic"), ("e.aedat4", b"", "wrong magic"), ("e.h5", b"\x89HDF", "not an HDF5"),
-    ("e.npz", b"PK\x03\x04garbage", "cannot read"), ("e.npy", b"\x93NUMPY", "cannot read"), ("e.xyz", b"", "unknown event file ending"),
-])
+@pytest.mark.parametrize(
+    "name, data, message",
+    [
+        ("e.raw", b"\x00\x01" * 100, "without '% evt'"),
+        ("e.raw", b"% evt 2.1\n% end\n", "unsupported EVT version"),
+        ("e.raw", b"% format EVT21;width=1\n% end\n", "unsupported EVT version"),
+        ("e.raw", b"% evt 4.0\n% end\n", "unsupported EVT version"),
+        ("e.raw", b"% evt 2.0\n% end\n" + b"\0" * 7, "truncated: 3 stray bytes"),
+        ("e.aedat4", b"#!AER-DAT3.1\r\n", "wrong magic"),
+        ("e.aedat4", b"", "wrong magic"),
+        ("e.h5", b"\x89HDF", "not an HDF5"),
+        ("e.npz", b"PK\x03\x04garbage", "cannot read"),
+        ("e.npy", b"\x93NUMPY", "cannot read"),
+        ("e.xyz", b"", "unknown event file ending"),
+    ],
+)
 def test_damaged_files(tmp_path, name, data, message):
     with pytest.raises(AssetError, match=message) as caught:
         open_events(_bad(tmp_path, name, data)).read()
@@ -243,6 +319,7 @@ def test_damaged_files(tmp_path, name, data, message):
 def test_random_damage_never_ends_in_a_traceback(tmp_path, name):
     """Flipped and missing bytes either go unnoticed (a flipped coordinate is one) or give one line."""
     from blinkgl.io.frames import open_frames
+
     path, rng, errors = tmp_path / name, np.random.default_rng(0), 0
     if name.startswith("e"):
         write_events(path, random_events(1000), H, W)
@@ -259,7 +336,9 @@ def test_random_damage_never_ends_in_a_traceback(tmp_path, name):
             data[int(rng.integers(0, len(data) if k % 3 == 1 else min(300, len(data))))] ^= int(rng.integers(1, 256))
         path.write_bytes(data)
         try:
-            open_events(path).sized().read() if name.startswith("e") else list(open_frames(path, fps=None if name == "f.npz" else 10))
+            open_events(path).sized().read() if name.startswith("e") else list(
+                open_frames(path, fps=None if name == "f.npz" else 10)
+            )
         except BlinkGLError as error:
             errors += 1
             assert "\n" not in str(error)
@@ -274,11 +353,18 @@ def test_truncated_recordings(tmp_path):
             open_events(_bad(tmp_path, "e.aedat4", source.read_bytes()[:keep])).read()
 
 
-@pytest.mark.parametrize("array, message", [
-    (np.zeros((5, 4)), "no column 't'.*plain array"), (np.zeros(3, [("t", "f8"), ("x", "i4"), ("y", "i4")]), "no column 'p'"),
-    (np.array([(np.nan, 1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), r"time of event 0 .got nan"),
-    (np.array([(1, -1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), r"x of event 0 .got -1"),
-])
+@pytest.mark.parametrize(
+    "array, message",
+    [
+        (np.zeros((5, 4)), "no column 't'.*plain array"),
+        (np.zeros(3, [("t", "f8"), ("x", "i4"), ("y", "i4")]), "no column 'p'"),
+        (
+            np.array([(np.nan, 1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]),
+            r"time of event 0 .got nan",
+        ),
+        (np.array([(1, -1, 1, 1)], [("t", "f8"), ("x", "i4"), ("y", "i4"), ("p", "i4")]), r"x of event 0 .got -1"),
+    ],
+)
 def test_arrays_that_are_not_events(tmp_path, array, message):
     np.save(tmp_path / "e.npy", array)
     with pytest.raises(BlinkGLError, match=message):

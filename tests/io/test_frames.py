@@ -37,11 +37,14 @@ def test_folder_in_natural_order(tmp_path):
     assert listed(source) == listed(source), "can be read again"
 
 
-@pytest.mark.parametrize("name, text, expected", [
-    ("timestamps.txt", "0\n1000\n2500\n", [0, 10**6, 2_500_000]),
-    ("timestamps.txt", "# seconds\n0.0\n1e-3\n0.0025\n", [0, 10**6, 2_500_000]),
-    ("images.txt", "0.5 f0.png\n0.6 f1.png\n0.75 f2.png\n0.9 f3.png\n", [500_000_000, 600_000_000, 750_000_000]),
-])
+@pytest.mark.parametrize(
+    "name, text, expected",
+    [
+        ("timestamps.txt", "0\n1000\n2500\n", [0, 10**6, 2_500_000]),
+        ("timestamps.txt", "# seconds\n0.0\n1e-3\n0.0025\n", [0, 10**6, 2_500_000]),
+        ("images.txt", "0.5 f0.png\n0.6 f1.png\n0.75 f2.png\n0.9 f3.png\n", [500_000_000, 600_000_000, 750_000_000]),
+    ],
+)
 def test_time_stamp_files_are_found(tmp_path, name, text, expected):
     images(tmp_path)
     (tmp_path / name).write_text(text)
@@ -54,7 +57,12 @@ def test_event_camera_dataset_folder():
     for path in (root, root / "images"):
         source = open_frames(path)
         frames = list(source)
-        assert len(frames) == 12 and frames[1][1] == 38_766_001 and frames[0][0].shape == (180, 240) and frames[0][0].dtype == np.uint8
+        assert (
+            len(frames) == 12
+            and frames[1][1] == 38_766_001
+            and frames[0][0].shape == (180, 240)
+            and frames[0][0].dtype == np.uint8
+        )
 
 
 def test_video(tmp_path):
@@ -75,8 +83,10 @@ def test_arrays(tmp_path, dtype, channels):
     frames = np.random.default_rng(0).integers(0, 200, (4, 6, 8, *channels)).astype(dtype)
     np.save(tmp_path / "a.npy", frames)
     np.savez(tmp_path / "a.npz", frames=frames, timestamps_us=[0, 5, 10, 20])
-    for source, times in ((open_frames(tmp_path / "a.npy", fps=10), [0, 10**8, 2 * 10**8, 3 * 10**8]),
-                          (open_frames(tmp_path / "a.npz"), [0, 5000, 10000, 20000])):
+    for source, times in (
+        (open_frames(tmp_path / "a.npy", fps=10), [0, 10**8, 2 * 10**8, 3 * 10**8]),
+        (open_frames(tmp_path / "a.npz"), [0, 5000, 10000, 20000]),
+    ):
         got = list(source)
         assert [t for _, t, _ in got] == times
         expected = frames[..., 0] if channels == (1,) else frames
@@ -88,8 +98,26 @@ def test_float_and_deep_images(tmp_path):
     rng = np.random.default_rng(0)
     colour = (rng.random((10, 14, 3)) * 4).astype(np.float32)
     raw = np.ascontiguousarray(np.moveaxis(colour, -1, 0)[[1, 2, 0]]).tobytes()
-    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "gbrpf32le", "-s", "14x10", "-i", "-",
-                    "-format", "float", str(tmp_path / "a.exr")], input=raw, check=True)
+    subprocess.run(
+        [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-loglevel",
+            "error",
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "gbrpf32le",
+            "-s",
+            "14x10",
+            "-i",
+            "-",
+            "-format",
+            "float",
+            str(tmp_path / "a.exr"),
+        ],
+        input=raw,
+        check=True,
+    )
     assert np.array_equal(read_any_image(tmp_path / "a.exr"), colour)
     cv2.imwrite(str(tmp_path / "a.hdr"), colour[..., ::-1])
     assert np.allclose(read_any_image(tmp_path / "a.hdr"), colour, rtol=0.02, atol=0.02)
@@ -123,7 +151,10 @@ def test_bad_folders(tmp_path):
     with pytest.raises(EventDataError, match="no time stamp for image f2.png"):
         open_frames(folder)
     (folder / "timestamps.txt").write_text("0\n20\n10\n")
-    with pytest.raises(EventDataError, match=r"frame 2 \(f2.png\): time stamps must increase \(got '1e-05 s'\); expected more than 2e-05 s"):
+    with pytest.raises(
+        EventDataError,
+        match=r"frame 2 \(f2.png\): time stamps must increase \(got '1e-05 s'\); expected more than 2e-05 s",
+    ):
         list(open_frames(folder))
     (folder / "f1.png").write_bytes(b"\x89PNG")
     with pytest.raises(AssetError, match="f1.png: cannot decode"):

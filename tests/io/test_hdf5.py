@@ -43,8 +43,15 @@ def link_in_a_group(file, name, secret):
     file[name] = h5py.SoftLink("/deep/er/x")
 
 
-@pytest.mark.parametrize("how, message", [(external_storage, "a data set with external storage"), (external_link, "an external link"),
-                                          (virtual, "a virtual data set"), (link_in_a_group, "an external link")])
+@pytest.mark.parametrize(
+    "how, message",
+    [
+        (external_storage, "a data set with external storage"),
+        (external_link, "an external link"),
+        (virtual, "a virtual data set"),
+        (link_in_a_group, "an external link"),
+    ],
+)
 @pytest.mark.parametrize("kind", ["dsec", "mvsec", "rectify_map"])
 def test_files_that_lead_elsewhere_are_refused(tmp_path, how, message, kind):
     secret = tmp_path / "secret"
@@ -81,14 +88,24 @@ def test_nobody_opens_hdf5_by_another_way():
                 assert '"w"' in line, f"{path.name}:{number}: {line.strip()}"
 
 
-@pytest.mark.parametrize("change, message", [
-    ({"t_offset": np.zeros(3, int)}, r"'t_offset' has the wrong shape or type \(got 'int64 \(3,\)'\)"), ({"t_offset": "late"}, "'t_offset' has the wrong"),
-    ({"t_offset": h5py.Empty("i8")}, "'t_offset' has the wrong"), ({"t_offset": None}, "no dataset 't_offset'"), ({"t_offset": 1 << 62}, "t of event"),
-    ({"ms_to_idx": np.zeros((2, 2), int)}, "'ms_to_idx' has the wrong"), ({"ms_to_idx": np.zeros(2)}, "'ms_to_idx' has the wrong"),
-    ({"ms_to_idx": None}, "no dataset 'ms_to_idx'"), ({"events/x": None}, "no dataset 'events/x'"), ({"events/p": np.zeros((3, 1), int)}, "'events/p' has the wrong"),
-    ({"events/x": np.zeros(3)}, "'events/x' has the wrong"), ({"events/x": np.zeros(4, int)}, "differ in length"),
-    ({"events/y": np.zeros(3, [("a", "i4")])}, "'events/y' has the wrong"),
-])
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"t_offset": np.zeros(3, int)}, r"'t_offset' has the wrong shape or type \(got 'int64 \(3,\)'\)"),
+        ({"t_offset": "late"}, "'t_offset' has the wrong"),
+        ({"t_offset": h5py.Empty("i8")}, "'t_offset' has the wrong"),
+        ({"t_offset": None}, "no dataset 't_offset'"),
+        ({"t_offset": 1 << 62}, "t of event"),
+        ({"ms_to_idx": np.zeros((2, 2), int)}, "'ms_to_idx' has the wrong"),
+        ({"ms_to_idx": np.zeros(2)}, "'ms_to_idx' has the wrong"),
+        ({"ms_to_idx": None}, "no dataset 'ms_to_idx'"),
+        ({"events/x": None}, "no dataset 'events/x'"),
+        ({"events/p": np.zeros((3, 1), int)}, "'events/p' has the wrong"),
+        ({"events/x": np.zeros(3)}, "'events/x' has the wrong"),
+        ({"events/x": np.zeros(4, int)}, "differ in length"),
+        ({"events/y": np.zeros(3, [("a", "i4")])}, "'events/y' has the wrong"),
+    ],
+)
 def test_dsec_data_sets_of_wrong_shape_or_type(tmp_path, change, message):
     with h5py.File(dsec(tmp_path / "e.h5"), "r+") as file:
         for name, value in change.items():
@@ -102,7 +119,9 @@ def test_dsec_data_sets_of_wrong_shape_or_type(tmp_path, change, message):
 @pytest.mark.parametrize("value", [None, np.zeros(4), np.zeros((4, 3)), np.zeros((4, 4), int), np.array(["a"])])
 def test_mvsec_table_of_wrong_shape_or_type(tmp_path, value):
     with h5py.File(tmp_path / "e.hdf5", "w") as file:
-        file.create_group("davis/left/events") if value is None else file.create_dataset("davis/left/events", data=np.asarray(value).astype("S") if value.dtype.kind == "U" else value)
+        file.create_group("davis/left/events") if value is None else file.create_dataset(
+            "davis/left/events", data=np.asarray(value).astype("S") if value.dtype.kind == "U" else value
+        )
     with pytest.raises(AssetError, match="'davis/left/events'"):
         open_events(tmp_path / "e.hdf5").read()
 
@@ -115,10 +134,17 @@ def test_claims_without_data(tmp_path):
         file.create_dataset("none", (0,), "u8", maxshape=(None,))
         file["one"] = np.uint64(5)
     with open_hdf5(tmp_path / "a.h5") as file:
-        for name, message in (("chunked", "claims 1000000000000 values, but fewer"), ("plain", "but fewer"), ("chunk", "chunks too large")):
+        for name, message in (
+            ("chunked", "claims 1000000000000 values, but fewer"),
+            ("plain", "but fewer"),
+            ("chunk", "chunks too large"),
+        ):
             with pytest.raises(AssetError, match=message):
                 dataset(file, name, tmp_path / "a.h5", shape=(None,))
-        assert len(dataset(file, "none", tmp_path / "a.h5", shape=(None,))) == 0 and dataset(file, "one", tmp_path / "a.h5", shape=())[()] == 5
+        assert (
+            len(dataset(file, "none", tmp_path / "a.h5", shape=(None,))) == 0
+            and dataset(file, "one", tmp_path / "a.h5", shape=())[()] == 5
+        )
 
 
 def test_a_filter_that_is_not_installed_is_named(tmp_path):
@@ -144,7 +170,10 @@ def test_blosc_without_its_parameters_does_not_crash(tmp_path):
     assert struct.unpack_from("<HH", data, at + 4) == (1, 7)  # optional, seven parameters
     data[at + 6] = 0
     path.write_bytes(data)
-    with open_hdf5(path) as file, pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'rectify_map' lacks what Blosc needs"):
+    with (
+        open_hdf5(path) as file,
+        pytest.raises(AssetError, match="m.h5: damaged HDF5 file: dataset 'rectify_map' lacks what Blosc needs"),
+    ):
         dataset(file, "rectify_map", path, shape=(24, 32, 2), kinds="f")
 
 
@@ -152,7 +181,9 @@ def test_rows_written_here_are_those_of_the_filter(tmp_path):
     """Byte for byte what h5py writes through HDF5's filter with one thread, incompressible
     chunks and partial ones included."""
     rng = np.random.default_rng(0)
-    rows = np.concatenate([rng.integers(0, 50, 9000), rng.integers(0, 2**63, 4096), np.zeros(500, int)]).astype(np.uint64)
+    rows = np.concatenate([rng.integers(0, 50, 9000), rng.integers(0, 2**63, 4096), np.zeros(500, int)]).astype(
+        np.uint64
+    )
     cuts = [0, 10, 4096, 5000, 12_000, len(rows)]
     for name in "ab":
         with h5py.File(tmp_path / name, "w", rdcc_nbytes=0) as file:
@@ -184,8 +215,16 @@ print(hashlib.sha256(open(sys.argv[1], "rb").read()).hexdigest())
 
 def test_the_environment_is_left_alone_and_does_not_change_the_bytes(tmp_path):
     environment = {k: v for k, v in os.environ.items() if k != "BLOSC_NTHREADS"}
-    digests = {subprocess.run([sys.executable, "-c", _PROGRAM, str(tmp_path / "e.h5")], env={**environment, **extra}, capture_output=True, text=True,
-                              check=True).stdout for extra in ({}, {"BLOSC_NTHREADS": "3"})}
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", _PROGRAM, str(tmp_path / "e.h5")],
+            env={**environment, **extra},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for extra in ({}, {"BLOSC_NTHREADS": "3"})
+    }
     assert len(digests) == 1
 
 
@@ -193,7 +232,9 @@ def test_hdf5plugin_is_all_that_h5py_needs(tmp_path):
     """What the documentation tells readers to import."""
     write_events(tmp_path / "e.h5", open_events(dsec(tmp_path / "d.h5")).read(), 10, 10)
     with h5py.File(tmp_path / "e.h5") as file:
-        assert file["events/x"][()].tolist() == GOOD["x"] and hdf5plugin.Blosc.filter_id in [int(k) for k in file["events/x"]._filters]
+        assert file["events/x"][()].tolist() == GOOD["x"] and hdf5plugin.Blosc.filter_id in [
+            int(k) for k in file["events/x"]._filters
+        ]
     with DsecEventReader(tmp_path / "e.h5") as reader:
         assert reader.count == 3
 

@@ -26,7 +26,9 @@ def test_dsec_flow_png_read_by_opencv(tmp_path):
     decoded = (rgb[..., :2].astype(np.float64) - 2**15) / 128
     assert np.abs(decoded - flow)[valid].max() <= 0.5 / 128
     again, again_valid = flow_png.read_flow_png(tmp_path / "f.png")
-    assert np.array_equal(again_valid, valid) and np.array_equal(again[valid], decoded[valid]) and not again[~valid].any()
+    assert (
+        np.array_equal(again_valid, valid) and np.array_equal(again[valid], decoded[valid]) and not again[~valid].any()
+    )
 
 
 def test_flow_beyond_the_format_is_marked_invalid_not_clipped(tmp_path):
@@ -79,13 +81,20 @@ def test_pfm_real_file_and_orientation(tmp_path):
     assert pfm.read_pfm(tmp_path / "big.pfm").ravel().tolist() == [2, 1]  # bottom row is stored first
 
 
-@pytest.mark.parametrize("read, name, data, message", [
-    (flo.read_flo, "a.flo", b"PIEH", "wrong tag"), (flo.read_flo, "a.flo", flo.encode_flo(np.zeros((4, 4, 2)))[:-1], "truncated"),
-    (flo.read_flo, "a.flo", b"PIEH" + b"\xff" * 8, "impossible"), (pfm.read_pfm, "a.pfm", b"P6\n1 1\n255\n", "wrong header"),
-    (pfm.read_pfm, "a.pfm", pfm.encode_pfm(np.zeros((3, 3)))[:-1], "truncated"), (flow_png.read_flow_png, "a.png", b"\x89PNG..", "corrupt"),
-    (flow_png.read_flow_png, "a.png", images.encode_mask(np.ones((3, 3))), "16-bit RGB"), (flow_png.read_flow_png, "a.png", b"", "corrupt"),
-    (images.read_npy, "a.npy", images.encode_npy(np.zeros(10))[:-8], "truncated or malformed array"),
-])
+@pytest.mark.parametrize(
+    "read, name, data, message",
+    [
+        (flo.read_flo, "a.flo", b"PIEH", "wrong tag"),
+        (flo.read_flo, "a.flo", flo.encode_flo(np.zeros((4, 4, 2)))[:-1], "truncated"),
+        (flo.read_flo, "a.flo", b"PIEH" + b"\xff" * 8, "impossible"),
+        (pfm.read_pfm, "a.pfm", b"P6\n1 1\n255\n", "wrong header"),
+        (pfm.read_pfm, "a.pfm", pfm.encode_pfm(np.zeros((3, 3)))[:-1], "truncated"),
+        (flow_png.read_flow_png, "a.png", b"\x89PNG..", "corrupt"),
+        (flow_png.read_flow_png, "a.png", images.encode_mask(np.ones((3, 3))), "16-bit RGB"),
+        (flow_png.read_flow_png, "a.png", b"", "corrupt"),
+        (images.read_npy, "a.npy", images.encode_npy(np.zeros(10))[:-8], "truncated or malformed array"),
+    ],
+)
 def test_bad_files(tmp_path, read, name, data, message):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(AssetError, match=message):

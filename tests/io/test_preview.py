@@ -37,13 +37,27 @@ def film(monkeypatch):
 
 def some_events(count: int, height: int, width: int) -> Events:
     dice = np.random.default_rng(0)
-    return Events(dice.integers(0, width, count).astype(np.uint16), dice.integers(0, height, count).astype(np.uint16), np.zeros(count, np.int64),
-                  dice.integers(0, 2, count).astype(np.uint8))
+    return Events(
+        dice.integers(0, width, count).astype(np.uint16),
+        dice.integers(0, height, count).astype(np.uint16),
+        np.zeros(count, np.int64),
+        dice.integers(0, 2, count).astype(np.uint8),
+    )
 
 
-@pytest.mark.parametrize("height, width, panel", [
-    (48, 64, (96, 128)), (199, 300, (398, 600)), (200, 300, (200, 300)), (360, 480, (360, 480)), (480, 640, (360, 480)), (720, 1280, (360, 640)), (261, 347, (260, 348)), (1, 1, (2, 2)),
-])
+@pytest.mark.parametrize(
+    "height, width, panel",
+    [
+        (48, 64, (96, 128)),
+        (199, 300, (398, 600)),
+        (200, 300, (200, 300)),
+        (360, 480, (360, 480)),
+        (480, 640, (360, 480)),
+        (720, 1280, (360, 640)),
+        (261, 347, (260, 348)),
+        (1, 1, (2, 2)),
+    ],
+)
 @pytest.mark.parametrize("flow", [True, False])
 def test_panels_are_enlarged_below_200_rows_and_no_higher_than_360(height, width, panel, flow):
     """Sides are even, as the codec needs them; 4 px between the panels, 30 rows of captions above."""
@@ -60,11 +74,17 @@ def test_panels_are_enlarged_below_200_rows_and_no_higher_than_360(height, width
     assert (picture[30:, : panel[1]] == to_srgb8(np.float32([0.5]))[0]).all(), "light is shown as sRGB"
     assert (picture[30:, panel[1] + 4 : 2 * panel[1] + 4] == 255).all(), "no events: white"
     if flow:
-        assert (picture[30:, -panel[1]:] == (32, 34, 38)).all(), "no flow yet"
+        assert (picture[30:, -panel[1] :] == (32, 34, 38)).all(), "no flow yet"
 
 
-@pytest.mark.parametrize("image", [np.random.default_rng(1).random((50, 60)).astype(np.float32), np.random.default_rng(1).random((50, 60, 3)).astype(np.float32),
-                                   np.random.default_rng(1).integers(0, 256, (50, 60, 3), np.uint8)])
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.random.default_rng(1).random((50, 60)).astype(np.float32),
+        np.random.default_rng(1).random((50, 60, 3)).astype(np.float32),
+        np.random.default_rng(1).integers(0, 256, (50, 60, 3), np.uint8),
+    ],
+)
 def test_frames_and_events_are_enlarged_pixel_by_pixel(image):
     made = PreviewWriter("p.mp4", 50, 60, flow=False)
     events = some_events(700, 50, 60)
@@ -123,15 +143,23 @@ def test_the_clock():
 
 def test_captions(monkeypatch):
     said = []
-    monkeypatch.setattr(PreviewWriter, "_caption", lambda self, panel, detail: said.append((panel, self._names[panel], detail)))
+    monkeypatch.setattr(
+        PreviewWriter, "_caption", lambda self, panel, detail: said.append((panel, self._names[panel], detail))
+    )
     made = PreviewWriter("p.mp4", 48, 64, t0_us=1_000, rate_hz=100, fps=40, label="camera")
     made.add_events(some_events(1234, 48, 64))
     made.add_events(some_events(6, 48, 64))
     made.frame(13_345, np.zeros((48, 64), np.float32))
     made.frame(24_000, np.zeros((48, 64), np.float32))
     made.set_flow(np.full((48, 64, 2), 3.0, np.float32))
-    assert said == [(2, "optical flow", ""), (0, "camera", "12.3 ms   slowed 2.5x"), (1, "events", "ON blue, OFF red   1,240"),
-                    (0, "camera", "23.0 ms   slowed 2.5x"), (1, "events", "ON blue, OFF red   0"), (2, "optical flow", "full colour = 4.24 px")]
+    assert said == [
+        (2, "optical flow", ""),
+        (0, "camera", "12.3 ms   slowed 2.5x"),
+        (1, "events", "ON blue, OFF red   1,240"),
+        (0, "camera", "23.0 ms   slowed 2.5x"),
+        (1, "events", "ON blue, OFF red   0"),
+        (2, "optical flow", "full colour = 4.24 px"),
+    ]
 
 
 def test_captions_are_written_above_their_panel():
@@ -144,7 +172,9 @@ def test_captions_are_written_above_their_panel():
     assert rows.min() >= 0 and rows.max() < 30 and columns.min() >= 132 and columns.max() < 260
     strip = made._canvas[:30, 132:260]
     dark = (np.abs(strip.astype(int) - back).max(axis=2) > 20).any(axis=0)
-    assert 6 <= np.flatnonzero(dark)[0] <= 10 and 128 - 11 <= np.flatnonzero(dark)[-1] <= 128 - 7, "name at the left edge, detail at the right one"
+    assert 6 <= np.flatnonzero(dark)[0] <= 10 and 128 - 11 <= np.flatnonzero(dark)[-1] <= 128 - 7, (
+        "name at the left edge, detail at the right one"
+    )
     lit = (np.abs(strip.astype(int) - back).max(axis=2) > 20).any(axis=1)
     assert abs(np.flatnonzero(lit).mean() - 15) < 4
 
@@ -203,7 +233,14 @@ def test_the_legend_is_the_wheel_in_the_lower_right_corner():
 
 def middlebury(u: float, v: float) -> np.ndarray:
     """Colour of a flow of at most unit length, by the published bands of hue (Baker et al. 2011)."""
-    bands = [(15, (255, 0, 0), (0, 1, 0)), (6, (255, 255, 0), (-1, 0, 0)), (4, (0, 255, 0), (0, 0, 1)), (11, (0, 255, 255), (0, -1, 0)), (13, (0, 0, 255), (1, 0, 0)), (6, (255, 0, 255), (0, 0, -1))]
+    bands = [
+        (15, (255, 0, 0), (0, 1, 0)),
+        (6, (255, 255, 0), (-1, 0, 0)),
+        (4, (0, 255, 0), (0, 0, 1)),
+        (11, (0, 255, 255), (0, -1, 0)),
+        (13, (0, 0, 255), (1, 0, 0)),
+        (6, (255, 0, 255), (0, 0, -1)),
+    ]
     ring = [np.array(start) + 255 * k / steps * np.array(way) for steps, start, way in bands for k in range(steps)]
     turn = (np.arctan2(-v, -u) / np.pi + 1) / 2 * 55
     low = int(turn) % 55

@@ -28,8 +28,12 @@ H, W = 24, 32
 
 def events_between(t0, t1, n, seed=0) -> Events:
     rng = np.random.default_rng(seed)
-    return Events(rng.integers(0, W, n).astype(np.uint16), rng.integers(0, H, n).astype(np.uint16),
-                  np.sort(rng.integers(t0, t1, n)), rng.integers(0, 2, n).astype(np.uint8))
+    return Events(
+        rng.integers(0, W, n).astype(np.uint16),
+        rng.integers(0, H, n).astype(np.uint16),
+        np.sort(rng.integers(t0, t1, n)),
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
 
 
 def fill(writer: SequenceWriter, labels: int = 3, reuse: bool = True) -> None:
@@ -71,7 +75,11 @@ def test_contents_read_back_independently(tmp_path):
     assert (seq / "images/timestamps.txt").read_text() == "0\n100000\n200000\n"
     stamps = np.loadtxt(seq / "flow/forward_timestamps.txt", delimiter=",", comments="#", dtype=np.int64)
     assert stamps.tolist() == [[0, 100000], [100000, 200000], [200000, 300000]]
-    assert (seq / "flow/backward_timestamps.txt").read_text().startswith("# from_timestamp_us, to_timestamp_us\n100000, 0\n")
+    assert (
+        (seq / "flow/backward_timestamps.txt")
+        .read_text()
+        .startswith("# from_timestamp_us, to_timestamp_us\n100000, 0\n")
+    )
     rng = np.random.default_rng(1)
     image, flow = rng.random((H, W, 3)).astype(np.float32), rng.normal(size=(H, W, 2)).astype(np.float32)
     assert np.array_equal(cv2.imread(str(seq / "images/000001.png"))[..., ::-1], srgb.to_srgb8(image))
@@ -79,7 +87,9 @@ def test_contents_read_back_independently(tmp_path):
     assert not rgb[0, 0, 2] and rgb[1:, :, 2].all()
     assert np.abs((rgb[1:, :, :2] - 2**15) / 128 - flow[1:]).max() <= 0.5 / 128
     full = np.load(seq / "flow/forward_npy/000001.npy")
-    assert full.shape == (H, W, 3) and full[0, 0].tolist() == [300, 300, 1] and np.array_equal(full[1:, :, :2], flow[1:])
+    assert (
+        full.shape == (H, W, 3) and full[0, 0].tolist() == [300, 300, 1] and np.array_equal(full[1:, :, :2], flow[1:])
+    )
     assert np.array_equal(flo.read_flo(seq / "flow/forward_flo/000001.flo")[0][1:], flow[1:])
     with h5py.File(seq / "flow/forward.h5") as file:
         assert np.array_equal(file["flow"][1, 1:], flow[1:]) and file["valid"].shape == (3, H, W)
@@ -100,10 +110,17 @@ def test_same_input_same_bytes(tmp_path):
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
 
 
-@pytest.mark.parametrize("damage, problem", [
-    ("flip", "events.h5: checksum differs"), ("cut", "ids/000000.png: .* bytes, manifest says"), ("remove", "poses.npz: missing"),
-    ("add", "images/x.png: not in the manifest"), ("manifest", "damaged manifest"), ("none", "no manifest"),
-])
+@pytest.mark.parametrize(
+    "damage, problem",
+    [
+        ("flip", "events.h5: checksum differs"),
+        ("cut", "ids/000000.png: .* bytes, manifest says"),
+        ("remove", "poses.npz: missing"),
+        ("add", "images/x.png: not in the manifest"),
+        ("manifest", "damaged manifest"),
+        ("none", "no manifest"),
+    ],
+)
 def test_verify_finds_damage(tmp_path, damage, problem):
     seq = tmp_path / "a"
     make(seq)
@@ -123,6 +140,7 @@ def test_verify_finds_damage(tmp_path, damage, problem):
         (seq / "manifest.json").unlink()
     problems = verify_sequence(seq)
     import re
+
     assert len(problems) == 1 and re.search(problem, problems[0])
 
 
@@ -151,6 +169,7 @@ def test_existing_output_is_refused_and_untouched(tmp_path):
 def test_errors_of_the_background_threads_surface(tmp_path, monkeypatch):
     def full(image):
         raise OSError(28, "No space left on device")
+
     monkeypatch.setattr(images, "encode_image", full)
     with pytest.raises((OutputError, OSError), match="[Nn]o space left"):
         make(tmp_path / "a")
@@ -178,8 +197,14 @@ def test_full_disk_is_one_clear_error_and_leaves_nothing(small_disk, what):
             for i in range(40):
                 if what != "labels":
                     n = 100_000
-                    writer.append_events(Events(rng.integers(0, 320, n).astype(np.uint16), rng.integers(0, 240, n).astype(np.uint16),
-                                                np.sort(rng.integers(i * 10**6, (i + 1) * 10**6, n)), rng.integers(0, 2, n).astype(np.uint8)))
+                    writer.append_events(
+                        Events(
+                            rng.integers(0, 320, n).astype(np.uint16),
+                            rng.integers(0, 240, n).astype(np.uint16),
+                            np.sort(rng.integers(i * 10**6, (i + 1) * 10**6, n)),
+                            rng.integers(0, 2, n).astype(np.uint8),
+                        )
+                    )
                 if what != "events":
                     writer.label("depth", i, rng.random((240, 320), dtype=np.float32), 0)
     assert "blinkgl-tmp" not in str(caught.value) and "\n" not in str(caught.value)
@@ -195,7 +220,7 @@ from blinkgl.events.types import Events
 from blinkgl.errors import OutputError
 rng = np.random.default_rng(0)
 try:
-    with DsecEventWriter({str(small_disk / 'e.h5')!r}, 480, 640) as w:
+    with DsecEventWriter({str(small_disk / "e.h5")!r}, 480, 640) as w:
         for i in range(40):
             n = 100_000
             w.append(Events(rng.integers(0, 640, n).astype('u2'), rng.integers(0, 480, n).astype('u2'),
@@ -212,7 +237,7 @@ def test_kill_leaves_no_final_name_and_the_next_run_cleans_up(tmp_path):
     code = f"""
 import time, numpy as np
 from blinkgl.io.sequence_dir import SequenceWriter
-with SequenceWriter({str(tmp_path / 'a')!r}, 24, 32, config_yaml='') as w:
+with SequenceWriter({str(tmp_path / "a")!r}, 24, 32, config_yaml='') as w:
     w.label('depth', 0, np.zeros((24, 32)), 0)
     print('ready', flush=True)
     time.sleep(60)
@@ -234,7 +259,12 @@ def test_only_own_dead_temporaries_are_removed(tmp_path):
     dead = subprocess.Popen(["true"])
     dead.wait()
     token = machine_token()
-    keep = [f".x.blinkgl-tmp-{'0' * 12}-{dead.pid}-0", f".x.blinkgl-tmp-{token}-{os.getpid()}-0", "x", f"x.blinkgl-tmp-{token}-{dead.pid}-0"]
+    keep = [
+        f".x.blinkgl-tmp-{'0' * 12}-{dead.pid}-0",
+        f".x.blinkgl-tmp-{token}-{os.getpid()}-0",
+        "x",
+        f"x.blinkgl-tmp-{token}-{dead.pid}-0",
+    ]
     for name in [*keep, f".x.blinkgl-tmp-{token}-{dead.pid}-0"]:
         (tmp_path / name).mkdir()
     outside = tmp_path / "x" / "data"

@@ -34,8 +34,26 @@ def decimals(count: int) -> list[str]:
 
 def test_times_are_the_nearest_microsecond(tmp_path):
     """Half of one away from zero; refused beyond 10^18 µs and not before."""
-    for text in [*decimals(300), "0.0000005", "-0.0000005", "0.00000049999", "1.5e-6", "25e-7", ".5", "5.", "1.e3", "1e-30", "1e-19", "9e-19", "5e-7",
-                 "123456.7890125", "00000000000000000000001.5", "0.000000000000000000000000000001e30", "1234567890123456.7", "0.12345678901234567890123"]:
+    for text in [
+        *decimals(300),
+        "0.0000005",
+        "-0.0000005",
+        "0.00000049999",
+        "1.5e-6",
+        "25e-7",
+        ".5",
+        "5.",
+        "1.e3",
+        "1e-30",
+        "1e-19",
+        "9e-19",
+        "5e-7",
+        "123456.7890125",
+        "00000000000000000000001.5",
+        "0.000000000000000000000000000001e30",
+        "1234567890123456.7",
+        "0.12345678901234567890123",
+    ]:
         exact = (Decimal(text) * 10**6).to_integral_value(ROUND_HALF_UP)
         if abs(exact) < 10**17:
             assert read(tmp_path / "e.txt", f"{text} 1 2 1\n").t.tolist() == [int(exact)], text
@@ -44,12 +62,25 @@ def test_times_are_the_nearest_microsecond(tmp_path):
                 read(tmp_path / "e.txt", f"{text} 1 2 1\n")
 
 
-@pytest.mark.parametrize("text, value", [("12", 12), ("+12", 12), ("012", 12), ("1234567890123456", 1234567890123456), ("-7", -7), ("12345678901234567", 12345678901234567)])
+@pytest.mark.parametrize(
+    "text, value",
+    [
+        ("12", 12),
+        ("+12", 12),
+        ("012", 12),
+        ("1234567890123456", 1234567890123456),
+        ("-7", -7),
+        ("12345678901234567", 12345678901234567),
+    ],
+)
 def test_integers_are_microseconds(tmp_path, text, value):
     assert read(tmp_path / "e.txt", f"{text} 1 2 1\n").t.tolist() == [value]
 
 
-@pytest.mark.parametrize("text", ["123456789012345678", "1e", "1e+", "1ex", ".", "+", "-", "--1", "1-", "1.2.3", "0x10", "e5", "1e99999999999"])
+@pytest.mark.parametrize(
+    "text",
+    ["123456789012345678", "1e", "1e+", "1ex", ".", "+", "-", "--1", "1-", "1.2.3", "0x10", "e5", "1e99999999999"],
+)
 def test_what_is_no_number(tmp_path, text):
     with pytest.raises(AssetError, match="line 2 is not an event"):
         read(tmp_path / "e.txt", f"0 1 2 1\n{text} 1 2 1\n")
@@ -61,7 +92,21 @@ def test_coordinates_may_be_written_as_decimals(tmp_path, column):
     assert (events.x.tolist(), events.y.tolist()) == ([3], [3])
 
 
-@pytest.mark.parametrize("line", ["5 3.5 2 1", "5 30001e-4 2 1", "5 65536 2 1", "5 3 65536 1", "5 3 -1 1", "5 3 2 -2", "5 3 2 2", "5 3 2 0.5", "5 1e-3 2 1", "5 3 2 1 #"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "5 3.5 2 1",
+        "5 30001e-4 2 1",
+        "5 65536 2 1",
+        "5 3 65536 1",
+        "5 3 -1 1",
+        "5 3 2 -2",
+        "5 3 2 2",
+        "5 3 2 0.5",
+        "5 1e-3 2 1",
+        "5 3 2 1 #",
+    ],
+)
 def test_coordinates_and_polarities_that_are_none(tmp_path, line):
     with pytest.raises(AssetError, match="line 3 is not an event"):
         read(tmp_path / "e.txt", f"% width height\n4 1 1 1\n{line}\n")
@@ -72,7 +117,15 @@ def test_corners_of_what_is_held(tmp_path):
     assert (events.x.tolist(), events.y.tolist(), events.p.tolist()) == ([65535, 0, 0], [0, 65535, 0], [0, 0, 1])
 
 
-@pytest.mark.parametrize("text, lines", [("0.5 1 2 1\n3 1 2 1\n", 2), ("3 1 2 1\n# c\n0.5 1 2 1\n", 3), ("0 1 2 1\n1.5 1 2 1\n2 1 1 1\n", 3), ("1 1 2 1\n2e0 1 2 1\n", 2)])
+@pytest.mark.parametrize(
+    "text, lines",
+    [
+        ("0.5 1 2 1\n3 1 2 1\n", 2),
+        ("3 1 2 1\n# c\n0.5 1 2 1\n", 3),
+        ("0 1 2 1\n1.5 1 2 1\n2 1 1 1\n", 3),
+        ("1 1 2 1\n2e0 1 2 1\n", 2),
+    ],
+)
 def test_units_of_time_do_not_mix(tmp_path, text, lines):
     with pytest.raises(AssetError, match=f"line {lines} has its time in another unit"):
         read(tmp_path / "e.txt", text)
@@ -88,7 +141,12 @@ def test_a_plain_zero_is_of_either_unit(tmp_path):
 def test_separators_comments_and_empty_lines(tmp_path):
     text = "# one\n\n%two\n 1\t2,3 ,\t1 \r\n   # indented\n2 , 3 4\t0\n\n%last"
     events = read(tmp_path / "e.txt", text)
-    assert [events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist()] == [[1, 2], [2, 3], [3, 4], [1, 0]]
+    assert [events.t.tolist(), events.x.tolist(), events.y.tolist(), events.p.tolist()] == [
+        [1, 2],
+        [2, 3],
+        [3, 4],
+        [1, 0],
+    ]
 
 
 def test_a_size_is_taken_once_and_only_before_the_first_event(tmp_path):
@@ -98,12 +156,24 @@ def test_a_size_is_taken_once_and_only_before_the_first_event(tmp_path):
     (tmp_path / "e.txt").write_text("# c\n640,480\nt x y p\n1 2 3 1\n")
     reader = TextReader(tmp_path / "e.txt")
     assert (reader.width, reader.height) == (640, 480) and len(next(reader.chunks())) == 1
-    for text, line in (("640 480\n640 480\n1 2 3 1\n", 2), ("1 2 3 1\n640 480\n", 2), ("t x y p\nt x y p\n1 2 3 1\n", 2)):
+    for text, line in (
+        ("640 480\n640 480\n1 2 3 1\n", 2),
+        ("1 2 3 1\n640 480\n", 2),
+        ("t x y p\nt x y p\n1 2 3 1\n", 2),
+    ):
         with pytest.raises(AssetError, match=f"line {line} is not an event"):
             read(tmp_path / "f.txt", text)
 
 
-@pytest.mark.parametrize("head, unit", [("t[s] x y p", 0.5), ("timestamp[us],x,y,polarity", 5e-7), ("t (µs) x [px] y [px] p", 5e-7), ('ts,"x","y","on"', None)])
+@pytest.mark.parametrize(
+    "head, unit",
+    [
+        ("t[s] x y p", 0.5),
+        ("timestamp[us],x,y,polarity", 5e-7),
+        ("t (µs) x [px] y [px] p", 5e-7),
+        ('ts,"x","y","on"', None),
+    ],
+)
 def test_the_unit_that_a_name_says_binds(tmp_path, head, unit):
     path = tmp_path / "e.txt"
     for t, microseconds in (("0.5", 500_000), ("5", 5)):
@@ -129,14 +199,22 @@ def test_the_longest_line(tmp_path):
 @pytest.mark.parametrize("separator, unit", [(" ", "s"), (",", "s"), (" ", "us"), (",", "us")])
 def test_what_is_written_is_what_python_would_print(tmp_path, separator, unit):
     t = np.array([0, 7, 999_999, 1_000_000, 1_000_001, 59_000_000, 1_506_117_887_123_456])
-    events = Events(np.array([0, 9, 10, 99, 100, 1279, 1], np.uint16), np.array([719, 0, 1, 10, 99, 100, 5], np.uint16), t, np.array([0, 1, 1, 0, 1, 0, 1], np.uint8))
+    events = Events(
+        np.array([0, 9, 10, 99, 100, 1279, 1], np.uint16),
+        np.array([719, 0, 1, 10, 99, 100, 5], np.uint16),
+        t,
+        np.array([0, 1, 1, 0, 1, 0, 1], np.uint8),
+    )
     writer = TextWriter(tmp_path / "e.txt", 720, 1280, separator, unit=unit)
     writer.append(Events.empty())
     writer.append(events)
     writer.close()
     head = {(",", "s"): ["t,x,y,p"], (",", "us"): ["t,x@1280,y@720,on"]}.get((separator, unit), [])
     stamp = (lambda v: f"{v // 10**6}.{v % 10**6:06d}") if unit == "s" else str
-    rows = [separator.join((stamp(int(v)), *(str(int(c[k])) for c in (events.x, events.y, events.p)))) for k, v in enumerate(t)]
+    rows = [
+        separator.join((stamp(int(v)), *(str(int(c[k])) for c in (events.x, events.y, events.p))))
+        for k, v in enumerate(t)
+    ]
     assert (tmp_path / "e.txt").read_text() == "".join(line + "\n" for line in head + rows)
     back = Events.concatenate(list(TextReader(tmp_path / "e.txt").chunks(64)))
     assert all(np.array_equal(getattr(back, k), getattr(events, k)) for k in "xytp")
@@ -146,11 +224,17 @@ def test_the_writer_refuses(tmp_path):
     with pytest.raises(EventDataError, match="unit of time .got 'ms'.; expected s or us"):
         TextWriter(tmp_path / "e.txt", 10, 10, unit="ms")
     writer = TextWriter(tmp_path / "e.txt", 10, 10)
-    one = lambda t, x=0, y=0: Events(np.array([x], np.uint16), np.array([y], np.uint16), np.array([t]), np.ones(1, np.uint8))
+    one = lambda t, x=0, y=0: Events(
+        np.array([x], np.uint16), np.array([y], np.uint16), np.array([t]), np.ones(1, np.uint8)
+    )
     with pytest.raises(EventDataError, match="negative time .got -1."):
         writer.append(one(-1))
     writer.append(one(5))
-    for bad, message in ((one(4), r"backwards at event 1 .got \(5, 4\)"), (one(6, 10), "event 1 is outside the sensor"), (one(6, 0, 10), "event 1 is outside")):
+    for bad, message in (
+        (one(4), r"backwards at event 1 .got \(5, 4\)"),
+        (one(6, 10), "event 1 is outside the sensor"),
+        (one(6, 0, 10), "event 1 is outside"),
+    ):
         with pytest.raises(EventDataError, match=message):
             writer.append(bad)
     writer.abort()

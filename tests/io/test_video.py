@@ -52,8 +52,14 @@ def test_truncated_video_is_an_error_that_names_the_frame(tmp_path, ending):
     assert f"after frame {count}" in str(caught.value) and 5 < count < 25
 
 
-@pytest.mark.parametrize("content, message", [(b"", "cannot read video"), (b"not a video at all" * 100, "cannot read video: .*[Ii]nvalid data"),
-                                              (None, "no such file")])
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (b"", "cannot read video"),
+        (b"not a video at all" * 100, "cannot read video: .*[Ii]nvalid data"),
+        (None, "no such file"),
+    ],
+)
 def test_unreadable_video(tmp_path, content, message):
     if content is not None:
         (tmp_path / "v.mp4").write_bytes(content)
@@ -65,8 +71,21 @@ def test_unreadable_video(tmp_path, content, message):
 @pytest.mark.parametrize("degrees, shape", [(0, (48, 64)), (90, (64, 48)), (180, (48, 64)), (270, (64, 48))])
 def test_rotated_video_comes_upright(tmp_path, degrees, shape):
     write_video(tmp_path / "v.mp4")
-    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-display_rotation", str(degrees), "-i", tmp_path / "v.mp4", "-c", "copy",
-                    tmp_path / "r.mp4"], check=True)
+    subprocess.run(
+        [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-loglevel",
+            "error",
+            "-display_rotation",
+            str(degrees),
+            "-i",
+            tmp_path / "v.mp4",
+            "-c",
+            "copy",
+            tmp_path / "r.mp4",
+        ],
+        check=True,
+    )
     reader = VideoReader(tmp_path / "r.mp4")
     upright = np.rot90(next(iter(VideoReader(tmp_path / "v.mp4"))), degrees // 90)
     frame = next(iter(reader))
@@ -108,8 +127,14 @@ def test_preview(tmp_path, height, width, flow):
         for i in range(11):
             t = 5000 + i * 5000  # twice the preview's rate: every second frame is due
             n = 100
-            preview.add_events(Events(rng.integers(0, width, n).astype(np.uint16), rng.integers(0, height, n).astype(np.uint16),
-                                      np.full(n, t, np.int64), rng.integers(0, 2, n).astype(np.uint8)))
+            preview.add_events(
+                Events(
+                    rng.integers(0, width, n).astype(np.uint16),
+                    rng.integers(0, height, n).astype(np.uint16),
+                    np.full(n, t, np.int64),
+                    rng.integers(0, 2, n).astype(np.uint8),
+                )
+            )
             assert preview.due(t) == (i % 2 == 0)
             if i % 4 == 0:
                 preview.set_flow(rng.normal(size=(height, width, 2)).astype(np.float32))

@@ -64,8 +64,23 @@ def test_a_cold_and_a_warm_simulate(tmp_path):
     np.save(tmp_path / "f.npy", np.random.default_rng(0).integers(0, 255, (3, 8, 8), np.uint8))
     said = []
     for _ in range(2):
-        done = subprocess.run([sys.executable, "-m", "blinkgl.cli", "simulate", str(tmp_path / "f.npy"), "--fps", "100", "--overwrite",
-                               "-o", str(tmp_path / "e.npz")], capture_output=True, text=True, check=True,
-                              env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")})
+        done = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "blinkgl.cli",
+                "simulate",
+                str(tmp_path / "f.npy"),
+                "--fps",
+                "100",
+                "--overwrite",
+                "-o",
+                str(tmp_path / "e.npz"),
+            ],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+        )
         said.append("compiling kernels, once per machine: " in done.stdout)
     assert said == [True, False]

@@ -25,9 +25,20 @@ def by_name(report) -> dict[str, doctor.Check]:
 def test_this_machine_passes_every_required_check(report):
     assert report.ok, [check for check in report.checks if check.status == "missing"]
     checks = by_name(report)
-    for name in ("OpenGL/context", "OpenGL/version", "OpenGL/32F depth, reversed-Z", "OpenGL/R32F target", "OpenGL/RG32F target",
-                 "OpenGL/RGBA32F target", "Kernels/numba", "Kernels/threads", "Kernels/SIMD", "Codecs/HDF5 blosc-zstd",
-                 "Codecs/libx264 video", "Codecs/16-bit RGB PNG"):
+    for name in (
+        "OpenGL/context",
+        "OpenGL/version",
+        "OpenGL/32F depth, reversed-Z",
+        "OpenGL/R32F target",
+        "OpenGL/RG32F target",
+        "OpenGL/RGBA32F target",
+        "Kernels/numba",
+        "Kernels/threads",
+        "Kernels/SIMD",
+        "Codecs/HDF5 blosc-zstd",
+        "Codecs/libx264 video",
+        "Codecs/16-bit RGB PNG",
+    ):
         assert checks[name].status == "ok", checks[name]
 
 
@@ -59,7 +70,7 @@ def test_no_opengl_is_reported_with_the_remedy_and_status_2(monkeypatch, capsys)
 
 def test_a_codec_that_lies_is_found(monkeypatch):
     cv2 = pytest.importorskip("cv2")
-    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: (data.astype("uint16")))
+    monkeypatch.setattr(cv2, "imdecode", lambda data, flags: data.astype("uint16"))
     check = next(check for check in doctor._codecs() if check.name == "16-bit RGB PNG")
     assert check.status == "missing" and "opencv-python-headless" in check.remedy
 

@@ -24,8 +24,12 @@ def poisson(rate_hz: float, on_share: float, seconds=4.0, seed=0, t0=0, pixels=N
     weights = np.ones((H, W)) if pixels is None else pixels
     n = rng.poisson(rate_hz * seconds * weights.sum())
     where = rng.choice(H * W, n, p=(weights / weights.sum()).ravel())
-    return Events((where % W).astype(np.uint16), (where // W).astype(np.uint16),
-                  t0 + np.sort(rng.integers(0, round(seconds * 1e6), n)), (rng.random(n) < on_share).astype(np.uint8))
+    return Events(
+        (where % W).astype(np.uint16),
+        (where // W).astype(np.uint16),
+        t0 + np.sort(rng.integers(0, round(seconds * 1e6), n)),
+        (rng.random(n) < on_share).astype(np.uint8),
+    )
 
 
 def test_counts_rates_and_intervals(tmp_path):
@@ -36,7 +40,9 @@ def test_counts_rates_and_intervals(tmp_path):
     inside = lambda e: e.window(int(result.edges_us[0]), int(result.edges_us[-1]))
     assert len(result.edges_us) == 9 and result.a.count == len(inside(a)) and result.b.count == len(inside(b))
     assert result.a.count == pytest.approx(len(a), abs=3)
-    assert np.allclose(result.a.rate_hz, 20 * H * W, rtol=0.05) and np.nanmean(result.rate_ratio) == pytest.approx(2, rel=0.03)
+    assert np.allclose(result.a.rate_hz, 20 * H * W, rtol=0.05) and np.nanmean(result.rate_ratio) == pytest.approx(
+        2, rel=0.03
+    )
     assert result.a.on_off_ratio == pytest.approx(1, rel=0.03) and result.b.on_off_ratio == pytest.approx(4, rel=0.05)
     assert abs(result.pixel_correlation) < 0.1, "independent"
     # The interval of a Poisson process is exponential: median ln 2 / rate (bins of a tenth of a decade).
@@ -54,7 +60,11 @@ def test_recording_with_itself_and_shifted(tmp_path):
     write_events(tmp_path / "a.npz", a, H, W)
     write_events(tmp_path / "b.npz", Events(a.x, a.y, a.t + 10**9, a.p), H, W)
     result = compare(tmp_path / "a.npz", tmp_path / "a.npz")
-    assert result.pixel_correlation == pytest.approx(1) and np.allclose(result.polarity_correlation, 1) and result.iei_distance == 0
+    assert (
+        result.pixel_correlation == pytest.approx(1)
+        and np.allclose(result.polarity_correlation, 1)
+        and result.iei_distance == 0
+    )
     with pytest.raises(EventDataError, match=r"no common time .*--zero-time"):
         compare(tmp_path / "a.npz", tmp_path / "b.npz")
     result = compare(tmp_path / "a.npz", tmp_path / "b.npz", zero_time=True)
@@ -77,7 +87,10 @@ def test_polarity_sum_against_frames(tmp_path):
         events.append(Events(x.astype(np.uint16), y.astype(np.uint16), t, p.astype(np.uint8)))
     write_events(tmp_path / "e.h5", events, H, W)
     np.savez(tmp_path / "f.npz", frames=(codes / 255), timestamps_us=np.arange(5) * 10_000)
-    for result in (compare(tmp_path / "e.h5", tmp_path / "f.npz"), compare(tmp_path / "e.h5", frames=tmp_path / "f.npz")):
+    for result in (
+        compare(tmp_path / "e.h5", tmp_path / "f.npz"),
+        compare(tmp_path / "e.h5", frames=tmp_path / "f.npz"),
+    ):
         assert result.b is None and len(result.a.frame_correlation) == 4
         assert result.a.frame_correlation.min() > 0.97
         assert np.allclose(result.a.implied_threshold, threshold, rtol=0.1)

@@ -32,7 +32,7 @@ def frames8(count=8, height=H, width=W, channels=()) -> np.ndarray:
     ramp = np.linspace(30, 120, width)
     for i in range(count):
         row = ramp.copy()
-        row[3 * i:3 * i + 6] = 230
+        row[3 * i : 3 * i + 6] = 230
         out[i] = row.reshape(1, width, *(1,) * len(channels))
     return out
 
@@ -54,7 +54,12 @@ def test_generator_equals_the_emulator_by_hand():
     report = SimulationReport()
     ours = all_of((f for f in frames), fps=100, emulator=config, seed=5, report=report)
     assert same(ours, by_hand)
-    assert (report.frames, report.steps, report.events, report.on) == (8, 8, len(ours), int(ours.p.sum())) and report.duration_s == pytest.approx(0.07)
+    assert (report.frames, report.steps, report.events, report.on) == (
+        8,
+        8,
+        len(ours),
+        int(ours.p.sum()),
+    ) and report.duration_s == pytest.approx(0.07)
     assert same(all_of([(f, i * 10_000_000) for i, f in enumerate(frames)], emulator=config, seed=5), by_hand)
     assert same(all_of(frames[..., None], fps=100, emulator=config, seed=5), by_hand)
     assert same(Events.concatenate(list(blinkgl.simulate(frames, fps=100, emulator=config, seed=5))), by_hand)
@@ -63,7 +68,12 @@ def test_generator_equals_the_emulator_by_hand():
 def test_input_types_agree():
     frames = frames8()
     reference = all_of(frames, fps=100, emulator=EsimConfig(threshold_sigma=0), gamma="srgb")
-    for other in (np.repeat(frames[..., None], 3, axis=-1), frames.astype(np.uint16) * 257, frames / np.float32(255), frames / 255.0):
+    for other in (
+        np.repeat(frames[..., None], 3, axis=-1),
+        frames.astype(np.uint16) * 257,
+        frames / np.float32(255),
+        frames / 255.0,
+    ):
         events = all_of(other, fps=100, emulator=EsimConfig(threshold_sigma=0), gamma="srgb")
         assert abs(len(events) - len(reference)) <= 0.01 * len(reference)
 
@@ -76,7 +86,9 @@ def test_luminance_of_colour_and_gamma():
     assert np.allclose(Decoder("linear")(codes, ""), exact(lambda x: x), atol=1e-6)
     assert np.allclose(Decoder(2.2)(codes, ""), exact(lambda x: x**2.2), atol=1e-6)
     real = np.random.default_rng(0).random((5, 6, 3)) * 10
-    assert np.allclose(Decoder(None)(real, ""), real @ np.array([0.2126, 0.7152, 0.0722]), rtol=1e-6), "floats are linear"
+    assert np.allclose(Decoder(None)(real, ""), real @ np.array([0.2126, 0.7152, 0.0722]), rtol=1e-6), (
+        "floats are linear"
+    )
 
 
 @pytest.mark.parametrize("emulator", ["esim", "v2e", "voltmeter"])
@@ -85,19 +97,24 @@ def test_interpolations_run_and_order_events(emulator, interpolate):
     report = SimulationReport()
     texture = cv2.GaussianBlur(np.random.default_rng(0).random((80, 160)) * 255, (0, 0), 3)
     frames = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    frames = np.stack([frames[:, 4 * i:4 * i + 100] for i in range(5)])
+    frames = np.stack([frames[:, 4 * i : 4 * i + 100] for i in range(5)])
     events = all_of(frames, fps=100, emulator=emulator, interpolate=interpolate, report=report)
     assert len(events) and np.all(np.diff(events.t) >= 0) and events.t[-1] <= 40_000
     assert report.frames == 5 and (report.steps == 5 if interpolate == "linear" else report.steps > 5)
     assert (report.displacement is not None) == (interpolate == "motion")
 
 
-@pytest.mark.parametrize("frame, message", [
-    (np.full((H, W), np.nan, np.float32), r"frame 2: intensity at pixel x=0, y=0 cannot be used \(got nan\)"),
-    (np.full((H, W), -1, np.float32), "frame 2: intensity.*got -1"), (np.full((H, W), np.inf, np.float32), "frame 2: intensity.*inf"),
-    (np.ones((H, W + 1), np.float32), "frame 2: frame size changed"), (np.ones((H, W, 4), np.float32), "frame 2: not a frame"),
-    (np.ones((H, W), np.int32), "unsupported pixel type|unsupported frame type"),
-])
+@pytest.mark.parametrize(
+    "frame, message",
+    [
+        (np.full((H, W), np.nan, np.float32), r"frame 2: intensity at pixel x=0, y=0 cannot be used \(got nan\)"),
+        (np.full((H, W), -1, np.float32), "frame 2: intensity.*got -1"),
+        (np.full((H, W), np.inf, np.float32), "frame 2: intensity.*inf"),
+        (np.ones((H, W + 1), np.float32), "frame 2: frame size changed"),
+        (np.ones((H, W, 4), np.float32), "frame 2: not a frame"),
+        (np.ones((H, W), np.int32), "unsupported pixel type|unsupported frame type"),
+    ],
+)
 @pytest.mark.parametrize("interpolate", ["linear", "cubic", "motion"])
 def test_bad_frames_are_named(frame, message, interpolate):
     good = np.ones((H, W), np.float32)
@@ -208,6 +225,7 @@ def test_memory_does_not_grow_with_the_clip():
         size = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return size
+
     peak(20)
     assert peak(400) < 1.2 * peak(40) + 100_000
 
@@ -215,21 +233,58 @@ def test_memory_does_not_grow_with_the_clip():
 def test_commands(tmp_path, capsys):
     write_video(tmp_path / "v.mp4", frames8(10))
     out = str(tmp_path / "e.h5")
-    assert run(["simulate", str(tmp_path / "v.mp4"), "--out", out, "-e", "v2e", "--set", "preset=clean", "--interpolate", "motion"]) == 0
+    assert (
+        run(
+            [
+                "simulate",
+                str(tmp_path / "v.mp4"),
+                "--out",
+                out,
+                "-e",
+                "v2e",
+                "--set",
+                "preset=clean",
+                "--interpolate",
+                "motion",
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr().out
     assert "from 10 frames" in said and "interpolated by dense-flow warp, not recorded" in said
     assert run(["simulate", str(tmp_path / "v.mp4"), "--out", out]) == 2
     assert "output file exists; expected a new name, or --overwrite" in capsys.readouterr().err
     (tmp_path / "c.yaml").write_text("emulator: v2e\ncontrast_threshold: 1e-1\n")
-    assert run(["simulate", str(tmp_path / "v.mp4"), "--out", out, "--config", str(tmp_path / "c.yaml"), "--overwrite", "-q"]) == 0
-    expected = Events.concatenate(list(frames_to_events(VideoReader(tmp_path / "v.mp4"), fps=100, emulator=V2eConfig(contrast_threshold=0.1))))
+    assert (
+        run(
+            [
+                "simulate",
+                str(tmp_path / "v.mp4"),
+                "--out",
+                out,
+                "--config",
+                str(tmp_path / "c.yaml"),
+                "--overwrite",
+                "-q",
+            ]
+        )
+        == 0
+    )
+    expected = Events.concatenate(
+        list(frames_to_events(VideoReader(tmp_path / "v.mp4"), fps=100, emulator=V2eConfig(contrast_threshold=0.1)))
+    )
     assert capsys.readouterr().out == "" and same(open_events(out).read(), expected)
     assert run(["convert", out, str(tmp_path / "e.raw"), "--format", "evt2"]) == 0
     assert "40x30, from dsec" in capsys.readouterr().out
     assert run(["compare", out, str(tmp_path / "e.raw"), "--interval-ms", "10", "-o", str(tmp_path / "c")]) == 0
     said = capsys.readouterr().out
     assert "event counts per pixel" in said and (tmp_path / "c" / "compare.png").stat().st_size > 10_000
-    for arguments in (["--set", "contrast"], ["--config", str(tmp_path / "none.yaml")], ["--set", "contrast_treshold=1"], ["--gamma", "x"]):
+    for arguments in (
+        ["--set", "contrast"],
+        ["--config", str(tmp_path / "none.yaml")],
+        ["--set", "contrast_treshold=1"],
+        ["--gamma", "x"],
+    ):
         assert run(["simulate", str(tmp_path / "v.mp4"), "--out", str(tmp_path / "n.h5"), *arguments]) == 2
         error = capsys.readouterr().err
         assert error.startswith("error: ") and error.count("\n") == 1
@@ -241,11 +296,18 @@ def test_real_frames_against_the_real_recording():
     """The signs and places of the simulated events are the recording's: correlation of
     polarity sums, per frame interval."""
     from blinkgl.recordings.comparison import compare
+
     root = shared("data/events/slider_depth")
     import tempfile
+
     with tempfile.TemporaryDirectory() as folder:
-        file_to_events(root, f"{folder}/e.h5", gamma="linear", interpolate="motion",
-                      emulator=EsimConfig(contrast_threshold=0.5, log_eps=10 / 255))
+        file_to_events(
+            root,
+            f"{folder}/e.h5",
+            gamma="linear",
+            interpolate="motion",
+            emulator=EsimConfig(contrast_threshold=0.5, log_eps=10 / 255),
+        )
         result = compare(root / "events_chunk.txt", f"{folder}/e.h5", frames=root)
     assert len(result.edges_us) == 5 and result.polarity_correlation.min() > 0.8
     assert 0.7 < np.nanmean(result.rate_ratio) < 1.1 and result.pixel_correlation > 0.75
@@ -267,19 +329,37 @@ def test_a_sensor_brings_its_parameters_and_its_read_out(tmp_path, capsys):
     assert report.lost > 0 < report.late and len(kept) + report.lost + report.late == len(free)
     assert len(kept) <= 12e6 * 19 / 2000 + 1 and kept.t[-1] <= report.last_ns // 1000
     np.save(tmp_path / "strobe.npy", np.stack(strobe))
-    command = ["simulate", str(tmp_path / "strobe.npy"), "--fps", "2000", "--sensor", "DAVIS 346", "--set", "refractory_us=0",
-               "--out", str(tmp_path / "e.h5")]
+    command = [
+        "simulate",
+        str(tmp_path / "strobe.npy"),
+        "--fps",
+        "2000",
+        "--sensor",
+        "DAVIS 346",
+        "--set",
+        "refractory_us=0",
+        "--out",
+        str(tmp_path / "e.h5"),
+    ]
     assert run(command) == 0 and "lost in the sensor's read-out" in capsys.readouterr().out
     assert run([*command[:-1], str(tmp_path / "f.h5"), "--sensor", "kodak"]) == 2
     assert "unknown sensor" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text, overrides, message", [
-    ("{1: 2}", [], "esim: a key is not text"), ("emulator: [esim]", [], "emulator: unknown emulator"), ("emulator: {a: 1}", [], "emulator: unknown emulator"),
-    ("- 1", [], "not a table of keys .got .1..; expected emulator parameters"), ("contrast_threshold: [", [], "not valid YAML"),
-    ("", ["preset=[]"], "esim.preset: unknown key"), ("", ["emulator=v2e", "preset=[]"], "v2e.preset: unknown choice"),
-    ("", ["contrast_threshold={"], "--set contrast_threshold.*not valid YAML"), ("", ["emulator=v2e", "contrast_threshold=many"], "not a number"),
-])
+@pytest.mark.parametrize(
+    "text, overrides, message",
+    [
+        ("{1: 2}", [], "esim: a key is not text"),
+        ("emulator: [esim]", [], "emulator: unknown emulator"),
+        ("emulator: {a: 1}", [], "emulator: unknown emulator"),
+        ("- 1", [], "not a table of keys .got .1..; expected emulator parameters"),
+        ("contrast_threshold: [", [], "not valid YAML"),
+        ("", ["preset=[]"], "esim.preset: unknown key"),
+        ("", ["emulator=v2e", "preset=[]"], "v2e.preset: unknown choice"),
+        ("", ["contrast_threshold={"], "--set contrast_threshold.*not valid YAML"),
+        ("", ["emulator=v2e", "contrast_threshold=many"], "not a number"),
+    ],
+)
 @pytest.mark.parametrize("sensor", [None, "davis346"])
 def test_emulator_parameters_that_cannot_be_used(tmp_path, text, overrides, message, sensor):
     from blinkgl.recordings.simulation import emulator_config

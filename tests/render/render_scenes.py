@@ -105,7 +105,10 @@ def thing(name, instance_id, shape, path, material=None) -> SceneObject:
 
 
 def rig(width=160, height=120, focal=150.0, path=None, near=0.05) -> Rig:
-    return Rig.alone(PinHole(width, height, focal, focal * 1.03, width / 2 - 1.7, height / 2 + 0.6, near), path or still(rotation=LEVEL))
+    return Rig.alone(
+        PinHole(width, height, focal, focal * 1.03, width / 2 - 1.7, height / 2 + 0.6, near),
+        path or still(rotation=LEVEL),
+    )
 
 
 def scene(objects, seen_by: Rig | None = None, light=None, background=0.0) -> Scene:
@@ -161,7 +164,9 @@ def mixed_scene(width=160, height=120, seed=3, unlit=False, camera_moves=True, t
         SceneObject("ground", 2, (Part(quad(15, 15, splits=8), paint(1)),), still((0, 5, -1.5)), "ground"),
         thing("ball", 3, sphere(0.8, 4), curve(seed, (-0.9, 5.0, -0.3), 0.3, 0.4), paint(2)),
         thing("box", 4, cube(0.6), curve(seed + 1, (1.0, 4.5, -0.2), 0.3, 0.5), paint(3)),
-        thing("sheet", 5, quad(0.5, 0.7), curve(seed + 2, (0.2, 3.6, 0.5), 0.25, 0.6, LEVEL), paint(4, double_sided=True)),
+        thing(
+            "sheet", 5, quad(0.5, 0.7), curve(seed + 2, (0.2, 3.6, 0.5), 0.25, 0.6, LEVEL), paint(4, double_sided=True)
+        ),
     )
     path = curve(seed + 3, (0, 0, 0), 0.15, 0.05, LEVEL) if camera_moves else still(rotation=LEVEL)
     return scene(objects, rig(width, height, 0.94 * width, path), background=0.0)

@@ -23,7 +23,9 @@ def half_plane(angle: float, offset: float, size: int = 48) -> tuple[Scene, np.n
     far = 4.0 * size
     normal, along = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
     edge = offset * normal
-    corners = np.array([edge - far * along, edge + far * along, edge + far * along - far * normal, edge - far * along - far * normal])
+    corners = np.array(
+        [edge - far * along, edge + far * along, edge + far * along - far * normal, edge - far * along - far * normal]
+    )
     depth = 10.0
     points = np.column_stack([corners * depth / size, np.full(4, depth)])  # camera axes; fx = size
     plane = thing("edge", 1, mesh(points, [[0, 1, 2], [0, 2, 3]]), still(), Material(unlit=True, double_sided=True))
@@ -60,7 +62,9 @@ def test_an_edge_is_as_bright_as_it_covers_the_pixel(gl, antialiasing):
     for angle in (0.3, 1.0, 2.2, 4.0):
         for offset in (0.0, 0.21, 0.37):
             world, coverage = half_plane(angle, offset)
-            with Renderer(gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing=antialiasing)) as renderer:
+            with Renderer(
+                gl, world, RenderConfig(antialiasing=antialiasing, image_antialiasing=antialiasing)
+            ) as renderer:
                 luminance, colour = renderer.luminance(0).read(), renderer.colour(0).read()
             np.testing.assert_allclose(luminance * count, np.rint(luminance * count), atol=1e-5)
             np.testing.assert_allclose(colour[..., 1], luminance, atol=1e-6)
@@ -107,8 +111,16 @@ def stripes(period_texels: int, distance: float, size: int = 64) -> Scene:
     image = np.repeat(np.repeat(image[None, :, None], 1024, 0), 3, 2)
     flat = quad(32.0, 32.0)
     flat = type(flat)(flat.vertices, flat.faces, flat.normals, (flat.vertices[:, :2] * 64 / 1024).astype(np.float32))
-    body = thing("stripes", 1, flat, still((0, distance, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(image), unlit=True, double_sided=True))
-    return scene([body], Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still((0, 0, 0), LEVEL)))
+    body = thing(
+        "stripes",
+        1,
+        flat,
+        still((0, distance, 0), type(LEVEL).from_matrix(FACING)),
+        Material(Texture(image), unlit=True, double_sided=True),
+    )
+    return scene(
+        [body], Rig.alone(PinHole(size, size, size, size, (size - 1) / 2, (size - 1) / 2), still((0, 0, 0), LEVEL))
+    )
 
 
 @pytest.mark.parametrize("bias", [-2.0, -1.0, 0.0, 1.0])
@@ -117,7 +129,10 @@ def test_mip_bias_moves_the_level_by_that_much(gl, bias):
     level 2 + bias has, sampled by hand."""
     distance, period = 4.0, 16  # 4 texels per pixel: level 2; stripes of 8 texels vanish at level 4
     contrast = {}
-    for name, scene_distance, config in (("biased", distance, RenderConfig(mip_bias=bias)), ("plain", distance, RenderConfig())):
+    for name, scene_distance, config in (
+        ("biased", distance, RenderConfig(mip_bias=bias)),
+        ("plain", distance, RenderConfig()),
+    ):
         with Renderer(gl, stripes(period, scene_distance), config) as renderer:
             contrast[name] = float(renderer.luminance(0).read()[8:-8, 8:-8].std())
     expected = {}
@@ -135,7 +150,13 @@ def test_four_taps_of_a_linear_texture_are_one(gl):
     """The mean of four places around the centre is the value at the centre where the texture is
     linear, and unlit flat colours do not change."""
     ramp = np.repeat(np.linspace(0.1, 0.9, 256, dtype=np.float32)[None, :, None], 256, 0).repeat(3, 2)
-    body = thing("ramp", 1, quad(1.0, 1.0), still((0, 2.0, 0), type(LEVEL).from_matrix(FACING)), Material(Texture(ramp), unlit=True, double_sided=True))
+    body = thing(
+        "ramp",
+        1,
+        quad(1.0, 1.0),
+        still((0, 2.0, 0), type(LEVEL).from_matrix(FACING)),
+        Material(Texture(ramp), unlit=True, double_sided=True),
+    )
     world = scene([body], Rig.alone(PinHole(64, 64, 150, 150, 31.5, 31.5), still((0, 0, 0), LEVEL)))
     with Renderer(gl, world, RenderConfig()) as one, Renderer(gl, world, RenderConfig(antialiasing="taps4")) as four:
         np.testing.assert_allclose(four.luminance(0).read()[8:-8, 8:-8], one.luminance(0).read()[8:-8, 8:-8], atol=2e-3)
@@ -155,10 +176,18 @@ def test_four_taps_are_nearer_to_the_finer_image(gl):
 # ---- bad input ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("tree, message", [
-    ({"antialiasing": "msaa8"}, r"antialiasing"), ({"supersample": 2}, r"unknown key"), ({"image_antialiasing": "taps4"}, r"image_antialiasing"),
-    ({"mip_bias": 9}, r"mip_bias"), ({"lod": {"edge_px": 0}}, r"lod.edge_px"), ({"lod": {"edges": 2}}, r"unknown key"), ({"lod": True}, r"lod"),
-])
+@pytest.mark.parametrize(
+    "tree, message",
+    [
+        ({"antialiasing": "msaa8"}, r"antialiasing"),
+        ({"supersample": 2}, r"unknown key"),
+        ({"image_antialiasing": "taps4"}, r"image_antialiasing"),
+        ({"mip_bias": 9}, r"mip_bias"),
+        ({"lod": {"edge_px": 0}}, r"lod.edge_px"),
+        ({"lod": {"edges": 2}}, r"unknown key"),
+        ({"lod": True}, r"lod"),
+    ],
+)
 def test_bad_keys_are_named(tree, message):
     with pytest.raises(ConfigError, match=message):
         validate(RenderConfig, tree, where="render")
@@ -173,15 +202,15 @@ def test_bad_samples_are_refused(gl):
         gl.framebuffer(8, 8, ("R32F",), depth="texture", samples=4)
 
 
-
-
 @pytest.mark.parametrize("antialiasing, blurred", [("none", 0.01), ("taps4", 0.25)])
 def test_anisotropy_keeps_stripes_that_run_into_the_distance(gl, antialiasing, blurred):
     """Stripes along the view on grazing ground: a pixel is as wide as ever and very long, an
     isotropic mip level averages as wide as long."""
     image = np.zeros((64, 64, 3), np.float32)
     image[:, (np.arange(64) // 8) % 2 == 0] = 1.0
-    ground = thing("ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True))
+    ground = thing(
+        "ground", 1, quad(40, 40, 8), still((0, 0, -1.0)), Material(Texture(image), uv_scale=(10.0, 10.0), unlit=True)
+    )
     world = scene([ground], Rig.alone(PinHole(96, 64, 90.0, 90.0, 47.5, 8.0), still(rotation=LEVEL)))
     contrast = {}
     for anisotropy in (1.0, 4.0):

@@ -38,11 +38,16 @@ def wall(kind: str, texels: int = TEXELS):
     facing = drift((start, -1.0, 0.0), (start + speed, -1.0, 0.0), LEVEL, LEVEL, DURATION)
     upright = LEVEL * LEVEL.from_euler("x", 180, degrees=True)  # the quad's +z towards the camera, its +x to the right
     material = Material(texture, unlit=True, uv_scale=(2.0, 2.0))
-    return scene([thing("wall", 1, sheet, still(rotation=upright), material)], Rig.alone(PinHole(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2), facing))
+    return scene(
+        [thing("wall", 1, sheet, still(rotation=upright), material)],
+        Rig.alone(PinHole(WIDTH, HEIGHT, FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2), facing),
+    )
 
 
 def simulate(gl, kind: str, step_ns: int, world, reconstruction: str = "linear", config=PLAIN) -> Events:
-    emulator = Esim(HEIGHT, WIDTH, EsimConfig(contrast_threshold=THRESHOLD, threshold_sigma=0.0, log_eps=1e-9), 1, reconstruction)
+    emulator = Esim(
+        HEIGHT, WIDTH, EsimConfig(contrast_threshold=THRESHOLD, threshold_sigma=0.0, log_eps=1e-9), 1, reconstruction
+    )
     chunks = []
     with Renderer(gl, world, config) as renderer:
         for t in range(0, int(DURATION * SECOND) + 1, step_ns):
@@ -119,7 +124,10 @@ def test_cubics_converge_faster_on_rendered_frames(gl, direction, monkeypatch, r
     # that small.
     world, config = wall("sinusoid", 16384), RenderConfig(image_antialiasing="none", mip_bias=-8.0)
     steps = [200_000_000, 166_666_667, 125_000_000]
-    medians = [np.median(errors(simulate(gl, "sinusoid", step, world, reconstruction, config), "sinusoid", direction)) for step in steps]
+    medians = [
+        np.median(errors(simulate(gl, "sinusoid", step, world, reconstruction, config), "sinusoid", direction))
+        for step in steps
+    ]
     straight = [np.median(errors(simulate(gl, "sinusoid", step, world), "sinusoid", direction)) for step in steps]
     order = np.polyfit(np.log(steps), np.log(medians), 1)[0]
     assert least < order < most, f"order {order:.2f}, median errors {medians} µs, linear {straight} µs"
@@ -139,13 +147,17 @@ def test_rates_are_those_of_finer_and_finer_differences(gl, antialiasing):
         small = renderer.brightness(SECOND // 3, 4).read()
     difference = (ahead - behind) / (2e-9 * h)
     off = np.abs(rate - difference)
-    assert np.median(off) < 0.03 * np.median(np.abs(difference)) and np.percentile(off, 85) < 0.1 * np.percentile(np.abs(difference), 85)
+    assert np.median(off) < 0.03 * np.median(np.abs(difference)) and np.percentile(off, 85) < 0.1 * np.percentile(
+        np.abs(difference), 85
+    )
     # The small picture sees the same rates, though its own pixels are four times as large.
     for q in (50, 90):
         assert np.percentile(np.abs(small[..., 1]), q) == pytest.approx(np.percentile(np.abs(rate), q), rel=0.1)
 
 
-@pytest.mark.parametrize("antialiasing, gain, error", [("none", np.sinc(1 / 6) ** 2 * np.sinc(0.5 / 6), 0.21), ("taps4", 0.885, 0.17)])
+@pytest.mark.parametrize(
+    "antialiasing, gain, error", [("none", np.sinc(1 / 6) ** 2 * np.sinc(0.5 / 6), 0.21), ("taps4", 0.885, 0.17)]
+)
 def test_the_rate_is_taken_over_half_a_pixel(gl, antialiasing, gain, error):
     """Stripes of six texels, a pixel each, that slide by. Straight lines between texels keep sinc²(1/6) of the true
     rate, a difference over half a pixel sinc(0.5/6) of that, one over two pixels sinc(2/6): 0.75 in all. Much less than
@@ -156,7 +168,10 @@ def test_the_rate_is_taken_over_half_a_pixel(gl, antialiasing, gain, error):
     paint = Material(texture=Texture(np.tile(stripes.astype(np.float32)[None, :, None], (texels, 1, 3))), unlit=True)
     facing = LEVEL * LEVEL.from_euler("x", 180, degrees=True)
     slides = drift((0, 1, 0), (speed / focal, 1, 0), facing)
-    world = scene([thing("wall", 1, quad(0.5, 0.5), slides, paint)], Rig.alone(PinHole(48, 16, focal, focal, 23.5, 7.5), still(rotation=LEVEL)))
+    world = scene(
+        [thing("wall", 1, quad(0.5, 0.5), slides, paint)],
+        Rig.alone(PinHole(48, 16, focal, focal, 23.5, 7.5), still(rotation=LEVEL)),
+    )
     found, true = [], []
     with Renderer(gl, world, RenderConfig(antialiasing=antialiasing)) as renderer:
         for t in np.linspace(0.05, 0.9, 23):

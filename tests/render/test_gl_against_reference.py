@@ -42,7 +42,17 @@ from render_scenes import (
 
 MS = 1_000_000
 T0, T1, T_BACK = 300 * MS, 400 * MS, 200 * MS
-EVERYTHING = LabelRequest("images", "depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
+EVERYTHING = LabelRequest(
+    "images",
+    "depth",
+    "ids",
+    "normals",
+    "velocity",
+    "flow_forward",
+    "flow_backward",
+    "occlusion_forward",
+    "occlusion_backward",
+)
 FLAT_WAY = LEVEL * Rotation.from_euler("x", 180, degrees=True)  # a quad that faces a LEVEL camera
 
 
@@ -56,9 +66,16 @@ def shapes():
     spin = Rotation.from_rotvec([0.1, -0.2, 0.3])
     red = Material(base_color=(0.9, 0.5, 0.3))
     return {
-        "plane": scene([thing("plane", 7, quad(8, 8), drift((0.1, 4, 0.2), (0.4, 4.6, -0.1), tilt, tilt * spin), red)], moving_camera()),
-        "sphere": scene([thing("ball", 3, sphere(1.0, 4), drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), turn, spin), red)], moving_camera()),
-        "cube": scene([thing("box", 70000, cube(1.0), drift((0.3, 5, -0.2), (-0.2, 4.5, 0.1), turn, spin), red)], moving_camera()),
+        "plane": scene(
+            [thing("plane", 7, quad(8, 8), drift((0.1, 4, 0.2), (0.4, 4.6, -0.1), tilt, tilt * spin), red)],
+            moving_camera(),
+        ),
+        "sphere": scene(
+            [thing("ball", 3, sphere(1.0, 4), drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), turn, spin), red)], moving_camera()
+        ),
+        "cube": scene(
+            [thing("box", 70000, cube(1.0), drift((0.3, 5, -0.2), (-0.2, 4.5, 0.1), turn, spin), red)], moving_camera()
+        ),
         "everything": mixed_scene(textured=False),
     }
 
@@ -120,7 +137,9 @@ def test_occluded_masks_agree_off_the_bands_at_both_times(gl):
         there = np.floor(np.moveaxis(np.indices(ref.hit.shape)[::-1], 0, -1) + ref.forward.flow + 0.5).astype(int)
         x = np.clip(there[..., 0], 0, world.camera.width - 1)
         y = np.clip(there[..., 1], 0, world.camera.height - 1)
-        clear = off_silhouettes(ref) & (~reference.silhouette_band(other.instance, other.depth)[y, x] | ref.forward.outside)
+        clear = off_silhouettes(ref) & (
+            ~reference.silhouette_band(other.instance, other.depth)[y, x] | ref.forward.outside
+        )
         assert clear.mean() > 0.8 and ref.forward.occluded[clear].sum() > 300
         hidden = ref.forward.occluded & ~ref.forward.outside
         assert hidden[clear].sum() > 30  # some by other objects, not only by leaving the image
@@ -157,11 +176,16 @@ def test_back_faces_and_two_sided_light(gl):
     light = Light(sun_direction=(0.48, 0.6, 0.64), sun=0.7, sky=0.5)
     inside = scene(
         [
-            thing("room", 1, cube(3.0), still(rotation=Rotation.from_rotvec([0.1, 0.2, 0.3])), Material(double_sided=True)),
-            thing("sheet", 2, quad(0.5, 0.5), drift((0, 2, 0), (0.1, 2, 0), LEVEL * Rotation.from_rotvec([0.4, 0.2, 0]))),
+            thing(
+                "room", 1, cube(3.0), still(rotation=Rotation.from_rotvec([0.1, 0.2, 0.3])), Material(double_sided=True)
+            ),
+            thing(
+                "sheet", 2, quad(0.5, 0.5), drift((0, 2, 0), (0.1, 2, 0), LEVEL * Rotation.from_rotvec([0.4, 0.2, 0]))
+            ),
             thing("hollow", 3, cube(40.0), still()),  # closed, seen from inside: culled
         ],
-        moving_camera(), light,
+        moving_camera(),
+        light,
     )
     ref = reference.render(inside, T0, forward_ns=T1, backward_ns=T_BACK)
     labels, luminance = drawn(gl, inside)
@@ -180,7 +204,9 @@ def test_supersampling_is_the_mean_of_finer_rays(gl, factor):
     sub = (np.arange(factor) + 0.5) / factor - 0.5
     grid = reference.pixel_grid(cam)
     rays = (grid[:, None, None] + np.stack(np.meshgrid(sub, sub), -1)).reshape(-1, 2)
-    fine = reference.surface(world, reference.cast(world, T0, rays)).luminance.reshape(cam.height, cam.width, -1).mean(-1)
+    fine = (
+        reference.surface(world, reference.cast(world, T0, rays)).luminance.reshape(cam.height, cam.width, -1).mean(-1)
+    )
     with Renderer(gl, world, RenderConfig(antialiasing=f"ssaa{factor}")) as renderer:
         luminance = renderer.luminance(T0).read()
     error = np.abs(luminance - fine)
@@ -207,7 +233,10 @@ def test_camera_rotation_gives_depth_independent_flow(gl):
     """x' ~ K R K^-1 x at every depth."""
     base = mixed_scene()
     eye = drift((0, 0, 0), (0, 0, 0), LEVEL, LEVEL * Rotation.from_rotvec([0.06, -0.09, 0.2]))
-    frozen = [replace(o, path=still(o.path.pose(0)[:3, 3], Rotation.from_matrix(o.path.pose(0)[:3, :3]))) for o in base.objects]
+    frozen = [
+        replace(o, path=still(o.path.pose(0)[:3, 3], Rotation.from_matrix(o.path.pose(0)[:3, :3])))
+        for o in base.objects
+    ]
     world = replace(base, objects=tuple(frozen)).with_path(eye)
     cam = world.camera
     labels, _ = drawn(gl, world)
@@ -355,8 +384,13 @@ def test_curved_paths_of_many_objects(gl):
     """A crowd of small meshes: ids, flow and masks at once."""
     rng = np.random.default_rng(4)
     crowd = [
-        thing(f"{k}", 10 + k, (sphere(0.25, 2), cube(0.2), quad(0.3, 0.2))[k % 3], curve(50 + k, rng.uniform([-1.5, 3, -1], [1.5, 6, 1]), 0.3, 1.0),
-              Material(double_sided=k % 3 == 2))
+        thing(
+            f"{k}",
+            10 + k,
+            (sphere(0.25, 2), cube(0.2), quad(0.3, 0.2))[k % 3],
+            curve(50 + k, rng.uniform([-1.5, 3, -1], [1.5, 6, 1]), 0.3, 1.0),
+            Material(double_sided=k % 3 == 2),
+        )
         for k in range(24)
     ]
     world = scene(crowd, moving_camera())
@@ -375,13 +409,20 @@ def test_curved_paths_of_many_objects(gl):
 def test_random_world_of_real_meshes_and_photographs(gl):
     """A sequence of configs/flying_objects.yaml at a quarter of its size, from real assets, as generation draws it."""
     models, textures = shared("data/assets/models_cc0"), shared("data/assets/textures_cc0")
-    options = [f"scene.pool.folders=[{models}]", f"scene.textures.folders=[{textures}]", "camera.width=160", "camera.height=120"]
+    options = [
+        f"scene.pool.folders=[{models}]",
+        f"scene.textures.folders=[{textures}]",
+        "camera.width=160",
+        "camera.height=120",
+    ]
     config = load_run(files("blinkgl.configs") / "flying_objects.yaml", options).sequence(1)
     world = build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns, seed=config.seed, sequence=1)
     t = world.t0_ns + 400 * MS
     ref = reference.render(world, t, forward_ns=t + 100 * MS)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        labels = renderer.labels(t, LabelRequest("depth", "ids", "velocity", "flow_forward", "occlusion_forward"), t + 100 * MS)
+        labels = renderer.labels(
+            t, LabelRequest("depth", "ids", "velocity", "flow_forward", "occlusion_forward"), t + 100 * MS
+        )
     assert len(np.unique(ref.instance)) >= 4
     band = reference.silhouette_band(ref.instance, ref.depth)
     flips = labels.ids != ref.instance
@@ -399,7 +440,11 @@ def test_random_world_of_real_meshes_and_photographs(gl):
 @pytest.mark.parametrize(
     "file, right, wrong",
     [
-        ("include/motion.glsl", "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next", "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next"),
+        (
+            "include/motion.glsl",
+            "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next",
+            "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next",
+        ),
         ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
         ("include/motion.glsl", "* d.z) / w_next", "* d.z) * gl_FragCoord.w"),
         ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),

@@ -15,9 +15,15 @@ def seen_at(x: float, y: float, depth: float = 3.0) -> np.ndarray:
     return depth * np.array([(x - CAMERA.cx) / CAMERA.fx, (y - CAMERA.cy) / CAMERA.fy, 1.0])
 
 
-@pytest.mark.parametrize("plane, inside, outside", [
-    (0, (-0.4, 20), (-0.6, 20)), (1, (63.4, 20), (63.6, 20)), (2, (30, -0.4), (30, -0.6)), (3, (30, 39.4), (30, 39.6)),
-])
+@pytest.mark.parametrize(
+    "plane, inside, outside",
+    [
+        (0, (-0.4, 20), (-0.6, 20)),
+        (1, (63.4, 20), (63.6, 20)),
+        (2, (30, -0.4), (30, -0.6)),
+        (3, (30, 39.4), (30, 39.6)),
+    ],
+)
 def test_a_plane_is_where_the_image_ends(plane, inside, outside):
     planes = CAMERA.frustum_planes()
     assert planes.shape == (5, 3)
@@ -66,5 +72,8 @@ def test_the_rate_is_the_limit_of_differences():
     camera, thing = np.stack([at(0.3, 1), at(0.3, 2)]), np.stack([at(0.3, 3), at(0.3, 4)])
     got = cam_from_obj_rate(camera, np.stack([rate(1), rate(2)]), thing, np.stack([rate(3), rate(4)]))
     for k in range(2):
-        wanted = (cam_from_obj(at(0.3 + step, 1 + k), at(0.3 + step, 3 + k)) - cam_from_obj(at(0.3 - step, 1 + k), at(0.3 - step, 3 + k))) / (2 * step)
+        wanted = (
+            cam_from_obj(at(0.3 + step, 1 + k), at(0.3 + step, 3 + k))
+            - cam_from_obj(at(0.3 - step, 1 + k), at(0.3 - step, 3 + k))
+        ) / (2 * step)
         np.testing.assert_allclose(got[k], wanted, atol=1e-8)

@@ -38,27 +38,48 @@ def test_equals_slow_twin(shape, tolerance):
     rng = np.random.default_rng(shape[0] * 100 + shape[1])
     answers = set()
     for _ in range(40):
-        ids, ids_next = (np.kron(rng.integers(0, 3, (5, 7)), np.ones((2, 2), int))[: shape[0], : shape[1]].astype(np.uint32) for _ in range(2))
+        ids, ids_next = (
+            np.kron(rng.integers(0, 3, (5, 7)), np.ones((2, 2), int))[: shape[0], : shape[1]].astype(np.uint32)
+            for _ in range(2)
+        )
         if rng.random() < 0.3:
             ids_next[:] = ids[:] = 1
         y, x = np.mgrid[: shape[0], : shape[1]]
         plane = 1 / (0.3 + 0.02 * x - 0.01 * y)
-        depth_next = (plane * (1 + rng.choice([0, 0, 0.0005, 0.03, 0.3], shape) * rng.choice([-1, 1], shape))).astype(np.float32)
+        depth_next = (plane * (1 + rng.choice([0, 0, 0.0005, 0.03, 0.3], shape) * rng.choice([-1, 1], shape))).astype(
+            np.float32
+        )
         depth_next[ids_next == 0] = 0
-        w = (plane * (1 + rng.choice([0, 0.0005, 0.01, 0.04, 0.1, 0.5], shape) * rng.choice([-1, 1], shape))).astype(np.float32)
+        w = (plane * (1 + rng.choice([0, 0.0005, 0.01, 0.04, 0.1, 0.5], shape) * rng.choice([-1, 1], shape))).astype(
+            np.float32
+        )
         flow = rng.choice([0.0, 0.25, 0.5, 1.0, 2.75], (*shape, 2)) * rng.choice([-1, 1], (*shape, 2))
         flow = flow.astype(np.float32)
         valid = (ids > 0) & (rng.random(shape) < 0.9)
         mask = occlusion_mask(flow, w, valid, ids, depth_next, ids_next, near=2.0, tolerance=tolerance)
         assert mask.dtype == bool and not mask[~valid].any()
         for r, c in zip(*np.nonzero(valid)):
-            assert mask[r, c] == hidden(c, r, flow[r, c], float(w[r, c]), ids, depth_next, ids_next, 2.0, tolerance), (r, c)
+            assert mask[r, c] == hidden(c, r, flow[r, c], float(w[r, c]), ids, depth_next, ids_next, 2.0, tolerance), (
+                r,
+                c,
+            )
             answers.add(bool(mask[r, c]))
     assert answers == ({True, False} if max(shape) > 1 else answers)
 
 
-@pytest.mark.parametrize("step, seen", [((-0.5, 0), True), ((-0.51, 0), False), ((3.49, 0), True), ((3.5, 0), False),
-                                        ((0, -0.5), True), ((0, -0.51), False), ((0, 2.49), True), ((0, 2.5), False)])
+@pytest.mark.parametrize(
+    "step, seen",
+    [
+        ((-0.5, 0), True),
+        ((-0.51, 0), False),
+        ((3.49, 0), True),
+        ((3.5, 0), False),
+        ((0, -0.5), True),
+        ((0, -0.51), False),
+        ((0, 2.49), True),
+        ((0, 2.5), False),
+    ],
+)
 def test_the_image_ends_half_a_pixel_beyond_the_outermost_centres(step, seen):
     ids, depth = np.ones((3, 4), np.uint32), np.full((3, 4), 5.0, np.float32)
     flow, valid = np.zeros((3, 4, 2), np.float32), np.zeros((3, 4), bool)

@@ -90,16 +90,26 @@ def test_a_pass_reads_another(gl):
             for reach in (1, 3):
                 edges = renderer.draw(EdgeBand(reach), t).read()
                 window = {"size": 2 * reach + 1, "mode": "nearest"}
-                np.testing.assert_array_equal(edges, ndimage.maximum_filter(ids, **window) != ndimage.minimum_filter(ids, **window))
+                np.testing.assert_array_equal(
+                    edges, ndimage.maximum_filter(ids, **window) != ndimage.minimum_filter(ids, **window)
+                )
                 assert 0 < edges.mean() < 0.9
-        assert {dict(defines).get("REACH") for name, defines in gl.shaders.compiled if name == EdgeBand.program} == {"1", "3"}
+        assert {dict(defines).get("REACH") for name, defines in gl.shaders.compiled if name == EdgeBand.program} == {
+            "1",
+            "3",
+        }
 
 
 def test_a_shadow_map_is_a_pass_before_a_pass(gl):
     """A box over a floor, lit from above: shadows where a ray from the surface to the
     lamp, cast in float64, meets the box."""
     lamp, facing_up = np.array([0.4, 4.0, 3.0]), np.array([0.0, 0.0, 1.0])
-    world = scene([thing("floor", 1, quad(6, 6), still((0, 4, -1))), thing("box", 2, cube(0.4), drift((-0.5, 4, 0.2), (0.5, 4, 0.2)))])
+    world = scene(
+        [
+            thing("floor", 1, quad(6, 6), still((0, 4, -1))),
+            thing("box", 2, cube(0.4), drift((-0.5, 4, 0.2), (0.5, 4, 0.2))),
+        ]
+    )
     with Renderer(gl, world, PLAIN) as renderer:
         for t in (0, 3 * SECOND // 4):
             light = renderer.draw(Lamplight(ShadowMap(tuple(lamp))), t).read()
@@ -123,7 +133,10 @@ def test_what_two_inputs_read_is_drawn_once(gl):
     @dataclass(frozen=True)
     class Both(ScreenPass):
         program: ClassVar[str] = str(TOYS / "edge_band.glsl")
-        inputs: ClassVar[tuple[Input, ...]] = (Input("ids", EdgeBand(1), "edge"), *(Input("ids", EdgeBand(2)) for _ in range(2)))
+        inputs: ClassVar[tuple[Input, ...]] = (
+            Input("ids", EdgeBand(1), "edge"),
+            *(Input("ids", EdgeBand(2)) for _ in range(2)),
+        )
         outputs: ClassVar[tuple[Output, ...]] = (Output("edge", "R32UI"),)
 
         def defines(self, kind):
@@ -228,18 +241,33 @@ def test_what_is_read_what_is_viewed_and_what_is_written_into_are_one(gl, antial
     config = RenderConfig(antialiasing=antialiasing, image_antialiasing=antialiasing)
     with Renderer(gl, mixed_scene(48, 36), config) as renderer:
         for t in (0, SECOND // 5):
-            frames = [renderer.luminance(t, rate=True), renderer.brightness(t, 5), renderer.velocity(t, 3), renderer.colour(t),
-                      renderer.draw(Geometry(("depth", "ids", "normals")), t)]
+            frames = [
+                renderer.luminance(t, rate=True),
+                renderer.brightness(t, 5),
+                renderer.velocity(t, 3),
+                renderer.colour(t),
+                renderer.draw(Geometry(("depth", "ids", "normals")), t),
+            ]
             for frame in frames:
                 for name in frame.names:
                     image = frame.read(name)
-                    assert image.flags.owndata and image.flags.c_contiguous and image.shape[:2] == (frame.height, frame.width)
+                    assert (
+                        image.flags.owndata
+                        and image.flags.c_contiguous
+                        and image.shape[:2] == (frame.height, frame.width)
+                    )
                     out = np.empty_like(image)
                     assert frame.read(name, out) is out
                     np.testing.assert_array_equal(image, out)
                     np.testing.assert_array_equal(image, frame.view(name))
-                    assert np.shares_memory(frame.view(name), frame.view(name)) and not np.shares_memory(frame.view(name), image)
-                    for wrong in (np.empty((3, 3), image.dtype), np.empty(image.shape, np.float64), np.asfortranarray(image)):
+                    assert np.shares_memory(frame.view(name), frame.view(name)) and not np.shares_memory(
+                        frame.view(name), image
+                    )
+                    for wrong in (
+                        np.empty((3, 3), image.dtype),
+                        np.empty(image.shape, np.float64),
+                        np.asfortranarray(image),
+                    ):
                         if wrong.shape != image.shape or wrong.dtype != image.dtype or not wrong.flags.c_contiguous:
                             with pytest.raises(ValueError, match="out must be a C-contiguous"):
                                 frame.read(name, wrong)
@@ -271,8 +299,18 @@ def test_a_moment_is_computed_once_and_shared(gl):
     with Renderer(gl, world, PLAIN) as renderer:
         asked.clear()
         for t in range(interval, 6 * interval, interval):
-            renderer.velocity_of_movers(t, 4), renderer.luminance(t, rate=True), renderer.brightness(t, 2), renderer.colour(t)
-            renderer.labels(t, LabelRequest("flow_forward", "flow_backward", "occlusion_forward", "velocity"), t + interval, t - interval)
+            (
+                renderer.velocity_of_movers(t, 4),
+                renderer.luminance(t, rate=True),
+                renderer.brightness(t, 2),
+                renderer.colour(t),
+            )
+            renderer.labels(
+                t,
+                LabelRequest("flow_forward", "flow_backward", "occlusion_forward", "velocity"),
+                t + interval,
+                t - interval,
+            )
     assert set(asked.values()) == {1}, asked
     assert {t for what, t in asked if what == "pose"} == {k * interval for k in range(7)}
     assert {t for what, t in asked if what == "derivative"} == {k * interval for k in range(1, 6)}
@@ -287,7 +325,9 @@ def test_a_moment_through_another_camera(gl):
         assert near.T_cam_obj is moment.through(view).T_cam_obj or np.array_equal(near.T_cam_obj, moment.T_cam_obj)
         np.testing.assert_array_equal(near.mvp, view.projection @ moment.T_cam_obj)
         np.testing.assert_array_equal(near.rates.T_world_obj, rates.T_world_obj)
-        np.testing.assert_allclose(near.rates.mvp, view.projection @ np.linalg.solve(moment.view.projection, rates.mvp), atol=1e-9)
+        np.testing.assert_allclose(
+            near.rates.mvp, view.projection @ np.linalg.solve(moment.view.projection, rates.mvp), atol=1e-9
+        )
         there, h = pose((1.0, 2.0, 3.0), LEVEL), 1000
         far = moment.from_place(view, there)
         np.testing.assert_allclose(far.T_cam_obj, np.linalg.inv(there) @ moment.T_world_obj, atol=1e-12)
@@ -296,6 +336,9 @@ def test_a_moment_through_another_camera(gl):
 
 
 def test_passes_are_values():
-    assert Luminance() == Luminance(False) and len({Luminance(), Luminance(), Luminance(True), Brightness(), Colour()}) == 4
+    assert (
+        Luminance() == Luminance(False)
+        and len({Luminance(), Luminance(), Luminance(True), Brightness(), Colour()}) == 4
+    )
     assert Mean(Luminance(True)) == Mean(Luminance(True)) and Geometry(("ids",)) != Geometry(("depth",))
     assert [o.format for o in Mean(Luminance(True)).outputs] == ["RG32F"]

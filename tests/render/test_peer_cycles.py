@@ -52,7 +52,9 @@ def test_camera_and_poses_mean_the_same_pixel(tmp_path, fx, fy, cx, cy):
     eye = replace(world.camera, fx=fx, fy=fy, cx=cx, cy=cy)
     job, arrays = exported(world.with_camera(eye), tmp_path)
     assert job["size"] == [160, 120] and job["blender_camera"] == blender_camera(eye)
-    assert min(job["blender_camera"]["pixel_aspect_x"], job["blender_camera"]["pixel_aspect_y"]) == 1.0  # Blender's least
+    assert (
+        min(job["blender_camera"]["pixel_aspect_x"], job["blender_camera"]["pixel_aspect_y"]) == 1.0
+    )  # Blender's least
     for k, body in enumerate(world.objects):
         for n, t in enumerate(TIMES):
             corner = body.parts[0].mesh.vertices[-1]
@@ -75,8 +77,14 @@ def test_meshes_materials_and_textures_are_written_once(tmp_path):
     paint = Material(texture, (0.5, 0.6, 0.7), (3.0, 400.0))
     ball = sphere(0.5, 1)
     sky = SceneObject("sky", 1, mixed_scene().objects[0].parts, still(), "sky")
-    world = scene([sky, thing("a", 2, ball, still(), paint), thing("b", 3, ball, still((1, 0, 0)), paint),
-                   thing("c", 4, ball, still(), replace(paint, uv_scale=(1.0, 1.0), double_sided=True, unlit=True))])
+    world = scene(
+        [
+            sky,
+            thing("a", 2, ball, still(), paint),
+            thing("b", 3, ball, still((1, 0, 0)), paint),
+            thing("c", 4, ball, still(), replace(paint, uv_scale=(1.0, 1.0), double_sided=True, unlit=True)),
+        ]
+    )
     job, arrays = exported(world, tmp_path)
     assert [b["parts"] for b in job["bodies"]] == [[[0, 0]], [[1, 1]], [[1, 1]], [[2, 2]]]
     assert [b["picture_only"] for b in job["bodies"]] == [True, False, False, False]
@@ -84,8 +92,10 @@ def test_meshes_materials_and_textures_are_written_once(tmp_path):
     assert [(m["unlit"], m["culled"]) for m in job["materials"]] == [(True, True), (False, True), (True, False)]
     assert {name for name in arrays if name.startswith("texture")} == {"texture0", "texture1"}
     np.testing.assert_allclose(arrays["texture1"], reference.srgb_to_linear(bytes_ / 255.0), atol=1e-7)
-    assert all(arrays[f"{name}1"].dtype == dtype for name, dtype in
-               (("vertices", np.float32), ("normals", np.float32), ("uvs", np.float32), ("faces", np.int32)))
+    assert all(
+        arrays[f"{name}1"].dtype == dtype
+        for name, dtype in (("vertices", np.float32), ("normals", np.float32), ("uvs", np.float32), ("faces", np.int32))
+    )
     # v upwards, and the same place in the texture but for whole repeats
     back = arrays["uvs1"] * [1, -1] + [0, 1] - ball.uvs * np.array([3.0, 400.0])
     np.testing.assert_allclose(back, np.rint(back), atol=3e-5)
@@ -93,7 +103,9 @@ def test_meshes_materials_and_textures_are_written_once(tmp_path):
 
 
 def test_rotations_of_the_worker():
-    turns = Rotation.concatenate([Rotation.random(50, random_state=1), Rotation.from_rotvec(np.pi * np.eye(3)), Rotation.identity(1)])
+    turns = Rotation.concatenate(
+        [Rotation.random(50, random_state=1), Rotation.from_rotvec(np.pi * np.eye(3)), Rotation.identity(1)]
+    )
     for R in turns.as_matrix():
         again = Rotation.from_quat(cycles_worker.quaternion(R), scalar_first=True).as_matrix()
         np.testing.assert_allclose(again, R, atol=1e-14)
@@ -145,14 +157,26 @@ def test_no_blender_is_one_line_that_says_what_to_do(tmp_path, monkeypatch):
         next(frames(mixed_scene(), TIMES))
 
 
-@pytest.mark.parametrize("module, words", [
-    ("raise ImportError('built for Python 3.11')", r"bpy cannot be imported by Python 3\.\d+: built for Python 3.11"),
-    ("import sys; print('Segmentation of something'); sys.exit(11)", r"stopped after 0 of 2 frames \(status 11\): Segmentation of something"),
-    ("", r"stopped after 0 of 2 frames \(status 1\): AttributeError"),
-])
+@pytest.mark.parametrize(
+    "module, words",
+    [
+        (
+            "raise ImportError('built for Python 3.11')",
+            r"bpy cannot be imported by Python 3\.\d+: built for Python 3.11",
+        ),
+        (
+            "import sys; print('Segmentation of something'); sys.exit(11)",
+            r"stopped after 0 of 2 frames \(status 11\): Segmentation of something",
+        ),
+        ("", r"stopped after 0 of 2 frames \(status 1\): AttributeError"),
+    ],
+)
 def test_blender_that_does_not_fit_or_stops_is_one_line(tmp_path, monkeypatch, module, words):
     (tmp_path / "bpy.py").write_text(module + "\n")
-    monkeypatch.setenv(peer_cycles.ENVIRONMENT, program(tmp_path / "python", f"#!/bin/sh\nPYTHONPATH='{tmp_path}' exec '{sys.executable}' \"$@\"\n"))
+    monkeypatch.setenv(
+        peer_cycles.ENVIRONMENT,
+        program(tmp_path / "python", f"#!/bin/sh\nPYTHONPATH='{tmp_path}' exec '{sys.executable}' \"$@\"\n"),
+    )
     assert peer_cycles.available() == ""
     with pytest.raises(BlinkGLError, match=words) as error:
         next(frames(mixed_scene(), TIMES))
@@ -175,7 +199,11 @@ time.sleep(600)
     cost = Cost()
     pictures = frames(mixed_scene(), TIMES, cost=cost)
     first = next(pictures)
-    assert first.dtype == np.float32 and np.allclose(first, 0.5) and (cost.wall_s, cost.cpu_s, cost.setup_s) == ([2], [3], 1)
+    assert (
+        first.dtype == np.float32
+        and np.allclose(first, 0.5)
+        and (cost.wall_s, cost.cpu_s, cost.setup_s) == ([2], [3], 1)
+    )
     process, folder = (tmp_path / "who").read_text().split()
     pictures.close()
     assert not Path(folder).exists()
@@ -183,9 +211,15 @@ time.sleep(600)
         os.kill(int(process), 0)
 
 
-@pytest.mark.parametrize("wrong, words", [({"samples": 0}, "cycles.samples: out of range"), ({"bounces": -1}, "cycles.bounces"),
-                                          ({"shadows": False}, "cycles.bounces: light that passes through"),
-                                          ({"engine": "luxcore"}, "cycles.engine: unknown engine")])
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        ({"samples": 0}, "cycles.samples: out of range"),
+        ({"bounces": -1}, "cycles.bounces"),
+        ({"shadows": False}, "cycles.bounces: light that passes through"),
+        ({"engine": "luxcore"}, "cycles.engine: unknown engine"),
+    ],
+)
 def test_settings_are_checked(wrong, words):
     with pytest.raises(ConfigError, match=words):
         CyclesSettings(**wrong)
@@ -237,7 +271,9 @@ def test_light_without_shadows_is_ours(gl, sun, sky):
         here = (true.instance == instance) & ~band
         assert here.sum() > 300 and np.median(error[here]) < 6e-4 and np.quantile(error[here], 0.95) < 2.5e-3
         assert sun or np.quantile(error[here], 0.99) < 2.5e-3
-    assert max((true.luminance[(true.instance == k) & ~band] > 0.1).sum() for k in (3, 4, 5)) > 200  # something of it is lit
+    assert (
+        max((true.luminance[(true.instance == k) & ~band] > 0.1).sum() for k in (3, 4, 5)) > 200
+    )  # something of it is lit
 
 
 @needs_blender
@@ -245,9 +281,14 @@ def test_shadow_of_a_ball_lies_where_it_should():
     """Sun alone on a plane: dark exactly where the line from the ground to the sun meets the ball."""
     radius, centre, sun = 0.5, np.array([0.2, 4.0, 0.6]), np.array([-0.5, -0.3, 1.0]) / np.sqrt(1.34)
     paint = Material(base_color=(0.5, 0.5, 0.5))
-    world = scene([SceneObject("ground", 1, (Part(quad(15, 15), paint),), still((0, 5, -1)), "ground"),
-                   thing("ball", 2, sphere(radius, 4), still(centre), paint)],
-                  rig(path=still((0, 0, 1.0), LEVEL * Rotation.from_rotvec([-0.4, 0, 0]))), Light(tuple(sun), 1.0, 0.0))
+    world = scene(
+        [
+            SceneObject("ground", 1, (Part(quad(15, 15), paint),), still((0, 5, -1)), "ground"),
+            thing("ball", 2, sphere(radius, 4), still(centre), paint),
+        ],
+        rig(path=still((0, 0, 1.0), LEVEL * Rotation.from_rotvec([-0.4, 0, 0]))),
+        Light(tuple(sun), 1.0, 0.0),
+    )
     theirs = next(frames(world, [0], CyclesSettings(samples=16, bounces=0)))
     true = reference.render(world, 0)
     ground = true.instance == 1
@@ -265,12 +306,18 @@ def test_shadow_of_a_ball_lies_where_it_should():
 def test_ground_shines_on_a_sheet():
     """Inter-reflection has a closed form over a wide ground: a vertical sheet gets half of the dome and, of the
     ground's radiance albedo * sky, half again: L = a_sheet sky (0.5 + 0.5 a_ground)."""
+
     def paint(albedo, **more):
         return Material(base_color=(albedo,) * 3, **more)
 
-    world = scene([SceneObject("ground", 1, (Part(quad(4000, 4000), paint(0.6)),), still((0, 0, -20)), "ground"),
-                   thing("sheet", 2, quad(1, 1), still((0, 3, 0), LEVEL), paint(0.5, double_sided=True))],
-                  rig(48, 32, 60.0), Light(sun=0.0, sky=0.8))
+    world = scene(
+        [
+            SceneObject("ground", 1, (Part(quad(4000, 4000), paint(0.6)),), still((0, 0, -20)), "ground"),
+            thing("sheet", 2, quad(1, 1), still((0, 3, 0), LEVEL), paint(0.5, double_sided=True)),
+        ],
+        rig(48, 32, 60.0),
+        Light(sun=0.0, sky=0.8),
+    )
     sheet = reference.render(world, 0).instance == 2
     assert sheet.sum() > 500
     for bounces, factor in ((0, 0.5), (1, 0.8)):
@@ -282,9 +329,19 @@ def test_ground_shines_on_a_sheet():
 def test_one_sided_meshes_vanish_from_behind_and_the_same_seed_draws_the_same(tmp_path):
     """The camera stands in a closed cube, which BlinkGL culls, and sees the sheet outside; a
     still scene is the same in every frame."""
-    world = scene([thing("around", 1, cube(0.5), still(), Material(base_color=(1, 0, 0), unlit=True)),
-                   thing("sheet", 2, quad(9, 9), still((0, 3, 0), LEVEL), Material(base_color=(0.25,) * 3, unlit=True, double_sided=True))],
-                  rig(32, 24, 30.0))
+    world = scene(
+        [
+            thing("around", 1, cube(0.5), still(), Material(base_color=(1, 0, 0), unlit=True)),
+            thing(
+                "sheet",
+                2,
+                quad(9, 9),
+                still((0, 3, 0), LEVEL),
+                Material(base_color=(0.25,) * 3, unlit=True, double_sided=True),
+            ),
+        ],
+        rig(32, 24, 30.0),
+    )
     pictures = list(colours(world, [0, 1000], CyclesSettings(samples=4)))
     np.testing.assert_allclose(pictures[0], 0.25, atol=1e-6)
     np.testing.assert_array_equal(*pictures)

@@ -21,9 +21,28 @@ def forest_of(parts: list[np.ndarray], cull: list[bool]):
 def ask(kernel, forest, origins, axes, rays, near=0.0, far=None, skip=None):
     n = len(rays)
     hit, bary, depth = np.empty((n, 3), np.int32), np.zeros((n, 3)), np.empty(n)
-    kernel(forest.triangles, forest.face, forest.lower, forest.upper, forest.child, forest.count, forest.root, forest.first, forest.size, forest.cull,
-           forest.extent, origins, axes, rays, near, np.full(n, np.inf) if far is None else far, np.full((n, 2), -1, np.int32) if skip is None else skip,
-           hit, bary, depth)
+    kernel(
+        forest.triangles,
+        forest.face,
+        forest.lower,
+        forest.upper,
+        forest.child,
+        forest.count,
+        forest.root,
+        forest.first,
+        forest.size,
+        forest.cull,
+        forest.extent,
+        origins,
+        axes,
+        rays,
+        near,
+        np.full(n, np.inf) if far is None else far,
+        np.full((n, 2), -1, np.int32) if skip is None else skip,
+        hit,
+        bary,
+        depth,
+    )
     return hit, bary, depth
 
 
@@ -62,8 +81,14 @@ def forest_with_an_empty_part(parts, cull):
     at = next(k for k, p in enumerate(parts) if not len(p))
     from dataclasses import replace
 
-    return replace(whole, root=np.insert(whole.root, at, 0).astype(np.int32), first=np.insert(whole.first, at, whole.first[at]).astype(np.int32),
-                   size=np.insert(whole.size, at, 0).astype(np.int32), cull=np.array(cull), extent=np.insert(whole.extent, at, 1.0))
+    return replace(
+        whole,
+        root=np.insert(whole.root, at, 0).astype(np.int32),
+        first=np.insert(whole.first, at, whole.first[at]).astype(np.int32),
+        size=np.insert(whole.size, at, 0).astype(np.int32),
+        cull=np.array(cull),
+        extent=np.insert(whole.extent, at, 1.0),
+    )
 
 
 @pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
@@ -78,10 +103,18 @@ def test_nearest_of_all_triangles(kernel, culled):
     depths[:, np.array(cull)[names[:, 0]]] = np.where(fronts, depths, np.inf)[:, np.array(cull)[names[:, 0]]]
     rng = np.random.default_rng(0)
     first = names[depths.argmin(1)].astype(np.int32)
-    passed = np.where((rng.random(len(rays)) < 0.5)[:, None] & np.isfinite(depths.min(1))[:, None], first, -1).astype(np.int32)
+    passed = np.where((rng.random(len(rays)) < 0.5)[:, None] & np.isfinite(depths.min(1))[:, None], first, -1).astype(
+        np.int32
+    )
     other = passed.copy()  # the same face of another part, which is not passed through
     other[passed[:, 0] == 0, 0] = 3
-    for near, far, skip in ((0.0, None, None), (2.3, None, None), (0.0, rng.uniform(1.5, 3.5, len(rays)), None), (0.0, None, passed), (0.0, None, other)):
+    for near, far, skip in (
+        (0.0, None, None),
+        (2.3, None, None),
+        (0.0, rng.uniform(1.5, 3.5, len(rays)), None),
+        (0.0, None, passed),
+        (0.0, None, other),
+    ):
         allowed = np.where((depths >= near) & (depths < (np.inf if far is None else far[:, None])), depths, np.inf)
         if skip is not None:
             allowed[(names[None, :, 0] == skip[:, :1]) & (names[None, :, 1] == skip[:, 1:])] = np.inf
@@ -108,18 +141,34 @@ def test_of_equal_depths_the_lower_part_and_triangle_is_hit(kernel, reverse):
     far = sheet + [0, 0, 1]
     heap = np.concatenate([far, sheet, sheet, far, sheet, sheet, far])
     parts = [far, heap[::-1] if reverse else heap, heap]
-    hit, _, depth = ask(kernel, forest_of(parts, [False] * 3), np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), np.zeros((1, 2)))
+    hit, _, depth = ask(
+        kernel, forest_of(parts, [False] * 3), np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), np.zeros((1, 2))
+    )
     assert hit[0, :2].tolist() == [1, 1] and depth[0] == 2
     skip = np.array([[1, 1]], np.int32)
-    assert ask(kernel, forest_of(parts, [False] * 3), np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), np.zeros((1, 2)), skip=skip)[0][0, :2].tolist() == [1, 2]
+    assert ask(
+        kernel,
+        forest_of(parts, [False] * 3),
+        np.zeros((3, 3)),
+        np.tile(np.eye(3), (3, 1, 1)),
+        np.zeros((1, 2)),
+        skip=skip,
+    )[0][0, :2].tolist() == [1, 2]
 
 
 @pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
 def test_near_and_far_are_half_open(kernel):
     """A hit at the near distance counts, one at the far distance does not."""
     forest = forest_of([np.array([[[-1, -1, 2], [1, -1, 2], [0, 1, 2.0]]])], [False])
-    at = lambda near, far: ask(kernel, forest, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 2)), near, np.array([far]))[0][0, 0]
-    assert at(2.0, 3.0) == 0 and at(0.0, 2.0) == -1 and at(np.nextafter(2.0, 3), 3.0) == -1 and at(0.0, np.nextafter(2.0, 3)) == 0
+    at = lambda near, far: ask(
+        kernel, forest, np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 2)), near, np.array([far])
+    )[0][0, 0]
+    assert (
+        at(2.0, 3.0) == 0
+        and at(0.0, 2.0) == -1
+        and at(np.nextafter(2.0, 3), 3.0) == -1
+        and at(0.0, np.nextafter(2.0, 3)) == 0
+    )
 
 
 @pytest.mark.parametrize("kernel", [nearest_tree, nearest_exhaustive])
@@ -128,7 +177,9 @@ def test_edges_and_corners_belong_to_the_triangle_seen_from_either_side(kernel, 
     """Rays exactly through them: an edge that two triangles share is missed by neither."""
     sheet = np.array([[[-1, -1, 2], [1, -1, 2], [-1, 1, 2.0]]])
     rays = np.array([[-1, -1], [1, -1], [-1, 1], [0, -1], [-1, 0], [0, 0], [-0.5, -0.5], [0.5, -0.5 - 2**-30]]) / 2
-    hit, bary, depth = ask(kernel, forest_of([sheet[:, ::-1] if turned else sheet], [False]), np.zeros((1, 3)), np.eye(3)[None], rays)
+    hit, bary, depth = ask(
+        kernel, forest_of([sheet[:, ::-1] if turned else sheet], [False]), np.zeros((1, 3)), np.eye(3)[None], rays
+    )
     assert (hit[:, 0] == 0).all() and (depth == 2).all() and set(hit[:, 2]) == {int(turned)} and (bary >= 0).all()
     outside = np.array([[-1 - 2**-30, 0], [0, -1 - 2**-30], [2**-29, 0], [1, 1]]) / 2
     assert (ask(kernel, forest_of([sheet], [False]), np.zeros((1, 3)), np.eye(3)[None], outside)[0][:, 0] == -1).all()
@@ -145,7 +196,7 @@ def test_a_tree_holds_every_triangle_once_inside_its_boxes():
         assert depth <= 7, "balanced"
         if tree.count[node]:
             assert 1 <= tree.count[node] <= LEAF_TRIANGLES
-            inside = tree.triangles[tree.child[node]:tree.child[node] + tree.count[node]].reshape(-1, 3)
+            inside = tree.triangles[tree.child[node] : tree.child[node] + tree.count[node]].reshape(-1, 3)
             seen += range(tree.child[node], tree.child[node] + tree.count[node])
             np.testing.assert_array_equal((tree.lower[node], tree.upper[node]), (inside.min(0), inside.max(0)))
         else:

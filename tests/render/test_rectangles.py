@@ -33,9 +33,28 @@ def test_a_box_is_inside_its_rectangle_with_a_pixel_to_spare_and_no_more():
         low = dice.uniform(-0.5, 0, 3)
         high = low + dice.uniform(0.05, 0.8, 3)
         T = pose([*dice.uniform(-2, 2, 2), dice.uniform(1.5, 6)], dice.normal(size=3))
-        corners = np.array([[(low, high)[a][0], (low, high)[b][1], (low, high)[c][2]] for a in (0, 1) for b in (0, 1) for c in (0, 1)]) @ T[:3, :3].T + T[:3, 3]
-        x, y = CAMERA.fx * corners[:, 0] / corners[:, 2] + CAMERA.cx, CAMERA.fy * corners[:, 1] / corners[:, 2] + CAMERA.cy
-        x0, x1, y0, y1 = math.floor(x.min()) - 1, math.ceil(x.max()) + 1, math.floor(y.min()) - 1, math.ceil(y.max()) + 1  # pixels, both ends included
+        corners = (
+            np.array(
+                [
+                    [(low, high)[a][0], (low, high)[b][1], (low, high)[c][2]]
+                    for a in (0, 1)
+                    for b in (0, 1)
+                    for c in (0, 1)
+                ]
+            )
+            @ T[:3, :3].T
+            + T[:3, 3]
+        )
+        x, y = (
+            CAMERA.fx * corners[:, 0] / corners[:, 2] + CAMERA.cx,
+            CAMERA.fy * corners[:, 1] / corners[:, 2] + CAMERA.cy,
+        )
+        x0, x1, y0, y1 = (
+            math.floor(x.min()) - 1,
+            math.ceil(x.max()) + 1,
+            math.floor(y.min()) - 1,
+            math.ceil(y.max()) + 1,
+        )  # pixels, both ends included
         x0, x1, y0, y1 = max(x0, 0), min(x1, 63), max(y0, 0), min(y1, 39)
         found = screen_rectangle(item(low, high), T, CAMERA)
         if x0 > x1 or y0 > y1:
@@ -53,11 +72,23 @@ def test_what_reaches_the_near_plane_may_be_anywhere():
     assert screen_rectangle(box, pose([0, 0, 0.1]), CAMERA) == everywhere
     assert screen_rectangle(box, pose([5, 0, 0.2]), CAMERA) == everywhere
     assert screen_rectangle(box, pose([0, 0, 0.3]), CAMERA) != everywhere
-    assert screen_rectangle(box, pose([0, 0, -1.0]), CAMERA) is None and screen_rectangle(box, pose([0, 0, 0.0]), CAMERA) is None
+    assert (
+        screen_rectangle(box, pose([0, 0, -1.0]), CAMERA) is None
+        and screen_rectangle(box, pose([0, 0, 0.0]), CAMERA) is None
+    )
 
 
-@pytest.mark.parametrize("a, b, meet", [((0, 0, 2, 2), (2, 0, 4, 2), False), ((0, 0, 2, 2), (1, 1, 3, 3), True), ((0, 0, 2, 2), (0, 2, 2, 4), False), ((0, 0, 9, 9), (3, 3, 4, 4), True),
-                                        ((0, 0, 2, 2), (5, 0, 6, 2), False), ((0, 0, 2, 2), (1, 5, 2, 6), False)])
+@pytest.mark.parametrize(
+    "a, b, meet",
+    [
+        ((0, 0, 2, 2), (2, 0, 4, 2), False),
+        ((0, 0, 2, 2), (1, 1, 3, 3), True),
+        ((0, 0, 2, 2), (0, 2, 2, 4), False),
+        ((0, 0, 9, 9), (3, 3, 4, 4), True),
+        ((0, 0, 2, 2), (5, 0, 6, 2), False),
+        ((0, 0, 2, 2), (1, 5, 2, 6), False),
+    ],
+)
 def test_rectangles_meet_where_they_share_a_pixel(a, b, meet):
     a, b = Rectangle(*a), Rectangle(*b)
     assert a.meets(b) is b.meets(a) is meet
@@ -72,6 +103,12 @@ def test_area_and_scale():
 
 def test_merging_goes_on_until_none_meet():
     """The union of two meets a third that neither did."""
-    chain = [Rectangle(0, 0, 2, 2), Rectangle(5, 5, 6, 6), Rectangle(1, 1, 5, 2), Rectangle(4, 1, 6, 9), Rectangle(20, 0, 21, 1)]
+    chain = [
+        Rectangle(0, 0, 2, 2),
+        Rectangle(5, 5, 6, 6),
+        Rectangle(1, 1, 5, 2),
+        Rectangle(4, 1, 6, 9),
+        Rectangle(20, 0, 21, 1),
+    ]
     assert merged(chain) == [Rectangle(0, 0, 6, 9), Rectangle(20, 0, 21, 1)] == merged(chain[::-1])
     assert merged([]) == []

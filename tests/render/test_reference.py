@@ -133,7 +133,9 @@ def test_cube_depth_ids_normals_and_flow():
     np.testing.assert_allclose(frame.normal[seen], (outward @ m0[:3, :3].T)[seen], atol=1e-6)  # normals are float32
 
     local = o + enter[..., None] * d
-    flow = project(world.rig, local @ m1[:3, :3].T + m1[:3, 3], t1) - project(world.rig, local @ m0[:3, :3].T + m0[:3, 3], t0)
+    flow = project(world.rig, local @ m1[:3, :3].T + m1[:3, 3], t1) - project(
+        world.rig, local @ m0[:3, :3].T + m0[:3, 3], t0
+    )
     np.testing.assert_allclose(frame.forward.flow[seen], flow[seen], atol=1e-10)
     # what turns away is hidden by the cube itself: its outward normal at t1 against the ray from the camera
     away = ((outward @ m1[:3, :3].T) * (local @ m1[:3, :3].T + m1[:3, 3] - eye.pose(t1)[:3, 3])).sum(-1) > 0
@@ -147,8 +149,10 @@ def test_camera_rotation_is_the_homography():
     """x' ~ K R10 K^-1 x whatever is seen there: the flow does not depend on depth."""
     eye = drift((1, 2, 3), (1, 2, 3), LEVEL, LEVEL * Rotation.from_rotvec([0.06, -0.09, 0.2]))
     base = mixed_scene()
-    frozen = tuple(replace(o, path=still(o.path.pose(0)[:3, 3] + [1, 2, 3], Rotation.from_matrix(o.path.pose(0)[:3, :3])))
-                   for o in base.objects)
+    frozen = tuple(
+        replace(o, path=still(o.path.pose(0)[:3, 3] + [1, 2, 3], Rotation.from_matrix(o.path.pose(0)[:3, :3])))
+        for o in base.objects
+    )
     world = scene(frozen, rig(path=eye))
     cam, t0, t1 = world.camera, 0, 800 * MS
     frame = reference.render(world, t0, forward_ns=t1)
@@ -171,7 +175,9 @@ def test_velocity_is_the_limit_of_flow_with_order_one():
     assert order == pytest.approx(1.0, abs=0.1)
     # symmetric difference: two orders further down, the twist agrees with the motion itself
     h = MS // 10
-    middle = (reference.flow_to(world, hits, t0 + h).flow - reference.flow_to(world, hits, t0 - h).flow) / (2 * h * 1e-9)
+    middle = (reference.flow_to(world, hits, t0 + h).flow - reference.flow_to(world, hits, t0 - h).flow) / (
+        2 * h * 1e-9
+    )
     np.testing.assert_allclose(middle, velocity, atol=1e-5 * np.abs(velocity).max())
 
 
@@ -324,7 +330,9 @@ def test_texture_is_upright_decoded_and_repeats():
     """A quad that fills the image texel by pixel: the picture itself, row 0 at the top, sRGB decoded."""
     rng = np.random.default_rng(5)
     image = rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)
-    eye = Rig.alone(PinHole(16, 12, 20.0, 20.0, 7.5, 5.5), still((0, 0, 2.0), Rotation.from_euler("x", 180, degrees=True)))
+    eye = Rig.alone(
+        PinHole(16, 12, 20.0, 20.0, 7.5, 5.5), still((0, 0, 2.0), Rotation.from_euler("x", 180, degrees=True))
+    )
     sheet = quad(0.8, 0.6)  # 16 x 12 px at distance 2
     paint = Material(texture=Texture(image), unlit=True)
     frame = reference.render(scene([thing("picture", 1, sheet, still(), paint)], eye), 0)
@@ -405,7 +413,10 @@ def test_probe_is_the_pixel():
 
 def test_parts_of_one_object_share_its_id():
     both = SceneObject(
-        "pair", 6, (Part(cube(0.4), Material()), Part(sphere(0.5, 2), Material(base_color=(0.2, 0.2, 0.2)))), still((0, 4, 0))
+        "pair",
+        6,
+        (Part(cube(0.4), Material()), Part(sphere(0.5, 2), Material(base_color=(0.2, 0.2, 0.2)))),
+        still((0, 4, 0)),
     )
     frame = reference.render(scene([thing("wall", 1, cube(0.1), still((5, 4, 0))), both]), 0)
     assert set(np.unique(frame.part[frame.instance == 6])) == {1, 2}
@@ -416,7 +427,9 @@ def test_silhouette_band():
     world = scene(
         [
             thing("ground", 1, quad(500, 500), still((0, 0, -1.0))),
-            thing("step", 2, quad(0.3, 0.3), still((0.0, 3.0, 0.2), LEVEL * Rotation.from_euler("x", 180, degrees=True))),
+            thing(
+                "step", 2, quad(0.3, 0.3), still((0.0, 3.0, 0.2), LEVEL * Rotation.from_euler("x", 180, degrees=True))
+            ),
         ]
     )
     frame = reference.render(world, 0)
@@ -434,5 +447,3 @@ def test_silhouette_band():
     jump = reference.silhouette_band(same, frame.depth)
     card = frame.instance == 2
     assert jump[card & band].mean() > 0.95 and not jump[card & ~band].any()
-
-

@@ -26,11 +26,17 @@ def world(width=96, height=72, objects=12, light=Light()):
     made = []
     for i in range(objects):
         mesh = [primitives.cuboid(), primitives.sphere(), primitives.torus()][i % 3]
-        material = Material(Texture(image), base_color=(1.0, 0.8, 0.5), unlit=i % 4 == 0) if i % 2 else Material(base_color=(0.2, 0.5, 0.9))
+        material = (
+            Material(Texture(image), base_color=(1.0, 0.8, 0.5), unlit=i % 4 == 0)
+            if i % 2
+            else Material(base_color=(0.2, 0.5, 0.9))
+        )
         centre = rng.uniform((-6, -2, -3), (6, 9, 3))  # some behind the camera, some outside the view
         made.append(SceneObject(f"object {i}", i + 1, (Part(mesh, material),), curve(i, centre, 0.5, 1.0)))
     f = 0.8 * width
-    camera = Rig.alone(PinHole(width, height, f, f, (width - 1) / 2, (height - 1) / 2), curve(99, (0, -4, 0), 0.1, 0.1, LEVEL))
+    camera = Rig.alone(
+        PinHole(width, height, f, f, (width - 1) / 2, (height - 1) / 2), curve(99, (0, -4, 0), 0.1, 0.1, LEVEL)
+    )
     return Scene(tuple(made), camera, 0, SECOND, light, background=0.25)
 
 
@@ -46,11 +52,17 @@ def buffers(frame):
 
 def test_frustum_culling_changes_no_pixel(gl, monkeypatch):
     with Renderer(gl, world(), PLAIN) as renderer:
-        culled = [renderer.luminance(t).read() for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
+        culled = (
+            [renderer.luminance(t).read() for t in (0, SECOND // 2)],
+            buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0)),
+        )
         drawn = renderer.stats.triangles
         monkeypatch.setattr(Moment, "visible", property(lambda self: renderer.items))
         renderer.stats.triangles = 0
-        full = [renderer.luminance(t).read() for t in (0, SECOND // 2)], buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0))
+        full = (
+            [renderer.luminance(t).read() for t in (0, SECOND // 2)],
+            buffers(renderer.labels(SECOND // 2, ALL, SECOND, 0)),
+        )
         assert drawn < renderer.stats.triangles, "the scene has something to cull"
     for a, b in zip(culled[0], full[0]):
         np.testing.assert_array_equal(a, b)
@@ -95,9 +107,18 @@ def test_supersampling_is_the_mean_of_a_finer_image(gl, factor):
     """Slow twin: the same camera with n times the pixels, averaged by NumPy."""
     scene = world()
     c = scene.camera
-    fine = PinHole(c.width * factor, c.height * factor, c.fx * factor, c.fy * factor,
-                   (c.cx + 0.5) * factor - 0.5, (c.cy + 0.5) * factor - 0.5, c.near)
-    with Renderer(gl, scene, RenderConfig(antialiasing=f"ssaa{factor}", image_antialiasing=f"ssaa{factor}")) as renderer:
+    fine = PinHole(
+        c.width * factor,
+        c.height * factor,
+        c.fx * factor,
+        c.fy * factor,
+        (c.cx + 0.5) * factor - 0.5,
+        (c.cy + 0.5) * factor - 0.5,
+        c.near,
+    )
+    with Renderer(
+        gl, scene, RenderConfig(antialiasing=f"ssaa{factor}", image_antialiasing=f"ssaa{factor}")
+    ) as renderer:
         luminance, colour = renderer.luminance(0).read(), renderer.colour(0).read()
     with Renderer(gl, scene.with_camera(fine), PLAIN) as renderer:
         h, w = c.height, c.width
@@ -125,10 +146,15 @@ def test_frames_and_labels_are_drawn_from_the_same_level_of_detail(gl):
     objects = (SceneObject("ball", 1, (Part(ball, Material(unlit=True)),), still((0.3, 12, 0.2))),)
     camera = Rig.alone(PinHole(96, 72, 90, 90, 47.5, 35.5), still((0, 0, 0), LEVEL))
     scene = Scene(objects, camera, 0, SECOND, Light())
-    with Renderer(gl, scene, PLAIN) as full, Renderer(gl, scene, PLAIN.model_copy(update={"lod": LodConfig(enabled=True)})) as coarse:
+    with (
+        Renderer(gl, scene, PLAIN) as full,
+        Renderer(gl, scene, PLAIN.model_copy(update={"lod": LodConfig(enabled=True)})) as coarse,
+    ):
         assert coarse.triangles < full.triangles / 4 and full.scene is scene
         for renderer in (full, coarse):
-            np.testing.assert_array_equal(renderer.luminance(0).read() > 0, renderer.labels(0, LabelRequest("ids")).ids == 1)
+            np.testing.assert_array_equal(
+                renderer.luminance(0).read() > 0, renderer.labels(0, LabelRequest("ids")).ids == 1
+            )
         assert np.abs((coarse.luminance(0).read() > 0).sum() / (full.luminance(0).read() > 0).sum() - 1) < 0.05
 
 
@@ -160,15 +186,25 @@ def test_small_pictures_cover_the_whole_image(gl, width, height, every):
     """(98 * (1 / 49) is 1.9999999999999998.) Pixels are W / w apart: a wall that drifts shows
     its velocity at exactly those places."""
     small = (max(1, height // every), max(1, width // every))
-    wall = SceneObject("wall", 1, (Part(primitives.cuboid(), Material(unlit=True)),), drift((-1.0, 4, 0), (1.0, 4.5, 0)))
-    camera = Rig.alone(PinHole(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2), still(rotation=LEVEL))
+    wall = SceneObject(
+        "wall", 1, (Part(primitives.cuboid(), Material(unlit=True)),), drift((-1.0, 4, 0), (1.0, 4.5, 0))
+    )
+    camera = Rig.alone(
+        PinHole(width, height, 0.2 * width, 0.2 * width, (width - 1) / 2, (height - 1) / 2), still(rotation=LEVEL)
+    )
     scene = Scene((wall,), camera, 0, SECOND)
     with Renderer(gl, scene, PLAIN) as renderer:
-        made = renderer.velocity(0, every).read(), renderer.velocity_of_movers(0, every).read(), renderer.brightness(0, every).read()
+        made = (
+            renderer.velocity(0, every).read(),
+            renderer.velocity_of_movers(0, every).read(),
+            renderer.brightness(0, every).read(),
+        )
         assert all(a.shape == (*small, 2) and a.dtype == np.float32 for a in made)
     fewer = PinHole.centred(small[1], small[0], 0.2 * small[1], 0.2 * width * small[0] / height)
     with Renderer(gl, scene.with_camera(fewer), PLAIN) as renderer:
-        np.testing.assert_allclose(made[0], renderer.velocity(0).read() * (width / small[1], height / small[0]), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(
+            made[0], renderer.velocity(0).read() * (width / small[1], height / small[0]), rtol=1e-4, atol=1e-4
+        )
 
 
 # ---- matrices ----------------------------------------------------------------------------------------------------
@@ -202,7 +238,9 @@ def test_rate_of_relative_pose_is_its_derivative_to_second_order():
     errors = []
     steps = [4_000_000, 2_000_000, 1_000_000]
     for h in steps:
-        central = (cam_from_obj(camera.pose(t + h), body.pose(t + h)) - cam_from_obj(camera.pose(t - h), body.pose(t - h))) / (2e-9 * h)
+        central = (
+            cam_from_obj(camera.pose(t + h), body.pose(t + h)) - cam_from_obj(camera.pose(t - h), body.pose(t - h))
+        ) / (2e-9 * h)
         errors.append(np.abs(central - rate).max())
     order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert abs(order - 2) < 0.3

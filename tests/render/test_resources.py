@@ -12,7 +12,14 @@ from blinkgl.scene.types import Material, Mesh
 
 def mesh(reach: float) -> Mesh:
     corners = np.array([[-reach, 0, 0], [reach, 0, 0], [0, reach / 2, 0]]) + [0.0, 3.0, 0.0]
-    return Mesh(corners, np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.float32), np.zeros((3, 2), np.float32), True, "sheet")
+    return Mesh(
+        corners,
+        np.array([[0, 1, 2]], np.int32),
+        np.zeros((3, 3), np.float32),
+        np.zeros((3, 2), np.float32),
+        True,
+        "sheet",
+    )
 
 
 def test_the_largest_mesh_and_one_that_is_larger():
@@ -25,6 +32,12 @@ def test_the_largest_mesh_and_one_that_is_larger():
 
 
 def test_exactly_the_largest_radius_is_drawn():
-    flat = Mesh(np.array([[-MAX_RADIUS, 0, 0], [MAX_RADIUS, 0, 0], [0, 0, 0.0]]), np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.float32),
-                np.zeros((3, 2), np.float32), True, "line")
+    flat = Mesh(
+        np.array([[-MAX_RADIUS, 0, 0], [MAX_RADIUS, 0, 0], [0, 0, 0.0]]),
+        np.array([[0, 1, 2]], np.int32),
+        np.zeros((3, 3), np.float32),
+        np.zeros((3, 2), np.float32),
+        True,
+        "line",
+    )
     assert _draw_item(0, flat, Material(double_sided=True), "object", True).radius == MAX_RADIUS

@@ -108,12 +108,12 @@ def test_any_order_of_kinds_and_of_looking(gl, seed, antialiasing):
                 if where is not None:
                     outside = np.ones_like(image, bool)
                     for r in where:
-                        outside[r.y0:r.y1, r.x0:r.x1] = False
+                        outside[r.y0 : r.y1, r.x0 : r.x1] = False
                     np.testing.assert_array_equal(image[outside], truth[outside])
             drawn.append((frame, truth))
             if rng.integers(3):
                 np.testing.assert_array_equal(frame.view(), truth)
-            for name in frame.names[int(rng.integers(2)):]:
+            for name in frame.names[int(rng.integers(2)) :]:
                 np.testing.assert_array_equal(frame.view(name), true.read(name))
             if not rng.integers(4):
                 np.testing.assert_array_equal(frame.read(), truth)
@@ -173,7 +173,7 @@ def test_changes_are_where_they_are_said_to_be(gl, antialiasing):
             now = frame.read()
             outside, y = np.ones_like(now, bool), np.arange(120)
             for r in frame.changed_since(last):
-                outside[r.y0:r.y1, r.x0:r.x1] = False
+                outside[r.y0 : r.y1, r.x0 : r.x1] = False
             np.testing.assert_array_equal(now[outside], before[outside])
             y0, y1 = frame.rows_changed_since(last)
             assert outside[(y < y0) | (y >= y1)].all() and not outside[y0].all() and not outside[y1 - 1].all()
@@ -189,13 +189,19 @@ def test_nothing_moves_nothing_is_drawn(gl, antialiasing):
         first = renderer.luminance(0)
         seen, drawn = first.view(), renderer.stats.triangles
         second = renderer.luminance(SECOND)
-        assert second.changed_since(first) == [] and second.rows_changed_since(first) == (0, 0) and renderer.stats.triangles == drawn
+        assert (
+            second.changed_since(first) == []
+            and second.rows_changed_since(first) == (0, 0)
+            and renderer.stats.triangles == drawn
+        )
         assert np.shares_memory(second.view(), seen) and (seen == second.read()).all()
 
 
 def test_an_object_through_the_camera_and_out_of_the_image(gl):
     """Across the near plane every pixel is redrawn; out of sight nothing is, and its last place is mended."""
-    path = KeyframePath([0, SECOND // 2, SECOND], [(0, 3, 0), (0, -3, 0), (40, 3, 0)], [(0, 0, 0, 1)] * 3, interpolation="linear")
+    path = KeyframePath(
+        [0, SECOND // 2, SECOND], [(0, 3, 0), (0, -3, 0), (40, 3, 0)], [(0, 0, 0, 1)] * 3, interpolation="linear"
+    )
     world = scene([thing("wall", 1, cube(0.5), still((1, 9, 0))), thing("ball", 2, sphere(0.8), path)])
     with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
         for t in range(0, SECOND + 1, SECOND // 40):
@@ -216,8 +222,15 @@ def test_speed_is_a_bound_and_exact_where_nothing_is_hidden(gl):
     world = mixed_scene(camera_moves=False)
     with Renderer(gl, world, PLAIN) as quick, full_redraw(gl, world) as slow:
         for t in range(0, SECOND, SECOND // 5):
-            assert largest_speed(quick.velocity_of_movers(t).read()) >= largest_speed(slow.velocity_of_movers(t).read()) * (1 - 1e-6)
-    alone = scene([thing("wall", 1, cube(2.0), still((0, 30, 0))), thing("ball", 2, sphere(0.5), drift((-1, 4, 0), (1, 4, 0), LEVEL))])
+            assert largest_speed(quick.velocity_of_movers(t).read()) >= largest_speed(
+                slow.velocity_of_movers(t).read()
+            ) * (1 - 1e-6)
+    alone = scene(
+        [
+            thing("wall", 1, cube(2.0), still((0, 30, 0))),
+            thing("ball", 2, sphere(0.5), drift((-1, 4, 0), (1, 4, 0), LEVEL)),
+        ]
+    )
     with Renderer(gl, alone, PLAIN) as quick, full_redraw(gl, alone) as slow:
         moved = [largest_speed(renderer.velocity_of_movers(SECOND // 2).read()) for renderer in (quick, slow)]
         assert moved[0] == pytest.approx(moved[1], rel=1e-6)

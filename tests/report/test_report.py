@@ -20,13 +20,36 @@ from blinkgl.report.charts import histogram, number, size
 from blinkgl.report.collect import collect
 
 RECIPE = {
-    "seed": 5, "camera": {"width": 48, "height": 36}, "time": {"duration": 0.2, "label_rate": 20}, "timeline": {"kind": "uniform", "fps": 200},
-    "scene": {"kind": "random", "objects": {"count": {"integer": [1, 3]}}, "pool": {"primitives": ["cuboid"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
-              "textures": {"procedural": ["checks"], "variants": 12, "photographs": False, "max_size": 64, "test_fraction": 0.3}},
-    "labels": {"flow": ["forward"], "ids": True, "depth": True}, "preview": {"enabled": False},
-    "groups": {"fly": {"output": {"sequences": 5}, "events": {"shares": [
-        {"share": 0.6, "value": {"emulator": "esim", "contrast_threshold": {"uniform": [0.2, 0.4]}}}, {"share": 0.4, "value": {"emulator": "esim", "contrast_threshold": 0.5}}]}},
-        "probe": {"output": {"split": "test", "sequences": 2}}},
+    "seed": 5,
+    "camera": {"width": 48, "height": 36},
+    "time": {"duration": 0.2, "label_rate": 20},
+    "timeline": {"kind": "uniform", "fps": 200},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": {"integer": [1, 3]}},
+        "pool": {"primitives": ["cuboid"], "variants": 12, "urdfs": False, "test_fraction": 0.3},
+        "textures": {
+            "procedural": ["checks"],
+            "variants": 12,
+            "photographs": False,
+            "max_size": 64,
+            "test_fraction": 0.3,
+        },
+    },
+    "labels": {"flow": ["forward"], "ids": True, "depth": True},
+    "preview": {"enabled": False},
+    "groups": {
+        "fly": {
+            "output": {"sequences": 5},
+            "events": {
+                "shares": [
+                    {"share": 0.6, "value": {"emulator": "esim", "contrast_threshold": {"uniform": [0.2, 0.4]}}},
+                    {"share": 0.4, "value": {"emulator": "esim", "contrast_threshold": 0.5}},
+                ]
+            },
+        },
+        "probe": {"output": {"split": "test", "sequences": 2}},
+    },
 }
 
 
@@ -81,10 +104,28 @@ def test_the_page_is_whole_and_shows_what_is_there(data, capsys):
     text = " ".join(page.text)
     assert "url(" not in text and "@import" not in text and "<script" not in (data / "report.html").read_text()
     assert len(page.images) == 3 * (3 + 3), "frame, events, flow; and depth, ids and occlusion, which its labels are"
-    pictures = [cv2.imdecode(np.frombuffer(base64.b64decode(i.split(",")[1]), np.uint8), cv2.IMREAD_COLOR) for i in page.images]
-    assert {p.shape for p in pictures} == {(36, 48, 3)} and sum(p.std() > 3 for p in pictures) >= 15, "masks may be black"
-    for words in ("5 / 5", "2 / 2", "train, esim", "Displacement", "Depth", "instance id", "occluded, forward", "scene.objects.count", "events.contrast_threshold", "fly: uniform, 3 sequences",
-                  "fly: shares, 5 sequences", "made at the first attempt", "7 of 7", "None."):
+    pictures = [
+        cv2.imdecode(np.frombuffer(base64.b64decode(i.split(",")[1]), np.uint8), cv2.IMREAD_COLOR) for i in page.images
+    ]
+    assert {p.shape for p in pictures} == {(36, 48, 3)} and sum(p.std() > 3 for p in pictures) >= 15, (
+        "masks may be black"
+    )
+    for words in (
+        "5 / 5",
+        "2 / 2",
+        "train, esim",
+        "Displacement",
+        "Depth",
+        "instance id",
+        "occluded, forward",
+        "scene.objects.count",
+        "events.contrast_threshold",
+        "fly: uniform, 3 sequences",
+        "fly: shares, 5 sequences",
+        "made at the first attempt",
+        "7 of 7",
+        "None.",
+    ):
         assert words in text, words
     assert run(["verify", str(data)]) == 0, "the page belongs to the data set"
 
@@ -98,7 +139,10 @@ def test_numbers_are_those_of_the_files(data):
     assert 0 < found.quantities["displacement"].mean() < 50
     np.testing.assert_allclose(found.quantities["speed"], found.quantities["displacement"] * 20)  # labels every 50 ms
     parameters = {(p.group, p.path, p.kind): p for p in found.parameters}
-    drawn = [yaml.safe_load((data / f"train/fly_{i:06d}/config.yaml").read_text())["events"]["contrast_threshold"] for i in range(5)]
+    drawn = [
+        yaml.safe_load((data / f"train/fly_{i:06d}/config.yaml").read_text())["events"]["contrast_threshold"]
+        for i in range(5)
+    ]
     assert sorted(parameters["fly", "events.contrast_threshold", "uniform"].values + [0.5, 0.5]) == sorted(drawn)
 
 
@@ -107,7 +151,9 @@ def test_what_is_missing_or_broken_is_said(data, tmp_path):
     shutil.rmtree(copy / "train/fly_000001")
     (copy / "train/fly_000002/manifest.json").write_text("{")
     (copy / "train/fly_000003/flow/forward/000001.png").write_bytes(b"")
-    (copy / ".run/failed.json").write_text(json.dumps({"train/fly_000001": "the mesh <script>alert(1)</script> is corrupt"}))
+    (copy / ".run/failed.json").write_text(
+        json.dumps({"train/fly_000001": "the mesh <script>alert(1)</script> is corrupt"})
+    )
     assert run(["report", str(copy), "--out", str(tmp_path / "page.html"), "--examples", "7"]) == 0
     text = " ".join(read(tmp_path / "page.html").text)
     assert "<script>" not in (tmp_path / "page.html").read_text()
@@ -122,18 +168,33 @@ def test_no_data_set(tmp_path, capsys):
 
 def test_charts():
     two = histogram(np.array([1.0] * 10 + [2.0] * 5), bins=2, span=(0.5, 2.5))
-    assert len(two.bars) == 2 and two.bars[0][1] == pytest.approx(2 * two.bars[1][1]) and two.median_x == pytest.approx(6 + 288 / 4)
+    assert (
+        len(two.bars) == 2
+        and two.bars[0][1] == pytest.approx(2 * two.bars[1][1])
+        and two.median_x == pytest.approx(6 + 288 / 4)
+    )
     assert histogram(np.array([])) is None and histogram(np.array([-1.0, 0.0]), log=True) is None
     assert len(histogram(np.array([3.0, 3.0])).bars) == 1
-    assert [number(v) for v in (0.01234, 12.34, 1234.5, 12345, 2.5e6, 3e9, float("nan"))] == ["0.0123", "12.3", "1234", "12.3 k", "2.5 M", "3 G", "-"]
+    assert [number(v) for v in (0.01234, 12.34, 1234.5, 12345, 2.5e6, 3e9, float("nan"))] == [
+        "0.0123",
+        "12.3",
+        "1234",
+        "12.3 k",
+        "2.5 M",
+        "3 G",
+        "-",
+    ]
     assert [size(v) for v in (1234, 5.6e7, 1e9)] == ["0.00123 MB", "56 MB", "1 GB"]
 
 
 @pytest.fixture
 def draw():
     """A macro of charts.html, as a template uses it."""
+
     def drawn(call, **values):
-        template = markup._environment().from_string('{% import "report/charts.html" as charts %}{{ charts.' + call + " }}")
+        template = markup._environment().from_string(
+            '{% import "report/charts.html" as charts %}{{ charts.' + call + " }}"
+        )
         return template.render(values)
 
     return drawn
@@ -141,11 +202,19 @@ def draw():
 
 def test_charts_are_drawn_and_strangers_words_are_escaped(draw):
     evil = "<b title=\"x\" onload='y'>"
-    for drawn in (draw("bars(rows)", rows=[(evil, 1.0, 2.0)]), draw("stacked(parts)", parts=[(evil, 3.0), ("b", 1.0)]), draw("tiles(t)", t=[(evil, evil)]),
-                  draw("histogram(h, unit)", h=histogram(np.array([1.0, 2.0])), unit=evil)):
+    for drawn in (
+        draw("bars(rows)", rows=[(evil, 1.0, 2.0)]),
+        draw("stacked(parts)", parts=[(evil, 3.0), ("b", 1.0)]),
+        draw("tiles(t)", t=[(evil, evil)]),
+        draw("histogram(h, unit)", h=histogram(np.array([1.0, 2.0])), unit=evil),
+    ):
         assert "<b title" not in drawn and "&lt;b title=&#34;x&#34;" in drawn and "onload='" not in drawn
-    assert "left:100.0%" in draw("bars(rows)", rows=[("a", 1.0, 2.0)]) and "tick" not in draw("bars(rows)", rows=[("a", 1.0, None)])
-    assert "75 %" in draw("stacked(parts)", parts=[("a", 3.0), ("b", 1.0)]) and "no values" in draw("histogram(h)", h=None)
+    assert "left:100.0%" in draw("bars(rows)", rows=[("a", 1.0, 2.0)]) and "tick" not in draw(
+        "bars(rows)", rows=[("a", 1.0, None)]
+    )
+    assert "75 %" in draw("stacked(parts)", parts=[("a", 3.0), ("b", 1.0)]) and "no values" in draw(
+        "histogram(h)", h=None
+    )
     assert draw("histogram(h)", h=histogram(np.arange(9.0))).count('class="bar"') == 9
 
 

@@ -10,7 +10,14 @@ class GltfBuilder:
     """Collects arrays and JSON; ``glb()`` and ``gltf(folder, name)`` write the two kinds of file."""
 
     def __init__(self):
-        self.tree = {"asset": {"version": "2.0"}, "accessors": [], "bufferViews": [], "meshes": [], "nodes": [], "scenes": [{"nodes": []}]}
+        self.tree = {
+            "asset": {"version": "2.0"},
+            "accessors": [],
+            "bufferViews": [],
+            "meshes": [],
+            "nodes": [],
+            "scenes": [{"nodes": []}],
+        }
         self.data = b""
 
     def view(self, raw: bytes) -> int:
@@ -22,7 +29,9 @@ class GltfBuilder:
     def array(self, values, kind: str) -> int:
         values = np.ascontiguousarray(values)
         component = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121}[values.dtype.str[1:]]
-        self.tree["accessors"].append({"bufferView": self.view(values.tobytes()), "componentType": component, "count": len(values), "type": kind})
+        self.tree["accessors"].append(
+            {"bufferView": self.view(values.tobytes()), "componentType": component, "count": len(values), "type": kind}
+        )
         return len(self.tree["accessors"]) - 1
 
     def mesh(self, vertices, faces, normals=None, uvs=None, material=None) -> int:

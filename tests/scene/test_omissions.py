@@ -39,9 +39,9 @@ def glb(tmp_path, material=None, *, change=None, uvs=((0, 0), (1, 0), (0, 1)), i
         builder.tree["materials"] = [material]
     if image:
         builder.tree["images"] = [{"bufferView": builder.view(png(tmp_path))}]
-        builder.tree["textures"] = [{"source": 0,
-                                     **({"sampler": 0} if "samplers" in (image if isinstance(image, dict) else {})
-                                        else {})}]
+        builder.tree["textures"] = [
+            {"source": 0, **({"sampler": 0} if "samplers" in (image if isinstance(image, dict) else {}) else {})}
+        ]
         if isinstance(image, dict):
             builder.tree.update(image)
     builder.node(mesh=triangle(builder, uvs=uvs, material=None if material is None else 0))
@@ -56,47 +56,62 @@ def glb(tmp_path, material=None, *, change=None, uvs=((0, 0), (1, 0), (0, 1)), i
 TEXTURED = {"pbrMetallicRoughness": {**MATT, "baseColorTexture": {"index": 0}}}
 
 
-@pytest.mark.parametrize("material, expected", [
-    ({"pbrMetallicRoughness": MATT}, []),
-    ({"pbrMetallicRoughness": MATT, "emissiveFactor": [0, 0, 0.5]}, ["emissive light"]),
-    ({"pbrMetallicRoughness": MATT, "alphaMode": "BLEND"}, ["alpha BLEND (drawn opaque)"]),
-    ({"pbrMetallicRoughness": MATT, "alphaMode": "MASK"}, ["alpha MASK (drawn opaque)"]),
-    ({}, ["metal and roughness (drawn matt)"]),     # the standard's defaults are a metal
-    ({"pbrMetallicRoughness": {**MATT, "roughnessFactor": 0.4}}, ["metal and roughness (drawn matt)"]),
-    ({"pbrMetallicRoughness": MATT, "normalTexture": {"index": 0}, "occlusionTexture": {"index": 0}},
-     ["normal maps", "occlusion maps"]),
-    ({"pbrMetallicRoughness": MATT, "extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}}},
-     ["KHR_materials_transmission"]),
-    ({"extensions": {"KHR_materials_unlit": {}}, "emissiveFactor": [1, 1, 1]}, []),
-    # unlit is drawn, and says what there is to see
-])
+@pytest.mark.parametrize(
+    "material, expected",
+    [
+        ({"pbrMetallicRoughness": MATT}, []),
+        ({"pbrMetallicRoughness": MATT, "emissiveFactor": [0, 0, 0.5]}, ["emissive light"]),
+        ({"pbrMetallicRoughness": MATT, "alphaMode": "BLEND"}, ["alpha BLEND (drawn opaque)"]),
+        ({"pbrMetallicRoughness": MATT, "alphaMode": "MASK"}, ["alpha MASK (drawn opaque)"]),
+        ({}, ["metal and roughness (drawn matt)"]),  # the standard's defaults are a metal
+        ({"pbrMetallicRoughness": {**MATT, "roughnessFactor": 0.4}}, ["metal and roughness (drawn matt)"]),
+        (
+            {"pbrMetallicRoughness": MATT, "normalTexture": {"index": 0}, "occlusionTexture": {"index": 0}},
+            ["normal maps", "occlusion maps"],
+        ),
+        (
+            {"pbrMetallicRoughness": MATT, "extensions": {"KHR_materials_transmission": {"transmissionFactor": 1}}},
+            ["KHR_materials_transmission"],
+        ),
+        ({"extensions": {"KHR_materials_unlit": {}}, "emissiveFactor": [1, 1, 1]}, []),
+        # unlit is drawn, and says what there is to see
+    ],
+)
 def test_materials(tmp_path, material, expected):
     path = glb(tmp_path, material)
     assert said(path) == expected
-    assert said(path, keep_materials=False) == []       # replaced by the pool's textures: nothing of it was asked for
+    assert said(path, keep_materials=False) == []  # replaced by the pool's textures: nothing of it was asked for
 
 
-@pytest.mark.parametrize("sampler, uvs, expected", [
-    ({"wrapS": 33071}, [[0, 0], [2, 0], [0, 1]], ["texture wrap mode CLAMP_TO_EDGE (repeated)"]),
-    ({"wrapT": 33648}, [[0, 0], [1, 0], [0, -1]], ["texture wrap mode MIRRORED_REPEAT (repeated)"]),
-    ({"wrapS": 33071, "wrapT": 33071}, [[0, 0], [1, 0], [0, 1]], []),       # never leaves the image
-    ({"magFilter": 9728}, [[0, 0], [1, 0], [0, 1]], ["unfiltered textures (drawn smooth)"]),
-    ({"wrapS": 10497}, [[0, 0], [5, 0], [0, 1]], []),
-])
+@pytest.mark.parametrize(
+    "sampler, uvs, expected",
+    [
+        ({"wrapS": 33071}, [[0, 0], [2, 0], [0, 1]], ["texture wrap mode CLAMP_TO_EDGE (repeated)"]),
+        ({"wrapT": 33648}, [[0, 0], [1, 0], [0, -1]], ["texture wrap mode MIRRORED_REPEAT (repeated)"]),
+        ({"wrapS": 33071, "wrapT": 33071}, [[0, 0], [1, 0], [0, 1]], []),  # never leaves the image
+        ({"magFilter": 9728}, [[0, 0], [1, 0], [0, 1]], ["unfiltered textures (drawn smooth)"]),
+        ({"wrapS": 10497}, [[0, 0], [5, 0], [0, 1]], []),
+    ],
+)
 def test_samplers(tmp_path, sampler, uvs, expected):
     assert said(glb(tmp_path, TEXTURED, image={"samplers": [sampler]}, uvs=uvs)) == expected
 
 
 def test_vertex_colours(tmp_path):
     """One colour on all vertices is a factor, and drawn; others are said."""
-    path = glb(tmp_path, {"pbrMetallicRoughness": {**MATT, "baseColorFactor": [0.5, 1, 1, 1]}},
-               COLOR_0=(np.tile(np.array([0.5, 0.25, 1], "f4"), (3, 1)), "VEC3"))
+    path = glb(
+        tmp_path,
+        {"pbrMetallicRoughness": {**MATT, "baseColorFactor": [0.5, 1, 1, 1]}},
+        COLOR_0=(np.tile(np.array([0.5, 0.25, 1], "f4"), (3, 1)), "VEC3"),
+    )
     assert said(path) == [] and load_asset(path).parts[0].material.base_color == (0.25, 0.25, 1.0)
     path = glb(tmp_path, None, COLOR_0=(np.eye(3, dtype="f4"), "VEC3"))
     assert said(path) == ["vertex colours (left out)"]
-    header = ("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty "
-              "uchar red\nproperty uchar green\nproperty uchar blue\nelement face 1\nproperty list uchar int "
-              "vertex_indices\nend_header\n")
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty "
+        "uchar red\nproperty uchar green\nproperty uchar blue\nelement face 1\nproperty list uchar int "
+        "vertex_indices\nend_header\n"
+    )
     for last, expected in (("0 255 0", ["vertex colours (drawn in the most frequent one)"]), ("255 0 0", [])):
         (tmp_path / "a.ply").write_text(header + f"0 0 0 255 0 0\n1 0 0 255 0 0\n0 1 0 {last}\n3 0 1 2\n")
         assert said(tmp_path / "a.ply") == expected
@@ -111,34 +126,60 @@ def test_shapes_that_change(tmp_path):
         tree["animations"] = [{"channels": [], "samplers": []}]
 
     path = glb(tmp_path, JOINTS_0=(np.zeros((3, 4), "u1"), "VEC4"), change=change)
-    assert said(path) == ["morph targets (the base shape is drawn)", "skins (the rest shape is drawn)",
-                          "points and lines", "animations (the rest pose is drawn)"]
-    assert said(path, keep_materials=False) == said(path)       # shape is asked for whatever the material
+    assert said(path) == [
+        "morph targets (the base shape is drawn)",
+        "skins (the rest shape is drawn)",
+        "points and lines",
+        "animations (the rest pose is drawn)",
+    ]
+    assert said(path, keep_materials=False) == said(path)  # shape is asked for whatever the material
 
 
 def test_extensions_that_are_used(tmp_path):
     def change(tree):
-        tree["extensionsUsed"] = ["KHR_texture_transform", "EXT_mesh_gpu_instancing", "KHR_lights_punctual",
-                                  "KHR_xmp_json_ld"]
+        tree["extensionsUsed"] = [
+            "KHR_texture_transform",
+            "EXT_mesh_gpu_instancing",
+            "KHR_lights_punctual",
+            "KHR_xmp_json_ld",
+        ]
         tree["nodes"][0]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
 
-    assert said(glb(tmp_path, change=change)) == ["EXT_mesh_gpu_instancing",
-                                                  "lights (the configuration's sun and sky shine)"]
-    path = glb(tmp_path, TEXTURED, image=True,
-               change=lambda t: t["textures"].__setitem__(0, {"extensions": {"KHR_texture_basisu": {"source": 0}}}))
-    assert said(path) == ["textures of another kind (KHR_texture_basisu)"] and load_asset(path).parts[0].material.texture is None
+    assert said(glb(tmp_path, change=change)) == [
+        "EXT_mesh_gpu_instancing",
+        "lights (the configuration's sun and sky shine)",
+    ]
+    path = glb(
+        tmp_path,
+        TEXTURED,
+        image=True,
+        change=lambda t: t["textures"].__setitem__(0, {"extensions": {"KHR_texture_basisu": {"source": 0}}}),
+    )
+    assert (
+        said(path) == ["textures of another kind (KHR_texture_basisu)"]
+        and load_asset(path).parts[0].material.texture is None
+    )
 
 
-@pytest.mark.parametrize("extension",
-                         ["KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu",
-                          "EXT_mesh_gpu_instancing",
-                                       "KHR_materials_pbrSpecularGlossiness", "KHR_materials_transmission",
-                                       "ACME_unheard_of"])
+@pytest.mark.parametrize(
+    "extension",
+    [
+        "KHR_draco_mesh_compression",
+        "EXT_meshopt_compression",
+        "KHR_texture_basisu",
+        "EXT_mesh_gpu_instancing",
+        "KHR_materials_pbrSpecularGlossiness",
+        "KHR_materials_transmission",
+        "ACME_unheard_of",
+    ],
+)
 def test_an_extension_that_makes_another_scene_is_refused_when_required(tmp_path, extension):
     path = glb(tmp_path, change=lambda t: t.update(extensionsUsed=[extension], extensionsRequired=[extension]))
     with pytest.raises(AssetError) as error:
         load_asset(path)
-    assert str(error.value).startswith(f"{path}: the file needs the extension {extension}, which BlinkGL does not draw; expected a glTF 2.0 export")
+    assert str(error.value).startswith(
+        f"{path}: the file needs the extension {extension}, which BlinkGL does not draw; expected a glTF 2.0 export"
+    )
 
 
 @pytest.mark.parametrize("extension", ["KHR_lights_punctual", "KHR_materials_clearcoat", "KHR_texture_transform"])
@@ -148,8 +189,10 @@ def test_an_extension_of_light_alone_is_not_refused(tmp_path, extension):
 
 def test_a_scene_names_the_cameras_and_clips_that_it_does_not_use(tmp_path):
     builder = GltfBuilder()
-    builder.tree["cameras"] = [{"type": "orthographic", "name": "plan"},
-                               {"type": "perspective", "name": "eye", "perspective": {"yfov": 0.8}}]
+    builder.tree["cameras"] = [
+        {"type": "orthographic", "name": "plan"},
+        {"type": "perspective", "name": "eye", "perspective": {"yfov": 0.8}},
+    ]
     for k in range(2):
         builder.node(camera=k)
     builder.node(mesh=triangle(builder))
@@ -157,16 +200,27 @@ def test_a_scene_names_the_cameras_and_clips_that_it_does_not_use(tmp_path):
     (tmp_path / "s.glb").write_bytes(builder.glb())
     (line,) = from_gltf(tmp_path / "s.glb", CAMERA, 0, 10**9).omissions
     assert "animations beside 'walk' (scene.animation chooses one of: walk, run)" in line
-    assert "cameras beside 'plan' (scene.camera chooses one of: plan, node-0, eye, node-1)" in line and "an orthographic camera (drawn in perspective)" in line
+    assert (
+        "cameras beside 'plan' (scene.camera chooses one of: plan, node-0, eye, node-1)" in line
+        and "an orthographic camera (drawn in perspective)" in line
+    )
     assert from_gltf(tmp_path / "s.glb", CAMERA, 0, 10**9, camera_name="eye", animation="run").omissions == ()
 
 
 def test_obj_materials(tmp_path):
     png(tmp_path)
-    (tmp_path / "m.mtl").write_text("newmtl a\nKd 1 1 1\nKs 0.5 0.5 0.5\nKe 0 0 0\nd 0.5\nmap_Kd t.png\nmap_Bump n.png\nmap_Ke e.png\n")
-    (tmp_path / "a.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n")
-    assert said(tmp_path / "a.obj") == ["shine (drawn matt)", "transparency (drawn opaque)", "normal maps",
-                                        "emissive light"]
+    (tmp_path / "m.mtl").write_text(
+        "newmtl a\nKd 1 1 1\nKs 0.5 0.5 0.5\nKe 0 0 0\nd 0.5\nmap_Kd t.png\nmap_Bump n.png\nmap_Ke e.png\n"
+    )
+    (tmp_path / "a.obj").write_text(
+        "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\nf 1/1 2/2 3/3\n"
+    )
+    assert said(tmp_path / "a.obj") == [
+        "shine (drawn matt)",
+        "transparency (drawn opaque)",
+        "normal maps",
+        "emissive light",
+    ]
     assert said(tmp_path / "a.obj", keep_materials=False) == []
     (tmp_path / "t.png").unlink()
     assert "'t.png', which is missing" in said(tmp_path / "a.obj")
@@ -174,15 +228,19 @@ def test_obj_materials(tmp_path):
 
 def test_a_pool_and_a_trimesh_scene_say_it_too(tmp_path):
     glb(tmp_path, {"alphaMode": "BLEND", "pbrMetallicRoughness": MATT})
-    pool = object_pool(PoolConfig(primitives=(), folders=(str(tmp_path),), keep_materials=True, test_fraction=0),
-                       tmp_path)
-    for _ in range(2):      # loaded, and from the cache
-        assert pool.draw(np.random.default_rng(0),
-                         "train").omissions == ("a.glb asks for what is not drawn: alpha BLEND (drawn opaque)",)
+    pool = object_pool(
+        PoolConfig(primitives=(), folders=(str(tmp_path),), keep_materials=True, test_fraction=0), tmp_path
+    )
+    for _ in range(2):  # loaded, and from the cache
+        assert pool.draw(np.random.default_rng(0), "train").omissions == (
+            "a.glb asks for what is not drawn: alpha BLEND (drawn opaque)",
+        )
     box = trimesh.creation.box()
     box.visual.vertex_colors = np.arange(32).reshape(8, 4).astype(np.uint8)
     scene = from_trimesh(trimesh.Scene(box), CAMERA, camera_path=StaticPath(np.eye(4)))
-    assert scene.omissions == ("the trimesh scene asks for what is not drawn: vertex colours (drawn in the most frequent one)",)
+    assert scene.omissions == (
+        "the trimesh scene asks for what is not drawn: vertex colours (drawn in the most frequent one)",
+    )
 
 
 def test_draco_beside_plain_geometry_is_ignored(tmp_path):
@@ -190,9 +248,13 @@ def test_draco_beside_plain_geometry_is_ignored(tmp_path):
     draco = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
     path = glb(tmp_path, change=lambda t: t["meshes"][0]["primitives"][0].update(extensions=draco))
     assert len(load_asset(path).parts[0].mesh.faces) == 1
-    path = glb(tmp_path,
-               change=lambda t: (t["meshes"][0]["primitives"][0].update(extensions=draco),
-                                 t["accessors"][0].pop("bufferView")))
+    path = glb(
+        tmp_path,
+        change=lambda t: (
+            t["meshes"][0]["primitives"][0].update(extensions=draco),
+            t["accessors"][0].pop("bufferView"),
+        ),
+    )
     with pytest.raises(AssetError, match="needs the extension KHR_draco_mesh_compression"):
         load_asset(path)
 
@@ -200,8 +262,9 @@ def test_draco_beside_plain_geometry_is_ignored(tmp_path):
 def test_meshopt_without_a_fallback_is_named(tmp_path):
     builder = GltfBuilder()
     builder.node(mesh=triangle(builder))
-    builder.tree["buffers"] = [{"byteLength": len(builder.data),
-                                "extensions": {"EXT_meshopt_compression": {"fallback": True}}}]
+    builder.tree["buffers"] = [
+        {"byteLength": len(builder.data), "extensions": {"EXT_meshopt_compression": {"fallback": True}}}
+    ]
     (tmp_path / "a.gltf").write_text(json.dumps(builder.tree))
     with pytest.raises(AssetError, match="needs the extension EXT_meshopt_compression"):
         load_asset(tmp_path / "a.gltf")

@@ -139,13 +139,18 @@ def test_a_part_of_a_scene_sees_with_another_camera_and_on_another_way():
     np.testing.assert_array_equal(still.seen_by(1).camera_path.pose(0), offset(BASELINE))
 
 
-@pytest.mark.parametrize("make, message", [
-    (lambda: Rig(StaticPath(np.eye(4)), ()), r"^Rig.sensors: a rig without a sensor; expected one or more"),
-    (lambda: Rig(StaticPath(np.eye(4)), (Sensor(CAMERA, folder="a"), Sensor(CAMERA, folder="a"))),
-     r"^Rig.sensors: two sensors have one folder \(got 'a'\); expected a folder each"),
-    (lambda: stereo().seen_by(2), r"^seen_by: no such sensor \(got 2\); expected 0 to 1"),
-    (lambda: stereo(2 * np.eye(4)).seen_by(1).camera_path, r"pose is not rigid"),
-])
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: Rig(StaticPath(np.eye(4)), ()), r"^Rig.sensors: a rig without a sensor; expected one or more"),
+        (
+            lambda: Rig(StaticPath(np.eye(4)), (Sensor(CAMERA, folder="a"), Sensor(CAMERA, folder="a"))),
+            r"^Rig.sensors: two sensors have one folder \(got 'a'\); expected a folder each",
+        ),
+        (lambda: stereo().seen_by(2), r"^seen_by: no such sensor \(got 2\); expected 0 to 1"),
+        (lambda: stereo(2 * np.eye(4)).seen_by(1).camera_path, r"pose is not rigid"),
+    ],
+)
 def test_what_no_rig_is(make, message):
     with pytest.raises(ConfigError, match=message):
         make()

@@ -22,20 +22,35 @@ from blinkgl.trade.settings import Setting
 
 BUS = {"events_per_second": 20_000, "row_ns": 300, "queue_events": 40}
 DRAWN = {
-    "camera": {"width": 48, "height": 36}, "time": {"duration": 0.1, "label_rate": 30},
-    "scene": {"kind": "random", "objects": {"count": 3, "distance": [2, 4]}, "pool": {"primitives": ["cuboid"], "variants": 1, "urdfs": False},
-              "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 32}},
+    "camera": {"width": 48, "height": 36},
+    "time": {"duration": 0.1, "label_rate": 30},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 3, "distance": [2, 4]},
+        "pool": {"primitives": ["cuboid"], "variants": 1, "urdfs": False},
+        "textures": {"procedural": ["checks"], "variants": 2, "photographs": False, "max_size": 32},
+    },
     "timeline": {"kind": "uniform", "fps": 170, "reconstruction": "pchip"},
 }
 EVENTS = {"emulator": "esim", "contrast_threshold": 0.1, "refractory_us": 1500, "threshold_sigma": 0.03}
-COMMON = {"seed": 6, "events": EVENTS, "readout": BUS, "preview": {"enabled": False}, "labels": {"flow": ["forward"], "occlusion": False}}
+COMMON = {
+    "seed": 6,
+    "events": EVENTS,
+    "readout": BUS,
+    "preview": {"enabled": False},
+    "labels": {"flow": ["forward"], "occlusion": False},
+}
 FRAMES, FPS = 8, 50
 
 
 @pytest.fixture
 def run(request, tmp_path):
     """A configuration that is drawn, or one of recorded frames with their flow."""
-    tree = COMMON | (DRAWN if request.param == "drawn" else {"frames": {"folders": ["clip"], "fps": FPS, "max_px": 0.5, "interpolate": request.param}})
+    tree = COMMON | (
+        DRAWN
+        if request.param == "drawn"
+        else {"frames": {"folders": ["clip"], "fps": FPS, "max_px": 0.5, "interpolate": request.param}}
+    )
     if request.param != "drawn":
         write_frames(tmp_path / "clip")
     path = tmp_path / "run.yaml"
@@ -72,8 +87,12 @@ def test_every_door_gives_the_same(run, tmp_path):
     assert sequence.camera.dropped == recording.lost > 50 and sequence.camera.late > 0
     assert recording.frames == report.frames == sequence.frames
     by_pixel = np.lexsort((written.t, written.x, written.y))
-    gaps = np.diff(written.t[by_pixel])[(np.diff(written.x[by_pixel].astype(int)) == 0) & (np.diff(written.y[by_pixel].astype(int)) == 0)]
-    assert gaps.min() > 1500 - 1e6 * BUS["queue_events"] / BUS["events_per_second"] and len(gaps) > 100, "the refractory period, as late as the bus may be"
+    gaps = np.diff(written.t[by_pixel])[
+        (np.diff(written.x[by_pixel].astype(int)) == 0) & (np.diff(written.y[by_pixel].astype(int)) == 0)
+    ]
+    assert gaps.min() > 1500 - 1e6 * BUS["queue_events"] / BUS["events_per_second"] and len(gaps) > 100, (
+        "the refractory period, as late as the bus may be"
+    )
     truths = [item for item in items if isinstance(item, GroundTruth)]
     flows = [truth.frame.forward for truth in truths if truth.forward_ns is not None]
     assert len(flows) == report.labels == len(recording.flow)
@@ -82,9 +101,14 @@ def test_every_door_gives_the_same(run, tmp_path):
         saved, valid = blinkgl.read_flow(report.path / f"flow/forward/{k:06d}.png")
         assert np.array_equal(valid, flow.valid) and np.abs(saved - flow.flow)[valid].max() <= 1 / 256 + 1e-6
     for k in range(len(truths)):
-        assert np.array_equal(cv2.imread(str(report.path / f"images/{k:06d}.png"))[..., ::-1].max(-1), np.atleast_3d(recording.images[k]).max(-1))
+        assert np.array_equal(
+            cv2.imread(str(report.path / f"images/{k:06d}.png"))[..., ::-1].max(-1),
+            np.atleast_3d(recording.images[k]).max(-1),
+        )
     assert recording.image_t_us.tolist() == [truth.t_ns // 1000 for truth in truths]
-    assert len(recording.window(0)) == np.count_nonzero((written.t >= recording.t_us[0]) & (written.t < recording.t_us[1]))
+    assert len(recording.window(0)) == np.count_nonzero(
+        (written.t >= recording.t_us[0]) & (written.t < recording.t_us[1])
+    )
 
 
 @pytest.mark.parametrize("run", ["linear", "motion"], indirect=True)
@@ -95,8 +119,19 @@ def test_frames_of_a_folder_are_frames_of_any_source(run, tmp_path):
     config = run.sequence(0)
     frames = [cv2.imread(str(path)) for path in sorted((tmp_path / "clip/image_left").iterdir())]
     given = ((frame[..., 0], round(k * 1e9 / FPS)) for k, frame in enumerate(frames))
-    events = Events.concatenate(list(simulate(given, emulator=config.events, gamma="srgb", interpolate=config.frames.interpolate, max_px=0.5,
-                                              readout=config.readout, seed=kernel_seed(config.seed, 0, Role.EVENTS))))
+    events = Events.concatenate(
+        list(
+            simulate(
+                given,
+                emulator=config.events,
+                gamma="srgb",
+                interpolate=config.frames.interpolate,
+                max_px=0.5,
+                readout=config.readout,
+                seed=kernel_seed(config.seed, 0, Role.EVENTS),
+            )
+        )
+    )
     assert same(blinkgl.record(run).events, events)
 
 
@@ -104,7 +139,9 @@ def test_frames_of_a_folder_are_frames_of_any_source(run, tmp_path):
 def test_pictures_come_after_the_events_until_then(run):
     items = list(blinkgl.simulate_sequence(run, pictures_hz=20, labels=[]))
     pictures = [k for k, item in enumerate(items) if isinstance(item, Picture)]
-    assert len(pictures) > 2 and all(isinstance(items[k - 1], EventChunk) and items[k - 1].t_ns == items[k].t_ns for k in pictures)
+    assert len(pictures) > 2 and all(
+        isinstance(items[k - 1], EventChunk) and items[k - 1].t_ns == items[k].t_ns for k in pictures
+    )
     times = [items[k].t_ns / 1e9 for k in pictures]
     assert times[0] == 0 and np.diff(times).max() < 0.05 + 1 / 50 + 1e-9
     drawn = items[pictures[0]].velocity is not None
@@ -114,8 +151,11 @@ def test_pictures_come_after_the_events_until_then(run):
 @pytest.mark.parametrize("run", ["drawn", "motion"], indirect=True)
 def test_explain_sees_the_events_that_leave_the_sensor(run, monkeypatch):
     seen = []
-    monkeypatch.setattr(explain_module, "simulate_sequence",
-                        lambda *args, _door=explain_module.simulate_sequence, **kwargs: seen.append(_door(*args, **kwargs)) or seen[0])
+    monkeypatch.setattr(
+        explain_module,
+        "simulate_sequence",
+        lambda *args, _door=explain_module.simulate_sequence, **kwargs: seen.append(_door(*args, **kwargs)) or seen[0],
+    )
     explain(run)
     assert seen[0].camera.dropped > 0 and 0 < seen[0].events < seen[0].frames * BUS["queue_events"] * 10
 

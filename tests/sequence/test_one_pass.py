@@ -7,8 +7,13 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 KERNELS_ALONE = {"tools/bench_events.py", "tools/bench_load.py", "tools/draws.py"}
 THE_DOOR = {"blinkgl/front/sensors.py"}  # hands an emulator to a person who steps it
-OWN = {"make_emulator": {"blinkgl/events/camera.py", "blinkgl/events/table.py", "blinkgl/events/__init__.py"} | KERNELS_ALONE | THE_DOOR,
-       "Readout": {"blinkgl/events/camera.py", "tools/draws.py"}, "make_timeline": {"blinkgl/sequence/rendered.py", "blinkgl/timeline/__init__.py"}}
+OWN = {
+    "make_emulator": {"blinkgl/events/camera.py", "blinkgl/events/table.py", "blinkgl/events/__init__.py"}
+    | KERNELS_ALONE
+    | THE_DOOR,
+    "Readout": {"blinkgl/events/camera.py", "tools/draws.py"},
+    "make_timeline": {"blinkgl/sequence/rendered.py", "blinkgl/timeline/__init__.py"},
+}
 
 
 def test_nobody_else_makes_an_emulator_a_read_out_or_a_timeline():
@@ -16,7 +21,13 @@ def test_nobody_else_makes_an_emulator_a_read_out_or_a_timeline():
     for folder in ("blinkgl", "tools", "eflow", "examples"):
         for path in (ROOT / folder).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                names = [a.name for a in node.names] if isinstance(node, ast.ImportFrom) else [node.attr] if isinstance(node, ast.Attribute) else []
+                names = (
+                    [a.name for a in node.names]
+                    if isinstance(node, ast.ImportFrom)
+                    else [node.attr]
+                    if isinstance(node, ast.Attribute)
+                    else []
+                )
                 for name in names:
                     if name in users:
                         users[name].add(path.relative_to(ROOT).as_posix())

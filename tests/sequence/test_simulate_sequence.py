@@ -18,10 +18,17 @@ from blinkgl.render.renderer import Renderer
 from blinkgl.sequence import EventChunk, GroundTruth, Picture, simulate_sequence
 
 SMALL = {
-    "seed": 4, "camera": {"width": 48, "height": 36}, "time": {"duration": 0.1, "label_rate": 30, "start": 0.25},
-    "scene": {"kind": "random", "objects": {"count": 3, "distance": [2, 4]}, "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
-              "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64}},
-    "labels": {"flow": ["forward", "backward"], "depth": True}, "preview": {"enabled": False},
+    "seed": 4,
+    "camera": {"width": 48, "height": 36},
+    "time": {"duration": 0.1, "label_rate": 30, "start": 0.25},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 3, "distance": [2, 4]},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 2, "urdfs": False},
+        "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 64},
+    },
+    "labels": {"flow": ["forward", "backward"], "depth": True},
+    "preview": {"enabled": False},
 }
 
 
@@ -44,10 +51,19 @@ def assert_same(a: Events, b: Events) -> None:
 # --- order ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("changes", [
-    {}, {"timeline": {"kind": "uniform", "fps": 47, "reconstruction": "pchip"}}, {"timeline": {"kind": "uniform", "fps": 47, "reconstruction": "hermite"}},
-    {"events": {"emulator": "v2e", "preset": "noisy"}, "readout": {"events_per_second": 200_000, "queue_events": 200}},
-], ids=["default", "pchip", "hermite", "read-out"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"timeline": {"kind": "uniform", "fps": 47, "reconstruction": "pchip"}},
+        {"timeline": {"kind": "uniform", "fps": 47, "reconstruction": "hermite"}},
+        {
+            "events": {"emulator": "v2e", "preset": "noisy"},
+            "readout": {"events_per_second": 200_000, "queue_events": 200},
+        },
+    ],
+    ids=["default", "pchip", "hermite", "read-out"],
+)
 def test_ground_truth_comes_between_the_events_before_and_after_its_time(tmp_path, gl, changes):
     """The label rate and the frames' have no common divisor, so most labels lie inside a chunk."""
     config = config_of(tmp_path, **changes)
@@ -66,8 +82,12 @@ def test_ground_truth_comes_between_the_events_before_and_after_its_time(tmp_pat
             assert item.t_ns // 1000 == done_us and (last_us is None or isinstance(item, Picture) or last_us < done_us)
         inside += isinstance(item, GroundTruth)
     truths = [item for item in items if isinstance(item, GroundTruth)]
-    assert [t.t_ns for t in truths] == list(config.time.label_times_ns) and [t.k for t in truths] == list(range(len(truths)))
-    assert [t.forward_ns is not None for t in truths] == [True] * config.time.label_count + [False] and sequence.labels == config.time.label_count
+    assert [t.t_ns for t in truths] == list(config.time.label_times_ns) and [t.k for t in truths] == list(
+        range(len(truths))
+    )
+    assert [t.forward_ns is not None for t in truths] == [True] * config.time.label_count + [
+        False
+    ] and sequence.labels == config.time.label_count
     assert len([item for item in items if isinstance(item, Picture)]) > 3
     assert done_us == config.time.t1_ns // 1000 and sequence.events == len(events_of(items)) > 100
 
@@ -81,16 +101,24 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
         def spied(self, *args, **kwargs):
             drawn.append(name)
             return draw(self, *args, **kwargs)
+
         monkeypatch.setattr(Renderer, name, spied)
 
     for name in ("luminance", "colour", "labels", "velocity", "velocity_of_movers"):
         spy(name, getattr(Renderer, name))
     made = {}
-    for name, wanted in (("everything", {"pictures_hz": 40}), ("events", {"labels": False}), ("labels", {"events": False})):
+    for name, wanted in (
+        ("everything", {"pictures_hz": 40}),
+        ("events", {"labels": False}),
+        ("labels", {"events": False}),
+    ):
         drawn.clear()
         made[name] = list(simulate_sequence(config, 0, gl, **wanted))
-        expected = {"everything": {"luminance", "velocity_of_movers", "colour", "labels", "velocity"}, "events": {"luminance", "velocity_of_movers"},
-                    "labels": {"colour", "labels"}}
+        expected = {
+            "everything": {"luminance", "velocity_of_movers", "colour", "labels", "velocity"},
+            "events": {"luminance", "velocity_of_movers"},
+            "labels": {"colour", "labels"},
+        }
         assert set(drawn) == expected[name], "motion: what the timeline looks at"
     assert_same(events_of(made["everything"]), events_of(made["events"]))
     assert not events_of(made["labels"]).t.size
@@ -98,24 +126,41 @@ def test_what_is_asked_for_is_what_is_drawn(tmp_path, gl, monkeypatch):
         assert a.frame.values.keys() == b.frame.values.keys() and a.frame.values
         for name in ("images", "depth"):
             np.testing.assert_array_equal(getattr(a.frame, name), getattr(b.frame, name))
-        assert a.frame.backward is b.frame.backward is None or np.array_equal(a.frame.backward.flow, b.frame.backward.flow)
+        assert a.frame.backward is b.frame.backward is None or np.array_equal(
+            a.frame.backward.flow, b.frame.backward.flow
+        )
 
 
 # --- its consumers see one and the same -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("changes", [
-    {"timeline": {"kind": "uniform", "fps": 110, "reconstruction": "pchip"}, "events": {"emulator": "esim", "refractory_us": 2000},
-     "readout": {"events_per_second": 3000, "queue_events": 16}},
-    {"sensor": "davis346", "events": {"emulator": "v2e"}, "readout": {"events_per_second": 3000, "queue_events": 16}},
-], ids=["refractory, pchip, read-out", "sensor, v2e, read-out"])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {
+            "timeline": {"kind": "uniform", "fps": 110, "reconstruction": "pchip"},
+            "events": {"emulator": "esim", "refractory_us": 2000},
+            "readout": {"events_per_second": 3000, "queue_events": 16},
+        },
+        {
+            "sensor": "davis346",
+            "events": {"emulator": "v2e"},
+            "readout": {"events_per_second": 3000, "queue_events": 16},
+        },
+    ],
+    ids=["refractory, pchip, read-out", "sensor, v2e, read-out"],
+)
 def test_files_hold_what_happens(tmp_path, gl, changes):
     config = config_of(tmp_path, **changes)
     (report,) = generate_run(load_run(tmp_path / "run.yaml"), tmp_path / "out")
     with simulate_sequence(config, 0, gl) as sequence:
         items = list(sequence)
     assert_same(events_of(items), open_events(report.path / "events.h5").read())
-    assert sequence.camera.dropped > 0 and (report.events, report.frames, report.labels) == (sequence.events, sequence.frames, sequence.labels)
+    assert sequence.camera.dropped > 0 and (report.events, report.frames, report.labels) == (
+        sequence.events,
+        sequence.frames,
+        sequence.labels,
+    )
     with np.load(report.path / "poses.npz") as poses:
         truths = [item for item in items if isinstance(item, GroundTruth)]
         np.testing.assert_array_equal(poses["T_world_cam"][1:], [t.T_world_cam for t in truths])
@@ -128,7 +173,9 @@ def test_files_hold_what_happens(tmp_path, gl, changes):
 @pytest.mark.parametrize("how", ["break", "error", "never begun", "exhausted"])
 def test_opengl_is_let_go_however_it_ends(tmp_path, how, monkeypatch):
     released = []
-    monkeypatch.setattr(Renderer, "release", lambda self, _release=Renderer.release: (released.append(self), _release(self)))
+    monkeypatch.setattr(
+        Renderer, "release", lambda self, _release=Renderer.release: (released.append(self), _release(self))
+    )
     config = config_of(tmp_path)
 
     def consume():

@@ -30,8 +30,12 @@ def test_no_other_room_prints():
             continue
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             printed = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
-            rich = isinstance(node, (ast.Import, ast.ImportFrom)) and "rich" in [getattr(node, "module", "") or ""] + [n.name for n in node.names]
-            rich = rich or (isinstance(node, ast.ImportFrom) and (node.module or "").startswith(("rich.", "blinkgl.show")))
+            rich = isinstance(node, (ast.Import, ast.ImportFrom)) and "rich" in [getattr(node, "module", "") or ""] + [
+                n.name for n in node.names
+            ]
+            rich = rich or (
+                isinstance(node, ast.ImportFrom) and (node.module or "").startswith(("rich.", "blinkgl.show"))
+            )
             assert not printed and not rich, f"{place}:{node.lineno}"
 
 

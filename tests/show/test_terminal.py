@@ -53,7 +53,16 @@ def test_texts_tables_titles_and_bars_keep_their_brackets(capsys):
     console.print("path/[red]/x", soft_wrap=True)
     say(console, "path/:bug:/x " + "y" * 200)
     out = capsys.readouterr().out
-    assert all(text in out for text in ("out/run[1]", "column [bold]", "cell [cluster] [/red]", "path/[red]/x", "path/:bug:/x " + "y" * 200))
+    assert all(
+        text in out
+        for text in (
+            "out/run[1]",
+            "column [bold]",
+            "cell [cluster] [/red]",
+            "path/[red]/x",
+            "path/:bug:/x " + "y" * 200,
+        )
+    )
 
     class Task:
         description = "data[train]/a"
@@ -68,5 +77,7 @@ def test_there_is_no_other_console():
         for path in (ROOT / folder).rglob("*.py"):
             if path != ROOT / "blinkgl/show/terminal.py":
                 text = path.read_text(encoding="utf-8")
-                assert not re.search(r"(?<![\w.])(Console|TextColumn)\(|from_markup|rich_markup_mode=(?!None)", text), path
+                assert not re.search(r"(?<![\w.])(Console|TextColumn)\(|from_markup|rich_markup_mode=(?!None)", text), (
+                    path
+                )
                 assert text.count("typer.Typer(") == text.count("rich_markup_mode=None"), path

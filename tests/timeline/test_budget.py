@@ -24,13 +24,21 @@ def cubic_time(y: float, alpha: float, beta: float) -> float:
 
 def parabola_slope(points: list[tuple[float, float]], at: float) -> float:
     origin = points[0][0]
-    return float(np.polyval(np.polyder(np.polyfit([t - origin for t, _ in points], [v for _, v in points], 2)), at - origin))
+    return float(
+        np.polyval(np.polyder(np.polyfit([t - origin for t, _ in points], [v for _, v in points], 2)), at - origin)
+    )
 
 
 class SlowTimeError:
     def __init__(self, reconstruction, target, in_px, percentile):
         self.kind, self.target, self.in_px, self.percentile = reconstruction, target, in_px, percentile
-        self.points, self.frames, self.events, self.correction, self.typical = [(0.0, math.log(PRIOR[reconstruction][0]))], [], [], 0.0, None
+        self.points, self.frames, self.events, self.correction, self.typical = (
+            [(0.0, math.log(PRIOR[reconstruction][0]))],
+            [],
+            [],
+            0.0,
+            None,
+        )
 
     def line(self):
         """Of all measurements, each counting 0.9 of the next; the prior's slope as strong as a variance of 0.15."""
@@ -48,7 +56,14 @@ class SlowTimeError:
         return speed / min(d, 2 * math.exp(x0))
 
     def observe(self, t_ns, signal, slope, speed):
-        self.frames.append((t_ns * 1e-9, signal.ravel().astype(float), None if slope is None else slope.ravel().astype(float), speed.ravel().astype(float)))
+        self.frames.append(
+            (
+                t_ns * 1e-9,
+                signal.ravel().astype(float),
+                None if slope is None else slope.ravel().astype(float),
+                speed.ravel().astype(float),
+            )
+        )
         if self.kind == "pchip":
             if len(self.frames) < 4:
                 return
@@ -69,7 +84,9 @@ class SlowTimeError:
                 alpha, beta = a[2][i] * step / change, b[2][i] * step / change
             elif self.kind == "pchip":
                 at = lambda frame: (frame[0], frame[1][i])
-                alpha = parabola_slope([at(f) for f in ((older, a, b) if older else (a, b, newer))], a[0]) * step / change
+                alpha = (
+                    parabola_slope([at(f) for f in ((older, a, b) if older else (a, b, newer))], a[0]) * step / change
+                )
                 beta = parabola_slope([at(f) for f in (a, b, newer)], b[0]) * step / change
             alpha, beta = (min(max(v, 0.0), 3.0) for v in (alpha, beta))
             error.append(abs(cubic_time(min(max((middle[1][i] - a[1][i]) / change, 0.0), 1.0), alpha, beta) - s))
@@ -130,7 +147,11 @@ def test_equals_slow_twin(reconstruction, percentile, in_px):
         turned += burst * step
         wave = phase - rate * turned
         signal = (0.8 * np.sin(wave)).astype(np.float32).reshape(6, 10)
-        slope = (-0.8 * np.cos(wave) * rate * burst).astype(np.float32).reshape(6, 10) if reconstruction == "hermite" else None
+        slope = (
+            (-0.8 * np.cos(wave) * rate * burst).astype(np.float32).reshape(6, 10)
+            if reconstruction == "hermite"
+            else None
+        )
         for estimate in (fast, slow):
             estimate.observe(round(t * 1e9), signal, slope, (speed * burst).astype(np.float32).reshape(6, 10))
         for v in (1.0, 50.0, 4000.0):
@@ -159,7 +180,9 @@ def test_before_anything_is_measured_the_prior_decides():
     error = TimeError("linear", 0.1, True, 75.0)
     assert error.pace(10.0) == pytest.approx(10.0) and error.pace(0.0) == 0.0 and error.pace(-1.0) == 0.0
     assert TimeError("linear", 0.4, True, 75.0).pace(10.0) == pytest.approx(5.0)
-    assert TimeError("linear", 40.0, True, 75.0).pace(10.0) == pytest.approx(5.0), "and never more than twice what is known"
+    assert TimeError("linear", 40.0, True, 75.0).pace(10.0) == pytest.approx(5.0), (
+        "and never more than twice what is known"
+    )
     assert TimeError("linear", 0.01, False, 75.0).pace(10.0) == pytest.approx(10.0), "0.01 s at 10 px/s is 0.1 px"
 
 
@@ -168,7 +191,9 @@ def test_what_measures_nothing_is_not_a_measurement(case):
     error = TimeError("linear", 1e-4, False, 75.0)
     for k in range(5):
         signal = np.full((2, 3), 1.0 if case == "nothing changes" else 0.25 * k, np.float32)
-        error.observe(k * 1_000_000, signal, None, np.full((2, 3), 0.0 if case == "nothing moves" else 10.0, np.float32))
+        error.observe(
+            k * 1_000_000, signal, None, np.full((2, 3), 0.0 if case == "nothing moves" else 10.0, np.float32)
+        )
     assert error.measurements == 0 and error.pace(10.0) == TimeError("linear", 1e-4, False, 75.0).pace(10.0)
     assert error.info()["time_error"]["median_us"] is None
 

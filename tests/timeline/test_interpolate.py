@@ -20,14 +20,21 @@ def test_cubic_is_pchip_in_log_luminance():
     frames = rng.random((6, 5, 7)).astype(np.float32)
     frames[3, 0] = frames[2, 0]  # flat pieces, too
     out = list(interpolate.cubic(zip(frames, times.tolist()), 5))
-    assert [t for _, t in out[::5]] == times.tolist() and all(np.array_equal(a, b) for (a, _), b in zip(out[::5], frames))
+    assert [t for _, t in out[::5]] == times.tolist() and all(
+        np.array_equal(a, b) for (a, _), b in zip(out[::5], frames)
+    )
     reference = PchipInterpolator((times - times[0]) * 1e-6, np.log(frames.astype(np.float64) + 1e-3), axis=0)
-    inner = [(f, t) for f, t in out if times[1] <= t <= times[-2]]  # the ends have one neighbour only: linear here, quadratic there
+    inner = [
+        (f, t) for f, t in out if times[1] <= t <= times[-2]
+    ]  # the ends have one neighbour only: linear here, quadratic there
     assert len(inner) == 16
     for frame, t in inner:
         assert np.abs(np.log(frame + 1e-3) - reference((t - times[0]) * 1e-6)).max() < 2e-4
     first = [f for f, t in out if times[0] < t < times[1]]
-    assert all(((f >= np.minimum(frames[0], frames[1]) - 1e-5) & (f <= np.maximum(frames[0], frames[1]) + 1e-5)).all() for f in first)
+    assert all(
+        ((f >= np.minimum(frames[0], frames[1]) - 1e-5) & (f <= np.maximum(frames[0], frames[1]) + 1e-5)).all()
+        for f in first
+    )
 
 
 @pytest.mark.parametrize("factor", [2, 3, 7])
@@ -42,7 +49,9 @@ def test_cubic_is_the_hermite_spline_of_pchips_slopes_and_of_the_outer_secants(f
     slopes[0], slopes[-1] = (logs[1] - logs[0]) / (ms[1] - ms[0]), (logs[-1] - logs[-2]) / (ms[-1] - ms[-2])
     exact = CubicHermiteSpline(ms, logs, slopes)
     out = list(interpolate.cubic(zip(frames, times.tolist()), factor))
-    assert [t for _, t in out] == [int(a + (b - a) * k // factor) for a, b in itertools.pairwise(times) for k in range(factor)] + [int(times[-1])]
+    assert [t for _, t in out] == [
+        int(a + (b - a) * k // factor) for a, b in itertools.pairwise(times) for k in range(factor)
+    ] + [int(times[-1])]
     for frame, t in out:
         assert frame.dtype == np.float32 and frame.min() >= 0
         assert np.abs(np.log(frame + 1e-3) - exact((t - times[0]) * 1e-6)).max() < 2e-4
@@ -77,7 +86,9 @@ def test_motion_recovers_the_frames_that_were_left_out():
     given = [(scene(px), px * 1_000_000) for px in (0, 8, 16)]
     out = list(interpolate.motion(given, max_px=1.0, displacement=statistics))
     times = [t for _, t in out]
-    assert all(np.array_equal(out[times.index(t)][0], f) for f, t in given) and all(b > a for a, b in itertools.pairwise(times))
+    assert all(np.array_equal(out[times.index(t)][0], f) for f, t in given) and all(
+        b > a for a, b in itertools.pairwise(times)
+    )
     assert 7 <= statistics.median <= 9 and statistics.pairs == 2 and len(out) == 3 + statistics.inserted
     assert 14 <= statistics.inserted <= 24
     errors, blend = [], []
@@ -107,7 +118,11 @@ def test_a_ramp_that_moves_evenly_is_met_exactly():
 
 def test_pictures_are_blended_by_their_distance_in_time():
     """Nothing moves, but the light changes: a straight line in between."""
-    a, b, still = np.full((20, 20), 1.0, np.float32), np.full((20, 20), 5.0, np.float32), np.zeros((20, 20, 2), np.float32)
+    a, b, still = (
+        np.full((20, 20), 1.0, np.float32),
+        np.full((20, 20), 5.0, np.float32),
+        np.zeros((20, 20, 2), np.float32),
+    )
     out = list(interpolate._between(a, b, 0, 8, still, still, 4))
     assert [(float(frame.mean()), t) for frame, t in out] == [(2.0, 2), (3.0, 4), (4.0, 6)]
 
@@ -136,17 +151,28 @@ def test_displacement_keeps_means_of_medians_and_the_largest():
     seen.add(np.linspace(0, 10, 101))
     seen.add(np.linspace(0, 4, 101))
     seen.add(np.full(5, 3.0))
-    assert (seen.pairs, seen.median, seen.p99, seen.largest) == (3, pytest.approx((5 + 2 + 3) / 3), pytest.approx(9.9), 10.0)
+    assert (seen.pairs, seen.median, seen.p99, seen.largest) == (
+        3,
+        pytest.approx((5 + 2 + 3) / 3),
+        pytest.approx(9.9),
+        10.0,
+    )
     seen.inserted = 7
-    assert str(seen) == ("displacement per given frame: median 3.3 px, 99th percentile 9.9 px, largest 10 px; "
-                         "7 frames interpolated by dense-flow warp, not recorded")
+    assert str(seen) == (
+        "displacement per given frame: median 3.3 px, 99th percentile 9.9 px, largest 10 px; "
+        "7 frames interpolated by dense-flow warp, not recorded"
+    )
 
 
 def test_as_many_steps_as_the_quickest_but_a_few_pixels_ask_for(monkeypatch):
     """The 99.5th percentile of the displacement over max_px, rounded up; never more than there are nanoseconds."""
     flow = np.zeros((20, 50, 2), np.float32)
     flow[..., 0] = np.linspace(0, 5, 1000).reshape(20, 50)  # 99.5 %: 4.975 px
-    monkeypatch.setattr(interpolate.cv2, "DISOpticalFlow_create", lambda preset: type("Dis", (), {"calc": lambda self, a, b, none: flow.copy()})())
+    monkeypatch.setattr(
+        interpolate.cv2,
+        "DISOpticalFlow_create",
+        lambda preset: type("Dis", (), {"calc": lambda self, a, b, none: flow.copy()})(),
+    )
     frames = [(np.full((20, 50), 0.5, np.float32), t) for t in (0, 1000)]
     count = lambda frames=frames, **more: len(list(interpolate.motion(frames, **more))) - 1
     assert [count(max_px=px) for px in (1.0, 4.97, 4.98, 0.5, 100.0)] == [5, 2, 1, 10, 1]
@@ -173,5 +199,7 @@ def test_motion_of_frames_too_small_for_dense_flow():
     for size in ((16, 16), (16, 300), (300, 16), (17, 130)):
         assert len(list(interpolate.motion([(np.zeros(size, np.float32), t) for t in (0, 10)]))) == 2
     for size in ((15, 300), (300, 15), (12, 64), (1, 1)):
-        with pytest.raises(EventDataError, match=f"too small for dense flow .got '{size[1]}x{size[0]}'.; expected at least 16x16"):
+        with pytest.raises(
+            EventDataError, match=f"too small for dense flow .got '{size[1]}x{size[0]}'.; expected at least 16x16"
+        ):
             list(interpolate.motion([(np.zeros(size, np.float32), t) for t in (0, 10)]))

@@ -45,10 +45,14 @@ def picture(array: np.ndarray):
     return SimpleNamespace(read=lambda: array)
 
 
-@pytest.mark.parametrize("config, inside", [
-    (DisplacementTimeline(max_px=0.5, sample_every=1), [(100, 0.5)]),
-    (DisplacementTimeline(max_px=0.3, percentile=50, sample_every=2), [(50, 0.3)]),
-    (DisplacementTimeline(max_px=0.3, percentile=50, max_px_peak=0.4, sample_every=1), [(50, 0.3), (100, 0.4)])])
+@pytest.mark.parametrize(
+    "config, inside",
+    [
+        (DisplacementTimeline(max_px=0.5, sample_every=1), [(100, 0.5)]),
+        (DisplacementTimeline(max_px=0.3, percentile=50, sample_every=2), [(50, 0.3)]),
+        (DisplacementTimeline(max_px=0.3, percentile=50, max_px_peak=0.4, sample_every=1), [(50, 0.3), (100, 0.4)]),
+    ],
+)
 def test_displacement_over_whole_intervals(gl, world, config, inside):
     """The exact flow from each frame to the next keeps to the percentile's bound and to the peak's."""
     with Renderer(gl, world, PLAIN) as renderer:
@@ -82,19 +86,34 @@ def test_brightness_bound_holds_between_frames(gl, world, fraction, percent):
         times = times_of(config, renderer).tolist()
         worst = 0.0
         for a, b in zip(times[:-1:4], times[1::4]):
-            (la, lb), (ia, ib) = zip(*((np.log(renderer.luminance(t).read() + 1e-3), renderer.labels(t, LabelRequest("ids")).ids) for t in (a, b)))
+            (la, lb), (ia, ib) = zip(
+                *(
+                    (np.log(renderer.luminance(t).read() + 1e-3), renderer.labels(t, LabelRequest("ids")).ids)
+                    for t in (a, b)
+                )
+            )
             change = np.abs(lb - la)[(ia == ib)]
             worst = max(worst, np.percentile(change[change > 0], percent))
         assert 0.4 * fraction * 0.2 < worst <= 1.1 * fraction * 0.2
-        fewer = times_of(BrightnessTimeline(max_fraction_of_threshold=2 * fraction, percentile=percent, sample_every=4, min_step_us=20), renderer)
+        fewer = times_of(
+            BrightnessTimeline(
+                max_fraction_of_threshold=2 * fraction, percentile=percent, sample_every=4, min_step_us=20
+            ),
+            renderer,
+        )
         assert len(fewer) == pytest.approx(len(times) / 2, rel=0.15)
 
 
 def test_response_is_the_emulators_own_slope():
     luminance = np.array([0.0, 0.003, 0.02, 0.07, 0.09, 0.5, 2.0], np.float32)
-    for config, signal in ((EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2), lambda i: np.log(i + 1e-3)),
-                           (V2eConfig(), lambda i: np.array([lin_log(np.float32(v * V2eConfig().full_scale)) for v in i], float)),
-                           (VoltmeterConfig(), lambda i: VoltmeterConfig().k1 * np.log(i * VoltmeterConfig().full_scale + VoltmeterConfig().k2))):
+    for config, signal in (
+        (EsimConfig(contrast_threshold=0.3, contrast_threshold_off=0.2), lambda i: np.log(i + 1e-3)),
+        (V2eConfig(), lambda i: np.array([lin_log(np.float32(v * V2eConfig().full_scale)) for v in i], float)),
+        (
+            VoltmeterConfig(),
+            lambda i: VoltmeterConfig().k1 * np.log(i * VoltmeterConfig().full_scale + VoltmeterConfig().k2),
+        ),
+    ):
         response, h = emulator_of(config).response(config), 1e-3 * luminance.astype(float) + 1e-6
         slope = response.change(luminance, np.ones_like(luminance))
         np.testing.assert_allclose(slope, (signal(luminance + h) - signal(luminance + 0.0)) / h, rtol=0.02)
@@ -166,20 +185,34 @@ def drifting(config: BudgetTimeline, fast: float = 1.0, seconds: float = 1.5):
     under an image speed that is said to be 50 px/s all the time."""
     x, rate, half = np.linspace(0, 2 * np.pi, 600, endpoint=False)[None], 40.0, 0.04
     speed = np.full((1, 600, 2), (50.0, 0.0), np.float32)
-    timeline = make_timeline(config, 0, int(seconds * 1e9), SimpleNamespace(velocity_of_movers=lambda t, n: picture(speed)), Esim.response(ESIM))
+    timeline = make_timeline(
+        config,
+        0,
+        int(seconds * 1e9),
+        SimpleNamespace(velocity_of_movers=lambda t, n: picture(speed)),
+        Esim.response(ESIM),
+    )
     for t_ns in timeline:
         k, t = divmod(t_ns * 1e-9, 2 * half)
         x_now = x - rate * (k * half * (1 + fast) + min(t, half) + fast * max(t - half, 0.0))
         luminance = np.exp(0.5 * np.sin(x_now))
         change = -0.5 * np.cos(x_now) * luminance * rate * (1.0 if t < half else fast)
-        timeline.observe(t_ns, luminance.astype(np.float32), change.astype(np.float32) if config.reconstruction == "hermite" else None)
+        timeline.observe(
+            t_ns,
+            luminance.astype(np.float32),
+            change.astype(np.float32) if config.reconstruction == "hermite" else None,
+        )
     return timeline.info()["time_error"]
 
 
 def test_steps_in_two_halves_measure_the_order():
     """Cubics are of order 4 on a sinusoid, 3.6 with the turning points. At one length of step
     nothing but the prior, 2.5, would speak of it."""
-    said = drifting(BudgetTimeline(max_time_error_us=20.0, reconstruction="hermite", min_step_us=20, max_step_us=40_000, sample_every=1))
+    said = drifting(
+        BudgetTimeline(
+            max_time_error_us=20.0, reconstruction="hermite", min_step_us=20, max_step_us=40_000, sample_every=1
+        )
+    )
     assert 3.3 < said["order"] <= 4.0
 
 
@@ -207,7 +240,9 @@ def test_a_frame_is_judged_by_the_speed_at_the_nearest_time_that_was_looked_at()
 
 def test_nothing_moves_nothing_is_measured():
     still = SimpleNamespace(velocity_of_movers=lambda t, n: picture(np.zeros((3, 4, 2), np.float32)))
-    timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, Esim.response(ESIM))
+    timeline = make_timeline(
+        BudgetTimeline(max_time_error_us=10.0, max_step_us=1000), 0, 10 * MS, still, Esim.response(ESIM)
+    )
     count = 0
     for t in timeline:
         timeline.observe(t, np.ones((12, 16), np.float32))
@@ -216,11 +251,15 @@ def test_nothing_moves_nothing_is_measured():
     assert count == 11 and said["measurements"] == 0 and said["median_us"] is None
 
 
-@pytest.mark.parametrize("shape, small", [((1, 1), (1, 1)), ((1, 16), (1, 4)), ((24, 1), (6, 1)), ((15, 23), (3, 5)), ((3, 5), (1, 1))])
+@pytest.mark.parametrize(
+    "shape, small", [((1, 1), (1, 1)), ((1, 16), (1, 4)), ((24, 1), (6, 1)), ((15, 23), (3, 5)), ((3, 5), (1, 1))]
+)
 def test_images_smaller_than_the_sampling_or_no_multiple_of_it(shape, small):
     """The small picture of speeds is max(1, size // n) pixels a side; the signal is looked up at the same places."""
     world = SimpleNamespace(velocity_of_movers=lambda t, n: picture(np.full((*small, 2), 50.0, np.float32)))
-    timeline = make_timeline(BudgetTimeline(max_time_error_us=100.0, max_step_us=1000), 0, 10 * MS, world, Esim.response(ESIM))
+    timeline = make_timeline(
+        BudgetTimeline(max_time_error_us=100.0, max_step_us=1000), 0, 10 * MS, world, Esim.response(ESIM)
+    )
     for t in timeline:
         timeline.observe(t, np.full(shape, 1 + 0.5 * math.sin(t * 1e-6), np.float32))
     assert timeline.info()["time_error"]["measurements"] > 0

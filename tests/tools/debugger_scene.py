@@ -72,7 +72,11 @@ def edit(path: Path, right: str, wrong: str) -> None:
 
 
 MISTAKES = {
-    "sign of the flow": ("include/motion.glsl", "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next", "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next"),
+    "sign of the flow": (
+        "include/motion.glsl",
+        "(d.xy - ndc_of_fragment(image_size) * d.z) / w_next",
+        "(ndc_of_fragment(image_size) * d.z - d.xy) / w_next",
+    ),
     "no perspective division": ("include/motion.glsl", "* d.z) / w_next", "* d.z)"),
     "depth off by near": ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),
 }
@@ -82,25 +86,63 @@ _UV = "float luminance = texture(albedo, uv).r;"
 LOOKUP_MISTAKES = {
     # name: ([(file, right, wrong), …], the first buffer that is wrong, words of the suspicion, the objects)
     "noperspective varying": (
-        [("include/vertex.glsl", "out vec2 uv;", "noperspective out vec2 uv;"), ("include/vertex.glsl", "in vec2 uv;", "noperspective in vec2 uv;")],
-        "luminance_uv", "without perspective", {"floor"}),
+        [
+            ("include/vertex.glsl", "out vec2 uv;", "noperspective out vec2 uv;"),
+            ("include/vertex.glsl", "in vec2 uv;", "noperspective in vec2 uv;"),
+        ],
+        "luminance_uv",
+        "without perspective",
+        {"floor"},
+    ),
     "sRGB decoded twice": (
-        [("colour.glsl", "radiance *= texture(albedo, uv).rgb;", "radiance *= pow(texture(albedo, uv).rgb, vec3(2.2));")],
-        "colour_albedo", "sRGB is decoded twice", {"floor", "ball"}),
-    "mip bias +1": ([("luminance.glsl", _UV, _UV.replace("uv)", "uv, 1.0)"))], "luminance_level", "a mip bias of +1", {"floor", "ball"}),
+        [
+            (
+                "colour.glsl",
+                "radiance *= texture(albedo, uv).rgb;",
+                "radiance *= pow(texture(albedo, uv).rgb, vec3(2.2));",
+            )
+        ],
+        "colour_albedo",
+        "sRGB is decoded twice",
+        {"floor", "ball"},
+    ),
+    "mip bias +1": (
+        [("luminance.glsl", _UV, _UV.replace("uv)", "uv, 1.0)"))],
+        "luminance_level",
+        "a mip bias of +1",
+        {"floor", "ball"},
+    ),
     "uv off by half a texel": (
         [("luminance.glsl", _UV, _UV.replace("uv)", "uv + 0.5 / vec2(textureSize(albedo, 0)))"))],
-        "luminance_uv", "shifted by half a texel (+0.5, +0.5)", {"floor", "ball"}),
+        "luminance_uv",
+        "shifted by half a texel (+0.5, +0.5)",
+        {"floor", "ball"},
+    ),
     # thought of when the debugger was done
     "normal not normalised": (
-        [("include/light.glsl", "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    return", "vec3 n = normal;\n    return")],
-        "luminance_light", "the interpolated normal is not normalised", {"ball"}),
+        [
+            (
+                "include/light.glsl",
+                "vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30));\n    return",
+                "vec3 n = normal;\n    return",
+            )
+        ],
+        "luminance_light",
+        "the interpolated normal is not normalised",
+        {"ball"},
+    ),
     "width and height exchanged": (
         [("include/motion.glsl", "* gl_FragCoord.w * 0.5 * image_size;", "* gl_FragCoord.w * 0.5 * image_size.yx;")],
-        "velocity", "x is 0.75 times, y 1.333 times", {"floor", "ball", "box", "passing"}),
+        "velocity",
+        "x is 0.75 times, y 1.333 times",
+        {"floor", "ball", "box", "passing"},
+    ),
     "two-sided normal reversed": (
         [("luminance.glsl", "gl_FrontFacing ? normal : -normal", "gl_FrontFacing ? -normal : normal")],
-        "luminance_light", "the normal points the other way", {"floor"}),
+        "luminance_light",
+        "the normal points the other way",
+        {"floor"},
+    ),
 }
 
 

@@ -7,8 +7,11 @@ import pytest
 from blinkgl.tools import command_docs
 from blinkgl.tools.config_docs import eflow_page, page
 
-PAGES = {"docs/configuration.md": (page, "python -m blinkgl.tools.config_docs"), "docs/eflow_configuration.md": (eflow_page, "python -m blinkgl.tools.config_docs eflow"),
-         "docs/commands.md": (command_docs.page, "python -m blinkgl.tools.command_docs")}
+PAGES = {
+    "docs/configuration.md": (page, "python -m blinkgl.tools.config_docs"),
+    "docs/eflow_configuration.md": (eflow_page, "python -m blinkgl.tools.config_docs eflow"),
+    "docs/commands.md": (command_docs.page, "python -m blinkgl.tools.command_docs"),
+}
 
 
 @pytest.mark.parametrize("name", PAGES)

@@ -30,8 +30,16 @@ class TwoLines(ConfigError):
         return "two\nlines"
 
 
-@pytest.mark.parametrize("error, kind", [(KeyError("x"), "bug"), (TwoLines("two"), "lines"), (ConfigError("one line"), "refused"), (MemoryError(), "died"),
-                                         (RecursionError("deep"), "bug")])
+@pytest.mark.parametrize(
+    "error, kind",
+    [
+        (KeyError("x"), "bug"),
+        (TwoLines("two"), "lines"),
+        (ConfigError("one line"), "refused"),
+        (MemoryError(), "died"),
+        (RecursionError("deep"), "bug"),
+    ],
+)
 def test_what_counts_as_a_defect(tmp_path, monkeypatch, error, kind):
     def fail(*_):
         raise error

@@ -17,8 +17,26 @@ from blinkgl.tools import fuzz_files, fuzz_mutators
 from blinkgl.tools.fuzz_files import CRASH, HANG, MEMORY, OK, REFUSED, TRACEBACK, WRONG, Limits, fuzz
 from blinkgl.tools.fuzz_formats import FORMATS, Format
 
-SHORT = ("events text", "events dsec", "events mvsec", "events npz", "events evt3", "flow png dsec", "flow npy", "frames png", "frames pfm", "frames npz",
-         "mesh obj mtl and image", "mesh ply", "scene gltf", "scene glb", "texture hdr", "dataset manifest", "yaml explicit scene", "checkpoint weights")
+SHORT = (
+    "events text",
+    "events dsec",
+    "events mvsec",
+    "events npz",
+    "events evt3",
+    "flow png dsec",
+    "flow npy",
+    "frames png",
+    "frames pfm",
+    "frames npz",
+    "mesh obj mtl and image",
+    "mesh ply",
+    "scene gltf",
+    "scene glb",
+    "texture hdr",
+    "dataset manifest",
+    "yaml explicit scene",
+    "checkpoint weights",
+)
 """One of every kind; a format costs its imports and compiled kernels, a mutant next to nothing."""
 
 
@@ -27,7 +45,9 @@ def run(*arguments) -> int:
     import subprocess
     import sys
 
-    return subprocess.run([sys.executable, "-m", "blinkgl.tools.fuzz_files", *map(str, arguments)], capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, "-m", "blinkgl.tools.fuzz_files", *map(str, arguments)], capture_output=True, text=True
+    )
 
 
 def test_no_format_has_a_defect(tmp_path):
@@ -67,8 +87,19 @@ def _judge(how: str, folder):
     return None
 
 
-EXPECTED = {"ok": OK, "refused": REFUSED, "wrong": WRONG, "traceback": TRACEBACK, "nameless": WRONG, "lines": WRONG, "crash": CRASH, "exit": CRASH,
-            "spin": HANG, "sleep": HANG, "memory": MEMORY}
+EXPECTED = {
+    "ok": OK,
+    "refused": REFUSED,
+    "wrong": WRONG,
+    "traceback": TRACEBACK,
+    "nameless": WRONG,
+    "lines": WRONG,
+    "crash": CRASH,
+    "exit": CRASH,
+    "spin": HANG,
+    "sleep": HANG,
+    "memory": MEMORY,
+}
 
 
 def _make(folder):
@@ -83,14 +114,20 @@ def _break(rng, data):
 @pytest.mark.parametrize("how", EXPECTED)
 def test_every_outcome_is_told_apart_and_survived(tmp_path, how):
     made_up = Format("made up", _make, lambda folder: _judge(how, folder), (_break,))
-    report = fuzz(made_up, 2, limits=Limits(cpu_s=0, wall_s=0.5 if how == "sleep" else 60.0, memory_mb=16), out=tmp_path)
+    report = fuzz(
+        made_up, 2, limits=Limits(cpu_s=0, wall_s=0.5 if how == "sleep" else 60.0, memory_mb=16), out=tmp_path
+    )
     assert report.mutants == 2 and report.outcomes == {EXPECTED[how]: 2}
     kept = sorted(p.parent.name for p in tmp_path.glob("*/a"))
     if EXPECTED[how] in (OK, REFUSED):
         assert not report.defects and not kept
     else:
         (found,) = report.defects.values()
-        assert found["count"] == 2 and found["mutants"] == [0, 1] and '--formats "made up" --seed 0 --only 0' in found["repeat"]
+        assert (
+            found["count"] == 2
+            and found["mutants"] == [0, 1]
+            and '--formats "made up" --seed 0 --only 0' in found["repeat"]
+        )
         assert kept == ["made_up-0", "made_up-1"] and (tmp_path / "made_up-0/a").read_bytes().startswith(b"broken")
 
 
@@ -101,7 +138,11 @@ def test_the_same_seed_makes_the_same_mutants(tmp_path):
     a, b = (fuzz_files._Task(fmt, tmp_path / k, 0, Limits()) for k in "ab")
     mutants = [a.mutant(i) for i in range(40)]
     assert mutants == [b.mutant(i) for i in range(40)]
-    assert len({data for _, data, _ in mutants}) > 35 and {name for _, _, name in mutants} >= {"hdf5_objects", "fields", "flip_bits"}
+    assert len({data for _, data, _ in mutants}) > 35 and {name for _, _, name in mutants} >= {
+        "hdf5_objects",
+        "fields",
+        "flip_bits",
+    }
 
 
 def test_mutators_change_what_they_are_given():

@@ -30,8 +30,22 @@ def edits(source: str = SOURCE) -> list[str]:
 
 def test_every_kind_of_edit_is_there():
     found = edits()
-    for edit in ("10 -> 11", "< -> <=", "< -> >", "and -> or", "not -> (nothing)", "== -> !=", "log(x) -> None", "max -> min", "- -> +", "- -> (nothing)",
-                 "+= -> -=", "0.5 -> 0.75", "x < low and not x == LIMIT -> True", 'raise ValueError(f"{x + 1} is small") -> pass'):
+    for edit in (
+        "10 -> 11",
+        "< -> <=",
+        "< -> >",
+        "and -> or",
+        "not -> (nothing)",
+        "== -> !=",
+        "log(x) -> None",
+        "max -> min",
+        "- -> +",
+        "- -> (nothing)",
+        "+= -> -=",
+        "0.5 -> 0.75",
+        "x < low and not x == LIMIT -> True",
+        'raise ValueError(f"{x + 1} is small") -> pass',
+    ):
         assert edit in found, edit
 
 
@@ -45,7 +59,9 @@ def test_every_mutant_is_one_edit_that_parses():
         changed = mutant.apply(SOURCE)
         ast.parse(changed)
         assert changed != SOURCE
-        assert [a for a, b in zip(SOURCE.splitlines(), changed.splitlines()) if a != b][0] == SOURCE.splitlines()[mutant.line - 1]
+        assert [a for a, b in zip(SOURCE.splitlines(), changed.splitlines()) if a != b][0] == SOURCE.splitlines()[
+            mutant.line - 1
+        ]
 
 
 def test_kernels_are_known_for_what_they_are():
@@ -58,9 +74,19 @@ def test_columns_count_characters():
 
 
 def test_shaders_have_mutants_too():
-    found = [m.name for m in mutants_of("s.glsl", "#define A 1.0\nfloat x = a * b - 2.0; // c + d\nif (x < 0.0) x = min(x, -y);\n")]
-    assert found == ["s.glsl:2:13: * -> /", "s.glsl:2:17: - -> +", "s.glsl:2:19: 2.0 -> 3.0", "s.glsl:3:7: < -> >", "s.glsl:3:18: min -> max",
-                     "s.glsl:3:9: 0.0 -> 1.0", "s.glsl:3:25: - -> (nothing)"]
+    found = [
+        m.name
+        for m in mutants_of("s.glsl", "#define A 1.0\nfloat x = a * b - 2.0; // c + d\nif (x < 0.0) x = min(x, -y);\n")
+    ]
+    assert found == [
+        "s.glsl:2:13: * -> /",
+        "s.glsl:2:17: - -> +",
+        "s.glsl:2:19: 2.0 -> 3.0",
+        "s.glsl:3:7: < -> >",
+        "s.glsl:3:18: min -> max",
+        "s.glsl:3:9: 0.0 -> 1.0",
+        "s.glsl:3:25: - -> (nothing)",
+    ]
 
 
 def test_an_edit_of_another_source_is_refused():
@@ -71,7 +97,11 @@ def test_an_edit_of_another_source_is_refused():
 
 def test_a_key_knows_the_line_and_the_place_in_it():
     first, second = [m for m in mutants_of("m.py", "if a < b and c < d:\n    pass\n") if m.after == "<="]
-    assert key_of(first, "if a < b and c < d:") == "m.py | if a < b and c < d: | 6: < -> <=" != key_of(second, "if a < b and c < d:")
+    assert (
+        key_of(first, "if a < b and c < d:")
+        == "m.py | if a < b and c < d: | 6: < -> <="
+        != key_of(second, "if a < b and c < d:")
+    )
 
 
 def test_what_is_called_equivalent_exists_and_says_why():
@@ -84,26 +114,40 @@ def test_what_is_called_equivalent_exists_and_says_why():
 
 def test_what_is_compiled_into_a_kernel_is_compiled_itself():
     source = "@register_jitable\ndef f(a):\n    return a + 1\n\ndef g(a):\n    return a - 1\n"
-    assert {m.before: m.compiled for m in mutants_of("m.py", source) if m.operator == "arithmetic"} == {"+": True, "-": False}
+    assert {m.before: m.compiled for m in mutants_of("m.py", source) if m.operator == "arithmetic"} == {
+        "+": True,
+        "-": False,
+    }
 
 
 def test_an_edit_is_in_the_kernels_of_whoever_imports_it(tmp_path):
     """A kernel's callee, a constant of a module, a function that is called on import; not what
     stands in a method beside them."""
-    files = {"blinkgl/a.py": "from numba.extending import register_jitable\nLIMIT = 3\ndef table():\n    return 1 + "
-                             "1\nTABLE = table()\n@register_jitable\ndef callee(x):\n    return x * 2\nclass Thing:\n    "
-                             "def method(self):\n        return 4 - 5\n",
-             "blinkgl/b.py": "import numba\nfrom blinkgl.a import callee\n@numba.njit(cache=True)\ndef kernel(x):\n    "
-                             "return callee(x) / 6\n",
-             "blinkgl/c.py": "import numba\nfrom blinkgl import b\n@numba.njit(cache=True)\ndef other(x):\n    return x\n",
-             "blinkgl/d.py": "import blinkgl.c\nVALUE = 7\n", "blinkgl/__init__.py": ""}
+    files = {
+        "blinkgl/a.py": "from numba.extending import register_jitable\nLIMIT = 3\ndef table():\n    return 1 + "
+        "1\nTABLE = table()\n@register_jitable\ndef callee(x):\n    return x * 2\nclass Thing:\n    "
+        "def method(self):\n        return 4 - 5\n",
+        "blinkgl/b.py": "import numba\nfrom blinkgl.a import callee\n@numba.njit(cache=True)\ndef kernel(x):\n    "
+        "return callee(x) / 6\n",
+        "blinkgl/c.py": "import numba\nfrom blinkgl import b\n@numba.njit(cache=True)\ndef other(x):\n    return x\n",
+        "blinkgl/d.py": "import blinkgl.c\nVALUE = 7\n",
+        "blinkgl/__init__.py": "",
+    }
     (tmp_path / "blinkgl").mkdir()
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     kernels = Kernels(tmp_path)
-    stale = {m.before + m.after: {Path(p).stem for p in kernels.stale(m)} for name, text in files.items() for m in mutants_of(name, text)}
+    stale = {
+        m.before + m.after: {Path(p).stem for p in kernels.stale(m)}
+        for name, text in files.items()
+        for m in mutants_of(name, text)
+    }
     assert kernels.holders == {"blinkgl/a.py", "blinkgl/b.py", "blinkgl/c.py"}
-    assert stale["34"] == stale["+-"] == stale["*/"] == {"a", "b", "c"} and stale["/*"] == {"b", "c"} and stale["-+"] == stale["78"] == set()
+    assert (
+        stale["34"] == stale["+-"] == stale["*/"] == {"a", "b", "c"}
+        and stale["/*"] == {"b", "c"}
+        and stale["-+"] == stale["78"] == set()
+    )
     (tmp_path / "blinkgl/__pycache__").mkdir()
     for name in ("a.callee-7.py311.nbi", "b.kernel-4.py311.1.nbc", "c.other-4.py311.nbi"):
         (tmp_path / "blinkgl/__pycache__" / name).write_text("")
@@ -114,9 +158,17 @@ def test_an_edit_is_in_the_kernels_of_whoever_imports_it(tmp_path):
 
 def test_own_tests_are_asked_first():
     mutant = Mutant("blinkgl/events/curve.py", 1, 1, "a", "b", "x")
-    assert [Reach._distance(mutant, t) for t in ("tests/events/test_curve.py::a", "tests/events/test_esim.py::a", "tests/cross/test_cross.py::a")] == [0, 1, 2]
+    assert [
+        Reach._distance(mutant, t)
+        for t in ("tests/events/test_curve.py::a", "tests/events/test_esim.py::a", "tests/cross/test_cross.py::a")
+    ] == [0, 1, 2]
     assert Reach._distance(Mutant("shaders/colour.glsl", 1, 1, "a", "b", "x"), "tests/render/test_renderer.py::a") == 1
-    assert Reach._distance(Mutant("blinkgl/scene/motion/paths.py", 1, 1, "a", "b", "x"), "tests/scene/geometry/test_lod.py::a") == 1
+    assert (
+        Reach._distance(
+            Mutant("blinkgl/scene/motion/paths.py", 1, 1, "a", "b", "x"), "tests/scene/geometry/test_lod.py::a"
+        )
+        == 1
+    )
 
 
 @pytest.mark.slow
@@ -124,17 +176,36 @@ def test_verdicts(tmp_path):
     """A test that passes, one that fails, one that never ends, a process that dies: each in a child
     that sees the source as it is by then."""
     (tmp_path / "thing.py").write_text("VALUE = 1\n")
-    (tmp_path / "test_thing.py").write_text("import os, thing\ndef test_right(): assert thing.VALUE == 1\ndef test_spins():\n    while True: pass\n"
-                                            "def test_dies(): os._exit(3)\n")
+    (tmp_path / "test_thing.py").write_text(
+        "import os, thing\ndef test_right(): assert thing.VALUE == 1\ndef test_spins():\n    while True: pass\n"
+        "def test_dies(): os._exit(3)\n"
+    )
     server, seen = Server(tmp_path), []
     try:
         for tests, value in ((["right"], 1), (["right"], 2), (["spins"], 1), (["right", "dies"], 1), (["right"], 1)):
             (tmp_path / "thing.py").write_text(f"VALUE = {value}\n")
             (tmp_path / "output.failed").unlink(missing_ok=True)
             names = [f"test_thing.py::test_{name}" for name in tests]
-            outcome = server.ask({"tests": names, "seconds": dict.fromkeys(names, 0.0), "spare_s": 1, "limit_s": 60, "kernels": str(tmp_path / "kernels"),
-                                  "original": {}, "output": str(tmp_path / "output.txt")})
-            seen.append((outcome, (tmp_path / "output.failed").read_text() if (tmp_path / "output.failed").exists() else ""))
+            outcome = server.ask(
+                {
+                    "tests": names,
+                    "seconds": dict.fromkeys(names, 0.0),
+                    "spare_s": 1,
+                    "limit_s": 60,
+                    "kernels": str(tmp_path / "kernels"),
+                    "original": {},
+                    "output": str(tmp_path / "output.txt"),
+                }
+            )
+            seen.append(
+                (outcome, (tmp_path / "output.failed").read_text() if (tmp_path / "output.failed").exists() else "")
+            )
     finally:
         server.close()
-    assert seen == [("passed", ""), ("failed", "test_thing.py::test_right"), ("time", ""), ("failed", ""), ("passed", "")]
+    assert seen == [
+        ("passed", ""),
+        ("failed", "test_thing.py::test_right"),
+        ("time", ""),
+        ("failed", ""),
+        ("passed", ""),
+    ]

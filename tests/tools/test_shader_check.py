@@ -39,7 +39,14 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     status, out, _ = shader("check", "--json")
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
-    assert result["programs"] == {"colour.glsl": 16, "debug.glsl": 8, "downsample.glsl": 2, "label.glsl": 504, "luminance.glsl": 40, "velocity.glsl": 16}
+    assert result["programs"] == {
+        "colour.glsl": 16,
+        "debug.glsl": 8,
+        "downsample.glsl": 2,
+        "label.glsl": 504,
+        "luminance.glsl": 40,
+        "velocity.glsl": 16,
+    }
 
 
 def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeypatch):
@@ -53,7 +60,9 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
 
     monkeypatch.setattr(ShaderLoader, "_compile", record)
     monkeypatch.setattr(gl, "shaders", ShaderLoader(gl.ctx))
-    monkeypatch.setattr(Painter, "draw", lambda self, uniforms, item: None)  # linking is enough: llvmpipe compiles at the first draw
+    monkeypatch.setattr(
+        Painter, "draw", lambda self, uniforms, item: None
+    )  # linking is enough: llvmpipe compiles at the first draw
     world = scene_of(config, width=8, height=6)
     fields = [name for name, label in LABELS.items() if label.buffer]
     t = 100_000_000
@@ -69,8 +78,13 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
     gl.shaders.clear()
     table = {(name, normalised(defines)) for name in PRODUCTION for defines in variants.variants(name)}
     assert asked <= table
-    outputs = {tuple(pair for pair in defines if pair[0].startswith("OUT_")) for name, defines in asked if name == "label.glsl"}
-    assert outputs == {normalised({k: v for k, v in defines.items() if k.startswith("OUT_")}) for defines in variants.variants("label.glsl")}  # and none that nobody asks for
+    outputs = {
+        tuple(pair for pair in defines if pair[0].startswith("OUT_")) for name, defines in asked if name == "label.glsl"
+    }
+    assert outputs == {
+        normalised({k: v for k, v in defines.items() if k.startswith("OUT_")})
+        for defines in variants.variants("label.glsl")
+    }  # and none that nobody asks for
 
 
 def sources(folder=None) -> dict[str, str]:
@@ -79,7 +93,9 @@ def sources(folder=None) -> dict[str, str]:
     for name in PRODUCTION:
         for defines in variants.variants(name):
             for stage in STAGES:
-                out[f"{name} {stage} {normalised(defines)}"] = hashlib.sha256(expand(name, stage, defines, folder).text.encode()).hexdigest()
+                out[f"{name} {stage} {normalised(defines)}"] = hashlib.sha256(
+                    expand(name, stage, defines, folder).text.encode()
+                ).hexdigest()
     return out
 
 
@@ -145,8 +161,14 @@ print(json.dumps(seen))
 
 
 def test_an_error_is_shown_at_its_own_line_through_the_includes(shader, shaders):
-    edit(shaders / "include/motion.glsl", "    float w_next = 1.0 / gl_FragCoord.w + d.z;", "    float w_next = depht / gl_FragCoord.w + d.z;")
-    line = next(i for i, text in enumerate((shaders / "include/motion.glsl").read_text().splitlines(), 1) if "depht" in text)
+    edit(
+        shaders / "include/motion.glsl",
+        "    float w_next = 1.0 / gl_FragCoord.w + d.z;",
+        "    float w_next = depht / gl_FragCoord.w + d.z;",
+    )
+    line = next(
+        i for i, text in enumerate((shaders / "include/motion.glsl").read_text().splitlines(), 1) if "depht" in text
+    )
     status, out, err = shader("check", shaders / "include/motion.glsl", "--shaders", shaders)
     assert status == 1 and err == ""
     lines = out.splitlines()
@@ -176,8 +198,12 @@ def test_unused_varyings_uniforms_and_attributes_are_listed(shader, shaders):
     edit(shaders / "include/light.glsl", "light_strength.y * (0.5", "0.0 * light_strength.y * (0.5")
     status, out, _ = shader("check", "luminance.glsl", "--shaders", shaders)
     assert status == 0
-    for words in ("uniform 'spare' is never used in 24 of 40", "varying 'left_over' is written but the fragment stage does not take it",
-                  "uniform 'albedo' is never used in 8 of 40", "varying 'uv' is never read in 8 of 40"):
+    for words in (
+        "uniform 'spare' is never used in 24 of 40",
+        "varying 'left_over' is written but the fragment stage does not take it",
+        "uniform 'albedo' is never used in 8 of 40",
+        "varying 'uv' is never read in 8 of 40",
+    ):
         assert words in out, (words, out)
     line = (shaders / "include/vertex.glsl").read_text().splitlines().index("uniform float spare;") + 1
     assert f"include/vertex.glsl:{line}:15: uniform 'spare'" in out
@@ -193,19 +219,24 @@ def test_include_cycle_and_missing_include(shader, shaders):
 
 
 def test_files_select_programs_and_a_file_elsewhere_brings_its_folder(shader, shaders):
-    (shaders / "mine.glsl").write_text("#version 430 core\n#ifdef VERTEX_SHADER\nin vec3 p;\nvoid main() { gl_Position = vec4(p, 1.0); }\n#endif\n"
-                                       "#ifdef FRAGMENT_SHADER\nout vec4 c;\nvoid main() { c = vec4(oops); }\n#endif\n")
+    (shaders / "mine.glsl").write_text(
+        "#version 430 core\n#ifdef VERTEX_SHADER\nin vec3 p;\nvoid main() { gl_Position = vec4(p, 1.0); }\n#endif\n"
+        "#ifdef FRAGMENT_SHADER\nout vec4 c;\nvoid main() { c = vec4(oops); }\n#endif\n"
+    )
     status, out, _ = shader("check", shaders / "mine.glsl")
     assert status == 1 and "mine.glsl:8:24: error" in out
     status, out, _ = shader("check", "light.glsl", "--json")
     assert status == 0 and set(json.loads(out)["programs"]) == {"colour.glsl", "luminance.glsl"}
 
 
-@pytest.mark.parametrize("log, expected", [
-    ("0:12(5): error: `foo' undeclared", (12, "error")),
-    ("0(12) : error C1503: undefined variable \"foo\"", (12, "error")),
-    ("ERROR: 0:12: 'foo' : undeclared identifier", (12, "error")),
-])
+@pytest.mark.parametrize(
+    "log, expected",
+    [
+        ("0:12(5): error: `foo' undeclared", (12, "error")),
+        ('0(12) : error C1503: undefined variable "foo"', (12, "error")),
+        ("ERROR: 0:12: 'foo' : undeclared identifier", (12, "error")),
+    ],
+)
 def test_messages_of_other_drivers(log, expected, tmp_path):
     (tmp_path / "p.glsl").write_text("\n" * 7 + "float a; // nothing\nvoid main() { float x = foo; }\n\n\n\n")
     source = expand("p.glsl", "fragment", {}, tmp_path)
@@ -234,7 +265,9 @@ def test_active_lines_compile_to_the_same_interface(gl, name):
         kept = {}
         for stage in STAGES:
             version = text[stage].split("\n")[0]
-            kept[stage] = "\n".join([version, *(line for _, line in preprocess.active_lines(text[stage], defines=True))]) + "\n"
+            kept[stage] = (
+                "\n".join([version, *(line for _, line in preprocess.active_lines(text[stage], defines=True))]) + "\n"
+            )
             assert "#if" not in kept[stage]
         full = gl.ctx.program(vertex_shader=text["vertex"], fragment_shader=text["fragment"])
         bare = gl.ctx.program(vertex_shader=kept["vertex"], fragment_shader=kept["fragment"])
@@ -242,21 +275,49 @@ def test_active_lines_compile_to_the_same_interface(gl, name):
         full.release(), bare.release()
 
 
-@pytest.mark.parametrize("expression, macros, truth", [
-    ("defined(A) && !defined B", {"A": ""}, True), ("A > 2 || B == 1", {"A": "3"}, True), ("FACTOR * 2 != 4", {"FACTOR": "2"}, False),
-    ("UNKNOWN", {}, False), ("X", {"X": "Y", "Y": "7"}, True), ("__import__('os')", {}, False), ("1 +", {}, False), ("(1 << 2) == 4", {}, True),
-    ("1 || 1 / 0", {}, True), ("1 / 0", {}, False), ("0x1F == 31 && 017 == 15 && 7u == 7", {}, True), ("09", {}, False), ("1.5", {}, False),
-    ("7 / 2 == 3 && -7 / 2 == -3 && -7 % 2 == -1", {}, True), ("2147483647 + 1 < 0", {}, True), ("0x80000000 >> 31 == -1", {}, True),
-    ("~0 == -1 && !!5 == 1", {}, True), ("1 - 1 - 1 == -1", {}, True), ("A", {"A": ""}, False), ("defined A B", {}, False),
-])
+@pytest.mark.parametrize(
+    "expression, macros, truth",
+    [
+        ("defined(A) && !defined B", {"A": ""}, True),
+        ("A > 2 || B == 1", {"A": "3"}, True),
+        ("FACTOR * 2 != 4", {"FACTOR": "2"}, False),
+        ("UNKNOWN", {}, False),
+        ("X", {"X": "Y", "Y": "7"}, True),
+        ("__import__('os')", {}, False),
+        ("1 +", {}, False),
+        ("(1 << 2) == 4", {}, True),
+        ("1 || 1 / 0", {}, True),
+        ("1 / 0", {}, False),
+        ("0x1F == 31 && 017 == 15 && 7u == 7", {}, True),
+        ("09", {}, False),
+        ("1.5", {}, False),
+        ("7 / 2 == 3 && -7 / 2 == -3 && -7 % 2 == -1", {}, True),
+        ("2147483647 + 1 < 0", {}, True),
+        ("0x80000000 >> 31 == -1", {}, True),
+        ("~0 == -1 && !!5 == 1", {}, True),
+        ("1 - 1 - 1 == -1", {}, True),
+        ("A", {"A": ""}, False),
+        ("defined A B", {}, False),
+    ],
+)
 def test_conditions(expression, macros, truth):
     assert preprocess.evaluate(expression, macros) is truth
 
 
-@pytest.mark.parametrize("expression, macros", [
-    ("9**9**9", {}), ("1 << 99999999999", {}), ("9" * 100_000, {}), ("(" * 5_000 + "1" + ")" * 5_000, {}), ("-" * 5_000 + "1", {}),
-    ("a", {"a": "a"}), ("a", {"a": "b", "b": "a"}), ("a0", {f"a{i}": f"a{i + 1} + a{i + 1}" for i in range(60)}), ("1 +" * 50_000 + "1", {}),
-])
+@pytest.mark.parametrize(
+    "expression, macros",
+    [
+        ("9**9**9", {}),
+        ("1 << 99999999999", {}),
+        ("9" * 100_000, {}),
+        ("(" * 5_000 + "1" + ")" * 5_000, {}),
+        ("-" * 5_000 + "1", {}),
+        ("a", {"a": "a"}),
+        ("a", {"a": "b", "b": "a"}),
+        ("a0", {f"a{i}": f"a{i + 1} + a{i + 1}" for i in range(60)}),
+        ("1 +" * 50_000 + "1", {}),
+    ],
+)
 def test_conditions_that_would_take_for_ever(expression, macros):
     """Powers, shifts, long numbers, deep brackets, macros that name themselves or double at
     each step: read or refused at once."""
@@ -274,9 +335,14 @@ def test_a_macro_does_not_expand_itself_again():
 _expressions = st.recursive(
     st.integers(0, 40).map(str) | st.sampled_from(["A", "B", "0x7fffffff", "defined(A)", "defined C"]),
     lambda inner: st.one_of(
-        st.tuples(st.sampled_from("+-!~"), inner).map(lambda t: f"{t[0]} {t[1]}"), inner.map(lambda e: f"({e})"),
-        st.tuples(inner, st.sampled_from(["||", "&&", "|", "^", "&", "==", "!=", "<", ">", "<=", ">=", "+", "-", "*"]), inner).map(" ".join)),
-    max_leaves=8)
+        st.tuples(st.sampled_from("+-!~"), inner).map(lambda t: f"{t[0]} {t[1]}"),
+        inner.map(lambda e: f"({e})"),
+        st.tuples(
+            inner, st.sampled_from(["||", "&&", "|", "^", "&", "==", "!=", "<", ">", "<=", ">=", "+", "-", "*"]), inner
+        ).map(" ".join),
+    ),
+    max_leaves=8,
+)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -284,8 +350,12 @@ _expressions = st.recursive(
 def test_conditions_against_the_driver(gl, expression):
     """The driver's preprocessor is the oracle."""
     vertex = "#version 430 core\nvoid main() { gl_Position = vec4(0.0); }\n"
-    text = (f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform "
-            "float no;\n#endif\nout vec4 c;\nvoid main() { c = vec4(\n#if " + expression + "\nyes\n#else\nno\n#endif\n); }\n")
+    text = (
+        f"#version 430 core\n#define A 3\n#define B (A - 5)\n#if {expression}\nuniform float yes;\n#else\nuniform "
+        "float no;\n#endif\nout vec4 c;\nvoid main() { c = vec4(\n#if "
+        + expression
+        + "\nyes\n#else\nno\n#endif\n); }\n"
+    )
     program = gl.ctx.program(vertex_shader=vertex, fragment_shader=text)
     says = "yes" in program
     program.release()
@@ -293,14 +363,19 @@ def test_conditions_against_the_driver(gl, expression):
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.text(alphabet="01239xXuAB()+-*/%<>&|^!~= \t.'\"\\#defined", max_size=60), st.dictionaries(st.sampled_from("AB"), st.text(alphabet="AB12()+<", max_size=12)))
+@given(
+    st.text(alphabet="01239xXuAB()+-*/%<>&|^!~= \t.'\"\\#defined", max_size=60),
+    st.dictionaries(st.sampled_from("AB"), st.text(alphabet="AB12()+<", max_size=12)),
+)
 def test_conditions_of_any_text_are_answered(expression, macros):
     assert preprocess.evaluate(expression, macros) in (True, False)
 
 
 def test_else_branches():
-    text = ("#if 0\na\n#elif 1\nb // c\n#elif 1\nd\n#else\ne\n#endif\n#ifndef X\n#define X 1\nf /* g\nh */ "
-            "i\n#endif\n#ifdef X\nj\n#endif\n")
+    text = (
+        "#if 0\na\n#elif 1\nb // c\n#elif 1\nd\n#else\ne\n#endif\n#ifndef X\n#define X 1\nf /* g\nh */ "
+        "i\n#endif\n#ifdef X\nj\n#endif\n"
+    )
     assert [line.strip() for _, line in preprocess.active_lines(text)] == ["b", "f", "i", "j"]
 
 
@@ -312,15 +387,30 @@ def test_time_counts_what_is_drawn(shader, config):
     result = json.loads(out)
     assert status == 0 and result["repeat"] == 3 and result["width"] == 96
     passes = {p["pass"]: p for p in result["passes"]}
-    assert set(passes) == {"luminance", "colour", "labels", "occlusion, per direction"}  # a uniform timeline needs no velocity
+    assert set(passes) == {
+        "luminance",
+        "colour",
+        "labels",
+        "occlusion, per direction",
+    }  # a uniform timeline needs no velocity
     for p in passes.values():
-        assert p["gpu_ms"] > 0 and 0 <= p["vertex_ms"] <= p["gpu_ms"] and p["fragment_ms"] == pytest.approx(p["gpu_ms"] - p["vertex_ms"])
-        assert p["triangles"] == sum(v["triangles"] for v in p["variants"]) and p["draws"] == sum(v["draws"] for v in p["variants"])
+        assert (
+            p["gpu_ms"] > 0
+            and 0 <= p["vertex_ms"] <= p["gpu_ms"]
+            and p["fragment_ms"] == pytest.approx(p["gpu_ms"] - p["vertex_ms"])
+        )
+        assert p["triangles"] == sum(v["triangles"] for v in p["variants"]) and p["draws"] == sum(
+            v["draws"] for v in p["variants"]
+        )
         assert sum(v["fragments"] for v in p["variants"]) == p["fragments"]
         assert 0.3 < p["overdraw"] < 2.5
     assert passes["colour"]["fragments"] == pytest.approx(4 * passes["luminance"]["fragments"], rel=0.05)
-    assert {v["variant"] for v in passes["luminance"]["variants"]} == {"luminance.glsl TEXTURED LIT", "luminance.glsl TEXTURED LIT TWO_SIDED",
-                                                                       "luminance.glsl LIT", "luminance.glsl TWO_SIDED"}
+    assert {v["variant"] for v in passes["luminance"]["variants"]} == {
+        "luminance.glsl TEXTURED LIT",
+        "luminance.glsl TEXTURED LIT TWO_SIDED",
+        "luminance.glsl LIT",
+        "luminance.glsl TWO_SIDED",
+    }
 
 
 class _Recorder:
@@ -353,10 +443,13 @@ class _Recorder:
         return call
 
 
-@pytest.mark.parametrize("is_software, expected", [
-    (True, "finish finish stamp finish count draw counted finish stamp finish finish"),
-    (False, "finish stamp count draw counted stamp finish"),
-])
+@pytest.mark.parametrize(
+    "is_software, expected",
+    [
+        (True, "finish finish stamp finish count draw counted finish stamp finish finish"),
+        (False, "finish stamp count draw counted stamp finish"),
+    ],
+)
 def test_a_stopwatch_waits_around_time_stamps_of_software(is_software, expected):
     """A stamp taken while llvmpipe's threads still draw would miss the rasteriser's work; a
     card must not be waited for in between."""
@@ -375,8 +468,12 @@ def test_overdraw_and_the_half_resolution_twin(gl):
     big, small = scene.camera, half.camera
     assert (big.width, big.height, small.width, small.height) == (64, 48, 32, 24)
     for ray in ((0.3, -0.2), (-0.1, 0.4)):
-        for axis, (full, twin) in enumerate((((big.fx, big.cx, big.width), (small.fx, small.cx, small.width)),
-                                             ((big.fy, big.cy, big.height), (small.fy, small.cy, small.height)))):
+        for axis, (full, twin) in enumerate(
+            (
+                ((big.fx, big.cx, big.width), (small.fx, small.cx, small.width)),
+                ((big.fy, big.cy, big.height), (small.fy, small.cy, small.height)),
+            )
+        ):
             at = [(f * ray[axis] + c + 0.5) / n for f, c, n in (full, twin)]  # as a fraction of the image
             assert at[0] == pytest.approx(at[1], abs=1e-12)
     for world, pixels in ((scene, 64 * 48), (half, 32 * 24)):
@@ -388,31 +485,34 @@ def test_overdraw_and_the_half_resolution_twin(gl):
 # ------------------------------------------------------------------------------------------------- bad input
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (("passes", "CONFIG", "--out", "TMP", "--pass", "depht"), ["--pass", "depht", "depth"]),
-    (("probe", "CONFIG", "--pixel", "96,0"), ["--pixel", "96,0", "X < 96"]),
-    (("probe", "CONFIG", "--pixel", "-1,3"), ["--pixel", "0 <= X"]),
-    (("probe", "CONFIG", "--pixel", "3"), ["--pixel", "not a pixel"]),
-    (("probe", "CONFIG", "--pixel", "3,4", "--time", "9"), ["--time", "9", "0 to 0.4 s"]),
-    (("diff", "CONFIG", "--time", "nan"), ["--time", "0 to 0.4 s"]),
-    (("diff", "CONFIG", "--step", "0"), ["--step"]),
-    (("diff", "CONFIG", "--tolerance", "depth=x"), ["--tolerance", "depth=x"]),
-    (("diff", "CONFIG", "--tolerance", "dept=1"), ["--tolerance", "dept", "depth"]),
-    (("diff", "CONFIG", "--pass", "triangle"), ["--pass", "triangle"]),
-    (("diff", "CONFIG", "--shaders", "/nowhere/shaders"), ["--shaders", "no such shader folder"]),
-    (("check", "--shaders", "TMP"), ["--shaders", "no shaders in this folder"]),
-    (("check", "--shaders", "CONFIG"), ["--shaders", "not a folder"]),
-    (("check", "nothing.glsl"), ["nothing.glsl", "label.glsl"]),
-    (("check", "--backend", "vulkan"), ["gl.backend", "vulkan"]),
-    (("check", "--device", "97", "--backend", "egl"), ["gl"]),
-    (("show", "nothing.glsl"), ["nothing.glsl", "label.glsl"]),
-    (("show", "label.glsl", "--stage", "geometry"), ["--stage", "geometry"]),
-    (("show", "label.glsl", "--define", "2X"), ["2X"]),
-    (("probe", "/nowhere.yaml", "--pixel", "1,1"), ["/nowhere.yaml", "no such file"]),
-    (("serve", "CONFIG", "--port", "70000"), ["--port"]),
-    (("passes", "CONFIG", "--out", "CONFIG"), ["is a file"]),
-    (("diff", "CONFIG", "--set", "gl.device=97", "--set", "gl.backend=egl"), ["gl"]),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("passes", "CONFIG", "--out", "TMP", "--pass", "depht"), ["--pass", "depht", "depth"]),
+        (("probe", "CONFIG", "--pixel", "96,0"), ["--pixel", "96,0", "X < 96"]),
+        (("probe", "CONFIG", "--pixel", "-1,3"), ["--pixel", "0 <= X"]),
+        (("probe", "CONFIG", "--pixel", "3"), ["--pixel", "not a pixel"]),
+        (("probe", "CONFIG", "--pixel", "3,4", "--time", "9"), ["--time", "9", "0 to 0.4 s"]),
+        (("diff", "CONFIG", "--time", "nan"), ["--time", "0 to 0.4 s"]),
+        (("diff", "CONFIG", "--step", "0"), ["--step"]),
+        (("diff", "CONFIG", "--tolerance", "depth=x"), ["--tolerance", "depth=x"]),
+        (("diff", "CONFIG", "--tolerance", "dept=1"), ["--tolerance", "dept", "depth"]),
+        (("diff", "CONFIG", "--pass", "triangle"), ["--pass", "triangle"]),
+        (("diff", "CONFIG", "--shaders", "/nowhere/shaders"), ["--shaders", "no such shader folder"]),
+        (("check", "--shaders", "TMP"), ["--shaders", "no shaders in this folder"]),
+        (("check", "--shaders", "CONFIG"), ["--shaders", "not a folder"]),
+        (("check", "nothing.glsl"), ["nothing.glsl", "label.glsl"]),
+        (("check", "--backend", "vulkan"), ["gl.backend", "vulkan"]),
+        (("check", "--device", "97", "--backend", "egl"), ["gl"]),
+        (("show", "nothing.glsl"), ["nothing.glsl", "label.glsl"]),
+        (("show", "label.glsl", "--stage", "geometry"), ["--stage", "geometry"]),
+        (("show", "label.glsl", "--define", "2X"), ["2X"]),
+        (("probe", "/nowhere.yaml", "--pixel", "1,1"), ["/nowhere.yaml", "no such file"]),
+        (("serve", "CONFIG", "--port", "70000"), ["--port"]),
+        (("passes", "CONFIG", "--out", "CONFIG"), ["is a file"]),
+        (("diff", "CONFIG", "--set", "gl.device=97", "--set", "gl.backend=egl"), ["gl"]),
+    ],
+)
 def test_bad_input_is_one_line_and_2(shader, config, tmp_path, arguments, words):
     arguments = [{"CONFIG": config, "TMP": str(tmp_path)}.get(a, a) for a in arguments]
     status, out, err = shader(*arguments)
@@ -424,7 +524,9 @@ def test_unreadable_shader_folder(shader, shaders, monkeypatch):
     import os
 
     real = os.access
-    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != shaders and real(path, mode))  # root may read anything
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: Path(path) != shaders and real(path, mode)
+    )  # root may read anything
     status, _, err = shader("check", "--shaders", shaders)
     assert status == 2 and err.startswith("error: --shaders: shader folder cannot be read") and err.count("\n") == 1
 
@@ -432,11 +534,17 @@ def test_unreadable_shader_folder(shader, shaders, monkeypatch):
 def test_include_cycle_met_while_drawing(shader, config, shaders):
     (shaders / "include/motion.glsl").write_text('#include "motion.glsl"\n')
     status, out, err = shader("diff", config, "--shaders", shaders)
-    assert (status, out) == (2, "") and err == "error: include/motion.glsl:1: include cycle: include/motion.glsl -> include/motion.glsl\n"
+    assert (status, out) == (
+        2,
+        "",
+    ) and err == "error: include/motion.glsl:1: include cycle: include/motion.glsl -> include/motion.glsl\n"
 
 
 def test_an_older_copy_borrows_the_debug_program(shader, config, shaders):
     (shaders / "debug.glsl").unlink()
     assert shader("diff", config, "--shaders", shaders, "--pass", "depth")[0] == 0
-    assert "debug.glsl" in [p.name for p in Path(str(shader_folder())).iterdir()] and check._programs([], str(shaders))[1].count("debug.glsl") == 1
+    assert (
+        "debug.glsl" in [p.name for p in Path(str(shader_folder())).iterdir()]
+        and check._programs([], str(shaders))[1].count("debug.glsl") == 1
+    )
     assert open_folder(str(shaders)).path == shaders

@@ -53,18 +53,38 @@ def written(config, tmp_path_factory):
 def test_passes_writes_every_buffer_that_generation_renders(written, world):
     config, scene = world
     arrays = {name: np.load(written / f"{name}.npy") for name in moments.PASSES}
-    ask = LabelRequest("depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward")
+    ask = LabelRequest(
+        "depth",
+        "ids",
+        "normals",
+        "velocity",
+        "flow_forward",
+        "flow_backward",
+        "occlusion_forward",
+        "occlusion_backward",
+    )
     with create_context() as gl, Renderer(gl, scene, config.render) as renderer:
         labels = renderer.labels(T, ask, T_NEXT, T_LAST)
         luminance, colour = renderer.luminance(T).read(), renderer.colour(T).read()
     for name, expected in {
-        "luminance": luminance, "colour": colour, "depth": labels.depth, "id": labels.ids, "normals": labels.normals, "velocity": labels.velocity,
-        "flow_forward": labels.forward.flow, "valid_forward": labels.forward.valid, "occluded_forward": labels.forward.occluded,
-        "flow_backward": labels.backward.flow, "valid_backward": labels.backward.valid, "occluded_backward": labels.backward.occluded,
+        "luminance": luminance,
+        "colour": colour,
+        "depth": labels.depth,
+        "id": labels.ids,
+        "normals": labels.normals,
+        "velocity": labels.velocity,
+        "flow_forward": labels.forward.flow,
+        "valid_forward": labels.forward.valid,
+        "occluded_forward": labels.forward.occluded,
+        "flow_backward": labels.backward.flow,
+        "valid_backward": labels.backward.valid,
+        "occluded_backward": labels.backward.occluded,
     }.items():
         assert arrays[name].dtype == expected.dtype, name
         np.testing.assert_array_equal(arrays[name], expected, err_msg=name)
-    np.testing.assert_allclose(arrays["log_luminance"], np.log(luminance + np.float32(config.events.log_eps)), rtol=1e-6)
+    np.testing.assert_allclose(
+        arrays["log_luminance"], np.log(luminance + np.float32(config.events.log_eps)), rtol=1e-6
+    )
     assert arrays["luminance_uv"].shape == (HEIGHT, WIDTH, 2) and arrays["colour_level"].shape == (HEIGHT, WIDTH)
     assert not arrays["valid_forward"][labels.ids == 4].any() and (labels.ids == 4).any()  # the pane passes the camera
 
@@ -79,9 +99,16 @@ def test_pictures_are_labelled_and_large_enough(written):
 
 
 def test_only_the_passes_asked_for(shader, config, tmp_path):
-    status, _out, _ = shader("passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "colour_uv", "--time", 0.25)
-    assert status == 0 and sorted(p.name for p in (tmp_path / "o").iterdir()) == ["colour_uv.npy", "colour_uv.png", "contact_sheet.png",
-                                                                                      "depth.npy", "depth.png"]
+    status, _out, _ = shader(
+        "passes", config, "--out", tmp_path / "o", "--pass", "depth", "--pass", "colour_uv", "--time", 0.25
+    )
+    assert status == 0 and sorted(p.name for p in (tmp_path / "o").iterdir()) == [
+        "colour_uv.npy",
+        "colour_uv.png",
+        "contact_sheet.png",
+        "depth.npy",
+        "depth.png",
+    ]
 
 
 # ------------------------------------------------------------------------------------------------- against the
@@ -93,7 +120,10 @@ def both(config):
     subject = open_subject(config)
     when = moment(subject)
     with open_renderer(subject) as renderer:
-        gpu, ref = moments.GpuMoment(renderer, when, subject.log_eps), moments.ReferenceMoment(subject.scene, when, subject.log_eps)
+        gpu, ref = (
+            moments.GpuMoment(renderer, when, subject.log_eps),
+            moments.ReferenceMoment(subject.scene, when, subject.log_eps),
+        )
         for name in (*moments.PASSES, "part", "window", "next_depth_forward", "next_depth_backward"):
             gpu[name]
         comparison = compare.Comparison(gpu, ref)
@@ -134,7 +164,9 @@ def test_look_ups_are_those_of_the_pass_itself(both):
 
 
 def test_the_mip_bias_of_a_configuration_is_no_error(shader, config):
-    status, out, _ = shader("diff", config, "--set", "render.mip_bias=-1", "--pass", "luminance_level", "--pass", "luminance_albedo")
+    status, out, _ = shader(
+        "diff", config, "--set", "render.mip_bias=-1", "--pass", "luminance_level", "--pass", "luminance_albedo"
+    )
     assert status == 0, out
 
 
@@ -144,21 +176,37 @@ def test_derivative_of_luminance_of_a_sliding_cosine(gl):
     speed, depth, width, texels, periods = 0.5, 4.0, 4.0, 128, 2
     k = 2 * np.pi * periods / width
     u = (np.arange(texels) + 0.5) / texels
-    paint = np.repeat((0.5 + 0.3 * np.cos(2 * np.pi * periods * u)).astype(np.float32)[None, :, None], 3, axis=2).repeat(4, axis=0)
-    wall = SceneObject("wall", 1, (Part(grid(width=width, depth=width), Material(Texture(paint), unlit=True)),), StaticPath(np.eye(4)))
-    eye = KeyframePath([0, 10**9], [(0.0, 0, depth), (speed, 0, depth)], Rotation.concatenate([Rotation.from_matrix(np.diag([1.0, -1, -1]))] * 2),
-                       interpolation="linear")
+    paint = np.repeat(
+        (0.5 + 0.3 * np.cos(2 * np.pi * periods * u)).astype(np.float32)[None, :, None], 3, axis=2
+    ).repeat(4, axis=0)
+    wall = SceneObject(
+        "wall", 1, (Part(grid(width=width, depth=width), Material(Texture(paint), unlit=True)),), StaticPath(np.eye(4))
+    )
+    eye = KeyframePath(
+        [0, 10**9],
+        [(0.0, 0, depth), (speed, 0, depth)],
+        Rotation.concatenate([Rotation.from_matrix(np.diag([1.0, -1, -1]))] * 2),
+        interpolation="linear",
+    )
     scene = Scene((wall,), Rig.alone(PinHole(64, 8, 200.0, 200.0, 31.5, 3.5), eye), 0, 10**9)
     when = When(500_000_000, 600_000_000, 400_000_000, 499_000_000, 501_000_000)
     x = speed * 0.5 + depth * (np.arange(64) - 31.5) / 200.0
-    phase = wall.parts[0].mesh.uvs[:, 0][np.argmin(wall.parts[0].mesh.vertices[:, 0])] - (-0.5)  # where u = 0 lies, in texture widths
+    phase = wall.parts[0].mesh.uvs[:, 0][np.argmin(wall.parts[0].mesh.vertices[:, 0])] - (
+        -0.5
+    )  # where u = 0 lies, in texture widths
     expected = -0.3 * k * np.sin(k * x + 2 * np.pi * periods * phase) * speed
     with DebugRenderer(gl, scene, RenderConfig()) as renderer:
         measured = moments.GpuMoment(renderer, when, 1e-3)["dL_dt"]
     true = moments.ReferenceMoment(scene, when, 1e-3)["dL_dt"]
     largest = 0.3 * k * speed
-    for derivative in (measured, true):  # the bilinear texture's slope is a staircase: off by up to half a texel's curvature, 5 %
-        assert np.abs(derivative - expected).max() < 0.06 * largest and np.abs(derivative - expected).mean() < 0.03 * largest
+    for derivative in (
+        measured,
+        true,
+    ):  # the bilinear texture's slope is a staircase: off by up to half a texel's curvature, 5 %
+        assert (
+            np.abs(derivative - expected).max() < 0.06 * largest
+            and np.abs(derivative - expected).mean() < 0.03 * largest
+        )
     assert np.abs(measured - true).max() < 0.01 * largest
 
 
@@ -169,7 +217,9 @@ def test_reference_mip_level_of_a_facing_plane():
     texels = points[:, :, :2] * per_unit
     ray = np.array([[0.02, -0.01, 1.0]])
     slopes = np.array([[[1 / focal[0], 0.0], [0.0, 1 / focal[1]], [0.0, 0.0]]])
-    assert moments.footprint(points, texels, ray, slopes)[0] == pytest.approx(np.log2(per_unit * depth / 110.0), abs=1e-12)
+    assert moments.footprint(points, texels, ray, slopes)[0] == pytest.approx(
+        np.log2(per_unit * depth / 110.0), abs=1e-12
+    )
     points[0, 2, 2] = 9.0
 
     def where(rx, ry):
@@ -192,10 +242,21 @@ def test_mip_chain_keeps_the_mean_and_level_0_is_the_reference():
     np.testing.assert_allclose(chain[2].image[3, 5], image[12:16, 20:24].mean((0, 1)), atol=1e-6)
     np.testing.assert_allclose(chain[-1].image[0, 0], image.mean((0, 1)), atol=1e-6)
     uv = rng.uniform(-2, 2, (50, 2))
-    np.testing.assert_array_equal(mipmaps.sample_trilinear(texture, uv, np.zeros(50)), reference.sample_bilinear(texture, uv))
-    np.testing.assert_array_equal(mipmaps.sample_trilinear(texture, uv, np.full(50, -3.0)), reference.sample_bilinear(texture, uv))
+    np.testing.assert_array_equal(
+        mipmaps.sample_trilinear(texture, uv, np.zeros(50)), reference.sample_bilinear(texture, uv)
+    )
+    np.testing.assert_array_equal(
+        mipmaps.sample_trilinear(texture, uv, np.full(50, -3.0)), reference.sample_bilinear(texture, uv)
+    )
     half = mipmaps.sample_trilinear(texture, uv, np.full(50, 1.5))
-    np.testing.assert_allclose(half, (mipmaps.sample_trilinear(texture, uv, np.full(50, 1.0)) + mipmaps.sample_trilinear(texture, uv, np.full(50, 2.0))) / 2)
+    np.testing.assert_allclose(
+        half,
+        (
+            mipmaps.sample_trilinear(texture, uv, np.full(50, 1.0))
+            + mipmaps.sample_trilinear(texture, uv, np.full(50, 2.0))
+        )
+        / 2,
+    )
 
 
 # ------------------------------------------------------------------------------------------------- probe
@@ -210,7 +271,11 @@ def test_probe_shows_the_values_of_passes(shader, config, written, world):
         if row["name"] != "colour":  # passes super-samples it, as generation does
             np.testing.assert_array_equal(np.asarray(row["gpu"]), np.load(written / f"{row['name']}.npy")[y, x])
     by_name = {row["name"]: row for row in found["buffers"]}
-    assert by_name["depth"]["ulps"] < 8 and by_name["flow_forward"]["error"] < 1e-5 and by_name["flow_forward"]["error_unit"] == "px"
+    assert (
+        by_name["depth"]["ulps"] < 8
+        and by_name["flow_forward"]["error"] < 1e-5
+        and by_name["flow_forward"]["error_unit"] == "px"
+    )
     assert found["surface"]["gpu"]["object"] == found["surface"]["reference"]["object"] == "ball"
     bary = found["surface"]["reference"]["bary"]
     np.testing.assert_allclose(found["surface"]["gpu"]["bary"], bary, atol=1e-3)
@@ -275,7 +340,12 @@ def test_ulps():
 def test_diff_of_the_shipped_shaders_is_clean(shader, config, tmp_path):
     some = ("--pass", "depth", "--pass", "flow_forward", "--pass", "luminance")
     status, out, _ = shader("diff", config, "--time", 0.1, *some, "--out", tmp_path / "d")
-    assert status == 0 and "all 3 buffers agree" in out and "silhouette band" in out and "own albedo times its own light" in out
+    assert (
+        status == 0
+        and "all 3 buffers agree" in out
+        and "silhouette band" in out
+        and "own albedo times its own light" in out
+    )
     assert (tmp_path / "d" / "diff.png").stat().st_size > 10_000
     assert np.load(tmp_path / "d" / "depth_error.npy").shape == (HEIGHT, WIDTH)
 
@@ -287,7 +357,12 @@ def test_a_full_disk_names_the_user_s_file(shader, config, tmp_path, monkeypatch
     monkeypatch.setattr(np, "save", full)
     for command, more in (("passes", ()), ("diff", ("--tolerance", "1"))):
         status, _, err = shader(command, config, "--pass", "depth", *more, "--out", tmp_path / command)
-        assert status == 2 and err.startswith(f"error: {tmp_path / command}/depth") and "no space left" in err and "blinkgl-tmp" not in err
+        assert (
+            status == 2
+            and err.startswith(f"error: {tmp_path / command}/depth")
+            and "no space left" in err
+            and "blinkgl-tmp" not in err
+        )
         assert [p.name for p in (tmp_path / command).iterdir()] == []
 
 
@@ -300,13 +375,20 @@ def test_tolerances(shader, config):
     assert {o["object"] for o in objects} == {"floor", "ball", "box", "passing", "nothing hit"}
     assert [o["max"] for o in objects] == sorted((o["max"] for o in objects), reverse=True)
     assert sum(o["pixels"] for o in objects) == report["buffers"][0]["off_silhouettes"]["pixels"]
-    assert report["first"]["buffer"] == "depth" and {o["object"] for o in report["objects"]} == {"floor", "ball", "box", "passing"}
+    assert report["first"]["buffer"] == "depth" and {o["object"] for o in report["objects"]} == {
+        "floor",
+        "ball",
+        "box",
+        "passing",
+    }
     assert sum(report["buffers"][0]["histogram"].values()) == report["buffers"][0]["off_silhouettes"]["pixels"]
 
 
-EXPECTED = {"sign of the flow": ("flow_forward", "the sign is wrong", "forward flow"),
-            "no perspective division": ("flow_forward", "the perspective division is missing", "forward flow"),
-            "depth off by near": ("depth", "off by the near plane: near = 0.05 is subtracted", "depth")}
+EXPECTED = {
+    "sign of the flow": ("flow_forward", "the sign is wrong", "forward flow"),
+    "no perspective division": ("flow_forward", "the perspective division is missing", "forward flow"),
+    "depth off by near": ("depth", "off by the near plane: near = 0.05 is subtracted", "depth"),
+}
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -318,7 +400,9 @@ def test_a_broken_shader_is_found(shader, config, shaders, mistake):
     reports = {b["buffer"]: b for b in json.loads(out)["buffers"]}
     assert status == 1 and not reports[buffer]["passed"]
     assert reports[buffer]["suspicions"][0].startswith(suspicion)
-    unharmed = {"local", "id", "velocity", "normals", "luminance", "colour", "luminance_albedo", "colour_uv"} | ({"depth"} if buffer != "depth" else {"flow_forward"})
+    unharmed = {"local", "id", "velocity", "normals", "luminance", "colour", "luminance_albedo", "colour_uv"} | (
+        {"depth"} if buffer != "depth" else {"flow_forward"}
+    )
     assert all(reports[name]["passed"] for name in unharmed)
 
     worst = reports[buffer]["objects"][0]
@@ -344,7 +428,9 @@ def test_a_mistaken_look_up_is_named_as_such(shader, config, shaders, mistake):
         assert len(row) == 1 and re.search(r"\(\d+, \d+\)", row[0])
 
 
-@pytest.mark.parametrize("who, objects", [("ball", {"ball"}), ("passing", {"passing"}), ("camera", {"floor", "ball", "box", "passing"})])
+@pytest.mark.parametrize(
+    "who, objects", [("ball", {"ball"}), ("passing", {"passing"}), ("camera", {"floor", "ball", "box", "passing"})]
+)
 def test_a_stale_pose_is_named_with_its_time(shader, config, monkeypatch, who, objects):
     class Stale(DebugRenderer):
         def __init__(self, gl, scene, render):
@@ -366,20 +452,33 @@ def test_a_backward_flow_that_runs_forward_is_named(shader, config, monkeypatch)
     monkeypatch.setattr(session, "DebugRenderer", Forward)
     status, out, _ = shader("diff", config, "--json")
     first = json.loads(out)["first"]
-    assert status == 1 and first["buffer"] == "flow_backward" and first["suspicions"][0].startswith("the forward flow (")
+    assert (
+        status == 1 and first["buffer"] == "flow_backward" and first["suspicions"][0].startswith("the forward flow (")
+    )
 
 
 def test_another_object_s_texture_is_named(shader, config, monkeypatch):
     own = SceneResources.luminance_texture
-    monkeypatch.setattr(SceneResources, "luminance_texture", lambda self, material: own(self, next(i.material for i in self.items if i.textured)))
+    monkeypatch.setattr(
+        SceneResources,
+        "luminance_texture",
+        lambda self, material: own(self, next(i.material for i in self.items if i.textured)),
+    )
     status, out, _ = shader("diff", config, "--json")
     first = json.loads(out)["first"]
     assert status == 1 and (first["buffer"], first["objects"]) == ("luminance_albedo", ["floor"])
     assert first["suspicions"][0].startswith("the texture of ball (")
 
 
-@pytest.mark.parametrize("more", [("--time", "0.25"), ("--set", "camera.width=61", "--set", "camera.height=47"), ("--set", "render.mip_bias=-1", "--time", "0"),
-                                  ("--set", "render.antialiasing=taps4", "--time", "0.1")])
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("--time", "0.25"),
+        ("--set", "camera.width=61", "--set", "camera.height=47"),
+        ("--set", "render.mip_bias=-1", "--time", "0"),
+        ("--set", "render.antialiasing=taps4", "--time", "0.1"),
+    ],
+)
 def test_right_shaders_raise_no_suspicion(shader, config, more):
     status, out, _ = shader("diff", config, *more)
     assert status == 0 and "looks as if" not in out and "FAIL" not in out
@@ -435,4 +534,8 @@ def test_nothing_written_where_the_gpu_says_nan(both):
         report = comparison.report("depth")
     finally:
         comparison.gpu._made["depth"] = original
-    assert report.value == np.inf and report.tolerance == quantity.tolerance and (report.objects[0]["x"], report.objects[0]["y"]) == (x, y)
+    assert (
+        report.value == np.inf
+        and report.tolerance == quantity.tolerance
+        and (report.objects[0]["x"], report.objects[0]["y"]) == (x, y)
+    )

@@ -37,7 +37,9 @@ def served(config, tmp_path_factory):
 def ask(server, path: str, method: str = "GET", host: str | None = None):
     """(status, headers, body). Paths go over the wire as they are."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
-    connection._encode_request = lambda request: request.encode("utf-8", "surrogateescape")  # as it stands, not as http.client likes it
+    connection._encode_request = lambda request: request.encode(
+        "utf-8", "surrogateescape"
+    )  # as it stands, not as http.client likes it
     connection._validate_path = lambda path: None
     connection.putrequest(method, path, skip_host=True)
     if host != "":
@@ -103,17 +105,38 @@ def test_difference_of_gpu_and_reference_is_small_and_of_two_passes_is_not(serve
     assert status == 400 and "components" in json.loads(body)["error"]
 
 
-@pytest.mark.parametrize("path, words", [
-    ("/image?pass=nothing", "unknown pass"), ("/image", "unknown pass"), ("/image?pass=depth&t=99", "outside the sequence"), ("/image?pass=depth&t=x", "not a time"),
-    ("/image?pass=depth&t=inf", "outside the sequence"), ("/image?pass=depth&source=disk", "unknown source"), ("/image?pass=depth&map=../x", "unknown colour map"),
-    ("/image?pass=depth&low=nan", "not a number"), ("/image?pass=velocity&component=w", "no such component"), ("/probe?x=1", "not a pixel"),
-    ("/probe?x=96&y=0", "outside the image"), ("/difference?a=depth", "unknown source"), ("/image?pass=depth&t=1e308", "outside the sequence"),
-    ("/wait?version=²", "not a version"), ("/wait?version=%C2%B2", "not a version"), ("/wait?version=-1", "not a version"),
-    ("/wait?version=" + "9" * 30, "not a version"), ("/probe?x=%C2%B2&y=1", "not a pixel"), ("/probe?x=" + "9" * 1900 + "&y=1", "outside the image"),
-    ("/image?pass=depth&low=-1e308&high=1e308", "not a number"), ("/image?pass=depth&pass=id", "asked twice"), ("/image?pass=depth&size=3", "unknown parameter"),
-    ("/state?a=1", "unknown parameter"), ("/image?pass=" + "x" * 3000, "too long"), ("/verdict?t=-1e400", "outside the sequence"),
-    ("/difference?a=depth:gpu&b=local:gpu", "components"), ("/image?pass=depth&component=..", "no such component"),
-])
+@pytest.mark.parametrize(
+    "path, words",
+    [
+        ("/image?pass=nothing", "unknown pass"),
+        ("/image", "unknown pass"),
+        ("/image?pass=depth&t=99", "outside the sequence"),
+        ("/image?pass=depth&t=x", "not a time"),
+        ("/image?pass=depth&t=inf", "outside the sequence"),
+        ("/image?pass=depth&source=disk", "unknown source"),
+        ("/image?pass=depth&map=../x", "unknown colour map"),
+        ("/image?pass=depth&low=nan", "not a number"),
+        ("/image?pass=velocity&component=w", "no such component"),
+        ("/probe?x=1", "not a pixel"),
+        ("/probe?x=96&y=0", "outside the image"),
+        ("/difference?a=depth", "unknown source"),
+        ("/image?pass=depth&t=1e308", "outside the sequence"),
+        ("/wait?version=²", "not a version"),
+        ("/wait?version=%C2%B2", "not a version"),
+        ("/wait?version=-1", "not a version"),
+        ("/wait?version=" + "9" * 30, "not a version"),
+        ("/probe?x=%C2%B2&y=1", "not a pixel"),
+        ("/probe?x=" + "9" * 1900 + "&y=1", "outside the image"),
+        ("/image?pass=depth&low=-1e308&high=1e308", "not a number"),
+        ("/image?pass=depth&pass=id", "asked twice"),
+        ("/image?pass=depth&size=3", "unknown parameter"),
+        ("/state?a=1", "unknown parameter"),
+        ("/image?pass=" + "x" * 3000, "too long"),
+        ("/verdict?t=-1e400", "outside the sequence"),
+        ("/difference?a=depth:gpu&b=local:gpu", "components"),
+        ("/image?pass=depth&component=..", "no such component"),
+    ],
+)
 def test_bad_questions_get_400_and_one_line(served, path, words):
     status, headers, body = ask(served[0], path)
     assert status == 400 and headers["Content-Type"] == "application/json"
@@ -121,10 +144,25 @@ def test_bad_questions_get_400_and_one_line(served, path, words):
     assert words in error and "\n" not in error and "Traceback" not in error
 
 
-@pytest.mark.parametrize("path", [
-    "/../setup.cfg", "/..%2fserver.py", "/page/app.js", "/%2e%2e/%2e%2e/etc/passwd", "/app.js/../../cli.py", "//etc/passwd", "/index.html", "/favicon.ico",
-    "/state/", "/STATE", "/shaders/label.glsl", "/app.js%00", "/.git/config", "/proc/self/environ",
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../setup.cfg",
+        "/..%2fserver.py",
+        "/page/app.js",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/app.js/../../cli.py",
+        "//etc/passwd",
+        "/index.html",
+        "/favicon.ico",
+        "/state/",
+        "/STATE",
+        "/shaders/label.glsl",
+        "/app.js%00",
+        "/.git/config",
+        "/proc/self/environ",
+    ],
+)
 def test_unknown_routes_and_traversal_get_404(served, path):
     status, _, body = ask(served[0], path)
     assert status == 404 and json.loads(body) == {"error": "no such page"}
@@ -137,8 +175,20 @@ def test_other_methods_are_refused(served, method):
 
 def test_foreign_hosts_are_refused(served):
     server, _ = served
-    for host in ("evil.example", f"evil.example:{server.port}", "127.0.0.1.evil.example", f"127.0.0.1:{server.port + 1}", "", "localhost@evil.example",
-                 "0.0.0.0", "169.254.169.254", "[::1", "127.0.0.1/x", "localhost.", "127.1"):
+    for host in (
+        "evil.example",
+        f"evil.example:{server.port}",
+        "127.0.0.1.evil.example",
+        f"127.0.0.1:{server.port + 1}",
+        "",
+        "localhost@evil.example",
+        "0.0.0.0",
+        "169.254.169.254",
+        "[::1",
+        "127.0.0.1/x",
+        "localhost.",
+        "127.1",
+    ):
         status, _, body = ask(server, "/state", host=host)
         assert status == 403 and b"passes" not in body, host
     with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:  # two of them, the first one local
@@ -168,7 +218,9 @@ def test_many_askers_at_once_get_the_same_answer(served):
     """Requests come in many threads, OpenGL is used in one."""
     server, _ = served
     answers: list[bytes] = []
-    threads = [threading.Thread(target=lambda: answers.append(ask(server, "/image?pass=depth&t=0.15")[2])) for _ in range(12)]
+    threads = [
+        threading.Thread(target=lambda: answers.append(ask(server, "/image?pass=depth&t=0.15")[2])) for _ in range(12)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -178,7 +230,12 @@ def test_many_askers_at_once_get_the_same_answer(served):
 
 def test_nonsense_on_the_wire_does_not_stop_it(served):
     server, _ = served
-    for junk in (b"\x00\xff\xfe garbage\r\n\r\n", b"GET / HTTP/1.1\r\nHost: " + b"a" * 70_000 + b"\r\n\r\n", b"GET\r\n\r\n", b""):
+    for junk in (
+        b"\x00\xff\xfe garbage\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: " + b"a" * 70_000 + b"\r\n\r\n",
+        b"GET\r\n\r\n",
+        b"",
+    ):
         with socket.create_connection(("127.0.0.1", server.port), timeout=10) as wire:
             wire.sendall(junk)
     assert as_json(server, "/state")["width"] == WIDTH
@@ -276,7 +333,11 @@ def test_edits_are_taken_errors_keep_the_last_good_program(served):
     line = next(i for i, text in enumerate(label.read_text().splitlines(), 1) if "gl_FragCord" in text)
     error = broken["errors"][0]
     assert broken["generation"] == now["generation"]
-    assert error["where"].startswith(f"include/labels/depth.glsl:{line}:") and "gl_FragCord" in error["text"] and "^" in error["excerpt"]
+    assert (
+        error["where"].startswith(f"include/labels/depth.glsl:{line}:")
+        and "gl_FragCord" in error["text"]
+        and "^" in error["excerpt"]
+    )
     assert depth_at(server) == pytest.approx(2 * before, rel=1e-6)  # the last good program
 
     label.write_text(good)
@@ -310,7 +371,11 @@ def test_an_edit_that_drops_a_uniform_is_drawn(served):
     label = folder / "include/labels/flow_forward.glsl"
     good = label.read_text()
     state = as_json(server, "/state")
-    edit(label, "return vec4(displacement(difference_forward, local, image_size), 1.0);", "return vec4(1.0, 2.0, 3.0, 1.0);")
+    edit(
+        label,
+        "return vec4(displacement(difference_forward, local, image_size), 1.0);",
+        "return vec4(1.0, 2.0, 3.0, 1.0);",
+    )
     now = next_version(server, state["version"])
     assert now["errors"] == []
     row = next(b for b in as_json(server, "/probe?t=0.1&x=35&y=40")["buffers"] if b["name"] == "flow_forward")
@@ -327,8 +392,12 @@ def test_broken_from_the_start_is_one_error(shader, config, tmp_path):
 
 
 def test_the_command_says_where_and_ends_on_interrupt(config):
-    child = subprocess.Popen([sys.executable, "-m", "blinkgl.cli", "shader", "serve", config, "--port", "0"], stdout=subprocess.PIPE,
-                             stderr=subprocess.PIPE, text=True)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "blinkgl.cli", "shader", "serve", config, "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         line = child.stdout.readline()
         assert line.startswith("http://127.0.0.1:") and "Ctrl-C" in line
@@ -358,9 +427,11 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         assert page.run("return document.querySelector('#pane-a img').naturalWidth") == WIDTH
         assert page.run("return document.querySelectorAll('#a option').length") == 2 * len(PASSES)
 
-        picture = ("const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = "
-                   "i.naturalWidth; c.height = i.naturalHeight;const g = c.getContext('2d'); g.drawImage(i, 0, 0); return "
-                   "c.toDataURL()")
+        picture = (
+            "const c = document.createElement('canvas'), i = document.querySelector(arguments[0]); c.width = "
+            "i.naturalWidth; c.height = i.naturalHeight;const g = c.getContext('2d'); g.drawImage(i, 0, 0); return "
+            "c.toDataURL()"
+        )
         first = page.run(picture, "#pane-a img")
         page.choose("#time", "0.3")  # scrub
         page.wait("return document.body.dataset.shown === '0.3'")
@@ -371,8 +442,10 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         assert page.run("return document.querySelector('#b').value") == "depth:reference"  # B follows
         page.choose("#view", "difference")
         page.choose("#map", "turbo")
-        page.wait("return document.querySelector('#pane-b figcaption b').textContent === '|A − B|' && "
-                  "location.hash.includes('map=turbo')")
+        page.wait(
+            "return document.querySelector('#pane-b figcaption b').textContent === '|A − B|' && "
+            "location.hash.includes('map=turbo')"
+        )
         assert not page.run("return document.querySelector('#pane-b').hidden")
 
         page.click_at("#pane-a img", (40 + 0.5) / WIDTH, (45 + 0.5) / HEIGHT)
@@ -394,14 +467,24 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         page.wait("return document.querySelector('#verdict').className === 'good'", timeout=60)
         assert "all 22 buffers agree" in page.text("#verdict") and page.text("#objects") == ""
         good = (folder / "luminance.glsl").read_text()
-        edit(folder / "luminance.glsl", "float luminance = texture(albedo, uv).r;", "float luminance = texture(albedo, uv, 1.0).r;")
-        page.wait("return document.querySelector('#verdict').textContent.includes('has changed')")  # the verdict was of other shaders
+        edit(
+            folder / "luminance.glsl",
+            "float luminance = texture(albedo, uv).r;",
+            "float luminance = texture(albedo, uv, 1.0).r;",
+        )
+        page.wait(
+            "return document.querySelector('#verdict').textContent.includes('has changed')"
+        )  # the verdict was of other shaders
         page.run("document.querySelector('#compare').click()")
         page.wait("return document.querySelector('#verdict').className === 'bad'", timeout=60)
         assert "level of luminance" in page.text("#verdict") and "a mip bias of +1" in page.text("#verdict")
-        rows = page.run("return [...document.querySelectorAll('#objects tr')].slice(1).map((tr) => [...tr.children].map((td) => "
-                        "td.textContent))")
-        assert {cells[0] for cells in rows} == {"floor", "ball"} and all(cells[1] == "level of luminance" for cells in rows)
+        rows = page.run(
+            "return [...document.querySelectorAll('#objects tr')].slice(1).map((tr) => [...tr.children].map((td) => "
+            "td.textContent))"
+        )
+        assert {cells[0] for cells in rows} == {"floor", "ball"} and all(
+            cells[1] == "level of luminance" for cells in rows
+        )
         page.run("document.querySelector('#objects a').click()")
         page.wait("return document.querySelector('#probe').dataset.pixel === arguments[0]", rows[0][4].replace(" ", ""))
         (folder / "luminance.glsl").write_text(good)
@@ -410,11 +493,19 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         page.wait("return document.querySelector('#probe').dataset.pixel === '40,45'")
 
         good = (folder / "include/motion.glsl").read_text()
-        edit(folder / "include/motion.glsl", "return gl_FragCoord.xy / image_size * 2.0 - 1.0;", "return gl_FragCoord.xy / imagesize * 2.0 - 1.0;")
+        edit(
+            folder / "include/motion.glsl",
+            "return gl_FragCoord.xy / image_size * 2.0 - 1.0;",
+            "return gl_FragCoord.xy / imagesize * 2.0 - 1.0;",
+        )
         started = time.monotonic()
         error = page.wait("const e = document.querySelector('#errors'); return !e.hidden && e.textContent", timeout=20)
         noticed = time.monotonic() - started
-        line = next(i for i, text in enumerate((folder / "include/motion.glsl").read_text().splitlines(), 1) if "imagesize" in text)
+        line = next(
+            i
+            for i, text in enumerate((folder / "include/motion.glsl").read_text().splitlines(), 1)
+            if "imagesize" in text
+        )
         assert f"include/motion.glsl:{line}:" in error and "imagesize" in error and "^" in error
         assert "last good" in page.text("#reload")
         page.choose("#time", "0.22")  # the last good shaders draw what they never drew before

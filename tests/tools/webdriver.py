@@ -13,8 +13,17 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
-FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-         "--disable-component-update", "--disable-sync", "--window-size=1400,1100")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--window-size=1400,1100",
+)
 ELEMENT = "element-6066-11e4-a52e-4f735466cecf"  # the specification's key of an element reference
 
 
@@ -38,7 +47,11 @@ class Browser:
         try:
             self._until(lambda: self._call("GET", "/status")["ready"], 20)
             options = {"binary": shutil.which("chromium"), "args": [*FLAGS, f"--user-data-dir={folder / 'profile'}"]}
-            answer = self._call("POST", "/session", {"capabilities": {"alwaysMatch": {"browserName": "chrome", "goog:chromeOptions": options}}})
+            answer = self._call(
+                "POST",
+                "/session",
+                {"capabilities": {"alwaysMatch": {"browserName": "chrome", "goog:chromeOptions": options}}},
+            )
             self._session = f"/session/{answer['sessionId']}"
         except BaseException:
             self._end()
@@ -93,21 +106,40 @@ class Browser:
         return self._until(lambda: self.run(script, *arguments), timeout)
 
     def text(self, selector: str) -> str:
-        return self.run("const e = document.querySelector(arguments[0]); return e && !e.hidden ? e.textContent : ''", selector)
+        return self.run(
+            "const e = document.querySelector(arguments[0]); return e && !e.hidden ? e.textContent : ''", selector
+        )
 
     def click_at(self, selector: str, fx: float, fy: float) -> None:
         """A real mouse click at a fraction of an element's width and height."""
-        x, y = self.run("const e = document.querySelector(arguments[0]); e.scrollIntoView({block: 'nearest'}); const r = "
-                        "e.getBoundingClientRect();return [r.left + arguments[1] * r.width, r.top + arguments[2] * r.height]", selector, fx, fy)
+        x, y = self.run(
+            "const e = document.querySelector(arguments[0]); e.scrollIntoView({block: 'nearest'}); const r = "
+            "e.getBoundingClientRect();return [r.left + arguments[1] * r.width, r.top + arguments[2] * r.height]",
+            selector,
+            fx,
+            fy,
+        )
         move = {"type": "pointerMove", "duration": 0, "origin": "viewport", "x": round(x), "y": round(y)}
-        mouse = {"type": "pointer", "id": "mouse", "actions": [move, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]}
+        mouse = {
+            "type": "pointer",
+            "id": "mouse",
+            "actions": [move, {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}],
+        }
         self._call("POST", self._session + "/actions", {"actions": [mouse]})
 
     def choose(self, selector: str, value: str) -> None:
         """Sets a control as a person does: its value, then the events."""
-        self.run("const e = document.querySelector(arguments[0]); e.value = arguments[1];"
-                 "for (const kind of ['input', 'change']) e.dispatchEvent(new Event(kind, {bubbles: true}))", selector, value)
+        self.run(
+            "const e = document.querySelector(arguments[0]); e.value = arguments[1];"
+            "for (const kind of ['input', 'change']) e.dispatchEvent(new Event(kind, {bubbles: true}))",
+            selector,
+            value,
+        )
 
     def errors(self) -> list[str]:
         """Messages of the browser's console at level SEVERE."""
-        return [entry["message"] for entry in self._call("POST", self._session + "/se/log", {"type": "browser"}) if entry["level"] == "SEVERE"]
+        return [
+            entry["message"]
+            for entry in self._call("POST", self._session + "/se/log", {"type": "browser"})
+            if entry["level"] == "SEVERE"
+        ]

@@ -27,8 +27,12 @@ def train(*times, x=1, y=2, p=1) -> Events:
 
 def random_stream(n: int, span_us: int, seed: int) -> Events:
     rng = np.random.default_rng(seed)
-    return Events(rng.integers(0, W, n).astype(np.uint16), rng.integers(0, H, n).astype(np.uint16), np.sort(rng.integers(0, span_us, n)),
-                  rng.integers(0, 2, n).astype(np.uint8))
+    return Events(
+        rng.integers(0, W, n).astype(np.uint16),
+        rng.integers(0, H, n).astype(np.uint16),
+        np.sort(rng.integers(0, span_us, n)),
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
 
 
 def pairs(a: Events, b: Events, limit_us: int) -> list[tuple[int, int]]:

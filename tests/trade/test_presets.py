@@ -63,25 +63,49 @@ def test_figures_in_the_files_are_the_recorded_ones(recorded):
 
 
 CONFIG = {
-    "seed": 5, "camera": {"width": 96, "height": 72, "fov": 60}, "time": {"duration": 0.1, "label_rate": 20},
-    "scene": {"kind": "random", "objects": {"count": 5, "distance": [2, 5]}, "camera_motion": {"speed": [0.5, 1.0], "rotation_rate": [20, 40]},
-              "pool": {"primitives": ["cuboid", "sphere", "torus"], "variants": 4, "urdfs": False},
-              "textures": {"procedural": ["checks", "fbm", "bricks"], "variants": 4, "photographs": False, "max_size": 256}},
+    "seed": 5,
+    "camera": {"width": 96, "height": 72, "fov": 60},
+    "time": {"duration": 0.1, "label_rate": 20},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 5, "distance": [2, 5]},
+        "camera_motion": {"speed": [0.5, 1.0], "rotation_rate": [20, 40]},
+        "pool": {"primitives": ["cuboid", "sphere", "torus"], "variants": 4, "urdfs": False},
+        "textures": {"procedural": ["checks", "fbm", "bricks"], "variants": 4, "photographs": False, "max_size": 256},
+    },
 }
-RIVALS = [Setting(f"displacement {px:g} px", r, a, o) for px, r, a, o in (
-    (2, "linear", "none", ""), (2, "linear", "ssaa2", ""), (0.5, "linear", "none", ""), (0.5, "linear", "ssaa2", ""), (1, "pchip", "none", ""),
-    (1, "pchip", "ssaa2", "mip bias -0.5"), (2, "pchip", "ssaa4", ""))]
+RIVALS = [
+    Setting(f"displacement {px:g} px", r, a, o)
+    for px, r, a, o in (
+        (2, "linear", "none", ""),
+        (2, "linear", "ssaa2", ""),
+        (0.5, "linear", "none", ""),
+        (0.5, "linear", "ssaa2", ""),
+        (1, "pchip", "none", ""),
+        (1, "pchip", "ssaa2", "mip bias -0.5"),
+        (2, "pchip", "ssaa4", ""),
+    )
+]
 
 
 def test_no_rival_beats_a_preset_measured_again(gl, tmp_path):
     """Cost is what a busy machine cannot change: samples drawn. A rival has to be better by 15 %
     in both to count: the scene is small."""
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(CONFIG))
-    bench = Bench(gl, load_run(tmp_path / "c.yaml"), Options(clip_s=0.03, tiles=(1, 1, 96, 72), levels=((8, 0.1),), rounds=1))
+    bench = Bench(
+        gl, load_run(tmp_path / "c.yaml"), Options(clip_s=0.03, tiles=(1, 1, 96, 72), levels=((8, 0.1),), rounds=1)
+    )
     presets = [_Preset(name) for name in QUALITIES]
     results = bench.measure([*presets, *RIVALS])
     bench.judge(results, bench.speeds())
-    rows = [{"name": r.setting.name, "cost": r.frames_per_s * drawn(bench.config(r.setting.overrides)), "voxel": r.errors.voxel} for r in results]
+    rows = [
+        {
+            "name": r.setting.name,
+            "cost": r.frames_per_s * drawn(bench.config(r.setting.overrides)),
+            "voxel": r.errors.voxel,
+        }
+        for r in results
+    ]
     for preset in rows[: len(presets)]:
         assert not dominating(preset, rows, "cost", "voxel", margin=0.15), (preset, rows)
     errors = [row["voxel"] for row in rows[: len(presets)]]
@@ -101,4 +125,7 @@ class _Preset:
 
     def __init__(self, name: str):
         preset = load_quality(name)
-        self.name, self.overrides = name, tuple(f"{table}={json.dumps(preset[table])}" for table in ("timeline", "render"))
+        self.name, self.overrides = (
+            name,
+            tuple(f"{table}={json.dumps(preset[table])}" for table in ("timeline", "render")),
+        )

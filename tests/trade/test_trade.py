@@ -27,10 +27,15 @@ from blinkgl.trade.run import chosen, convergence_line, trade
 from blinkgl.trade.settings import Setting, design
 
 CONFIG = {
-    "seed": 3, "camera": {"width": 64, "height": 48}, "time": {"duration": 0.1, "label_rate": 20},
-    "scene": {"kind": "random", "objects": {"count": 3, "distance": [2, 4]},
-              "pool": {"primitives": ["cuboid", "sphere"], "variants": 4, "urdfs": False},
-              "textures": {"procedural": ["checks", "fbm"], "variants": 4, "photographs": False, "max_size": 64}},
+    "seed": 3,
+    "camera": {"width": 64, "height": 48},
+    "time": {"duration": 0.1, "label_rate": 20},
+    "scene": {
+        "kind": "random",
+        "objects": {"count": 3, "distance": [2, 4]},
+        "pool": {"primitives": ["cuboid", "sphere"], "variants": 4, "urdfs": False},
+        "textures": {"procedural": ["checks", "fbm"], "variants": 4, "photographs": False, "max_size": 64},
+    },
 }
 OPTIONS = Options(clip_s=0.02, tiles=(2, 2, 16, 12), levels=((2, 0.5), (4, 0.25)), rounds=1)
 
@@ -43,8 +48,18 @@ def config(tmp_path_factory):
 
 
 def test_front_by_hand():
-    rows = [dict(n=n, c=c, e=e) for n, c, e in (("a", 1, 9), ("b", 2, 5), ("worse than b", 3, 5), ("c", 4, 1), ("slow", 9, 2), ("equal to c", 4, 1),
-                                               ("unknown", 0, float("nan")))]
+    rows = [
+        dict(n=n, c=c, e=e)
+        for n, c, e in (
+            ("a", 1, 9),
+            ("b", 2, 5),
+            ("worse than b", 3, 5),
+            ("c", 4, 1),
+            ("slow", 9, 2),
+            ("equal to c", 4, 1),
+            ("unknown", 0, float("nan")),
+        )
+    ]
     assert [r["n"] for r in pareto_front(rows, "c", "e")] == ["a", "b", "c"]
 
 
@@ -82,7 +97,9 @@ def test_reference_converges_and_the_ladder_says_so(gl, config):
     assert levels[-1].ratio["voxel"] == pytest.approx(levels[-1].movement["voxel"] / results[0].errors.voxel)
     assert bench.errors(levels[-1].events, levels[-1].events, bench.speeds()).voxel == 0
     assert results[0].flow["flow_max_px"] < 1e-2
-    level = replace(levels[-1], movement=dict.fromkeys(levels[-1].movement, 1.0), smallest=dict.fromkeys(levels[-1].movement, 10.0))
+    level = replace(
+        levels[-1], movement=dict.fromkeys(levels[-1].movement, 1.0), smallest=dict.fromkeys(levels[-1].movement, 10.0)
+    )
     assert level.converged and not replace(level, smallest=dict.fromkeys(level.movement, 9.9)).converged
     assert not Level(1, 1.0, 1, 1.0, levels[0].events).converged, "a single level was never checked"
 
@@ -97,22 +114,50 @@ def test_events_are_the_same_in_every_round_and_order(gl, config):
     a, b = Setting("displacement 1 px"), Setting("uniform 400/s", antialiasing="ssaa2")
     first, second = bench.measure([a, b]), bench.measure([b, a])
     for mine, theirs in ((first[0], second[1]), (first[1], second[0])):
-        assert len(mine.events) and np.array_equal(mine.events.t, theirs.events.t) and mine.frames_per_s == theirs.frames_per_s
+        assert (
+            len(mine.events)
+            and np.array_equal(mine.events.t, theirs.events.t)
+            and mine.frames_per_s == theirs.frames_per_s
+        )
 
 
 def test_noise_is_taken_out():
-    twins = [EMULATORS[kind].noiseless(config) for kind, config in (
-        ("esim", EsimConfig(contrast_threshold=0.3, threshold_jitter=0.1, refractory_us=9)),
-        ("v2e", V2eConfig(contrast_threshold=0.3, threshold_sigma=0.01)), ("voltmeter", VoltmeterConfig(k1=5)))]
+    twins = [
+        EMULATORS[kind].noiseless(config)
+        for kind, config in (
+            ("esim", EsimConfig(contrast_threshold=0.3, threshold_jitter=0.1, refractory_us=9)),
+            ("v2e", V2eConfig(contrast_threshold=0.3, threshold_sigma=0.01)),
+            ("voltmeter", VoltmeterConfig(k1=5)),
+        )
+    ]
     assert [t.contrast_threshold for t in twins] == [0.3, 0.3, pytest.approx(0.2)]
     assert [(t.emulator, t.threshold_sigma, t.threshold_jitter, t.refractory_us) for t in twins] == [
-        ("esim", 0.021, 0, 0), ("esim", 0.01, 0, 0), ("esim", 0.021, 0, 0)]
+        ("esim", 0.021, 0, 0),
+        ("esim", 0.01, 0, 0),
+        ("esim", 0.021, 0, 0),
+    ]
 
 
 def test_a_noisy_emulators_settings_are_its_twins(gl, config):
     """V2E follows straight lines alone; the events that are judged are ESIM's, which follows cubics as well."""
-    bench = Bench(gl, load_run(config, ["events={emulator: v2e, contrast_threshold: 0.3}", "sensor=davis346", "camera.width=64", "camera.height=48"]), OPTIONS)
-    assert bench.config(Setting("displacement 2 px", "pchip").overrides).events == bench.emulator == EsimConfig(contrast_threshold=0.3, threshold_sigma=0.03)
+    bench = Bench(
+        gl,
+        load_run(
+            config,
+            [
+                "events={emulator: v2e, contrast_threshold: 0.3}",
+                "sensor=davis346",
+                "camera.width=64",
+                "camera.height=48",
+            ],
+        ),
+        OPTIONS,
+    )
+    assert (
+        bench.config(Setting("displacement 2 px", "pchip").overrides).events
+        == bench.emulator
+        == EsimConfig(contrast_threshold=0.3, threshold_sigma=0.03)
+    )
 
 
 def test_design():
@@ -139,13 +184,33 @@ def test_half_size_keeps_the_view(gl, config):
     template = load_run(config, ["camera.cx=31.5", "camera.fov=50"])
     full, half = (Bench(gl, template, OPTIONS, size) for size in ("", "half size"))
     assert (half.width, half.height) == (32, 24)
-    assert half.scene.camera.fx == pytest.approx(full.scene.camera.fx / 2) and half.scene.camera.cx == pytest.approx(15.5)
+    assert half.scene.camera.fx == pytest.approx(full.scene.camera.fx / 2) and half.scene.camera.cx == pytest.approx(
+        15.5
+    )
 
 
 @pytest.fixture(scope="module")
 def result(config, tmp_path_factory):
     out = tmp_path_factory.mktemp("out") / "t"
-    status = run(["trade", str(config), "--quick", "--clip", "0.01", "--rounds", "1", "--only", "1 px, linear, ssaa2", "--only", "2 px, linear, none", "--minutes", "0.1", "-o", str(out)])
+    status = run(
+        [
+            "trade",
+            str(config),
+            "--quick",
+            "--clip",
+            "0.01",
+            "--rounds",
+            "1",
+            "--only",
+            "1 px, linear, ssaa2",
+            "--only",
+            "2 px, linear, none",
+            "--minutes",
+            "0.1",
+            "-o",
+            str(out),
+        ]
+    )
     assert status == 0
     return out
 
@@ -163,8 +228,11 @@ def test_files_of_the_command(result):
 
 
 def test_errors(config, tmp_path, capsys):
-    for arguments, message in ((["--only", "raytracing"], "--only, --skip: no setting is called that"), (["--cost", "euros"], "--cost: unknown cost"),
-                               (["--set", "render.antialiasing=fxaa"], "render.antialiasing")):
+    for arguments, message in (
+        (["--only", "raytracing"], "--only, --skip: no setting is called that"),
+        (["--cost", "euros"], "--cost: unknown cost"),
+        (["--set", "render.antialiasing=fxaa"], "render.antialiasing"),
+    ):
         assert run(["trade", str(config), "-o", str(tmp_path / "x"), *arguments]) == 2
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1
@@ -192,8 +260,12 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
     result = trade(load_run(config), settings=setting, options=options)
     assert asked == [(4, 4, True), (16, 4, True)] and "16 paths a pixel by Cycles" in convergence_line(result)
     show(result, Console())
-    assert re.search(r"Cycles 3\.00 \(5\.00\), the settings \d+\.\d", capsys.readouterr().out), "theirs are timed: whatever they are"
-    same = trade(load_run(config), settings=setting, options=replace(options, reference="raster", levels=((2, 0.5), (2, 0.25))))
+    assert re.search(r"Cycles 3\.00 \(5\.00\), the settings \d+\.\d", capsys.readouterr().out), (
+        "theirs are timed: whatever they are"
+    )
+    same = trade(
+        load_run(config), settings=setting, options=replace(options, reference="raster", levels=((2, 0.5), (2, 0.25)))
+    )
     assert result["settings"][0]["voxel"] == pytest.approx(same["settings"][0]["voxel"], rel=0.02)
 
     monkeypatch.setattr(peer_cycles, "available", lambda: "no bpy here")
@@ -204,7 +276,10 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
 
 
 def test_an_unchecked_reference_is_called_that():
-    result = {"enough": 0.1, "sizes": {"full": {"converged": False, "levels": [{"scale": 8, "max_px": 0.1, "frames": 3, "ratio": {}}]}}}
+    result = {
+        "enough": 0.1,
+        "sizes": {"full": {"converged": False, "levels": [{"scale": 8, "max_px": 0.1, "frames": 3, "ratio": {}}]}},
+    }
     assert "NOT checked" in convergence_line(result)
     ratio = dict.fromkeys(("time_median_us", "time_p95_us", "wrong", "voxel"), 0.3)
     result["sizes"]["full"]["levels"].append({"scale": 16, "max_px": 0.05, "frames": 3, "ratio": ratio})
@@ -215,4 +290,6 @@ def test_an_unchecked_reference_is_called_that():
 
 def test_without_the_command(config):
     result = trade(load_run(config), settings=(Setting("displacement 1 px"),), options=OPTIONS, cost="cpu_s")
-    assert result["front"] == ["displacement 1 px, linear, none"] and result["sizes"]["full"]["clip_s"] == pytest.approx(0.02)
+    assert result["front"] == ["displacement 1 px, linear, none"] and result["sizes"]["full"][
+        "clip_s"
+    ] == pytest.approx(0.02)

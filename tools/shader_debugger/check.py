@@ -21,7 +21,8 @@ from blinkgl.tools.shader_debugger.variants import lookups, variants
 
 _DECLARATION = re.compile(
     r"^\s*(?:layout\s*\([^)]*\)\s*)?(?:(?:flat|smooth|noperspective|centroid|invariant|highp|mediump|lowp)\s+)*"
-    r"(in|out|uniform)\s+(?:(?:highp|mediump|lowp)\s+)?\w+\s+([^;{]+);")
+    r"(in|out|uniform)\s+(?:(?:highp|mediump|lowp)\s+)?\w+\s+([^;{]+);"
+)
 _NAME = re.compile(r"^\s*(\w+)")
 
 
@@ -47,10 +48,18 @@ class Result:
 
     def as_dict(self) -> dict:
         def plain(findings):
-            return [f.diagnostic.as_dict() | {"program": f.program, "variants": f.count, "example": f.example} for f in findings]
+            return [
+                f.diagnostic.as_dict() | {"program": f.program, "variants": f.count, "example": f.example}
+                for f in findings
+            ]
 
-        return {"renderer": self.renderer, "seconds": self.seconds, "programs": self.programs, "errors": plain(self.errors),
-                "unused": plain(self.unused)}
+        return {
+            "renderer": self.renderer,
+            "seconds": self.seconds,
+            "programs": self.programs,
+            "errors": plain(self.errors),
+            "unused": plain(self.unused),
+        }
 
 
 def check(files: list[str], shaders: str | None = None, backend: str = "auto", device: int = 0) -> Result:
@@ -112,7 +121,11 @@ def unused(sources: dict[str, ShaderSource], members: set[str]) -> list[Diagnost
             mentioned = words[stage].count(name) > 1
             problem = None
             if kind == "uniform" and name not in members:
-                problem = f"uniform '{name}' is never used" if not mentioned else f"uniform '{name}' has no effect on the output"
+                problem = (
+                    f"uniform '{name}' is never used"
+                    if not mentioned
+                    else f"uniform '{name}' has no effect on the output"
+                )
             elif kind == "in" and stage == "fragment" and not mentioned:
                 problem = f"varying '{name}' is never read"
             elif kind == "in" and stage == "vertex" and name not in members:
@@ -131,7 +144,7 @@ def _declarations(lines: list[tuple[int, str]]):
         match = _DECLARATION.match(line)
         for declarator in match[2].split(",") if match else ():
             if name := _NAME.match(declarator):
-                column = re.search(rf"\b{name[1]}\b", line[match.start(2):]).start() + match.start(2) + 1
+                column = re.search(rf"\b{name[1]}\b", line[match.start(2) :]).start() + match.start(2) + 1
                 yield match[1], name[1], number, column
 
 
@@ -152,10 +165,26 @@ def _programs(files: list[str], shaders: str | None):
         return folder, programs
     chosen: list[str] = []
     for text in files:
-        path = next((p for p in known if p.resolve() == Path(text).resolve() or str(p.relative_to(root)) == text or p.name == text), None)
+        path = next(
+            (
+                p
+                for p in known
+                if p.resolve() == Path(text).resolve() or str(p.relative_to(root)) == text or p.name == text
+            ),
+            None,
+        )
         if path is None:
-            raise ConfigError("no such shader", where="check", value=text, accepted="one of " + ", ".join(str(p.relative_to(root)) for p in known))
-        wanted = [path.name] if path.parent == root else [name for name in programs if _includes(folder, name, path.relative_to(root).as_posix())]
+            raise ConfigError(
+                "no such shader",
+                where="check",
+                value=text,
+                accepted="one of " + ", ".join(str(p.relative_to(root)) for p in known),
+            )
+        wanted = (
+            [path.name]
+            if path.parent == root
+            else [name for name in programs if _includes(folder, name, path.relative_to(root).as_posix())]
+        )
         chosen += [name for name in wanted if name not in chosen]
     return folder, chosen
 
@@ -172,18 +201,32 @@ def as_text(result: Result) -> str:
     lines = []
     for found in result.errors:
         d = found.diagnostic
-        lines += [f"{d.where}: {d.kind}: {d.text}" + (f" [{d.stage} stage]" if d.stage else ""), d.excerpt,
-                  (f"         in {found.count} of {result.programs[found.program]} variants of {found.program}, first "
-                  f"{_defines(found.example)}"), ""]
+        lines += [
+            f"{d.where}: {d.kind}: {d.text}" + (f" [{d.stage} stage]" if d.stage else ""),
+            d.excerpt,
+            (
+                f"         in {found.count} of {result.programs[found.program]} variants of {found.program}, first "
+                f"{_defines(found.example)}"
+            ),
+            "",
+        ]
     for found in result.unused:
         d = found.diagnostic
-        lines.append(f"{d.where}: {d.text} in {found.count} of {result.programs[found.program]} variants of {found.program}, "
-                     f"first {_defines(found.example)}")
+        lines.append(
+            f"{d.where}: {d.text} in {found.count} of {result.programs[found.program]} variants of {found.program}, "
+            f"first {_defines(found.example)}"
+        )
     if result.unused:
         lines.append("")
     lines += [f"{name:<18} {count:>4} variants" for name, count in result.programs.items()]
-    verdict = f"{len(result.errors)} error{'s' if len(result.errors) != 1 else ''}" if result.errors else "all compile and link"
-    lines.append(f"{verdict}, {len(result.unused)} unused; {total} variants in {result.seconds:.1f} s on {result.renderer}")
+    verdict = (
+        f"{len(result.errors)} error{'s' if len(result.errors) != 1 else ''}"
+        if result.errors
+        else "all compile and link"
+    )
+    lines.append(
+        f"{verdict}, {len(result.unused)} unused; {total} variants in {result.seconds:.1f} s on {result.renderer}"
+    )
     return "\n".join(lines)
 
 
@@ -205,7 +248,9 @@ def show_source(program: str, defines: list[str], stage: str, active: bool, numb
         source = expand(program, one, table, folder)
         if stage == "both":
             out.append(f"// ---- {one} stage of {program}\n")
-        keep: Callable[[int], bool] = {n for n, _ in active_lines(source.text)}.__contains__ if active else (lambda n: True)
+        keep: Callable[[int], bool] = (
+            {n for n, _ in active_lines(source.text)}.__contains__ if active else (lambda n: True)
+        )
         for number, line in enumerate(source.text.split("\n")[:-1], 1):
             if keep(number):
                 file, own = source.locate(number)

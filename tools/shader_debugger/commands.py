@@ -23,7 +23,9 @@ from blinkgl.tools.shader_debugger.session import Subject, When, check_pixel, op
 from blinkgl.tools.shader_debugger.verdict import as_text as verdict_text, verdict
 
 
-def write_passes(subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None) -> list[Path]:
+def write_passes(
+    subject: Subject, when: When, out: str, names: list[str] | None = None, shaders: str | None = None
+) -> list[Path]:
     """Every buffer as NAME.png (labelled) and NAME.npy, and contact_sheet.png, in the
     folder ``out``. Returns the paths.
 
@@ -33,13 +35,19 @@ def write_passes(subject: Subject, when: When, out: str, names: list[str] | None
 
     names = [check_pass(name) for name in names] if names else list(PASSES)
     paths, tiles = [], []
-    caption = f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
+    caption = (
+        f"{Path(subject.path).name}, sequence {subject.index}, seed {subject.config.seed}, t = {when.t_ns * 1e-9:.6g} s"
+    )
     with open_renderer(subject, shaders, as_configured=True) as renderer:
         folder = _folder(out)  # not before there is something to put into it
         gpu = GpuMoment(renderer, when, subject.log_eps)
         for name in names:
             info, array = PASSES[name], gpu[name]
-            with atomic_file(folder / f"{name}.npy") as temporary, output_errors(folder / f"{name}.npy"), temporary.open("wb") as file:
+            with (
+                atomic_file(folder / f"{name}.npy") as temporary,
+                output_errors(folder / f"{name}.npy"),
+                temporary.open("wb") as file,
+            ):
                 np.save(file, np.ascontiguousarray(array), allow_pickle=False)
             rgb, legend = pictures.picture(info.kind, array, hit=_meaningful(gpu, info))
             picture.save_labelled(folder / f"{name}.png", info, rgb, legend, f"{caption}, {renderer.gl.renderer}")
@@ -55,7 +63,11 @@ def _meaningful(moment, info) -> np.ndarray | None:
         return moment[info.name.replace("flow", "valid")]
     everywhere = info.name in ("luminance", "log_luminance", "dL_dt")  # the background has them, too
     if lookup_of(info.name)[1] in ("uv", "level"):
-        return moment["texture_size"][..., 0] > 1 if isinstance(moment, ReferenceMoment) else moment[f"{info.name.rpartition('_')[0]}_count"] > 0
+        return (
+            moment["texture_size"][..., 0] > 1
+            if isinstance(moment, ReferenceMoment)
+            else moment[f"{info.name.rpartition('_')[0]}_count"] > 0
+        )
     return moment["id"] != 0 if info.kind in ("scalar", "depth", "signed", "motion") and not everywhere else None
 
 
@@ -76,8 +88,14 @@ def run_probe(subject: Subject, when: When, pixel: str, shaders: str | None = No
     return json.dumps(_finite(found)) if as_json else as_text(found)
 
 
-def run_diff(subject: Subject, when: When, names: list[str] | None, tolerances: list[str], shaders: str | None = None,
-             out: str | None = None) -> tuple[dict, list[Report]]:
+def run_diff(
+    subject: Subject,
+    when: When,
+    names: list[str] | None,
+    tolerances: list[str],
+    shaders: str | None = None,
+    out: str | None = None,
+) -> tuple[dict, list[Report]]:
     """Compares the named buffers (default: all that can be); with ``out`` also writes
     diff.png and NAME_error.npy there.
     Returns what :func:`verdict.verdict` says, and the reports."""
@@ -99,8 +117,10 @@ def run_diff(subject: Subject, when: When, names: list[str] | None, tolerances: 
             path = folder / f"{report.quantity.name}_error.npy"
             with atomic_file(path) as temporary, output_errors(path), temporary.open("wb") as file:
                 np.save(file, report.errors, allow_pickle=False)
-        title = (f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = "
-                 f"{when.t_ns * 1e-9:.6g} s")
+        title = (
+            f"GPU against the float64 reference: {Path(subject.path).name}, sequence {subject.index}, t = "
+            f"{when.t_ns * 1e-9:.6g} s"
+        )
         picture.save_errors(folder / "diff.png", reports, title + "   (log scale; silhouettes and shared edges greyed)")
     return found, reports
 
@@ -124,14 +144,18 @@ def diff_text(found: dict, reports: list[Report]) -> str:
     """The verdict, the table, then histogram, suspicions and the worst pixel of each object of each buffer that failed,
     or of a single one."""
     lines = [*verdict_text(found), ""] if not found["passed"] else []
-    lines.append(f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} "
-                 f"{'max':>8}   silhouette band: over / pixels")
+    lines.append(
+        f"{'':5}{'buffer':<18} {'value':>9} {'tolerance':>9}  {'unit':<24} {'pixels':>8} {'median':>8} {'99 %':>8} "
+        f"{'max':>8}   silhouette band: over / pixels"
+    )
     summaries = [report.summary() for report in reports]
     for s in summaries:
         e, b = s["off_silhouettes"], s["silhouette_band"]
-        lines.append(f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  "
-                     f"{s['unit']:<24} {e['pixels']:>8} {e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   "
-                     f"{b['over_tolerance']} / {b['pixels']}")
+        lines.append(
+            f"{'ok' if s['passed'] else 'FAIL':5}{s['buffer']:<18} {s['value']:>9.2g} {s['tolerance']:>9.2g}  "
+            f"{s['unit']:<24} {e['pixels']:>8} {e['median']:>8.1e} {e['p99']:>8.1e} {e['max']:>8.1e}   "
+            f"{b['over_tolerance']} / {b['pixels']}"
+        )
     notes: dict[str, list[str]] = {}
     for s in summaries:
         if s["note"]:
@@ -140,25 +164,42 @@ def diff_text(found: dict, reports: list[Report]) -> str:
     for s in summaries:
         if s["passed"] and len(summaries) > 1:
             continue
-        lines += ["", f"{s['buffer']}: {s['off_silhouettes']['over_tolerance']} of {s['off_silhouettes']['pixels']} graded "
-                      "pixels "
-                  + (f"over {s['tolerance']:g} {s['unit']}" if s["statistic"] == "max" else "differ")]
+        lines += [
+            "",
+            f"{s['buffer']}: {s['off_silhouettes']['over_tolerance']} of {s['off_silhouettes']['pixels']} graded "
+            "pixels " + (f"over {s['tolerance']:g} {s['unit']}" if s["statistic"] == "max" else "differ"),
+        ]
         lines += [f"  it looks as if: {text}" for text in s["suspicions"]]
         top = max([1, *s["histogram"].values()])
-        bars = {name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count}
+        bars = {
+            name: max(1, round(40 * np.log1p(count) / np.log1p(top))) for name, count in s["histogram"].items() if count
+        }
         lines += [f"  {name:>6} {s['histogram'][name]:>8} {'#' * bar}" for name, bar in bars.items()]
-        lines += [f"  {o['object']}: {o['over_tolerance']} of {o['pixels']} px, median {o['median']:.2g}; worst ({o['x']}, "
-                  f"{o['y']}): error {o['error']:.3g}, GPU {_short(o['gpu'])}, reference {_short(o['reference'])}"
-                  + (f", triangle {o['triangle']}" if o["triangle"] >= 0 else "") for o in s["objects"] if o["over_tolerance"]]
+        lines += [
+            f"  {o['object']}: {o['over_tolerance']} of {o['pixels']} px, median {o['median']:.2g}; worst ({o['x']}, "
+            f"{o['y']}): error {o['error']:.3g}, GPU {_short(o['gpu'])}, reference {_short(o['reference'])}"
+            + (f", triangle {o['triangle']}" if o["triangle"] >= 0 else "")
+            for o in s["objects"]
+            if o["over_tolerance"]
+        ]
     failed = [s for s in summaries if not s["passed"]]
     if failed:
         w = next(iter(found["objects"]), None)
         closer = f"; look closer with: probe --pixel {w['x']},{w['y']}" if w else ""
         lines += ["", f"{len(failed)} of {len(summaries)} buffers are over their tolerance{closer}"]
     else:
-        lines += ["", f"all {len(summaries)} buffers agree with the reference" if len(summaries) > 1 else "agrees with the reference"]
+        lines += [
+            "",
+            f"all {len(summaries)} buffers agree with the reference"
+            if len(summaries) > 1
+            else "agrees with the reference",
+        ]
     return "\n".join(lines)
 
 
 def _short(v) -> str:
-    return "(" + ", ".join(f"{x:.5g}" for x in v) + ")" if isinstance(v, list) else (str(v) if isinstance(v, (bool, int)) else f"{v:.6g}")
+    return (
+        "(" + ", ".join(f"{x:.5g}" for x in v) + ")"
+        if isinstance(v, list)
+        else (str(v) if isinstance(v, (bool, int)) else f"{v:.6g}")
+    )

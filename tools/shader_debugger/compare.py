@@ -102,17 +102,25 @@ _MIPS = "against a CPU twin of mip-mapped sampling; drivers may make mip maps di
 
 def _shading(name: str, unit: str) -> tuple[Quantity, ...]:
     """The steps of one pass that shades."""
-    return (Quantity(f"{name}_uv", "px of shifted texture", 0.01, _pixels_of_texture, fit=2.0),
-            Quantity(f"{name}_level", "levels", 0.6, _absolute, note=_LEVEL, fit=1.0),
-            # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
-            Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
-            Quantity(f"{name}_light", "1", 1e-4, _absolute),
-            Quantity(name, unit, 1e-4, _absolute, note=_SHADING))
+    return (
+        Quantity(f"{name}_uv", "px of shifted texture", 0.01, _pixels_of_texture, fit=2.0),
+        Quantity(f"{name}_level", "levels", 0.6, _absolute, note=_LEVEL, fit=1.0),
+        # sRGB textures of 8 bits: llvmpipe rounds each of their mip levels to 8 bits again, 0.025 after ten
+        Quantity(f"{name}_albedo", "linear", 0.05 if name == "colour" else 0.03, _absolute, note=_TWIN, fit=1.0),
+        Quantity(f"{name}_light", "1", 1e-4, _absolute),
+        Quantity(name, unit, 1e-4, _absolute, note=_SHADING),
+    )
 
 
 _BEFORE = (
-    Quantity("local", "px of misplaced surface", 0.01, _misplaced, same_triangle=False,
-             note="how far from its pixel the point that was drawn lies by the true poses"),
+    Quantity(
+        "local",
+        "px of misplaced surface",
+        0.01,
+        _misplaced,
+        same_triangle=False,
+        note="how far from its pixel the point that was drawn lies by the true poses",
+    ),
 )
 _SHADED = (
     *_shading("luminance", "linear"),
@@ -143,7 +151,9 @@ def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
         except ValueError:
             value = float("nan")
         if not value >= 0:
-            raise ConfigError("not a tolerance", where="--tolerance", value=text, accepted="a number >= 0, or BUFFER=number")
+            raise ConfigError(
+                "not a tolerance", where="--tolerance", value=text, accepted="a number >= 0, or BUFFER=number"
+            )
         out |= {check_pass(name, QUANTITIES, "--tolerance"): value} if equals else dict.fromkeys(names, value)
     return out
 
@@ -178,12 +188,28 @@ class Report:
         inside, band = self.errors[self.graded], self.errors[self.band & ~np.isnan(self.errors)]
 
         def stats(e):
-            return {"pixels": int(e.size), "median": _at(e, 0.5), "p99": _at(e, 0.99), "max": _at(e, 1.0),
-                    "over_tolerance": int((e > self.limit).sum())}
+            return {
+                "pixels": int(e.size),
+                "median": _at(e, 0.5),
+                "p99": _at(e, 0.99),
+                "max": _at(e, 1.0),
+                "over_tolerance": int((e > self.limit).sum()),
+            }
 
-        return {"buffer": self.quantity.name, "unit": self.quantity.unit, "statistic": self.quantity.statistic, "value": self.value,
-                "tolerance": self.tolerance, "passed": self.passed, "off_silhouettes": stats(inside), "silhouette_band": stats(band),
-                "histogram": histogram(inside), "objects": self.objects, "suspicions": self.suspicions, "note": self.quantity.note}
+        return {
+            "buffer": self.quantity.name,
+            "unit": self.quantity.unit,
+            "statistic": self.quantity.statistic,
+            "value": self.value,
+            "tolerance": self.tolerance,
+            "passed": self.passed,
+            "off_silhouettes": stats(inside),
+            "silhouette_band": stats(band),
+            "histogram": histogram(inside),
+            "objects": self.objects,
+            "suspicions": self.suspicions,
+            "note": self.quantity.note,
+        }
 
 
 def _at(errors: np.ndarray, q: float) -> float:
@@ -199,9 +225,9 @@ def histogram(errors: np.ndarray) -> dict[str, int]:
     decades = np.clip(np.floor(np.log10(finite)).astype(int), -9, 9)
     out = {"0": int((errors == 0).sum())}
     for d in range(-9, 10):
-        if (n := int((decades == d).sum())):
+        if n := int((decades == d).sum()):
             out["<1e-8" if d == -9 else f"1e{d:+d}"] = n
-    if (n := int(np.isinf(errors).sum())):
+    if n := int(np.isinf(errors).sum()):
         out["inf"] = n
     return out
 
@@ -217,8 +243,10 @@ class Comparison:
         self.same_triangle = (gpu["part"] == ref["part"]) & ((gpu["triangle"] == ref["triangle"]) | ~frame.hit)
         things = [thing for thing, _ in reference.scene_parts(ref.scene)]
         names = [thing.name or f"object {thing.instance_id}" for thing in ref.scene.objects]
-        self.objects = [name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
-                        for name, thing in zip(names, ref.scene.objects)] + [NOTHING]
+        self.objects = [
+            name if names.count(name) == 1 else f"{name} (id {thing.instance_id})"
+            for name, thing in zip(names, ref.scene.objects)
+        ] + [NOTHING]
         index = {id(thing): i for i, thing in enumerate(ref.scene.objects)}
         self._object_of_part = np.array([index[id(thing)] for thing in things] + [len(names)], np.intp)
 
@@ -254,7 +282,9 @@ class Comparison:
         out = self.twin_colour(of, **more)
         return out if of == "colour" else luma_of(out)
 
-    def twin_colour(self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0), material: Material | None = None) -> np.ndarray:
+    def twin_colour(
+        self, of: str, level: float = 0.0, texels: tuple[float, float] = (0.0, 0.0), material: Material | None = None
+    ) -> np.ndarray:
         """:meth:`twin` in colour, for the luminance, too. Mistakes: a number of levels too coarse; coordinates moved by
         texels of the full resolution; another material everywhere."""
         gpu = self.gpu
@@ -263,8 +293,11 @@ class Comparison:
             on = gpu["part"] == p
             used = material or part.material
             move = 0.0 if used.texture is None else np.asarray(texels) / used.texture.image.shape[1::-1]
-            out[on] = mipmapped_albedo(used, np.nan_to_num(gpu[f"{of}_uv"][on].astype(np.float64)) + move,
-                                       gpu[f"{of}_level"][on].astype(np.float64) + level)
+            out[on] = mipmapped_albedo(
+                used,
+                np.nan_to_num(gpu[f"{of}_uv"][on].astype(np.float64)) + move,
+                gpu[f"{of}_level"][on].astype(np.float64) + level,
+            )
         return out
 
     def errors(self, name: str) -> np.ndarray:
@@ -290,7 +323,9 @@ class Comparison:
             graded &= self.gpu["part"] >= 0
         inside = errors[graded]
         value = (float(inside.mean()) if quantity.statistic == "mean" else float(inside.max())) if inside.size else 0.0
-        report = Report(quantity, quantity.tolerance if tolerance is None else tolerance, errors, graded, self.band, value)
+        report = Report(
+            quantity, quantity.tolerance if tolerance is None else tolerance, errors, graded, self.band, value
+        )
         report.objects = self._per_object(report)
         if not report.passed:
             report.suspicions = pose_suspicions(self, report) if name == "local" else suspicions(self, report)
@@ -314,8 +349,19 @@ class Comparison:
             rows = np.flatnonzero((report.graded & (owner == k)).ravel())
             errors = report.errors.ravel()[rows]
             y, x = np.unravel_index(rows[errors.argmax()], owner.shape)
-            out.append({"object": self.objects[k], "pixels": len(rows), "over_tolerance": int((errors > report.limit).sum()),
-                        "median": _at(errors, 0.5), "max": float(errors.max()), "x": int(x), "y": int(y),
-                        "error": float(errors.max()), "gpu": g[y, x].tolist(), "reference": r[y, x].tolist(),
-                        "triangle": int(self.ref["triangle"][y, x]) - 1})
+            out.append(
+                {
+                    "object": self.objects[k],
+                    "pixels": len(rows),
+                    "over_tolerance": int((errors > report.limit).sum()),
+                    "median": _at(errors, 0.5),
+                    "max": float(errors.max()),
+                    "x": int(x),
+                    "y": int(y),
+                    "error": float(errors.max()),
+                    "gpu": g[y, x].tolist(),
+                    "reference": r[y, x].tolist(),
+                    "triangle": int(self.ref["triangle"][y, x]) - 1,
+                }
+            )
         return sorted(out, key=lambda one: -one["max"])[:WORST]

@@ -52,13 +52,29 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder) ->
             text = _line(sources[stage].text, number)
             column = _column(text, match["text"], int(match.groupdict().get("column") or 0))
             if not file:  # a line that nobody wrote: an include guard, a #define
-                found.append(Diagnostic(sources[stage].name, 0, 0, match["kind"].lower(), match["text"], stage, f"generated line: {text}"))
+                found.append(
+                    Diagnostic(
+                        sources[stage].name,
+                        0,
+                        0,
+                        match["kind"].lower(),
+                        match["text"],
+                        stage,
+                        f"generated line: {text}",
+                    )
+                )
                 continue
-            found.append(Diagnostic(file, own, column, match["kind"].lower(), match["text"], stage, excerpt(folder, file, own, column)))
+            found.append(
+                Diagnostic(
+                    file, own, column, match["kind"].lower(), match["text"], stage, excerpt(folder, file, own, column)
+                )
+            )
     if any(d.kind == "error" for d in found):
         return found
     if error.log and sources:  # linking: no lines, but names
-        text = " ".join(line.strip() for line in error.log.splitlines() if line.strip(" =") and not _STAGE.match(line.strip()))
+        text = " ".join(
+            line.strip() for line in error.log.splitlines() if line.strip(" =") and not _STAGE.match(line.strip())
+        )
         for stage in (s for s in reversed(STAGES) if s in sources):
             for name in _QUOTED.findall(text):
                 if place := _declaration(sources[stage], name):
@@ -66,7 +82,17 @@ def diagnose(error: ShaderError, sources: Mapping[str, ShaderSource], folder) ->
         return [Diagnostic(next(iter(sources.values())).name, 0, 0, "error", text)]
     file, _, line = (error.where or "").rpartition(":")
     if file and line.isdigit():
-        return [Diagnostic(file, int(line), 1, "error", str(error).removeprefix(f"{error.where}: "), "", excerpt(folder, file, int(line), 1))]
+        return [
+            Diagnostic(
+                file,
+                int(line),
+                1,
+                "error",
+                str(error).removeprefix(f"{error.where}: "),
+                "",
+                excerpt(folder, file, int(line), 1),
+            )
+        ]
     return [Diagnostic(error.where or "shaders", 0, 0, "error", str(error).removeprefix(f"{error.where}: "))]
 
 

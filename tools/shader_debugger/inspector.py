@@ -105,11 +105,25 @@ class Inspector:
     def state(self) -> dict:
         """What the page shows around the pictures."""
         scene, config, gl = self.subject.scene, self.subject.config, self.renderer.gl
-        return {"config": self.subject.path, "sequence": self.subject.index, "seed": config.seed, "renderer": gl.renderer,
-                "width": scene.camera.width, "height": scene.camera.height, "t0": scene.t0_ns * 1e-9, "t1": scene.t1_ns * 1e-9,
-                "t": self.first.t_ns * 1e-9, "labels": [t * 1e-9 for t in config.time.label_times_ns],
-                "interval": config.time.interval_ns * 1e-9, "maps": pictures.MAPS, "folder": str(getattr(self.folder, "path", self.folder)),
-                "passes": [{"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source} for p in PASSES.values()]}
+        return {
+            "config": self.subject.path,
+            "sequence": self.subject.index,
+            "seed": config.seed,
+            "renderer": gl.renderer,
+            "width": scene.camera.width,
+            "height": scene.camera.height,
+            "t0": scene.t0_ns * 1e-9,
+            "t1": scene.t1_ns * 1e-9,
+            "t": self.first.t_ns * 1e-9,
+            "labels": [t * 1e-9 for t in config.time.label_times_ns],
+            "interval": config.time.interval_ns * 1e-9,
+            "maps": pictures.MAPS,
+            "folder": str(getattr(self.folder, "path", self.folder)),
+            "passes": [
+                {"name": p.name, "title": p.title, "unit": p.unit, "kind": p.kind, "source": p.source}
+                for p in PASSES.values()
+            ],
+        }
 
     def shaders(self) -> dict:
         return {"generation": self.generation, "errors": [d.as_dict() | {"where": d.where} for d in self.errors]}
@@ -119,17 +133,31 @@ class Inspector:
         when, name = self._when(q["t"]), q["pass"]
         source = self.gpu(when) if q["source"] == "gpu" else self.reference(when)
         info = PASSES[name]
-        rgb, legend = pictures.picture(info.kind, source[name], which=q["component"], colours=q["map"], low=q["low"], high=q["high"],
-                                      hit=_meaningful(source, info))
+        rgb, legend = pictures.picture(
+            info.kind,
+            source[name],
+            which=q["component"],
+            colours=q["map"],
+            low=q["low"],
+            high=q["high"],
+            hit=_meaningful(source, info),
+        )
         return picture.png_bytes(rgb), legend | {"unit": info.unit}
 
     def difference(self, q: dict[str, Any]) -> tuple[bytes, dict]:
         """PNG and legend of |A - B|, on a logarithmic scale unless q's low is 0."""
         when = self._when(q["t"])
-        a, b = (np.asarray((self.gpu(when) if source == "gpu" else self.reference(when))[name], np.float64) for name, source in (q["a"], q["b"]))
+        a, b = (
+            np.asarray((self.gpu(when) if source == "gpu" else self.reference(when))[name], np.float64)
+            for name, source in (q["a"], q["b"])
+        )
         if a.shape != b.shape:
-            raise ConfigError("have different numbers of components", where="a, b", value=", ".join(":".join(q[k]) for k in "ab"),
-                              accepted="two of the same kind")
+            raise ConfigError(
+                "have different numbers of components",
+                where="a, b",
+                value=", ".join(":".join(q[k]) for k in "ab"),
+                accepted="two of the same kind",
+            )
         which = "length" if q["component"] == "auto" else q["component"]
         with np.errstate(invalid="ignore"):
             change = np.where(a == b, 0.0, a - b)
@@ -139,7 +167,9 @@ class Inspector:
         low, high = min(low, 0.999 * high) if q["low"] is None else q["low"], high if q["high"] is None else q["high"]
         if low > 0:  # logarithmic: one flipped pixel on a silhouette would hide everything else
             values = np.where(np.isnan(values), values, np.clip(values, low, None))
-        rgb, legend = pictures.picture("depth", values, which="length", colours=q["map"] or picture.ERROR_MAP, low=low, high=high)
+        rgb, legend = pictures.picture(
+            "depth", values, which="length", colours=q["map"] or picture.ERROR_MAP, low=low, high=high
+        )
         return picture.png_bytes(rgb), legend | {"unit": PASSES[q["b"][0]].unit}
 
     def verdict(self, q: dict[str, Any]) -> dict:
@@ -148,7 +178,14 @@ class Inspector:
         reports = [comparison.report(name) for name in comparison.names()]
         found = verdict(comparison, reports)
         titles = {name: info.title for name, info in PASSES.items()}
-        return _finite(found | {"titles": titles, "buffers": [r.quantity.name for r in reports if not r.passed], "compared": len(reports)})
+        return _finite(
+            found
+            | {
+                "titles": titles,
+                "buffers": [r.quantity.name for r in reports if not r.passed],
+                "compared": len(reports),
+            }
+        )
 
     def probe(self, q: dict[str, Any]) -> dict:
         """The CLI's probe, with the CLI's text of every number."""
@@ -177,7 +214,9 @@ class Inspector:
             found = dict.fromkeys(diagnose(error, self._sources(new), new.folder))
             self.errors = [d for d in found if d.kind == "error"][:MOST_ERRORS]
         except Exception as error:  # noqa: BLE001 - an edit that compiles but cannot be drawn with: not the tool's end
-            self.errors = [Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")]
+            self.errors = [
+                Diagnostic(new.asked[0], 0, 0, "error", f"cannot be drawn with: {type(error).__name__}: {error}")
+            ]
         else:
             self.errors = []
             self.generation += 1

@@ -51,7 +51,9 @@ def sample_trilinear(texture: Texture, uv: np.ndarray, level: np.ndarray) -> np.
         on = low == k
         part = (level[on] - k)[:, None]
         upper = chain[min(k + 1, len(chain) - 1)]
-        out[on] = reference.sample_bilinear(chain[k], uv[on]) * (1 - part) + reference.sample_bilinear(upper, uv[on]) * part
+        out[on] = (
+            reference.sample_bilinear(chain[k], uv[on]) * (1 - part) + reference.sample_bilinear(upper, uv[on]) * part
+        )
     return out
 
 

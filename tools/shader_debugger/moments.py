@@ -40,10 +40,12 @@ LOOKUPS = ("uv", "level", "albedo", "light")
 
 def _lookups(name: str, program: str) -> tuple[Pass, ...]:
     source = f"{program} SHOW_LOOKUP"
-    return (Pass(f"{name}_uv", f"uv of {name}", "texture repeats", "uv", source),
-            Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
-            Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
-            Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source))
+    return (
+        Pass(f"{name}_uv", f"uv of {name}", "texture repeats", "uv", source),
+        Pass(f"{name}_level", f"level of {name}", "log2(texels per px)", "scalar", source),
+        Pass(f"{name}_albedo", f"albedo of {name}", "linear", "light", source),
+        Pass(f"{name}_light", f"light of {name}", "irradiance factor", "scalar", source),
+    )
 
 
 _BEFORE = (
@@ -71,7 +73,11 @@ class OfLabels(Mapping[str, _T]):
         self._made, self._before, self._shaded = made, tuple(before), tuple(shaded)
 
     def _all(self) -> dict[str, _T]:
-        views = [(label.towards is None and view.kind != "motion", self._made(label, view)) for label in LABELS.values() for view in label.views]
+        views = [
+            (label.towards is None and view.kind != "motion", self._made(label, view))
+            for label in LABELS.values()
+            for view in label.views
+        ]
         surface, motion = ([one for early, one in views if early is which] for which in (True, False))
         return {one.name: one for one in (*self._before, *surface, *self._shaded, *motion)}
 
@@ -86,7 +92,13 @@ class OfLabels(Mapping[str, _T]):
 
 
 def _of_label(label: Label, view: View) -> Pass:
-    return Pass(view.name, view.title, view.unit, view.kind, f"include/labels/{label.name}.glsl" if label.buffer else f"labels/{label.name}")
+    return Pass(
+        view.name,
+        view.title,
+        view.unit,
+        view.kind,
+        f"include/labels/{label.name}.glsl" if label.buffer else f"labels/{label.name}",
+    )
 
 
 PASSES = OfLabels(_of_label, _BEFORE, _SHADED)
@@ -162,8 +174,12 @@ class GpuMoment(_Lazy):
 
     def _inspect(self):
         out = self.renderer.inspect(self.when.t_ns)
-        return {"triangle": out["TRIANGLE"], "part": out["LOCAL"][..., 3].astype(np.int32) - 1, "local": out["LOCAL"][..., :3],
-                "window": out["WINDOW"]}
+        return {
+            "triangle": out["TRIANGLE"],
+            "part": out["LOCAL"][..., 3].astype(np.int32) - 1,
+            "local": out["LOCAL"][..., :3],
+            "window": out["WINDOW"],
+        }
 
     def _labels(self):
         when = self.when
@@ -194,7 +210,9 @@ class ReferenceMoment(_Lazy):
     @property
     def frame(self) -> reference.ReferenceFrame:
         if self._frame is None:
-            self._frame = reference.render(self.scene, self.when.t_ns, forward_ns=self.when.forward_ns, backward_ns=self.when.backward_ns)
+            self._frame = reference.render(
+                self.scene, self.when.t_ns, forward_ns=self.when.forward_ns, backward_ns=self.when.backward_ns
+            )
         return self._frame
 
     def at(self, t_ns: int) -> reference.ReferenceFrame:
@@ -231,12 +249,20 @@ class ReferenceMoment(_Lazy):
             return {name: luma_of(self["albedo"]) if name == "luminance_albedo" else self[what]}
         if name in (*LOOKUPS, "colour", "luminance", "texture_size"):
             return self._surface(self.when.t_ns)
-        return {f"next_depth_{way}": np.where(frame.hit, getattr(frame, way).depth, 0.0) for way in ("forward", "backward")}
+        return {
+            f"next_depth_{way}": np.where(frame.hit, getattr(frame, way).depth, 0.0) for way in ("forward", "backward")
+        }
 
     def _surface(self, t_ns: int) -> dict[str, np.ndarray]:
         frame, scene = self.at(t_ns), self.scene
         shape = frame.hit.shape
-        uv, light, level, albedo, size = np.zeros((*shape, 2)), np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3)), np.ones((*shape, 2))
+        uv, light, level, albedo, size = (
+            np.zeros((*shape, 2)),
+            np.zeros(shape),
+            np.zeros(shape),
+            np.zeros((*shape, 3)),
+            np.ones((*shape, 2)),
+        )
         xy = reference.pixel_grid(scene.camera).reshape(*shape, 2)
         for p, (thing, part) in enumerate(reference.scene_parts(scene)):
             on = frame.part == p
@@ -249,12 +275,26 @@ class ReferenceMoment(_Lazy):
                 corners = part.mesh.faces[frame.triangle[on]]
                 pose = reference.relative_pose_at(scene, thing, t_ns)
                 points = part.mesh.vertices[corners] @ pose[:3, :3].T + pose[:3, 3]
-                texels = part.mesh.uvs[corners].astype(np.float64) * part.material.uv_scale * part.material.texture.image.shape[1::-1]
-                level[on] = footprint(points, texels, scene.camera.rays(xy[on]), scene.camera.ray_jacobian(xy[on])) + self.mip_bias
+                texels = (
+                    part.mesh.uvs[corners].astype(np.float64)
+                    * part.material.uv_scale
+                    * part.material.texture.image.shape[1::-1]
+                )
+                level[on] = (
+                    footprint(points, texels, scene.camera.rays(xy[on]), scene.camera.ray_jacobian(xy[on]))
+                    + self.mip_bias
+                )
             albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
         colour = np.where(frame.hit[..., None], albedo * light[..., None], frame.colour)
-        return {"uv": uv, "light": light, "level": level, "albedo": albedo, "colour": colour, "luminance": colour @ LUMA,
-                "texture_size": size}
+        return {
+            "uv": uv,
+            "light": light,
+            "level": level,
+            "albedo": albedo,
+            "colour": colour,
+            "luminance": colour @ LUMA,
+            "texture_size": size,
+        }
 
 
 def open_reference(subject: Subject, when: When) -> ReferenceMoment:

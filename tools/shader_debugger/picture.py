@@ -38,7 +38,7 @@ def _style(axes) -> None:
 def _disc() -> np.ndarray:
     """The flow wheel without its corners, RGBA."""
     wheel = flow_wheel()
-    v, u = np.mgrid[-1:1:len(wheel) * 1j, -1:1:len(wheel) * 1j]
+    v, u = np.mgrid[-1 : 1 : len(wheel) * 1j, -1 : 1 : len(wheel) * 1j]
     return np.dstack([wheel, np.where(np.hypot(u, v) <= 1, 255, 0).astype(np.uint8)])
 
 
@@ -48,8 +48,13 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
     if kind == "bar":
         axes = figure.add_axes(box)
         low, high = legend["low"], legend["high"]
-        axes.pcolormesh(np.geomspace(low, high, 257) if legend["log"] else np.linspace(low, high, 257), [0, 1], np.linspace(0, 1, 256)[None],
-                        cmap=legend["map"], rasterized=True)
+        axes.pcolormesh(
+            np.geomspace(low, high, 257) if legend["log"] else np.linspace(low, high, 257),
+            [0, 1],
+            np.linspace(0, 1, 256)[None],
+            cmap=legend["map"],
+            rasterized=True,
+        )
         axes.set_xlim(low, high), axes.set_yticks([])
         if legend["log"]:
             ticks = [float(f"{v:.1g}") for v in np.geomspace(low, high, 5)[1:-1]]
@@ -61,15 +66,27 @@ def _legend(figure: Figure, box: tuple[float, float, float, float], legend: dict
             spine.set_visible(False)
         return
     x, y, _, h = box
-    text = {"mask": "white: yes, black: no", "ids": "one colour per number", "unit": "r, g, b = x, y, z; grey is 0",
-            "uv": "r, g = fractional part of u, v", "light": f"sRGB, white = {legend.get('high', 1):.3g}"}.get(kind, "")
+    text = {
+        "mask": "white: yes, black: no",
+        "ids": "one colour per number",
+        "unit": "r, g, b = x, y, z; grey is 0",
+        "uv": "r, g = fractional part of u, v",
+        "light": f"sRGB, white = {legend.get('high', 1):.3g}",
+    }.get(kind, "")
     if kind == "wheel":
         ratio = figure.get_figheight() / figure.get_figwidth()
         side = 2.1 * h
         axes = figure.add_axes((x, y + h - side, side * ratio, side))
         axes.imshow(_disc()), _style(axes)
         axes.set_frame_on(False)
-        figure.text(x + side * ratio * 1.25, y + h / 2, f"rim = {legend['high']:.3g}; hue is the direction", fontsize=size, color=MUTED, va="center")
+        figure.text(
+            x + side * ratio * 1.25,
+            y + h / 2,
+            f"rim = {legend['high']:.3g}; hue is the direction",
+            fontsize=size,
+            color=MUTED,
+            va="center",
+        )
         return
     figure.text(x, y + h / 2, text, fontsize=size, color=MUTED, va="center")
 
@@ -82,7 +99,9 @@ def _save(figure: Figure, path: Path, palette: bool = False) -> None:
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
     if palette:
-        image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)  # Pillow dithers to given palettes only
+        image = image.quantize(
+            palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG
+        )  # Pillow dithers to given palettes only
     with atomic_file(path) as temporary, output_errors(path):
         image.save(temporary, "PNG", optimize=palette)
 
@@ -97,7 +116,15 @@ def save_labelled(path: Path, info: Pass, rgb: np.ndarray, legend: dict, caption
     axes = figure.add_axes((20 / W, bottom / H, w / W, h / H))
     axes.imshow(rgb, interpolation="nearest", aspect="auto"), _style(axes)
     figure.text(20 / W, 1 - 18 / H, info.title, fontsize=12, color=INK, va="center", weight="bold")
-    figure.text(1 - 20 / W, 1 - 18 / H, f"{info.unit}   ·   {info.source}".strip(" ·"), fontsize=8, color=MUTED, va="center", ha="right")
+    figure.text(
+        1 - 20 / W,
+        1 - 18 / H,
+        f"{info.unit}   ·   {info.source}".strip(" ·"),
+        fontsize=8,
+        color=MUTED,
+        va="center",
+        ha="right",
+    )
     _legend(figure, (20 / W, 44 / H, min(360, w) / W, 14 / H), legend, 8)
     figure.text(20 / W, 10 / H, caption, fontsize=7, color=MUTED, va="center")
     _save(figure, path)
@@ -144,9 +171,24 @@ def save_errors(path: Path, reports: list, caption: str) -> None:
         axes = figure.add_axes((x / W, y / H, w / W, h / H))
         axes.imshow(rgb, interpolation="antialiased", aspect="auto"), _style(axes)
         verdict, colour = ("ok", "#15803d") if report.passed else ("over tolerance", "#b91c1c")
-        figure.text(x / W, (y + h + 9) / H, PASSES[report.quantity.name].title, fontsize=8.5, color=INK, va="center", weight="bold")
-        figure.text((x + w) / W, (y + h + 9) / H, f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}", fontsize=7,
-                    color=colour, va="center", ha="right")
+        figure.text(
+            x / W,
+            (y + h + 9) / H,
+            PASSES[report.quantity.name].title,
+            fontsize=8.5,
+            color=INK,
+            va="center",
+            weight="bold",
+        )
+        figure.text(
+            (x + w) / W,
+            (y + h + 9) / H,
+            f"{report.quantity.statistic} {report.value:.2g} {report.quantity.unit}: {verdict}",
+            fontsize=7,
+            color=colour,
+            va="center",
+            ha="right",
+        )
         bars = figure.add_axes((x / W, (y - 62) / H, w / W, 56 / H))
         inside = np.clip(decades[report.graded], -9, 2)
         bars.hist(inside, bins=np.linspace(-9, 2, 56), color="#3b6ea5")

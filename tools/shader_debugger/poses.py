@@ -40,6 +40,7 @@ def pose_suspicions(comparison, report) -> list[str]:
     wrong = report.graded & (report.errors > report.limit)
     owner = comparison.owner("local")
     numbers = [int(k) for k in np.unique(owner[wrong])]
+
     def sample(mask):
         y, x = np.nonzero(mask)
         some = np.linspace(0, len(x) - 1, min(SAMPLES, len(x))).astype(int)
@@ -48,17 +49,23 @@ def pose_suspicions(comparison, report) -> list[str]:
     groups = [(scene.objects[k], *sample(wrong & (owner == k))) for k in numbers]
 
     def left(some, t_cam: int, t_obj: int) -> float:
-        errors = [np.linalg.norm(_project(scene.camera, _pose(scene, thing, t_cam, t_obj), local) - xy, axis=1) for thing, xy, local in some]
+        errors = [
+            np.linalg.norm(_project(scene.camera, _pose(scene, thing, t_cam, t_obj), local) - xy, axis=1)
+            for thing, xy, local in some
+        ]
         # A point out of sight is as wrong as the picture is large: more would make any explanation look good beside it.
-        return float(np.quantile(np.nan_to_num(np.concatenate(errors), nan=scene.camera.width + scene.camera.height), 0.9))
+        return float(
+            np.quantile(np.nan_to_num(np.concatenate(errors), nan=scene.camera.width + scene.camera.height), 0.9)
+        )
 
     found = []
     before = left(groups, now, now)
     off = displaced(gpu, ref)[wrong]
     shift = np.median(off, axis=0)
-    whole = {f"everything is shifted by ({-shift[0]:+.3g}, {-shift[1]:+.3g}) px (the principal point, or a "
-             "pixel's centre)":
-             float(np.nan_to_num(np.quantile(np.linalg.norm(off - shift, axis=1), 0.9), nan=np.inf))}
+    whole = {
+        f"everything is shifted by ({-shift[0]:+.3g}, {-shift[1]:+.3g}) px (the principal point, or a "
+        "pixel's centre)": float(np.nan_to_num(np.quantile(np.linalg.norm(off - shift, axis=1), 0.9), nan=np.inf))
+    }
     if not scene.camera_path.is_static:
         t = _best(scene, now, lambda t: left(groups, t, now))
         whole[f"the camera is where it is at t = {_when(t, now)}: a stale pose"] = left(groups, t, now)

@@ -9,9 +9,27 @@ from __future__ import annotations
 import re
 
 _DIRECTIVE = re.compile(r"^\s*#\s*(\w+)\s*(.*?)\s*$")
-_TOKEN = re.compile(r"\s*(?:(?P<number>\d\w*)|(?P<name>[A-Za-z_]\w*)|(?P<operator><<|>>|<=|>=|==|!=|&&|\|\||[-+*/%<>&^|!~()]))")
-_PRECEDENCE = {op: level for level, ops in enumerate(
-    (("||",), ("&&",), ("|",), ("^",), ("&",), ("==", "!="), ("<", ">", "<=", ">="), ("<<", ">>"), ("+", "-"), ("*", "/", "%"))) for op in ops}
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>\d\w*)|(?P<name>[A-Za-z_]\w*)|(?P<operator><<|>>|<=|>=|==|!=|&&|\|\||[-+*/%<>&^|!~()]))"
+)
+_PRECEDENCE = {
+    op: level
+    for level, ops in enumerate(
+        (
+            ("||",),
+            ("&&",),
+            ("|",),
+            ("^",),
+            ("&",),
+            ("==", "!="),
+            ("<", ">", "<=", ">="),
+            ("<<", ">>"),
+            ("+", "-"),
+            ("*", "/", "%"),
+        )
+    )
+    for op in ops
+}
 MOST_TOKENS = 10_000  # of one condition with its macros written out
 DEEPEST = 100  # parentheses and signs inside each other
 
@@ -22,6 +40,7 @@ class ConditionError(ValueError):
 
 def without_comments(text: str) -> list[str]:
     """Lines of ``text``, comments blanked, line numbers and columns kept."""
+
     def blank(match: re.Match) -> str:
         return re.sub(r"[^\n]", " ", match[0])
 
@@ -43,7 +62,9 @@ def active_lines(text: str, defines: bool = False) -> list[tuple[int, str]]:
             continue
         word, rest = match[1], match[2]
         if word in ("if", "ifdef", "ifndef"):
-            truth = alive and (evaluate(rest, macros) if word == "if" else ((rest.split() or [""])[0] in macros) == (word == "ifdef"))
+            truth = alive and (
+                evaluate(rest, macros) if word == "if" else ((rest.split() or [""])[0] in macros) == (word == "ifdef")
+            )
             stack.append((alive, truth, truth))
             alive = truth
         elif word in ("elif", "else") and stack:
@@ -85,7 +106,7 @@ def _tokens(text: str) -> list[str]:
     while position < len(text):
         match = _TOKEN.match(text, position)
         if not match:
-            raise ConditionError(f"not of a condition: {text[position:position + 20].strip()!r}")
+            raise ConditionError(f"not of a condition: {text[position : position + 20].strip()!r}")
         out.append(match[match.lastgroup])
         position = match.end()
         if len(out) > MOST_TOKENS:
@@ -213,6 +234,21 @@ def _apply(operator: str, a: int, b: int, matters: bool) -> int:
         return _wrapped(quotient if operator == "/" else a - quotient * b)
     if operator in ("<<", ">>"):
         b &= 31  # GLSL leaves shifts by more undefined; this is what processors do
-    return _wrapped({"|": lambda: a | b, "^": lambda: a ^ b, "&": lambda: a & b, "==": lambda: int(a == b), "!=": lambda: int(a != b),
-                     "<": lambda: int(a < b), ">": lambda: int(a > b), "<=": lambda: int(a <= b), ">=": lambda: int(a >= b),
-                     "<<": lambda: a << b, ">>": lambda: a >> b, "+": lambda: a + b, "-": lambda: a - b, "*": lambda: a * b}[operator]())
+    return _wrapped(
+        {
+            "|": lambda: a | b,
+            "^": lambda: a ^ b,
+            "&": lambda: a & b,
+            "==": lambda: int(a == b),
+            "!=": lambda: int(a != b),
+            "<": lambda: int(a < b),
+            ">": lambda: int(a > b),
+            "<=": lambda: int(a <= b),
+            ">=": lambda: int(a >= b),
+            "<<": lambda: a << b,
+            ">>": lambda: a >> b,
+            "+": lambda: a + b,
+            "-": lambda: a - b,
+            "*": lambda: a * b,
+        }[operator]()
+    )

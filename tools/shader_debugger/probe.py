@@ -19,7 +19,11 @@ def ulps(gpu: np.ndarray, ref: np.ndarray) -> float:
         return float("inf")
     same = g == r
     spacing = np.spacing(np.abs(r).astype(np.float32)).astype(np.float64)
-    return float(np.where(same, 0.0, np.abs(np.where(same, 0.0, g - np.where(same, 0.0, r))) / np.where(same, 1.0, spacing)).max())
+    return float(
+        np.where(
+            same, 0.0, np.abs(np.where(same, 0.0, g - np.where(same, 0.0, r))) / np.where(same, 1.0, spacing)
+        ).max()
+    )
 
 
 def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comparison | None = None) -> dict:
@@ -42,13 +46,18 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
         "t_s": when.t_ns * 1e-9,
         "times_s": {"forward": when.forward_ns * 1e-9, "backward": when.backward_ns * 1e-9},
         "band": bool(comparison.band[y, x]),
-        "buffers": [_row(name, gpu, ref, comparison, x, y) for name in PASSES if name not in ("triangle", "local")],  # told below
+        "buffers": [
+            _row(name, gpu, ref, comparison, x, y) for name in PASSES if name not in ("triangle", "local")
+        ],  # told below
         "surface": {
             "gpu": _surface(parts, drawn, int(gpu["triangle"][y, x]) - 1, _barycentric(parts, drawn, gpu, x, y)),
-            "reference": _surface(parts, true, hit.triangle, hit.bary) | ({"front": hit.front, "corners": _plain(hit.corners)} if hit.hit else {}),
+            "reference": _surface(parts, true, hit.triangle, hit.bary)
+            | ({"front": hit.front, "corners": _plain(hit.corners)} if hit.hit else {}),
         },
         "positions": _positions(gpu, ref, x, y, seen) if true >= 0 or drawn >= 0 else [],
-        "why": {way: {"reference": seen[way].why, "gpu": _gpu_reason(gpu, way, x, y)} for way in ("forward", "backward")},
+        "why": {
+            way: {"reference": seen[way].why, "gpu": _gpu_reason(gpu, way, x, y)} for way in ("forward", "backward")
+        },
     }
 
 
@@ -58,21 +67,37 @@ def _plain(values):
 
 def _row(name, gpu, ref, comparison, x, y) -> dict:
     g, r = gpu[name][y, x], ref[name][y, x]
-    row = {"name": name, "title": PASSES[name].title, "unit": PASSES[name].unit, "gpu": g.tolist(), "reference": r.tolist(),
-           "error": None, "error_unit": "", "ulps": None, "ok": None, "note": ""}
+    row = {
+        "name": name,
+        "title": PASSES[name].title,
+        "unit": PASSES[name].unit,
+        "gpu": g.tolist(),
+        "reference": r.tolist(),
+        "error": None,
+        "error_unit": "",
+        "ulps": None,
+        "ok": None,
+        "note": "",
+    }
     if PASSES[name].kind in ("mask", "ids"):
         row |= {"error": float(g != r), "error_unit": "mismatch"}
     else:
         row["ulps"] = ulps(g, r)
-        row |= {"error": float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if row["ulps"] else 0.0,
-                "error_unit": PASSES[name].unit}
+        row |= {
+            "error": float(np.linalg.norm(np.atleast_1d(g.astype(np.float64) - r))) if row["ulps"] else 0.0,
+            "error_unit": PASSES[name].unit,
+        }
     if name in comparison.names() and name in QUANTITIES:
         quantity = QUANTITIES[name]
         error = float(comparison.errors(name)[y, x])
-        row["ok"] = None if comparison.band[y, x] else error <= (quantity.tolerance if quantity.statistic == "max" else 0.5)
+        row["ok"] = (
+            None if comparison.band[y, x] else error <= (quantity.tolerance if quantity.statistic == "max" else 0.5)
+        )
         if name in ("luminance", "colour"):
-            row["note"] = ("of the GPU's own albedo and light: "
-                           f"{np.array2string(np.asarray(comparison.pair(name)[1][y, x]), precision=7)}, {error:.2g} off")
+            row["note"] = (
+                "of the GPU's own albedo and light: "
+                f"{np.array2string(np.asarray(comparison.pair(name)[1][y, x]), precision=7)}, {error:.2g} off"
+            )
     if name == "colour_albedo" and ref["level"][y, x] > 0:
         row["note"] = f"full resolution (level 0): {np.array2string(ref['albedo_level0'][y, x], precision=5)}"
     return row
@@ -82,10 +107,19 @@ def _surface(parts, p, triangle, bary) -> dict:
     if p < 0:
         return {"object": None}
     thing, part = parts[p]
-    return {"object": thing.name, "category": thing.category, "instance": thing.instance_id,
-            "part": [i for i, own in enumerate(thing.parts) if own is part][0], "mesh": part.mesh.name,
-            "texture": part.material.texture.name if part.material.texture else None, "triangle": triangle, "bary": _plain(bary),
-            "double_sided": part.material.double_sided, "closed": part.mesh.closed, "unlit": part.material.unlit}
+    return {
+        "object": thing.name,
+        "category": thing.category,
+        "instance": thing.instance_id,
+        "part": [i for i, own in enumerate(thing.parts) if own is part][0],
+        "mesh": part.mesh.name,
+        "texture": part.material.texture.name if part.material.texture else None,
+        "triangle": triangle,
+        "bary": _plain(bary),
+        "double_sided": part.material.double_sided,
+        "closed": part.mesh.closed,
+        "unlit": part.material.unlit,
+    }
 
 
 def _barycentric(parts, p, gpu, x, y):
@@ -139,9 +173,16 @@ def _positions(gpu, ref, x, y, seen) -> list[dict]:
         add(f"camera, {label}", None, later.camera_to)
         w = float(gpu[f"next_depth_{way}"][y, x])
         there = ndc + gpu[f"flow_{way}"][y, x] * 2 / size
-        add(f"clip, {label}", [there[0] * w, there[1] * w, scene.camera.near, w] if p >= 0 else None,
-            P @ [*later.camera_to, 1.0] if later.camera_to is not None else None)
-        add(f"pixel, {label}", [x, y] + gpu[f"flow_{way}"][y, x].astype(np.float64) if gpu[f"valid_{way}"][y, x] else None, later.xy_to)
+        add(
+            f"clip, {label}",
+            [there[0] * w, there[1] * w, scene.camera.near, w] if p >= 0 else None,
+            P @ [*later.camera_to, 1.0] if later.camera_to is not None else None,
+        )
+        add(
+            f"pixel, {label}",
+            [x, y] + gpu[f"flow_{way}"][y, x].astype(np.float64) if gpu[f"valid_{way}"][y, x] else None,
+            later.xy_to,
+        )
     return rows
 
 
@@ -165,8 +206,10 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
     xn, yn = int(np.floor(xt + 0.5)), int(np.floor(yt + 0.5))
     other = int(there["ids"][yn, xn])
     names = {thing.instance_id: thing.name for thing in renderer.scene.objects}
-    return (f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth "
-            f"{there['depth'][yn, xn]:.6g}, the point is at Z' = {w:.6g}")
+    return (
+        f"hidden at t': pixel ({xn}, {yn}) shows {names.get(other, other)} (id {other}) at depth "
+        f"{there['depth'][yn, xn]:.6g}, the point is at Z' = {w:.6g}"
+    )
 
 
 # ------------------------------------------------------------------------------------------------- text
@@ -175,17 +218,25 @@ def _gpu_reason(gpu: GpuMoment, way: str, x: int, y: int) -> str:
 def as_text(found: dict) -> str:
     """The probe as fixed-width text."""
     x, y = found["pixel"]
-    lines = [(f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
-              f"{found['times_s']['backward']:.9g} s (backward)")]
+    lines = [
+        (
+            f"pixel ({x}, {y}) at t = {found['t_s']:.9g} s; t' = {found['times_s']['forward']:.9g} s (forward), "
+            f"{found['times_s']['backward']:.9g} s (backward)"
+        )
+    ]
     if found["band"]:
-        lines.append("in the silhouette band: the pixel's centre may fall on either side of an edge, so nothing is graded here")
+        lines.append(
+            "in the silhouette band: the pixel's centre may fall on either side of an edge, so nothing is graded here"
+        )
     lines += ["", f"{'':3}{'buffer':<20} {'GPU':<34} {'reference (float64)':<34} {'error':>10} {'ULPs':>9}  unit"]
     for row in found["buffers"]:
         mark = {True: "", False: "!!", None: ""}[row["ok"]]
         error = "" if row["error"] is None else f"{row['error']:.3g}"
         count = "" if row["ulps"] is None else f"{row['ulps']:.3g}"
-        lines.append(f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} {error:>10} "
-                     f"{count:>9}  {row['error_unit']}")
+        lines.append(
+            f"{mark:3}{row['title']:<20} {_numbers(row['gpu']):<34} {_numbers(row['reference']):<34} {error:>10} "
+            f"{count:>9}  {row['error_unit']}"
+        )
         if row["note"]:
             lines.append(f"{'':24}{row['note']}")
     lines.append("")
@@ -193,7 +244,9 @@ def as_text(found: dict) -> str:
         lines.append(f"{'GPU drew' if side == 'gpu' else 'reference hit':<14} {_surface_text(found['surface'][side])}")
     if found["positions"]:
         lines += ["", f"{'position':<20} {'GPU':<52} reference (float64)"]
-        lines += [f"{row['name']:<20} {_numbers(row['gpu']):<52} {_numbers(row['reference'])}" for row in found["positions"]]
+        lines += [
+            f"{row['name']:<20} {_numbers(row['gpu']):<52} {_numbers(row['reference'])}" for row in found["positions"]
+        ]
     lines.append("")
     for way, why in found["why"].items():
         for side in ("gpu", "reference"):
@@ -219,5 +272,7 @@ def _surface_text(s: dict) -> str:
     bary = f", barycentrics {_numbers(s['bary'])}" if s["bary"] is not None else ""
     side = "" if "front" not in s else (", from the front" if s["front"] else ", from behind")
     texture = f", texture {s['texture']}" if s["texture"] else ""
-    return (f"{s['object']} (id {s['instance']}, {s['category']}), part {s['part']} {s['mesh']}{texture}, triangle "
-            f"{s['triangle']}{bary}{side}")
+    return (
+        f"{s['object']} (id {s['instance']}, {s['category']}), part {s['part']} {s['mesh']}{texture}, triangle "
+        f"{s['triangle']}{bary}{side}"
+    )

@@ -53,7 +53,9 @@ def _number(key: str, text: str) -> float | None:
     except ValueError:
         value = math.nan
     if value is not None and not abs(value) <= LARGEST:
-        raise ConfigError("not a number", where=key, value=text, accepted=f"a number between -{LARGEST:g} and {LARGEST:g}, or nothing")
+        raise ConfigError(
+            "not a number", where=key, value=text, accepted=f"a number between -{LARGEST:g} and {LARGEST:g}, or nothing"
+        )
     return value
 
 
@@ -68,8 +70,13 @@ def _text(key: str, text: str) -> str:
     return text  # session.check_pixel reads the two together
 
 
-_VIEW: dict[str, Reader] = {"t": _seconds, "component": _choice("no such component", COMPONENTS, "auto"),
-                            "map": _choice("unknown colour map", MAPS, None), "low": _number, "high": _number}
+_VIEW: dict[str, Reader] = {
+    "t": _seconds,
+    "component": _choice("no such component", COMPONENTS, "auto"),
+    "map": _choice("unknown colour map", MAPS, None),
+    "low": _number,
+    "high": _number,
+}
 
 ROUTES: dict[str, dict[str, Reader]] = {
     "/state": {},
@@ -87,11 +94,17 @@ def read_query(route: str, text: str) -> dict[str, Any]:
     question mark. Raises ConfigError."""
     readers = ROUTES[route]
     if len(text) > LONGEST:
-        raise ConfigError("the question is too long", where=route, value=len(text), accepted=f"at most {LONGEST} characters")
+        raise ConfigError(
+            "the question is too long", where=route, value=len(text), accepted=f"at most {LONGEST} characters"
+        )
     given: dict[str, str] = {}
     for key, value in parse_qsl(text, keep_blank_values=True):
         if key not in readers or key in given:
-            raise ConfigError("asked twice" if key in given else "unknown parameter", where=route, value=key,
-                              accepted="one of " + ", ".join(readers) if readers else "none")
+            raise ConfigError(
+                "asked twice" if key in given else "unknown parameter",
+                where=route,
+                value=key,
+                accepted="one of " + ", ".join(readers) if readers else "none",
+            )
         given[key] = value
     return {key: read(key, given.get(key, "")) for key, read in readers.items()}

@@ -34,8 +34,11 @@ from blinkgl.tools.shader_debugger.session import Subject, When
 if TYPE_CHECKING:
     from importlib.resources.abc import Traversable
 
-PAGE = {"/": ("index.html", "text/html; charset=utf-8"), "/app.js": ("app.js", "text/javascript; charset=utf-8"),
-        "/style.css": ("style.css", "text/css; charset=utf-8")}
+PAGE = {
+    "/": ("index.html", "text/html; charset=utf-8"),
+    "/app.js": ("app.js", "text/javascript; charset=utf-8"),
+    "/style.css": ("style.css", "text/css; charset=utf-8"),
+}
 WAIT_S = 20.0  # a long poll's patience
 LOOK_S = 0.5  # between two looks at whether the page that waits is still there
 HEADER_S = 5.0  # for a whole header
@@ -46,9 +49,14 @@ THREADS = 12  # requests answered at a time
 MOST_QUEUED = 64  # more get 503
 MOST_WAITING = 8  # of THREADS, pages that wait for an edit; more get 503
 LOCAL = ("127.0.0.1", "localhost", "::1")
-HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer", "X-Frame-Options": "DENY",
-           "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
-                                      "connect-src 'self'; base-uri 'none'; form-action 'none'"}
+HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'",
+}
 
 
 def host_allowed(header: str | None, bound: str, port: int) -> bool:
@@ -116,7 +124,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _state(self, query: dict) -> None:
         worker = self.server.worker
-        self._json(worker.call(worker.inspector.state) | worker.call(worker.inspector.shaders) | {"version": worker.version})
+        self._json(
+            worker.call(worker.inspector.state) | worker.call(worker.inspector.shaders) | {"version": worker.version}
+        )
 
     def _image(self, query: dict) -> None:
         self._picture(self.server.worker.inspector.image, query)
@@ -193,7 +203,9 @@ class _Server:
 
     def __init__(self, host: str, port: int):
         self.bound = host
-        self.socket = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=128)
+        self.socket = socket.create_server(
+            (host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET, backlog=128
+        )
         self.socket.setblocking(False)
         self.address = self.socket.getsockname()
         self.waiting = threading.BoundedSemaphore(MOST_WAITING)
@@ -290,8 +302,15 @@ def _refuse(connection: socket.socket, status: str) -> None:
 class DebugServer:
     """The running page; ``with DebugServer(…) as server: server.url``. Raises GLError when it cannot start."""
 
-    def __init__(self, subject: Subject, when: When, shaders: str | None = None, host: str = "127.0.0.1", port: int = 0,
-                 step_us: float | None = None):
+    def __init__(
+        self,
+        subject: Subject,
+        when: When,
+        shaders: str | None = None,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        step_us: float | None = None,
+    ):
         self._server = _listen(host, port)
         try:
             self._server.worker = Worker(Inspector(subject, when, shaders, step_us))
@@ -329,11 +348,17 @@ def _listen(host: str, port: int) -> _Server:
     try:
         return _Server(host, port)
     except OSError as error:
-        raise GLError(f"cannot listen: {error.strerror or error}", where="serve", value=f"{host}:{port}",
-                      accepted="a free port of this machine; 0 takes any") from None
+        raise GLError(
+            f"cannot listen: {error.strerror or error}",
+            where="serve",
+            value=f"{host}:{port}",
+            accepted="a free port of this machine; 0 takes any",
+        ) from None
 
 
-def serve(subject: Subject, when: When, shaders: str | None, host: str, port: int, step_us: float | None = None) -> None:
+def serve(
+    subject: Subject, when: When, shaders: str | None, host: str, port: int, step_us: float | None = None
+) -> None:
     """Serves until interrupted."""
     with DebugServer(subject, when, shaders, host, port, step_us) as server:
         folder = server.folder

@@ -64,7 +64,9 @@ class When:
         return (self.forward_ns - self.t_ns) * 1e-9
 
 
-def open_subject(config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()) -> Subject:
+def open_subject(
+    config: str, *, seed: int | None = None, sequence: int | None = None, overrides: list[str] | tuple = ()
+) -> Subject:
     """The sequence that ``blinkgl generate CONFIG --seed SEED`` would make under number
     ``sequence`` (default: its first).
 
@@ -91,8 +93,12 @@ def moment(subject: Subject, seconds: float | None = None, step_us: float | None
     else:
         t_ns = round(seconds * NS_PER_S) if math.isfinite(seconds * NS_PER_S) else None
         if t_ns is None or not scene.t0_ns <= t_ns <= scene.t1_ns:
-            raise ConfigError("outside the sequence", where="--time", value=seconds,
-                              accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s")
+            raise ConfigError(
+                "outside the sequence",
+                where="--time",
+                value=seconds,
+                accepted=f"{scene.t0_ns / NS_PER_S:g} to {scene.t1_ns / NS_PER_S:g} s",
+            )
     if step_us is None:
         step = max(1000, timing.interval_ns // STEP_FRACTION)
     elif math.isfinite(step_us * 1000) and step_us * 1000 >= 1:
@@ -104,7 +110,7 @@ def moment(subject: Subject, seconds: float | None = None, step_us: float | None
 
 
 def check_pixel(scene: Scene, text: str) -> tuple[int, int]:
-    """"X,Y" as two integers inside the image. Raises ConfigError."""
+    """ "X,Y" as two integers inside the image. Raises ConfigError."""
     width, height = scene.camera.width, scene.camera.height
     accepted = f"X,Y with 0 <= X < {width} and 0 <= Y < {height}"
     try:
@@ -142,9 +148,16 @@ def open_folder(shaders: str | None):
     folder = Path(shaders)
     accepted = "a copy of the shaders/ folder"
     if not folder.is_dir():
-        raise GLError("no such shader folder" if not folder.exists() else "is not a folder", where="--shaders", value=shaders, accepted=accepted)
+        raise GLError(
+            "no such shader folder" if not folder.exists() else "is not a folder",
+            where="--shaders",
+            value=shaders,
+            accepted=accepted,
+        )
     if not os.access(folder, os.R_OK | os.X_OK):
-        raise GLError("shader folder cannot be read", where="--shaders", value=shaders, accepted="a folder with read permission")
+        raise GLError(
+            "shader folder cannot be read", where="--shaders", value=shaders, accepted="a folder with read permission"
+        )
     if not any(folder.glob("*.glsl")):
         raise GLError("no shaders in this folder", where="--shaders", value=shaders, accepted=accepted)
     return EditedFolder(folder)
@@ -161,7 +174,9 @@ class Snapshot:
     def of(cls, folder) -> Snapshot:
         root = folder.path if isinstance(folder, EditedFolder) else Path(str(folder))
         files = {}
-        places = {path.relative_to(root).as_posix(): path for path in files_of(folder)} | {name: Path(str(folder / name)) for name in LENT}
+        places = {path.relative_to(root).as_posix(): path for path in files_of(folder)} | {
+            name: Path(str(folder / name)) for name in LENT
+        }
         for name, path in places.items():
             try:
                 files[name] = path.read_bytes()
@@ -178,7 +193,11 @@ class Snapshot:
 
     def iterdir(self):
         inside = f"{self.path}/" if self.path else ""
-        return (Snapshot(self._files, path) for path in sorted(self._files) if path.startswith(inside) and "/" not in path[len(inside):])
+        return (
+            Snapshot(self._files, path)
+            for path in sorted(self._files)
+            if path.startswith(inside) and "/" not in path[len(inside) :]
+        )
 
     def read_text(self, encoding: str = "utf-8") -> str:
         if self.path not in self._files:
@@ -219,7 +238,11 @@ class Inspection(ScenePass):
     + 1, an index into ``reference.scene_parts``."""
 
     program: ClassVar[str] = DEBUG_PROGRAM
-    outputs: ClassVar[tuple[Output, ...]] = (Output("TRIANGLE", "R32UI"), Output("LOCAL", "RGBA32F"), Output("WINDOW", "RGBA32F"))
+    outputs: ClassVar[tuple[Output, ...]] = (
+        Output("TRIANGLE", "R32UI"),
+        Output("LOCAL", "RGBA32F"),
+        Output("WINDOW", "RGBA32F"),
+    )
 
     def defines(self, kind):
         return {f"OUT_{output.name}": i for i, output in enumerate(self.outputs)}
@@ -284,17 +307,31 @@ class DebugRenderer(Renderer):
 
         Raises ShaderError when the source shows nothing (a copy that is older than the debugger)."""
         program = LOOKUPS[name].program
-        if "show_lookup(" not in "".join(line for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
-                                         if not line.startswith("void")):
-            raise ShaderError("does not show what it looks up", where=program,
-                              accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the '
-                                       'shipped file')
+        if "show_lookup(" not in "".join(
+            line
+            for line in expand(program, "fragment", {}, self.gl.shaders.folder).text.splitlines()
+            if not line.startswith("void")
+        ):
+            raise ShaderError(
+                "does not show what it looks up",
+                where=program,
+                accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the '
+                "shipped file",
+            )
         frame = self.draw(LOOKUPS[name], t_ns)
         lookup, albedo = frame.read("lookup"), frame.read("albedo")
-        return {"result": frame.read(name), "uv": lookup[..., :2], "level": lookup[..., 2], "light": lookup[..., 3], "albedo": albedo[..., :3],
-                "count": albedo[..., 3]}
+        return {
+            "result": frame.read(name),
+            "uv": lookup[..., :2],
+            "level": lookup[..., 2],
+            "light": lookup[..., 3],
+            "albedo": albedo[..., :3],
+            "count": albedo[..., 3],
+        }
 
-    def raw(self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None) -> dict[str, np.ndarray]:
+    def raw(
+        self, t_ns: int, *names: str, forward_ns: int | None = None, backward_ns: int | None = None
+    ) -> dict[str, np.ndarray]:
         """Buffers of label.glsl as the shader wrote them, without the masks of ground truth, by
         the names of their labels: depth, ids …"""
         ends = {way: t for way, t in (("forward", forward_ns), ("backward", backward_ns)) if t is not None}

@@ -48,7 +48,11 @@ def _explain(comparison, report, gpu, right, wrong) -> list[str]:
         return []
     quantity, before = report.quantity, report.errors[wrong]
     limit = quantity.fit * (report.tolerance or np.finfo(np.float32).eps)
-    relative = lookup_of(quantity.name)[1] not in ("uv", "level", "albedo")  # those have a unit of their own, and zeros that mean nothing
+    relative = lookup_of(quantity.name)[1] not in (
+        "uv",
+        "level",
+        "albedo",
+    )  # those have a unit of their own, and zeros that mean nothing
     image = np.array(right, np.float64)
     found = []
     with np.errstate(all="ignore"):
@@ -81,8 +85,14 @@ def _candidates(comparison, report, r, g, on) -> Candidates:
     name = report.quantity.name
     _, what = lookup_of(name)
     specific = {"uv": _uv, "level": _level, "albedo": _albedo, "light": _light}.get(what) or {
-        "depth": _depth, "normals": _normals, "luminance": _shaded, "colour": _shaded, "velocity": _velocity,
-        "flow_forward": _flow, "flow_backward": _flow}.get(name)
+        "depth": _depth,
+        "normals": _normals,
+        "luminance": _shaded,
+        "colour": _shaded,
+        "velocity": _velocity,
+        "flow_forward": _flow,
+        "flow_backward": _flow,
+    }.get(name)
     if specific is not None:
         yield from specific(comparison, name, r, g, on)
     yield ("the pass looks nothing up here" if what in ("uv", "level") else "everything is zero"), np.zeros_like(r)
@@ -133,7 +143,10 @@ def _depth(comparison, name, r, g, on) -> Candidates:
     yield "1 / Z instead of Z", 1 / r
     y, x = np.nonzero(on)
     rays = camera.rays(np.stack([x, y], axis=1))
-    yield "distance along the ray instead of depth along the optical axis", r * np.linalg.norm(rays, axis=1) / rays[:, 2]
+    yield (
+        "distance along the ray instead of depth along the optical axis",
+        r * np.linalg.norm(rays, axis=1) / rays[:, 2],
+    )
 
 
 def _screen_weights(comparison, on) -> np.ndarray:
@@ -165,7 +178,9 @@ def _interpolated(comparison, on, attribute: str, weights: np.ndarray) -> np.nda
     for p, (_, own) in enumerate(reference.scene_parts(ref.scene)):
         rows = part == p
         corners = getattr(own.mesh, attribute)[own.mesh.faces[triangle[rows]]].astype(np.float64)
-        out[rows] = np.einsum("nc,nck->nk", weights[rows], corners) * (own.material.uv_scale if attribute == "uvs" else 1.0)
+        out[rows] = np.einsum("nc,nck->nk", weights[rows], corners) * (
+            own.material.uv_scale if attribute == "uvs" else 1.0
+        )
     return out
 
 
@@ -189,7 +204,10 @@ def _normals_seen(comparison, on) -> Iterator[tuple[str, np.ndarray]]:
     yield "the normal points the other way (not turned towards the camera, or turned twice)", -right
     yield "the normal stays in the object's axes", _turned(comparison, on, right, transposed=True)
     flat = _turned(comparison, on, _unit(_on_screen(comparison, on, "normals")))
-    yield "the normal is interpolated without perspective (noperspective)", flat * np.sign((flat * right).sum(axis=1, keepdims=True))
+    yield (
+        "the normal is interpolated without perspective (noperspective)",
+        flat * np.sign((flat * right).sum(axis=1, keepdims=True)),
+    )
 
 
 def _normals(comparison, name, r, g, on) -> Candidates:
@@ -237,7 +255,10 @@ def _uv_fitted(comparison, r, g, on) -> Candidates:
 def _level(comparison, name, r, g, on) -> Candidates:
     bias = float(np.round(_typical(g - r), 2))
     bias = round(bias) if abs(bias - round(bias)) < 0.15 else bias  # drivers approximate the level
-    yield f"a mip bias of {bias:+g} (levels that are {'coarser' if bias > 0 else 'finer'} than one texel a pixel)", r + bias
+    yield (
+        f"a mip bias of {bias:+g} (levels that are {'coarser' if bias > 0 else 'finer'} than one texel a pixel)",
+        r + bias,
+    )
     yield "always level 0: no mip maps", np.zeros_like(r)
     constant = float(np.round(_typical(g), 2))
     yield f"always level {constant:g}", np.full_like(r, constant)
@@ -254,9 +275,13 @@ def _albedo(comparison, name, r, g, on) -> Candidates:
         yield "sRGB is decoded twice (before r, g, b are weighed)", np.repeat(twice[:, None], 3, axis=1)
     yield "sRGB is not decoded", srgb_from_linear(np.clip(r, 0, 1)).astype(np.float64)
     for steps in (1, -1, 2, -2):
-        yield (f"sampled {abs(steps)} mip level{'s' * (abs(steps) > 1)} {'coarser' if steps > 0 else 'finer'} than "
-               "its level says"), \
-            comparison.twin(of, level=steps)[on]
+        yield (
+            (
+                f"sampled {abs(steps)} mip level{'s' * (abs(steps) > 1)} {'coarser' if steps > 0 else 'finer'} than "
+                "its level says"
+            ),
+            comparison.twin(of, level=steps)[on],
+        )
     for x, y in product((0.5, -0.5, 0.0), repeat=2):
         if x or y:
             yield f"sampled half a texel aside ({x:+g}, {y:+g})", comparison.twin(of, texels=(x, y))[on]
@@ -271,8 +296,12 @@ def _albedo(comparison, name, r, g, on) -> Candidates:
         yield "red and blue are exchanged", r[:, ::-1]
         yield "the luminance instead of the colour", np.repeat((r @ LUMA)[:, None], 3, axis=1)
     else:
-        for text, weights in (("the mean of r, g, b instead of their luminance", (1 / 3, 1 / 3, 1 / 3)), ("red alone instead of the luminance", (1, 0, 0)),
-                              ("Rec. 601 weights instead of Rec. 709", (0.299, 0.587, 0.114)), ("the weights are those of b, g, r", LUMA[::-1])):
+        for text, weights in (
+            ("the mean of r, g, b instead of their luminance", (1 / 3, 1 / 3, 1 / 3)),
+            ("red alone instead of the luminance", (1, 0, 0)),
+            ("Rec. 601 weights instead of Rec. 709", (0.299, 0.587, 0.114)),
+            ("the weights are those of b, g, r", LUMA[::-1]),
+        ):
             yield text, np.repeat((comparison.twin_colour(of)[on] @ np.asarray(weights))[:, None], 3, axis=1)
     light = ref["light"][on][:, None]
     yield "the light is multiplied in already", r * light
@@ -280,7 +309,10 @@ def _albedo(comparison, name, r, g, on) -> Candidates:
     for thing, own in reference.scene_parts(ref.scene):
         if own.material.texture is not None and id(own.material) not in seen:
             seen.add(id(own.material))
-            yield f"the texture of {thing.name or f'object {thing.instance_id}'}", comparison.twin(of, material=own.material)[on]
+            yield (
+                f"the texture of {thing.name or f'object {thing.instance_id}'}",
+                comparison.twin(of, material=own.material)[on],
+            )
 
 
 def _light(comparison, name, r, g, on) -> Candidates:
@@ -291,20 +323,34 @@ def _light(comparison, name, r, g, on) -> Candidates:
         yield text, reference.irradiance(scene, mistaken)
     yield "the sun is missing", light.sky * (0.5 + 0.5 * up)
     yield "the sky is missing", light.sun * np.maximum(0.0, facing)
-    yield "surfaces that face away from the sun are lit by it, too (|n.s|)", light.sun * np.abs(facing) + light.sky * (0.5 + 0.5 * up)
-    yield "surfaces that face away from the sun lose light (n.s below 0)", light.sun * facing + light.sky * (0.5 + 0.5 * up)
+    yield (
+        "surfaces that face away from the sun are lit by it, too (|n.s|)",
+        light.sun * np.abs(facing) + light.sky * (0.5 + 0.5 * up),
+    )
+    yield (
+        "surfaces that face away from the sun lose light (n.s below 0)",
+        light.sun * facing + light.sky * (0.5 + 0.5 * up),
+    )
     yield "the sun shines from the other side", light.sun * np.maximum(0.0, -facing) + light.sky * (0.5 + 0.5 * up)
     yield "the sky lights from below", light.sun * np.maximum(0.0, facing) + light.sky * (0.5 - 0.5 * up)
     yield "the same sky light everywhere", light.sun * np.maximum(0.0, facing) + light.sky
     blend = _interpolated(comparison, on, "normals", ref.frame.bary[on])
     length = np.linalg.norm(blend, axis=1)
-    yield "the interpolated normal is not normalised", light.sun * np.maximum(0.0, facing * length) + light.sky * (0.5 + 0.5 * up * length)
+    yield (
+        "the interpolated normal is not normalised",
+        light.sun * np.maximum(0.0, facing * length) + light.sky * (0.5 + 0.5 * up * length),
+    )
     # in a frame of its own each: what the sun or the zenith is when it is left in world axes while the normal is in the
     # object's
     local = _turned(comparison, on, normal, transposed=True)
-    yield "the sun's direction is not turned into the object's axes", \
-        light.sun * np.maximum(0.0, local @ np.asarray(light.sun_direction)) + light.sky * (0.5 + 0.5 * up)
-    yield "the zenith is not turned into the object's axes", light.sun * np.maximum(0.0, facing) + light.sky * (0.5 + 0.5 * local[:, 2])
+    yield (
+        "the sun's direction is not turned into the object's axes",
+        light.sun * np.maximum(0.0, local @ np.asarray(light.sun_direction)) + light.sky * (0.5 + 0.5 * up),
+    )
+    yield (
+        "the zenith is not turned into the object's axes",
+        light.sun * np.maximum(0.0, facing) + light.sky * (0.5 + 0.5 * local[:, 2]),
+    )
     yield "unlit: the light is always 1", np.ones_like(r)
 
 
@@ -343,7 +389,10 @@ def _flow(comparison, name, r, g, on) -> Candidates:
     now, then = ref["depth"][on][:, None], ref[f"next_depth_{way}"][on][:, None]
     yield "the perspective division is missing (not divided by Z')", r * then
     yield "divided by the depth at t instead of the depth at t'", r * then / now
-    yield "the velocity times the interval, not the displacement", ref["velocity"][on] * gpu.when.interval_s * (1 if way == "forward" else -1)
+    yield (
+        "the velocity times the interval, not the displacement",
+        ref["velocity"][on] * gpu.when.interval_s * (1 if way == "forward" else -1),
+    )
     yield f"the {other} flow", ref[f"flow_{other}"][on]
     yield "the local position is interpolated without perspective (noperspective)", _flow_of(comparison, way, on)
 
@@ -356,7 +405,9 @@ def _flow_of(comparison, way: str, on) -> np.ndarray:
     change, part = np.zeros((len(local), 3)), frame.part[on]
     for p, (thing, _) in enumerate(reference.scene_parts(ref.scene)):
         rows = part == p
-        step = reference.relative_pose_at(ref.scene, thing, getattr(when, f"{way}_ns")) - reference.relative_pose_at(ref.scene, thing, when.t_ns)
+        step = reference.relative_pose_at(ref.scene, thing, getattr(when, f"{way}_ns")) - reference.relative_pose_at(
+            ref.scene, thing, when.t_ns
+        )
         change[rows] = local[rows] @ step[:3, :3].T + step[:3, 3]
     y, x = np.nonzero(on)
     return camera.displacement(camera.rays(np.stack([x, y], axis=1)), frame.depth[on], change)

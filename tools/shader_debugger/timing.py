@@ -163,7 +163,12 @@ def passes_of(subject: Subject, when: When) -> dict[str, tuple]:
     config = subject.config
     asked, render = asked_for(config.labels), config.render
     rate = config.timeline.reconstruction == "hermite"
-    out = {"luminance" + (" and rate" if rate else ""): (lambda r: r.luminance(when.t_ns, rate), samples_of(render.antialiasing).grid)}
+    out = {
+        "luminance" + (" and rate" if rate else ""): (
+            lambda r: r.luminance(when.t_ns, rate),
+            samples_of(render.antialiasing).grid,
+        )
+    }
     if config.timeline.kind != "uniform":
         every = config.timeline.sample_every
         if config.timeline.kind == "brightness":
@@ -186,9 +191,22 @@ def measure(subject: Subject, when: When, shaders: str | None = None, repeat: in
     """Plain data (JSON): renderer, resolution, and per pass the medians over ``repeat`` runs. Times in ms."""
     with open_renderer(subject, shaders, as_configured=True) as opened:
         gl, config = opened.gl, subject.config.render
-        out = {"config": subject.path, "sequence": subject.index, "t_s": when.t_ns * 1e-9, "renderer": gl.renderer, "version": gl.version,
-               "software": gl.is_software, "width": opened.width, "height": opened.height, "repeat": repeat, "passes": []}
-        with TimedRenderer(gl, subject.scene, config) as full, TimedRenderer(gl, half_scene(subject.scene), config) as half:
+        out = {
+            "config": subject.path,
+            "sequence": subject.index,
+            "t_s": when.t_ns * 1e-9,
+            "renderer": gl.renderer,
+            "version": gl.version,
+            "software": gl.is_software,
+            "width": opened.width,
+            "height": opened.height,
+            "repeat": repeat,
+            "passes": [],
+        }
+        with (
+            TimedRenderer(gl, subject.scene, config) as full,
+            TimedRenderer(gl, half_scene(subject.scene), config) as half,
+        ):
             ratio = full.width * full.height / (half.width * half.height)
             for name, (call, scale) in passes_of(subject, when).items():
                 out["passes"].append(_measure_pass(name, call, scale, full, half, ratio, repeat))
@@ -198,7 +216,11 @@ def measure(subject: Subject, when: When, shaders: str | None = None, repeat: in
 def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, ratio: float, repeat: int) -> dict:
     runs: dict[str, list[Draws]] = {"full": [], "half": [], "each": []}
     for k in range(repeat + 1):
-        for kind, renderer in (("full", full), ("half", half), ("each", full)):  # interleaved: drift of the machine hits all alike
+        for kind, renderer in (
+            ("full", full),
+            ("half", half),
+            ("each", full),
+        ):  # interleaved: drift of the machine hits all alike
             result = renderer.run(call, each=kind == "each")
             if k:
                 runs[kind].append(result)
@@ -214,24 +236,53 @@ def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, r
     variants = []
     for variant, one in runs["each"][0].variants.items():
         ms = float(np.median([run.variants[variant].gpu_ms for run in runs["each"]]))
-        variants.append({"variant": variant, "gpu_ms": ms, "draws": one.draws, "triangles": one.triangles, "fragments": one.fragments})
+        variants.append(
+            {
+                "variant": variant,
+                "gpu_ms": ms,
+                "draws": one.draws,
+                "triangles": one.triangles,
+                "fragments": one.fragments,
+            }
+        )
     variants.sort(key=lambda v: -v["gpu_ms"])
-    return {"pass": name, "gpu_ms": whole, "wall_ms": median("full", "wall_ms"), "half_gpu_ms": small, "fragment_ms": fragment,
-            "vertex_ms": whole - fragment, "draws": first.draws, "triangles": first.triangles, "fragments": fragments,
-            "overdraw": fragments / pixels, "variants": variants}
+    return {
+        "pass": name,
+        "gpu_ms": whole,
+        "wall_ms": median("full", "wall_ms"),
+        "half_gpu_ms": small,
+        "fragment_ms": fragment,
+        "vertex_ms": whole - fragment,
+        "draws": first.draws,
+        "triangles": first.triangles,
+        "fragments": fragments,
+        "overdraw": fragments / pixels,
+        "variants": variants,
+    }
 
 
 def as_text(result: dict) -> str:
-    lines = [(f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x "
-              f"{result['height']} px, {result['renderer']}, median of {result['repeat']}"), "",
-             (f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} "
-              f"{'fragments':>10} {'overdraw':>8}")]
+    lines = [
+        (
+            f"{result['config']}, sequence {result['sequence']}, t = {result['t_s']:.6g} s, {result['width']} x "
+            f"{result['height']} px, {result['renderer']}, median of {result['repeat']}"
+        ),
+        "",
+        (
+            f"{'pass':<26} {'GPU ms':>8} {'wall ms':>8} {'vertex':>8} {'fragment':>8} {'draws':>6} {'triangles':>9} "
+            f"{'fragments':>10} {'overdraw':>8}"
+        ),
+    ]
     for p in result["passes"]:
-        lines.append(f"{p['pass']:<26} {p['gpu_ms']:>8.3f} {p['wall_ms']:>8.3f} {p['vertex_ms']:>8.3f} "
-                     f"{p['fragment_ms']:>8.3f} {p['draws']:>6} {p['triangles']:>9} {p['fragments']:>10} {p['overdraw']:>8.2f}")
+        lines.append(
+            f"{p['pass']:<26} {p['gpu_ms']:>8.3f} {p['wall_ms']:>8.3f} {p['vertex_ms']:>8.3f} "
+            f"{p['fragment_ms']:>8.3f} {p['draws']:>6} {p['triangles']:>9} {p['fragments']:>10} {p['overdraw']:>8.2f}"
+        )
     lines += ["", "per program variant, each draw waited for (the sum exceeds the pass):"]
     for p in result["passes"]:
         for v in p["variants"]:
-            lines.append(f"  {p['pass']:<24} {v['gpu_ms']:>8.3f} ms {v['draws']:>5} draws {v['triangles']:>8} triangles "
-                         f"{v['fragments']:>9} fragments  {v['variant']}")
+            lines.append(
+                f"  {p['pass']:<24} {v['gpu_ms']:>8.3f} ms {v['draws']:>5} draws {v['triangles']:>8} triangles "
+                f"{v['fragments']:>9} fragments  {v['variant']}"
+            )
     return "\n".join(lines)

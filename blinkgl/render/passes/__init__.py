@@ -15,5 +15,19 @@ from blinkgl.render.passes.velocity import Velocity
 PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean)
 """Those that a renderer draws of itself."""
 
-__all__ = ["PASSES", "Brightness", "Colour", "Geometry", "Input", "Luminance", "Mean", "Output", "Pass", "ScenePass", "ScreenPass", "Shot",
-           "Velocity", "filtered"]
+__all__ = [
+    "PASSES",
+    "Brightness",
+    "Colour",
+    "Geometry",
+    "Input",
+    "Luminance",
+    "Mean",
+    "Output",
+    "Pass",
+    "ScenePass",
+    "ScreenPass",
+    "Shot",
+    "Velocity",
+    "filtered",
+]

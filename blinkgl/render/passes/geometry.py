@@ -62,12 +62,18 @@ class Geometry(ScenePass):
             for name, array in given.items():
                 array = np.asarray(array)
                 if array.ndim not in (1, 2, 3) or len(array) != count:
-                    raise TypeError(f"label '{label.name}': `uniforms` gives '{name}' of shape {array.shape}, which does not "
-                                    f"begin with the {count} objects")
+                    raise TypeError(
+                        f"label '{label.name}': `uniforms` gives '{name}' of shape {array.shape}, which does not "
+                        f"begin with the {count} objects"
+                    )
                 if name in values or name in _OF_THE_PASS:
-                    raise TypeError(f"label '{label.name}': `uniforms` gives '{name}', which "
-                                    f"{values[name][0] if name in values else 'the pass'} gives, too")
-                columns = np.swapaxes(array, 1, 2) if array.ndim == 3 else array  # GLSL's matrices are stored by columns
+                    raise TypeError(
+                        f"label '{label.name}': `uniforms` gives '{name}', which "
+                        f"{values[name][0] if name in values else 'the pass'} gives, too"
+                    )
+                columns = (
+                    np.swapaxes(array, 1, 2) if array.ndim == 3 else array
+                )  # GLSL's matrices are stored by columns
                 kind = {"u": np.uint32, "i": np.int32}.get(array.dtype.kind, np.float32)
                 values[name] = (label.name, [row.tobytes() for row in np.ascontiguousarray(columns, kind)])
         return values
@@ -78,8 +84,10 @@ class Geometry(ScenePass):
         if missing := uniforms.keys() - values.keys() - _OF_THE_PASS:
             name = min(missing)
             whose = [f"'{one}'" for one in self.names if name in (LABELS[one].glsl or "")]
-            raise TypeError(f"label {whose[0] if len(whose) == 1 else ' or '.join(map(repr, self.names))}: `uniforms` gives no "
-                            f"'{name}'")
+            raise TypeError(
+                f"label {whose[0] if len(whose) == 1 else ' or '.join(map(repr, self.names))}: `uniforms` gives no "
+                f"'{name}'"
+            )
         for name, (label, _) in values.items():
             try:
                 uniforms[name]

@@ -48,7 +48,9 @@ class Luminance(_Luminance):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        return (Output("luminance", "RG32F", planes=("luminance", "rate")) if self.rate else Output("luminance", "R32F"),)
+        return (
+            Output("luminance", "RG32F", planes=("luminance", "rate")) if self.rate else Output("luminance", "R32F"),
+        )
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         return ({"RATE": 1} if self.rate else {}) | ({"TAPS4": 1} if self.samples.taps == 4 and kind.textured else {})

@@ -61,7 +61,9 @@ def at_level_of_detail(scene: Scene, config: LodConfig) -> Scene:
         return scene
     objects, before, after = [], 0, 0
     for obj in scene.objects:
-        parts = tuple(replace(part, mesh=_fitting(part.mesh, largest_scale(scene, obj, part), config)) for part in obj.parts)
+        parts = tuple(
+            replace(part, mesh=_fitting(part.mesh, largest_scale(scene, obj, part), config)) for part in obj.parts
+        )
         before += sum(len(part.mesh.faces) for part in obj.parts)
         after += sum(len(part.mesh.faces) for part in parts)
         objects.append(replace(obj, parts=parts))
@@ -147,8 +149,9 @@ def _decimated(mesh: Mesh, faces: int) -> Level:
     old_normals, old_uvs = mesh.normals[used], mesh.uvs[used].astype(np.float64)
     # agg: how fast the bound on the error of one collapse is raised; with the default of 7 levels came out twice as
     # wrong as with 4.
-    new, new_faces, collapses = fast_simplification.simplify(old, triangles, target_count=max(faces, 1), agg=4.0, preserve_border=True,
-                                                             return_collapses=True)
+    new, new_faces, collapses = fast_simplification.simplify(
+        old, triangles, target_count=max(faces, 1), agg=4.0, preserve_border=True, return_collapses=True
+    )
     # The replay finds (V,) which new vertex each old one went into. Its own points are float32.
     became = np.asarray(fast_simplification.replay_simplification(old, triangles, collapses)[2], np.int64)
     new, new_faces = np.asarray(new, np.float64), np.asarray(new_faces, np.int32)
@@ -172,7 +175,9 @@ def _decimated(mesh: Mesh, faces: int) -> Level:
 
     # The other way round: how far each old vertex is from the new surface, and from its texture there.
     back, face, weights = walk_to_nearest(old, new_at[1][new_at[0][became]], new, new_faces, *new_at)
-    shift = np.linalg.norm((weights[:, :, None] * uvs[new_faces[face]].astype(np.float64)).sum(axis=1) - old_uvs, axis=1)
+    shift = np.linalg.norm(
+        (weights[:, :, None] * uvs[new_faces[face]].astype(np.float64)).sum(axis=1) - old_uvs, axis=1
+    )
     texture = area(uvs[new_faces].astype(np.float64))
     units_per_uv = np.sqrt(np.where(texture > 1e-14, area(new[new_faces]) / np.maximum(texture, 1e-14), 0.0))
     sheared = float(np.sqrt(np.mean((shift * units_per_uv[face]) ** 2)))

@@ -15,16 +15,29 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.types import Mesh, Scene
 
 CREASE_DEGREES = 40.0
-WELD_RELATIVE = 1e-6        # vertices nearer than this times the extent are one point
-COARSE_WELD_RELATIVE = 1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part by itself
-_MAX_REPEATS = 1e9          # of a texture: float32 has no fraction left, and overflows later
-_MAX_COORDINATE = 1e15      # squares of larger coordinates lose all meaning in float32 and overflow soon after
+WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point
+COARSE_WELD_RELATIVE = (
+    1e-3  # likewise when the fine weld leaves gaps: exporters quantise each material's part by itself
+)
+_MAX_REPEATS = 1e9  # of a texture: float32 has no fraction left, and overflows later
+_MAX_COORDINATE = 1e15  # squares of larger coordinates lose all meaning in float32 and overflow soon after
 
 
-def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | None = None, uvs: np.ndarray | None = None,
-              name: str = "", source_hash: str = "", where: str | None = None, max_faces: int | None = None,
-              crease_degrees: float = CREASE_DEGREES, uv_size: float | None = None, project_degenerate: bool = False,
-              log: list[str] | None = None) -> Mesh:
+def make_mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    *,
+    normals: np.ndarray | None = None,
+    uvs: np.ndarray | None = None,
+    name: str = "",
+    source_hash: str = "",
+    where: str | None = None,
+    max_faces: int | None = None,
+    crease_degrees: float = CREASE_DEGREES,
+    uv_size: float | None = None,
+    project_degenerate: bool = False,
+    log: list[str] | None = None,
+) -> Mesh:
     """A valid mesh from raw triangles.
 
     Parameters
@@ -58,11 +71,15 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
     faces = faces.astype(np.int64)
     used = np.zeros(len(vertices), bool)
     used[faces] = True
-    bad = used & ~(np.abs(vertices) < _MAX_COORDINATE).all(axis=1)   # NaN compares false
+    bad = used & ~(np.abs(vertices) < _MAX_COORDINATE).all(axis=1)  # NaN compares false
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
-        raise AssetError(f"{int(bad.sum())} vertices are NaN, infinite or beyond {_MAX_COORDINATE:g}, the first is {first}",
-                         where=where, value=vertices[first].tolist(), accepted="finite coordinates")
+        raise AssetError(
+            f"{int(bad.sum())} vertices are NaN, infinite or beyond {_MAX_COORDINATE:g}, the first is {first}",
+            where=where,
+            value=vertices[first].tolist(),
+            accepted="finite coordinates",
+        )
 
     vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
     normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
@@ -70,12 +87,12 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
     uvs = None if uvs is None or np.shape(uvs) != (len(used), 2) else np.asarray(uvs, np.float64)[used]
 
     points, welded = weld(vertices, faces)
-    closed, inside_out = closed_or_nearly(points, welded)     # before slivers go: they close gaps of no width
+    closed, inside_out = closed_or_nearly(points, welded)  # before slivers go: they close gaps of no width
     kept = _faces_with_area(vertices, faces)
     if not kept.any():
         raise AssetError("the mesh has no faces with an area", where=where, accepted="a mesh with triangles")
     if not kept.all():
-        if (~kept).mean() > 0.1:        # a few slivers are in almost every file
+        if (~kept).mean() > 0.1:  # a few slivers are in almost every file
             log.append(f"{label}: {int((~kept).sum())} of {len(faces)} faces without area dropped")
         faces, welded = faces[kept], welded[kept]
 
@@ -83,13 +100,19 @@ def make_mesh(vertices: np.ndarray, faces: np.ndarray, *, normals: np.ndarray | 
         log.append(f"{label}: the normals are unusable, made new ones")
         normals = None
     if uvs_given:
-        broken = uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all()     # NaN compares false
+        broken = uvs is None or not (np.abs(uvs[faces]) < _MAX_REPEATS).all()  # NaN compares false
         if broken or (project_degenerate and uvs_degenerate(vertices, faces, uvs)):
-            log.append(f"{label}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones")
+            log.append(
+                f"{label}: the texture coordinates are {'broken' if broken else 'degenerate'}, projected new ones"
+            )
             uvs = None
 
     # From here on corner attributes, (F, 3, …), joined to vertices at the end.
-    corner_normals = crease_normals(vertices, faces, welded, crease_degrees) if normals is None else np.asarray(normals, np.float64)[faces]
+    corner_normals = (
+        crease_normals(vertices, faces, welded, crease_degrees)
+        if normals is None
+        else np.asarray(normals, np.float64)[faces]
+    )
     corner_uvs = box_project(vertices, faces, uv_size) if uvs is None else uvs[faces]
     if inside_out:
         log.append(f"{label}: the mesh was inside out, turned round")
@@ -111,7 +134,9 @@ def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((F,) smallest height, (F,) longest edge) of (F, 3, 3) triangles."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    edges = edges / np.where(longest > 0, longest, 1.0)[:, None, None]  # products of the smallest coordinates would underflow
+    edges = (
+        edges / np.where(longest > 0, longest, 1.0)[:, None, None]
+    )  # products of the smallest coordinates would underflow
     return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * longest, longest
 
 
@@ -138,15 +163,23 @@ def without_collapsed_faces(scene: Scene) -> Scene:
             if id(part.mesh) not in made:
                 kept = faces_in_float32(part.mesh)
                 faces = part.mesh.faces[kept]
-                made[id(part.mesh)] = part.mesh if kept.all() else replace(part.mesh, faces=faces) if len(faces) else None
+                made[id(part.mesh)] = (
+                    part.mesh if kept.all() else replace(part.mesh, faces=faces) if len(faces) else None
+                )
             mesh = made[id(part.mesh)]
             dropped += len(part.mesh.faces) - (0 if mesh is None else len(mesh.faces))
             if mesh is not None:
                 parts.append(part if mesh is part.mesh else replace(part, mesh=mesh))
-        objects.append(obj if len(parts) == len(obj.parts) and all(a is b for a, b in zip(parts, obj.parts)) else replace(obj, parts=tuple(parts)))
+        objects.append(
+            obj
+            if len(parts) == len(obj.parts) and all(a is b for a, b in zip(parts, obj.parts))
+            else replace(obj, parts=tuple(parts))
+        )
     if not dropped:
         return scene
-    return replace(scene, objects=tuple(objects), log=(*scene.log, f"{dropped} triangles without width in float32 are not drawn"))
+    return replace(
+        scene, objects=tuple(objects), log=(*scene.log, f"{dropped} triangles without width in float32 are not drawn")
+    )
 
 
 def _face_cross(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -168,14 +201,18 @@ def weld(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarra
     vertices at seams and between materials."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     step = max(float((high - low).max()) * WELD_RELATIVE, 1e-300)
-    cells = np.round((vertices - low) / step).astype(np.int64)      # below 2**20 each: one int64 holds all three
-    _, first, index = np.unique((cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True, return_inverse=True)
+    cells = np.round((vertices - low) / step).astype(np.int64)  # below 2**20 each: one int64 holds all three
+    _, first, index = np.unique(
+        (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2], return_index=True, return_inverse=True
+    )
     return vertices[first], index.reshape(-1)[faces]
 
 
 def _components(left: np.ndarray, right: np.ndarray, count: int) -> tuple[int, np.ndarray]:
     """(number of, (count,) label of) the connected components of ``count`` nodes joined by edges left-right."""
-    return connected_components(coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(count, count)), directed=False)
+    return connected_components(
+        coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(count, count)), directed=False
+    )
 
 
 def closedness(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool]:
@@ -219,8 +256,12 @@ def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool
     if closed:
         return closed, inside_out
     extent = float((points.max(axis=0) - points.min(axis=0)).max())
-    near = cKDTree(points).query_pairs(extent * COARSE_WELD_RELATIVE, output_type="ndarray") if len(points) < 100_000 else []
-    if len(near) == 0 or len(near) > 4 * len(points):      # nothing to merge, or so fine a mesh that all of it would be
+    near = (
+        cKDTree(points).query_pairs(extent * COARSE_WELD_RELATIVE, output_type="ndarray")
+        if len(points) < 100_000
+        else []
+    )
+    if len(near) == 0 or len(near) > 4 * len(points):  # nothing to merge, or so fine a mesh that all of it would be
         return False, False
     count, label = _components(near[:, 0], near[:, 1], len(points))
     merged = np.empty((count, 3))
@@ -228,7 +269,9 @@ def closed_or_nearly(points: np.ndarray, welded: np.ndarray) -> tuple[bool, bool
     return closedness(merged, label[welded].astype(np.int64))
 
 
-def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES) -> np.ndarray:
+def crease_normals(
+    vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, crease_degrees: float = CREASE_DEGREES
+) -> np.ndarray:
     """(F, 3, 3) float64 unit corner normals: angle-weighted mean over the fan of faces around the corner's point that
     are joined by edges bent less than ``crease_degrees``."""
     cross = _face_cross(vertices, faces)
@@ -236,7 +279,9 @@ def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, 
     corners = vertices[faces]
     to_next = np.roll(corners, -1, axis=1) - corners
     to_previous = np.roll(corners, 1, axis=1) - corners
-    angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))   # (F, 3)
+    angle = np.arctan2(
+        np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2)
+    )  # (F, 3)
 
     # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
     count = len(faces)
@@ -244,7 +289,7 @@ def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, 
     low, high = np.minimum(a, b), np.maximum(a, b)
     order = np.lexsort((high, low))
     same = (low[order][1:] == low[order][:-1]) & (high[order][1:] == high[order][:-1])
-    first, second = order[:-1][same], order[1:][same]             # edge numbers 3*face + k
+    first, second = order[:-1][same], order[1:][same]  # edge numbers 3*face + k
     smooth = (unit[first // 3] * unit[second // 3]).sum(axis=1) > np.cos(np.radians(crease_degrees))
     first, second = first[smooth], second[smooth]
     f_next, s_next = first - first % 3 + (first % 3 + 1) % 3, second - second % 3 + (second % 3 + 1) % 3
@@ -261,7 +306,14 @@ def crease_normals(vertices: np.ndarray, faces: np.ndarray, welded: np.ndarray, 
 
 
 # Seen from outside, with z (for ±z: y) up: (axis, sign) -> the axis and sign that point right, the axis that points up.
-_BOX_SIDES = {(0, 1): (1, 1, 2), (0, -1): (1, -1, 2), (1, 1): (0, -1, 2), (1, -1): (0, 1, 2), (2, 1): (0, 1, 1), (2, -1): (0, -1, 1)}
+_BOX_SIDES = {
+    (0, 1): (1, 1, 2),
+    (0, -1): (1, -1, 2),
+    (1, 1): (0, -1, 2),
+    (1, -1): (0, 1, 2),
+    (2, 1): (0, 1, 1),
+    (2, -1): (0, -1, 1),
+}
 
 
 def box_project(vertices: np.ndarray, faces: np.ndarray, uv_size: float | None = None) -> np.ndarray:
@@ -297,16 +349,29 @@ def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, *
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     uvs = uvs.reshape(-1, 2).astype(np.float32)
     # Adding 0.0 turns -0.0 into 0.0, which would otherwise split vertices. Normals are compared to 1e-5: float noise.
-    rows = np.concatenate([(positions + 0.0).view(np.int64), np.round(normals * 1e5).astype(np.int64),
-                           (uvs + 0.0).view(np.int32).astype(np.int64)], axis=1)
-    _, first, index = np.unique(np.ascontiguousarray(rows).view([("", np.int64)] * 8).ravel(), return_index=True, return_inverse=True)
+    rows = np.concatenate(
+        [
+            (positions + 0.0).view(np.int64),
+            np.round(normals * 1e5).astype(np.int64),
+            (uvs + 0.0).view(np.int32).astype(np.int64),
+        ],
+        axis=1,
+    )
+    _, first, index = np.unique(
+        np.ascontiguousarray(rows).view([("", np.int64)] * 8).ravel(), return_index=True, return_inverse=True
+    )
     # Vertices in order of first use: good for the vertex cache, and independent of how np.unique sorts.
     order = np.argsort(first, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     first = first[order]
-    return Mesh(vertices=positions[first], faces=rank[index.reshape(-1)].reshape(-1, 3).astype(np.int32),
-                normals=normals[first], uvs=uvs[first], **fields)
+    return Mesh(
+        vertices=positions[first],
+        faces=rank[index.reshape(-1)].reshape(-1, 3).astype(np.int32),
+        normals=normals[first],
+        uvs=uvs[first],
+        **fields,
+    )
 
 
 def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
@@ -331,7 +396,10 @@ def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
 
 def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
     """((3,), (3,)) corners of the common bounding box."""
-    return (np.min([m.vertices.min(axis=0) for m in meshes], axis=0), np.max([m.vertices.max(axis=0) for m in meshes], axis=0))
+    return (
+        np.min([m.vertices.min(axis=0) for m in meshes], axis=0),
+        np.max([m.vertices.max(axis=0) for m in meshes], axis=0),
+    )
 
 
 def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]:
@@ -350,10 +418,15 @@ def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = 
     if len(meshes) == 1:
         return replace(meshes[0], name=name or meshes[0].name, source_hash=source_hash or meshes[0].source_hash)
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    return Mesh(vertices=np.concatenate([m.vertices for m in meshes]),
-                faces=np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.int32),
-                normals=np.concatenate([m.normals for m in meshes]), uvs=np.concatenate([m.uvs for m in meshes]),
-                closed=closed_together(meshes), name=name, source_hash=source_hash)
+    return Mesh(
+        vertices=np.concatenate([m.vertices for m in meshes]),
+        faces=np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.int32),
+        normals=np.concatenate([m.normals for m in meshes]),
+        uvs=np.concatenate([m.uvs for m in meshes]),
+        closed=closed_together(meshes),
+        name=name,
+        source_hash=source_hash,
+    )
 
 
 def closed_together(meshes: tuple[Mesh, ...]) -> bool:

@@ -15,7 +15,14 @@ def incident_faces(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarra
 
 
 @numba.njit(**_JIT)
-def walk_to_nearest(points: np.ndarray, start: np.ndarray, vertices: np.ndarray, faces: np.ndarray, first: np.ndarray, face_at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def walk_to_nearest(
+    points: np.ndarray,
+    start: np.ndarray,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    first: np.ndarray,
+    face_at: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(distance (n,), face (n,), weights (n, 3)) of the nearest point of the mesh to each point (n, 3): from face
     ``start`` (n,) to the nearest of the faces that share a vertex with it, as long as one is nearer. A local minimum,
     never on a part of the mesh that is not connected with the start: on the far side of a

@@ -29,7 +29,7 @@ PARAMETERS = {
     "width": "edge in x, m",
     "depth": "edge in y, m",
     "radius": "m; prism, pyramid: of the circle through the polygon's corners; torus: from the axis to the "
-              "middle of the tube",
+    "middle of the tube",
     "tube": "radius of the tube, m, less than radius",
     "height": "along z, m; capsule: of the cylinder between the two half spheres",
     "segments": "faces round the z axis",
@@ -62,8 +62,12 @@ def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
         where = build.__name__
         unknown = set(parameters) - set(signature.parameters)
         if unknown:
-            raise AssetError("unknown parameter", where=where, value=min(unknown),
-                             accepted="one of " + ", ".join(signature.parameters))
+            raise AssetError(
+                "unknown parameter",
+                where=where,
+                value=min(unknown),
+                accepted="one of " + ", ".join(signature.parameters),
+            )
         bound = signature.bind(**parameters)
         bound.apply_defaults()
         for key, value in bound.arguments.items():
@@ -71,7 +75,12 @@ def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
             if isinstance(default, int):
                 low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MAX_SEGMENTS)
                 if float(value) != int(value) or not low <= value <= high:
-                    raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=f"a whole number in {low}..{high}")
+                    raise AssetError(
+                        "bad parameter",
+                        where=f"{where}.{key}",
+                        value=value,
+                        accepted=f"a whole number in {low}..{high}",
+                    )
                 bound.arguments[key] = int(value)
             elif np.shape(value) != np.shape(default) or not np.isfinite(value).all() or np.min(value) <= 0:
                 accepted = f"{len(default)} numbers greater than 0" if np.shape(default) else "a number greater than 0"
@@ -79,10 +88,15 @@ def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
             else:
                 bound.arguments[key] = tuple(map(float, value)) if np.shape(default) else float(value)
         positions, normals, uvs, faces = build(**bound.arguments)
-        return Mesh(vertices=np.ascontiguousarray(positions, np.float64), faces=np.ascontiguousarray(faces, np.int32),
-                    normals=np.ascontiguousarray(normals, np.float32), uvs=np.ascontiguousarray(uvs, np.float32),
-                    closed=closedness(*weld(positions, faces))[0], name=where,
-                    source_hash=parameter_hash("primitive", 1, where, tuple(bound.arguments.items())))
+        return Mesh(
+            vertices=np.ascontiguousarray(positions, np.float64),
+            faces=np.ascontiguousarray(faces, np.int32),
+            normals=np.ascontiguousarray(normals, np.float32),
+            uvs=np.ascontiguousarray(uvs, np.float32),
+            closed=closedness(*weld(positions, faces))[0],
+            name=where,
+            source_hash=parameter_hash("primitive", 1, where, tuple(bound.arguments.items())),
+        )
 
     return made
 
@@ -120,15 +134,18 @@ def _revolve(profile: np.ndarray, normals: np.ndarray, v: np.ndarray, segments: 
     """
     angle = 2 * math.pi * np.arange(segments + 1) / segments
     cos, sin = np.cos(angle), np.sin(angle)
-    cos[-1], sin[-1] = 1.0, 0.0     # the seam's two columns coincide exactly
+    cos[-1], sin[-1] = 1.0, 0.0  # the seam's two columns coincide exactly
     r, z = profile[:, :1], profile[:, 1:]
     positions = np.stack([r * cos, r * sin, np.broadcast_to(z, (len(profile), segments + 1))], axis=2).reshape(-1, 3)
-    n = np.stack([normals[:, :1] * cos, normals[:, :1] * sin, np.broadcast_to(normals[:, 1:], (len(profile), segments + 1))], axis=2)
+    n = np.stack(
+        [normals[:, :1] * cos, normals[:, :1] * sin, np.broadcast_to(normals[:, 1:], (len(profile), segments + 1))],
+        axis=2,
+    )
     uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), v[:, None]), axis=2).reshape(-1, 2).copy()
     faces = _lattice(segments, len(profile) - 1)
     pole = np.repeat(np.abs(profile[:, 0]) < 1e-12, segments + 1)
     positions[pole, :2] = 0.0
-    uvs[pole, 0] += 0.5 / segments    # a pole's vertex belongs to one segment: its middle
+    uvs[pole, 0] += 0.5 / segments  # a pole's vertex belongs to one segment: its middle
     return positions, n.reshape(-1, 3), uvs, faces[pole[faces].sum(axis=1) < 2]
 
 
@@ -149,10 +166,16 @@ def cuboid(extents: Sequence[float] = (1.0, 1.0, 1.0), subdivisions: int = 1) ->
     """Box of edge lengths ``extents``; the texture once on each side."""
     x, y, z = np.array(extents) / 2
     n = subdivisions
-    return _join([
-        square((x, -y, -z), (0, 2 * y, 0), (0, 0, 2 * z), n, n), square((-x, y, -z), (0, -2 * y, 0), (0, 0, 2 * z), n, n),
-        square((x, y, -z), (-2 * x, 0, 0), (0, 0, 2 * z), n, n), square((-x, -y, -z), (2 * x, 0, 0), (0, 0, 2 * z), n, n),
-        square((-x, -y, z), (2 * x, 0, 0), (0, 2 * y, 0), n, n), square((x, -y, -z), (-2 * x, 0, 0), (0, 2 * y, 0), n, n)])
+    return _join(
+        [
+            square((x, -y, -z), (0, 2 * y, 0), (0, 0, 2 * z), n, n),
+            square((-x, y, -z), (0, -2 * y, 0), (0, 0, 2 * z), n, n),
+            square((x, y, -z), (-2 * x, 0, 0), (0, 0, 2 * z), n, n),
+            square((-x, -y, -z), (2 * x, 0, 0), (0, 0, 2 * z), n, n),
+            square((-x, -y, z), (2 * x, 0, 0), (0, 2 * y, 0), n, n),
+            square((x, -y, -z), (-2 * x, 0, 0), (0, 2 * y, 0), n, n),
+        ]
+    )
 
 
 @_primitive
@@ -174,11 +197,47 @@ def sphere(radius: float = 0.5, segments: int = 32, rings: int = 16) -> Surface:
 def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
     """Sphere of 20 * 4**subdivisions nearly equal triangles, box-projected texture."""
     g = (1 + math.sqrt(5)) / 2
-    points = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g), (0, 1, -g),
-                       (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)])
+    points = np.array(
+        [
+            (-1, g, 0),
+            (1, g, 0),
+            (-1, -g, 0),
+            (1, -g, 0),
+            (0, -1, g),
+            (0, 1, g),
+            (0, -1, -g),
+            (0, 1, -g),
+            (g, 0, -1),
+            (g, 0, 1),
+            (-g, 0, -1),
+            (-g, 0, 1),
+        ]
+    )
     points /= np.linalg.norm(points[0])
-    faces = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11), (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
-                      (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5), (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    faces = np.array(
+        [
+            (0, 11, 5),
+            (0, 5, 1),
+            (0, 1, 7),
+            (0, 7, 10),
+            (0, 10, 11),
+            (1, 5, 9),
+            (5, 11, 4),
+            (11, 10, 2),
+            (10, 7, 6),
+            (7, 1, 8),
+            (3, 9, 4),
+            (3, 4, 2),
+            (3, 2, 6),
+            (3, 6, 8),
+            (3, 8, 9),
+            (4, 9, 5),
+            (2, 4, 11),
+            (6, 2, 10),
+            (8, 6, 7),
+            (9, 8, 1),
+        ]
+    )
     for _ in range(subdivisions):
         edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
         unique, index = np.unique(edges, axis=0, return_inverse=True)
@@ -187,7 +246,9 @@ def icosphere(radius: float = 0.5, subdivisions: int = 3) -> Surface:
         points = np.concatenate([points, middle / np.linalg.norm(middle, axis=1, keepdims=True)])
         a, b, c = faces.T
         ab, bc, ca = mid.T
-        faces = np.stack([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))], axis=1).reshape(-1, 3)
+        faces = np.stack(
+            [np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))], axis=1
+        ).reshape(-1, 3)
     mesh = make_mesh(points, faces, normals=points, name="icosphere")
     return radius * mesh.vertices, mesh.normals, mesh.uvs, mesh.faces
 
@@ -212,7 +273,9 @@ def cone(radius: float = 0.5, height: float = 1.0, segments: int = 32, rings: in
     # The normals at the tip belong to the middle of their segment, as the uvs there do.
     tip = slice(-(segments + 1), None)
     angle = 2 * math.pi * (np.arange(segments + 1) + 0.5) / segments
-    normals[tip] = np.stack([slope[0] * np.cos(angle), slope[0] * np.sin(angle), np.full(segments + 1, slope[1])], axis=1)
+    normals[tip] = np.stack(
+        [slope[0] * np.cos(angle), slope[0] * np.sin(angle), np.full(segments + 1, slope[1])], axis=1
+    )
     return _join([(positions, normals, uvs, faces), _disc(radius, -height / 2, False, segments)])
 
 
@@ -224,7 +287,12 @@ def torus(radius: float = 0.35, tube: float = 0.15, segments: int = 32, tube_seg
     angle = 2 * math.pi * np.arange(tube_segments + 1) / tube_segments
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     direction[-1] = direction[0]
-    return _revolve(np.array([radius, 0.0]) + tube * direction, direction, 1 - np.arange(tube_segments + 1) / tube_segments, segments)
+    return _revolve(
+        np.array([radius, 0.0]) + tube * direction,
+        direction,
+        1 - np.arange(tube_segments + 1) / tube_segments,
+        segments,
+    )
 
 
 @_primitive
@@ -235,7 +303,9 @@ def capsule(radius: float = 0.25, height: float = 0.5, segments: int = 32, rings
     top = np.stack([np.cos(latitude), np.sin(latitude)], axis=1)
     top[-1], top[0] = (0, 1), (1, 0)
     direction = np.concatenate([top[::-1] * [1, -1], top])
-    profile = radius * direction + np.concatenate([np.full((half + 1, 2), [0, -height / 2]), np.full((half + 1, 2), [0, height / 2])])
+    profile = radius * direction + np.concatenate(
+        [np.full((half + 1, 2), [0, -height / 2]), np.full((half + 1, 2), [0, height / 2])]
+    )
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))])
     return _revolve(profile, direction, 1 - length / length[-1], segments)
 
@@ -260,8 +330,14 @@ def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface
     walls = []
     for a, b in itertools.pairwise(rim):
         normal = np.cross(b - a, tip - a)
-        walls.append((np.stack([a, b, tip]), np.broadcast_to(normal / np.linalg.norm(normal), (3, 3)),
-                      np.array([[0.0, 1.0], [1.0, 1.0], [0.5, 0.0]]), np.array([[0, 1, 2]])))
+        walls.append(
+            (
+                np.stack([a, b, tip]),
+                np.broadcast_to(normal / np.linalg.norm(normal), (3, 3)),
+                np.array([[0.0, 1.0], [1.0, 1.0], [0.5, 0.0]]),
+                np.array([[0, 1, 2]]),
+            )
+        )
     return _join([*walls, _disc(radius, -height / 2, False, sides)])
 
 
@@ -289,7 +365,9 @@ def random_primitive(kind: str, index: int) -> Mesh:
     elif kind == "sphere":
         mesh = transform_mesh(sphere(), np.diag([1, between(0.6, 1), between(0.6, 1)]))
     elif kind == "icosphere":
-        mesh = transform_mesh(icosphere(subdivisions=int(rng.integers(1, 4))), np.diag([1, between(0.6, 1), between(0.6, 1)]))
+        mesh = transform_mesh(
+            icosphere(subdivisions=int(rng.integers(1, 4))), np.diag([1, between(0.6, 1), between(0.6, 1)])
+        )
     elif kind == "torus":
         mesh = torus(tube=between(0.06, 0.25))
     elif kind == "capsule":

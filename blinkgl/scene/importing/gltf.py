@@ -37,19 +37,26 @@ _DRAWN = {"KHR_materials_unlit", "KHR_texture_transform", "KHR_mesh_quantization
 # Not drawn, and yet no reason to refuse a file that requires them: shape, base colour and motion are what they would
 # be, only light is missing from the surface. Everything else that is required (compressed geometry or images,
 # instances, other material models, what nobody has heard of) would be a scene that is not the file's.
-_LIGHT_ONLY = {"KHR_lights_punctual", "KHR_materials_emissive_strength", "KHR_materials_clearcoat",
-               "KHR_materials_sheen",
-               "KHR_materials_specular", "KHR_materials_ior", "KHR_materials_iridescence", "KHR_materials_anisotropy",
-               "KHR_materials_dispersion"}
+_LIGHT_ONLY = {
+    "KHR_lights_punctual",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_clearcoat",
+    "KHR_materials_sheen",
+    "KHR_materials_specular",
+    "KHR_materials_ior",
+    "KHR_materials_iridescence",
+    "KHR_materials_anisotropy",
+    "KHR_materials_dispersion",
+}
 # Nothing to be seen in these.
 _INVISIBLE = {"KHR_xmp_json_ld", "KHR_xmp"}
 _DTYPES = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _MAX_NODES, _MAX_DEPTH = 200_000, 256
-_MAX_ZEROS = 64_000_000     # bytes of an accessor without a buffer behind it (all zeros): nothing in the file bounds them
+_MAX_ZEROS = 64_000_000  # bytes of an accessor without a buffer behind it (all zeros): nothing in the file bounds them
 _WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 _NEAREST = 9728
-_MAX_TIME = 1e7             # s, of an animation's keys
+_MAX_TIME = 1e7  # s, of an animation's keys
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +76,13 @@ def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
     determinant = float(np.linalg.det(linear))
     vertices = piece.vertices @ linear.T + matrix[:3, 3]
     # Cofactors instead of the inverse: also right for a map that flattens the mesh.
-    cofactors = np.stack([np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])])
+    cofactors = np.stack(
+        [np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])]
+    )
     normals = None if piece.normals is None else piece.normals @ cofactors.T * (1.0 if determinant >= 0 else -1.0)
-    return replace(piece, vertices=vertices, normals=normals, faces=piece.faces if determinant >= 0 else piece.faces[:, ::-1])
+    return replace(
+        piece, vertices=vertices, normals=normals, faces=piece.faces if determinant >= 0 else piece.faces[:, ::-1]
+    )
 
 
 @dataclass(frozen=True)
@@ -88,7 +99,9 @@ class Node:
     scale: tuple
     matrix: np.ndarray | None
 
-    def local(self, translation: ArrayLike | None = None, rotation: ArrayLike | None = None, scale: ArrayLike | None = None) -> np.ndarray:
+    def local(
+        self, translation: ArrayLike | None = None, rotation: ArrayLike | None = None, scale: ArrayLike | None = None
+    ) -> np.ndarray:
         """(4, 4) transform to the parent, with animated values in place of the resting ones."""
         if self.matrix is not None:
             return self.matrix
@@ -120,8 +133,12 @@ class Channel:
         h = times[i + 1] - times[i]
         s = (t - times[i]) / h
         if self.interpolation == "CUBICSPLINE":
-            v = ((2 * s**3 - 3 * s**2 + 1) * values[i] + h * (s**3 - 2 * s**2 + s) * self.values[i, 2]
-                 + (3 * s**2 - 2 * s**3) * values[i + 1] + h * (s**3 - s**2) * self.values[i + 1, 0])
+            v = (
+                (2 * s**3 - 3 * s**2 + 1) * values[i]
+                + h * (s**3 - 2 * s**2 + s) * self.values[i, 2]
+                + (3 * s**2 - 2 * s**3) * values[i + 1]
+                + h * (s**3 - s**2) * self.values[i + 1, 0]
+            )
             return v / np.linalg.norm(v) if self.path == "rotation" else v
         if self.path == "rotation":
             a, b = Rotation.from_quat(values[i]), Rotation.from_quat(values[i + 1])
@@ -205,8 +222,12 @@ class Document:
         index = primitive["attributes"][name]
         a = _item(self.tree, "accessors", index, self.where)
         if a["count"] != count or _WIDTHS[a["type"]] != width:
-            raise AssetError(f"the file is no valid glTF ({name} does not fit the positions)", where=self.where,
-                             value=f"{a['count']} {a['type']}", accepted=f"{count} VEC{width}")
+            raise AssetError(
+                f"the file is no valid glTF ({name} does not fit the positions)",
+                where=self.where,
+                value=f"{a['count']} {a['type']}",
+                accepted=f"{count} VEC{width}",
+            )
         return self.accessor(index).astype(np.float64)
 
     def _coloured(self, primitive: dict, material: Material | None, count: int) -> Material | None:
@@ -246,8 +267,12 @@ class Document:
 
     def pieces(self) -> list[Piece]:
         """The whole scene at rest as one object, in the file's axes."""
-        return [transformed(p, self.world(i)) for i, node in self.nodes.items() if node.mesh is not None
-                for p in self.mesh_pieces(node.mesh)]
+        return [
+            transformed(p, self.world(i))
+            for i, node in self.nodes.items()
+            if node.mesh is not None
+            for p in self.mesh_pieces(node.mesh)
+        ]
 
     def accessor(self, index: int) -> np.ndarray:
         """(count, n) values; normalised integers become floats."""
@@ -256,8 +281,12 @@ class Document:
         if "bufferView" in a:
             values = self._view(a["bufferView"], a.get("byteOffset", 0), count, width, dtype, index)
         elif count * width * dtype.itemsize > _MAX_ZEROS:
-            raise AssetError(f"accessor {index} has no buffer and too many values", where=self.where, value=count,
-                             accepted=f"at most {_MAX_ZEROS // 10**6} MB of zeros")
+            raise AssetError(
+                f"accessor {index} has no buffer and too many values",
+                where=self.where,
+                value=count,
+                accepted=f"at most {_MAX_ZEROS // 10**6} MB of zeros",
+            )
         else:
             values = np.zeros((count, width), dtype)
         if "sparse" in a:
@@ -293,14 +322,19 @@ class Document:
             m, pbr = _item(self.tree, "materials", index, self.where), self._base_colour(index)
             info = pbr.get("baseColorTexture") or {}
             transform = info.get("extensions", {}).get("KHR_texture_transform") or {}
-            material = Material(texture=self._texture(info["index"]) if info and self.materials else None,
-                                base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
-                                unlit="KHR_materials_unlit" in m.get("extensions", {}),
-                                double_sided=m.get("doubleSided", False))
+            material = Material(
+                texture=self._texture(info["index"]) if info and self.materials else None,
+                base_color=tuple(float(c) for c in pbr.get("baseColorFactor", (1, 1, 1, 1))[:3]),
+                unlit="KHR_materials_unlit" in m.get("extensions", {}),
+                double_sided=m.get("doubleSided", False),
+            )
             if self.materials:
                 self._note_material(m, pbr)
-            self._materials[index] = (material, transform.get("texCoord", info.get("texCoord", 0)),
-                                      _texture_transform(transform))
+            self._materials[index] = (
+                material,
+                transform.get("texCoord", info.get("texCoord", 0)),
+                _texture_transform(transform),
+            )
         return self._materials[index]
 
     def _note_material(self, m: dict, pbr: dict) -> None:
@@ -360,23 +394,39 @@ class Document:
             per_key = 3 if kind == "CUBICSPLINE" else 1
             keys, given = (_item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
             # Lengths first: the two are as long as the file says, whatever is behind them.
-            fits = (keys["type"] == "SCALAR" and given["count"] == per_key * keys["count"] > 0
-                    and _WIDTHS[given["type"]] == width)
+            fits = (
+                keys["type"] == "SCALAR"
+                and given["count"] == per_key * keys["count"] > 0
+                and _WIDTHS[given["type"]] == width
+            )
             times = self.accessor(sampler["input"]).astype(np.float64).ravel() if fits else np.zeros(0)
             values = self.accessor(sampler["output"]).astype(np.float64) if fits else np.zeros(0)
-            if (not fits or not (np.abs(values) <= 1e12).all() or not (np.abs(times) < _MAX_TIME).all()
-                    or (np.diff(times) <= 0).any()):      # NaN compares false
-                raise AssetError(f"the animation of {path} of node '{self.nodes[node].name}' is corrupt", where=self.where)
+            if (
+                not fits
+                or not (np.abs(values) <= 1e12).all()
+                or not (np.abs(times) < _MAX_TIME).all()
+                or (np.diff(times) <= 0).any()
+            ):  # NaN compares false
+                raise AssetError(
+                    f"the animation of {path} of node '{self.nodes[node].name}' is corrupt", where=self.where
+                )
             values = values.reshape(-1, per_key, width)
             if path == "rotation" and (np.linalg.norm(values[:, per_key // 2], axis=1) < 1e-9).any():
-                raise AssetError(f"the animation of node '{self.nodes[node].name}' has a rotation of zero",
-                                 where=self.where)
+                raise AssetError(
+                    f"the animation of node '{self.nodes[node].name}' has a rotation of zero", where=self.where
+                )
             found.append(Channel(node, path, times, values if per_key == 3 else values[:, 0], kind))
         return found
 
 
-def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, max_texture: int = 2048,
-         materials: bool = True) -> Document:
+def read(
+    path: Path,
+    data: bytes | None = None,
+    *,
+    max_faces: int = 5_000_000,
+    max_texture: int = 2048,
+    materials: bool = True,
+) -> Document:
     """Parses a file, checks its shape and its counts. Raises AssetError naming it."""
     path = Path(path)
     where = str(path)
@@ -400,8 +450,11 @@ def read(path: Path, data: bytes | None = None, *, max_faces: int = 5_000_000, m
 
 
 def _needs(extension: str, where: str) -> AssetError:
-    return AssetError(f"the file needs the extension {extension}, which BlinkGL does not draw", where=where,
-                      accepted="a glTF 2.0 export without it (uncompressed, PNG or JPEG images)")
+    return AssetError(
+        f"the file needs the extension {extension}, which BlinkGL does not draw",
+        where=where,
+        accepted="a glTF 2.0 export without it (uncompressed, PNG or JPEG images)",
+    )
 
 
 def inside(folder: Path, name: str, where: str) -> Path:
@@ -409,13 +462,20 @@ def inside(folder: Path, name: str, where: str) -> Path:
     ``..`` or by a link, or is missing."""
     target = Path(folder) / name
     try:
-        within = (name and "\0" not in name and not Path(name).is_absolute() and "\\" not in name
-                  and target.resolve().is_relative_to(Path(folder).resolve()))
+        within = (
+            name
+            and "\0" not in name
+            and not Path(name).is_absolute()
+            and "\\" not in name
+            and target.resolve().is_relative_to(Path(folder).resolve())
+        )
         found = within and target.is_file()
-    except (OSError, ValueError, RuntimeError):      # a name too long for the file system, a link to itself
+    except (OSError, ValueError, RuntimeError):  # a name too long for the file system, a link to itself
         within, found = True, False
     if not within:
-        raise AssetError("refers to a file outside its folder", where=where, value=name, accepted="a relative path below it")
+        raise AssetError(
+            "refers to a file outside its folder", where=where, value=name, accepted="a relative path below it"
+        )
     if not found:
         raise AssetError("refers to a file that is missing", where=where, value=name)
     return target
@@ -442,7 +502,11 @@ def _parse(data: bytes, where: str) -> tuple[dict, bytes]:
             raise AssetError("the file is truncated", where=where, value=f"{len(data)} bytes")
         version, length = struct.unpack_from("<II", data, 4)
         if version != 2 or length > len(data):
-            raise AssetError("the file is truncated or not glTF 2", where=where, value=f"version {version}, {len(data)} of {length} bytes")
+            raise AssetError(
+                "the file is truncated or not glTF 2",
+                where=where,
+                value=f"version {version}, {len(data)} of {length} bytes",
+            )
         position, chunks = 12, {}
         while position + 8 <= length:
             size, kind = struct.unpack_from("<II", data, position)
@@ -471,8 +535,12 @@ def _buffers(tree: dict, binary: bytes, path: Path) -> list[bytes]:
             raise _needs(compressed, str(path))
         data = _fetch(buffer["uri"] or "", path, "buffer") if "uri" in buffer else binary if number == 0 else b""
         if len(data) < buffer.get("byteLength", 0):
-            raise AssetError(f"buffer {number} is truncated", where=str(path), value=len(data),
-                             accepted=f"{buffer.get('byteLength')} bytes")
+            raise AssetError(
+                f"buffer {number} is truncated",
+                where=str(path),
+                value=len(data),
+                accepted=f"{buffer.get('byteLength')} bytes",
+            )
         buffers.append(data)
     return buffers
 
@@ -481,7 +549,9 @@ def _fetch(uri: str, path: Path, what: str) -> bytes:
     if uri.startswith("data:"):
         head, _, body = uri.partition(",")
         try:
-            return base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode("latin-1")
+            return (
+                base64.b64decode(body, validate=True) if head.endswith(";base64") else unquote(body).encode("latin-1")
+            )
         except (binascii.Error, ValueError):
             raise AssetError(f"the embedded {what} is corrupt", where=str(path)) from None
     if "://" in uri:
@@ -504,11 +574,17 @@ def _nodes(tree: dict, where: str) -> dict[int, Node]:
     while stack:
         i, parent, depth = stack.pop()
         if i in nodes or depth > _MAX_DEPTH:
-            raise AssetError("the nodes are no tree" if i in nodes
-                             else f"the nodes are nested more than {_MAX_DEPTH} deep", where=where, value=i)
+            raise AssetError(
+                "the nodes are no tree" if i in nodes else f"the nodes are nested more than {_MAX_DEPTH} deep",
+                where=where,
+                value=i,
+            )
         n = raw[_index(i, len(raw), "node", where)]
         matrix = np.array(n["matrix"], float).reshape(4, 4).T if n.get("matrix") else None
-        rest = [tuple(map(float, n.get(k, d))) for k, d in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))]
+        rest = [
+            tuple(map(float, n.get(k, d)))
+            for k, d in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))
+        ]
         nodes[i] = Node(str(n.get("name") or f"node-{i}"), parent, n.get("mesh"), n.get("camera"), *rest, matrix)
         stack += [(c, i, depth + 1) for c in reversed(n.get("children", []))]
     return nodes
@@ -551,9 +627,17 @@ def _triangles(order: np.ndarray, mode: int) -> np.ndarray:
 def _texture_transform(transform: dict | None) -> np.ndarray | None:
     if not transform:
         return None
-    (ox, oy), (sx, sy), r = transform.get("offset", (0, 0)), transform.get("scale", (1, 1)), float(transform.get("rotation", 0))
+    (ox, oy), (sx, sy), r = (
+        transform.get("offset", (0, 0)),
+        transform.get("scale", (1, 1)),
+        float(transform.get("rotation", 0)),
+    )
     c, s = np.cos(r), np.sin(r)
-    return np.array([[1, 0, ox], [0, 1, oy], [0, 0, 1]]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ np.diag([sx, sy, 1.0])
+    return (
+        np.array([[1, 0, ox], [0, 1, oy], [0, 0, 1]])
+        @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        @ np.diag([sx, sy, 1.0])
+    )
 
 
 def _item(tree: dict, key: str, index, where: str) -> dict:
@@ -563,5 +647,7 @@ def _item(tree: dict, key: str, index, where: str) -> dict:
 
 def _index(index, count: int, what: str, where: str) -> int:
     if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < count:
-        raise AssetError(f"the file is no valid glTF (a reference to {what} that does not exist)", where=where, value=index)
+        raise AssetError(
+            f"the file is no valid glTF (a reference to {what} that does not exist)", where=where, value=index
+        )
     return index

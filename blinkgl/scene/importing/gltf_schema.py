@@ -220,5 +220,8 @@ def check(tree: Any, where: str) -> None:
         first = error.errors(include_url=False)[0]
         path = ".".join(str(step) for step in first["loc"]) or "its JSON"
         message = first["msg"].removeprefix("Value error, ")
-        raise AssetError(f"the file is no valid glTF ({path}: {message[0].lower() + message[1:]})", where=where,
-                         value=... if first["type"] in ("missing", "value_error") else first["input"]) from None
+        raise AssetError(
+            f"the file is no valid glTF ({path}: {message[0].lower() + message[1:]})",
+            where=where,
+            value=... if first["type"] in ("missing", "value_error") else first["input"],
+        ) from None

@@ -28,7 +28,7 @@ from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_i
 from blinkgl.scene.types import Material, Part, Texture
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
-logging.getLogger("trimesh").setLevel(logging.CRITICAL)     # its warnings say nothing a user could act on
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings say nothing a user could act on
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,18 @@ class Asset:
         return replace(self, parts=tuple(Part(m, p.material) for m, p in zip(meshes, self.parts)))
 
 
-def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_BYTES, keep_materials: bool = True, max_texture: int = 2048,
-               source_hash: str | None = None, project_uvs: bool = False, uv_size: float | None = None,
-               up: str = "auto") -> Asset:
+def load_asset(
+    path: Path,
+    *,
+    max_faces: int = 5_000_000,
+    max_bytes: int = MAX_BYTES,
+    keep_materials: bool = True,
+    max_texture: int = 2048,
+    source_hash: str | None = None,
+    project_uvs: bool = False,
+    uv_size: float | None = None,
+    up: str = "auto",
+) -> Asset:
     """One object from a file.
 
     up : the file's axis that points up and becomes z, "y" or "z"; "auto" is y for glb and gltf, whose standard says so,
@@ -66,13 +75,22 @@ def load_asset(path: Path, *, max_faces: int = 5_000_000, max_bytes: int = MAX_B
     ``max_bytes`` bytes, references outside its folder, an extension required that is not drawn.
     """
     with reading("mesh", str(path)):
-        return _load(Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size,
-                     up)
+        return _load(
+            Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size, up
+        )
 
 
-def _load(path: Path, max_faces: int, max_bytes: int, keep_materials: bool, max_texture: int, source_hash: str | None,
-          project_uvs: bool,
-          uv_size: float | None, up: str) -> Asset:
+def _load(
+    path: Path,
+    max_faces: int,
+    max_bytes: int,
+    keep_materials: bool,
+    max_texture: int,
+    source_hash: str | None,
+    project_uvs: bool,
+    uv_size: float | None,
+    up: str,
+) -> Asset:
     where = str(path)
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
@@ -100,8 +118,18 @@ def _load(path: Path, max_faces: int, max_bytes: int, keep_materials: bool, max_
             continue
         # A palette picked by degenerate coordinates is fine with the file's own texture, useless with any other.
         own_texture = has_materials and piece.material is not None and piece.material.texture is not None
-        mesh = make_mesh(piece.vertices, piece.faces, normals=piece.normals, uvs=None if project_uvs else piece.uvs, name=path.stem,
-                         source_hash=digest, where=where, uv_size=uv_size, project_degenerate=not own_texture, log=log)
+        mesh = make_mesh(
+            piece.vertices,
+            piece.faces,
+            normals=piece.normals,
+            uvs=None if project_uvs else piece.uvs,
+            name=path.stem,
+            source_hash=digest,
+            where=where,
+            uv_size=uv_size,
+            project_degenerate=not own_texture,
+            log=log,
+        )
         material = piece.material if has_materials and piece.material is not None else Material()
         parts.append(Part(mesh, material))
     if not parts:
@@ -109,7 +137,7 @@ def _load(path: Path, max_faces: int, max_bytes: int, keep_materials: bool, max_
     if not has_materials:
         parts = [Part(concatenate(tuple(p.mesh for p in parts), name=path.stem, source_hash=digest), Material())]
     elif closed_together(tuple(p.mesh for p in parts)):
-        parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]     # one solid, split by material
+        parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]  # one solid, split by material
     return Asset(path.stem, digest, tuple(parts), has_materials, tuple(dict.fromkeys(log)), omissions.lines())
 
 
@@ -120,21 +148,31 @@ def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:
     return gltf.buffer_contents(path, contents(path, "mesh") if data is None else data)
 
 
-def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None,
-                    omissions: Omissions) -> list[gltf.Piece]:
+def _trimesh_pieces(
+    path: Path, data: bytes, kind: str, max_faces: int, max_texture: int | None, omissions: Omissions
+) -> list[gltf.Piece]:
     where = str(path)
     {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj}[kind](data, max_faces, where)
     resolver = FolderResolver(path.parent, where, kind, omissions)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        loaded = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, process=False,
-                                    maintain_order=True,
-                                    skip_materials=max_texture is None)
+        loaded = trimesh.load_scene(
+            io.BytesIO(data),
+            file_type=kind,
+            resolver=resolver,
+            process=False,
+            maintain_order=True,
+            skip_materials=max_texture is None,
+        )
     if max_texture is not None and resolver.refused is not None:
         raise resolver.refused
-    pieces = [piece_of_trimesh(g, max_texture=max_texture, where=where, file_normals=True, omissions=omissions,
-                               resolver=resolver)
-              for g in loaded.geometry.values() if isinstance(g, trimesh.Trimesh)]
+    pieces = [
+        piece_of_trimesh(
+            g, max_texture=max_texture, where=where, file_normals=True, omissions=omissions, resolver=resolver
+        )
+        for g in loaded.geometry.values()
+        if isinstance(g, trimesh.Trimesh)
+    ]
     if not pieces:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
     if any(not isinstance(g, trimesh.Trimesh) for g in loaded.geometry.values()):
@@ -142,9 +180,15 @@ def _trimesh_pieces(path: Path, data: bytes, kind: str, max_faces: int, max_text
     return pieces
 
 
-def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: str, file_normals: bool,
-                     omissions: Omissions,
-                     resolver: FolderResolver | None = None) -> gltf.Piece:
+def piece_of_trimesh(
+    mesh: trimesh.Trimesh,
+    *,
+    max_texture: int | None,
+    where: str,
+    file_normals: bool,
+    omissions: Omissions,
+    resolver: FolderResolver | None = None,
+) -> gltf.Piece:
     """Raw triangles and material of a ``trimesh.Trimesh``.
 
     file_normals : use normals that came with the mesh; trimesh's own smooth ones would round off a cuboid.
@@ -154,15 +198,21 @@ def piece_of_trimesh(mesh: trimesh.Trimesh, *, max_texture: int | None, where: s
     normals = mesh._cache.cache.get("vertex_normals") if file_normals else None  # noqa: SLF001
     uvs = getattr(mesh.visual, "uv", None)
     if uvs is not None and len(uvs) == len(mesh.vertices):
-        uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]      # trimesh has v upwards
+        uvs = np.asarray(uvs, np.float64)[:, :2] * [1, -1] + [0, 1]  # trimesh has v upwards
     else:
         uvs = None
-    return gltf.Piece(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), normals, uvs,
-                      None if max_texture is None else _material(mesh.visual, max_texture, where, omissions, resolver))
+    return gltf.Piece(
+        np.asarray(mesh.vertices, np.float64),
+        np.asarray(mesh.faces),
+        normals,
+        uvs,
+        None if max_texture is None else _material(mesh.visual, max_texture, where, omissions, resolver),
+    )
 
 
-def _material(visual, max_texture: int, where: str, omissions: Omissions,
-              resolver: FolderResolver | None) -> Material | None:
+def _material(
+    visual, max_texture: int, where: str, omissions: Omissions, resolver: FolderResolver | None
+) -> Material | None:
     material = getattr(visual, "material", None)
     if material is None:
         kind = getattr(visual, "kind", None)
@@ -178,19 +228,25 @@ def _material(visual, max_texture: int, where: str, omissions: Omissions,
         image = material.image
         diffuse = material.diffuse
         # An untouched default is no material; a texture is not darkened by the usual grey diffuse default.
-        if image is None and material.name is None and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3]):
+        if (
+            image is None
+            and material.name is None
+            and np.array_equal(diffuse[:3], trimesh.visual.color.DEFAULT_COLOR[:3])
+        ):
             return None
         colour = (1.0, 1.0, 1.0) if image is not None else gltf.to_linear(np.asarray(diffuse, float)[:3] / 255)
     else:
         factor = np.ones(3) if factor is None else np.asarray(factor)[:3]
-        colour = tuple(float(c) for c in (factor / 255 if factor.dtype.kind in "iu" else factor))     # glTF factors are linear
+        colour = tuple(
+            float(c) for c in (factor / 255 if factor.dtype.kind in "iu" else factor)
+        )  # glTF factors are linear
         if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
             omissions.add(f"alpha {material.alphaMode} (drawn opaque)")
         if np.any(getattr(material, "emissiveFactor", None)):
             omissions.add("emissive light")
     texture = None
     if image is not None:
-        opened = resolver is None       # by whoever made the mesh
+        opened = resolver is None  # by whoever made the mesh
         texture = texture_of(image, max_texture, where) if opened else resolver.texture(image, max_texture)
     return Material(texture=texture, base_color=colour, double_sided=bool(getattr(material, "doubleSided", False)))
 
@@ -213,7 +269,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
     def __init__(self, folder: Path, where: str, kind: str, omissions: Omissions):
         self.folder, self.where, self.kind, self.omissions = Path(folder), where, kind, omissions
         self.refused: AssetError | None = None
-        self._named: set[str] = set()                   # images that a material file names
+        self._named: set[str] = set()  # images that a material file names
         self._images: list[tuple[str, bytes]] = []
         self._textures: dict[int, Texture] = {}
 
@@ -221,7 +277,7 @@ class FolderResolver(trimesh.resolvers.Resolver):
         try:
             file = gltf.inside(self.folder, str(name), self.where)
             data = contents(file, "file")
-        except AssetError as error:         # trimesh swallows it; _trimesh_pieces raises it
+        except AssetError as error:  # trimesh swallows it; _trimesh_pieces raises it
             if "missing" in error.problem:
                 self.omissions.add(f"'{name}', which is missing")
             else:
@@ -272,13 +328,24 @@ class FolderResolver(trimesh.resolvers.Resolver):
         return [p.name for p in self.folder.iterdir() if p.suffix.lower() in (".mtl", *IMAGE_SUFFIXES)]
 
 
-_MTL_MAPS = {"map_bump": "normal maps", "bump": "normal maps", "norm": "normal maps",
-             "map_d": "transparency (drawn opaque)",
-             "map_ke": "emissive light", "map_ks": "shine (drawn matt)", "map_pr": "shine (drawn matt)",
-             "map_pm": "shine (drawn matt)"}
+_MTL_MAPS = {
+    "map_bump": "normal maps",
+    "bump": "normal maps",
+    "norm": "normal maps",
+    "map_d": "transparency (drawn opaque)",
+    "map_ke": "emissive light",
+    "map_ks": "shine (drawn matt)",
+    "map_pr": "shine (drawn matt)",
+    "map_pm": "shine (drawn matt)",
+}
 # Statement -> what it asks for, unless all its values are this.
-_MTL_VALUES = {"ke": ("emissive light", 0.0), "ks": ("shine (drawn matt)", 0.0), "pm": ("shine (drawn matt)", 0.0),
-               "d": ("transparency (drawn opaque)", 1.0), "tr": ("transparency (drawn opaque)", 0.0)}
+_MTL_VALUES = {
+    "ke": ("emissive light", 0.0),
+    "ks": ("shine (drawn matt)", 0.0),
+    "pm": ("shine (drawn matt)", 0.0),
+    "d": ("transparency (drawn opaque)", 1.0),
+    "tr": ("transparency (drawn opaque)", 0.0),
+}
 
 
 def _check_stl(data: bytes, max_faces: int, where: str) -> None:
@@ -287,9 +354,15 @@ def _check_stl(data: bytes, max_faces: int, where: str) -> None:
         # Binary when the size fits; ASCII begins with 'solid' (some binary files do too, hence the size first).
         if data.lstrip()[:5].lower() != b"solid" or len(data) == 84 + 50 * claimed:
             if claimed > max_faces:
-                raise AssetError("the mesh has too many faces", where=where, value=claimed, accepted=f"at most {max_faces}")
+                raise AssetError(
+                    "the mesh has too many faces", where=where, value=claimed, accepted=f"at most {max_faces}"
+                )
             if len(data) < 84 + 50 * claimed:
-                raise AssetError(f"the mesh is truncated: {claimed} faces need {84 + 50 * claimed} bytes", where=where, value=len(data))
+                raise AssetError(
+                    f"the mesh is truncated: {claimed} faces need {84 + 50 * claimed} bytes",
+                    where=where,
+                    value=len(data),
+                )
             return
     _limit(data.count(b"facet normal"), max_faces, where)
 
@@ -301,13 +374,18 @@ def _check_ply(data: bytes, max_faces: int, where: str) -> None:
     for name, digits in re.findall(rb"element\s+(\w+)\s+(\d+)", data[:end]):
         what = "faces" if name == b"face" else f"{name.decode(errors='replace')} elements"
         if len(digits) > 18:
-            raise AssetError(f"the mesh has too many {what}", where=where, value=f"a number of {len(digits)} digits",
-                             accepted=f"at most {max_faces} faces")
+            raise AssetError(
+                f"the mesh has too many {what}",
+                where=where,
+                value=f"a number of {len(digits)} digits",
+                accepted=f"at most {max_faces} faces",
+            )
         count = int(digits)
         if count > (max_faces if name == b"face" else 3 * max_faces + 1_000_000):
-            raise AssetError(f"the mesh has too many {what}", where=where, value=count,
-                             accepted=f"at most {max_faces} faces")
-        if count > len(data) - end:       # an element takes a byte at least
+            raise AssetError(
+                f"the mesh has too many {what}", where=where, value=count, accepted=f"at most {max_faces} faces"
+            )
+        if count > len(data) - end:  # an element takes a byte at least
             raise AssetError(f"the mesh is truncated: {count} {what} in {len(data)} bytes", where=where)
 
 
@@ -315,11 +393,17 @@ def _check_obj(data: bytes, max_faces: int, where: str) -> None:
     _limit(data.count(b"\nf ") + data.startswith(b"f "), max_faces, where)
     # trimesh allocates as many vertices as the largest index of a face says; a file has no more of them than lines.
     lines = data.count(b"\n") + data.count(b"\r") + 1
-    found = re.search(rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1),
-                      data.replace(b"\\\n", b" ") if b"\\\n" in data else data)
+    found = re.search(
+        rb"(?:\A|[\r\n])f[^\r\n]*?(\d{%d,})" % (len(str(lines)) + 1),
+        data.replace(b"\\\n", b" ") if b"\\\n" in data else data,
+    )
     if found:
-        raise AssetError("a face refers to a vertex that does not exist", where=where, value=found[1][:20].decode(),
-                         accepted=f"at most {lines}")
+        raise AssetError(
+            "a face refers to a vertex that does not exist",
+            where=where,
+            value=found[1][:20].decode(),
+            accepted=f"at most {lines}",
+        )
 
 
 def _limit(faces: int, max_faces: int, where: str) -> None:

@@ -81,8 +81,15 @@ class CollisionResult:
         return tuple(str(event) for event in self.events)
 
 
-def resolve_collisions(objects: tuple[SceneObject, ...] | list[SceneObject], camera_path: PosePath, camera_radius: float,
-                       t0_ns: int, t1_ns: int, tolerance: float = 1e-3, rest_margin: float = 0.01) -> CollisionResult:
+def resolve_collisions(
+    objects: tuple[SceneObject, ...] | list[SceneObject],
+    camera_path: PosePath,
+    camera_radius: float,
+    t0_ns: int,
+    t1_ns: int,
+    tolerance: float = 1e-3,
+    rest_margin: float = 0.01,
+) -> CollisionResult:
     """Cuts every moving body's path at its first collision in [t0, t1].
 
     objects       : moving and static ones, ground, walls and sky included.
@@ -98,9 +105,13 @@ def resolve_collisions(objects: tuple[SceneObject, ...] | list[SceneObject], cam
     search = _Search(bodies, int(t0_ns), int(t1_ns), tolerance, rest_margin)
     events = tuple(search.run())
     cut = {body.source: body.path for body in bodies if body.cut}
-    return CollisionResult(tuple(replace(o, path=cut[id(o)]) if id(o) in cut else o for o in objects),
-                           cut.get(CAMERA, camera_path), events, tuple(e for e in events if e.t_ns == t0_ns),
-                           search.distance_queries)
+    return CollisionResult(
+        tuple(replace(o, path=cut[id(o)]) if id(o) in cut else o for o in objects),
+        cut.get(CAMERA, camera_path),
+        events,
+        tuple(e for e in events if e.t_ns == t0_ns),
+        search.distance_queries,
+    )
 
 
 @dataclass(eq=False)
@@ -126,15 +137,23 @@ class _Body:
     def of_object(obj: SceneObject) -> _Body:
         meshes = [part.mesh for part in obj.parts if len(part.mesh.faces)]
         first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-        return _Body(obj.name, obj.category, id(obj), obj.path, np.concatenate([mesh.vertices for mesh in meshes]),
-                     np.concatenate([mesh.faces + k for mesh, k in zip(meshes, first)]),
-                     np.array([mesh.vertices[mesh.faces[0, 0]] for mesh in meshes]),
-                     closed=tuple((m.vertices, m.faces) for m in meshes if m.closed) if obj.category == "object" else ())
+        return _Body(
+            obj.name,
+            obj.category,
+            id(obj),
+            obj.path,
+            np.concatenate([mesh.vertices for mesh in meshes]),
+            np.concatenate([mesh.faces + k for mesh, k in zip(meshes, first)]),
+            np.array([mesh.vertices[mesh.faces[0, 0]] for mesh in meshes]),
+            closed=tuple((m.vertices, m.faces) for m in meshes if m.closed) if obj.category == "object" else (),
+        )
 
     @staticmethod
     def of_camera(path: PosePath, radius: float) -> _Body:
         # A point is a triangle of three equal corners: the same exact distance routine serves it.
-        return _Body(CAMERA, CAMERA, CAMERA, path, np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((1, 3)), pad=radius)
+        return _Body(
+            CAMERA, CAMERA, CAMERA, path, np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros((1, 3)), pad=radius
+        )
 
     def __post_init__(self):
         self.vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -149,7 +168,9 @@ class _Body:
         self.planes = None
         if self.is_static and self.category != CAMERA:
             T = self.path.pose(self.path.t0_ns)
-            self.planes = _face_planes(used @ T[:3, :3].T + T[:3, 3], self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
+            self.planes = _face_planes(
+                used @ T[:3, :3].T + T[:3, 3], self.vertices @ T[:3, :3].T + T[:3, 3], self.faces
+            )
         self._shape = None
 
     def shape(self) -> fcl.CollisionObject:
@@ -207,7 +228,10 @@ class _Search:
                 if separation <= self._tol(a, b):
                     found.append((a, b, "contact", max(separation, 0.0)))
         # Stopped only now: every pair is judged by the same scene.
-        return [Collision(self.t0, a.name, b.name, kind, separation, self._stop(self.t0, a, b)) for a, b, kind, separation in found]
+        return [
+            Collision(self.t0, a.name, b.name, kind, separation, self._stop(self.t0, a, b))
+            for a, b, kind, separation in found
+        ]
 
     def _pairs(self):
         for i, a in enumerate(self.bodies):
@@ -386,6 +410,10 @@ def _winding(point: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> floa
     a, b, c = (vertices[faces[:, k]] - point for k in range(3))
     la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
     det = np.einsum("ij,ij->i", a, np.cross(b, c))
-    dot = (la * lb * lc + np.einsum("ij,ij->i", a, b) * lc + np.einsum("ij,ij->i", b, c) * la
-           + np.einsum("ij,ij->i", c, a) * lb)
+    dot = (
+        la * lb * lc
+        + np.einsum("ij,ij->i", a, b) * lc
+        + np.einsum("ij,ij->i", b, c) * la
+        + np.einsum("ij,ij->i", c, a) * lb
+    )
     return float(np.arctan2(det, dot).sum() / (2 * np.pi))

@@ -71,8 +71,14 @@ class KeyframePath:
     Raises ConfigError (prefixed by ``where``) on wrong shapes, non-finite values, zero quaternions or unordered times.
     """
 
-    def __init__(self, times_ns: ArrayLike, positions: ArrayLike, rotations: Rotation | ArrayLike,
-                 interpolation: Literal["spline", "linear"] = "spline", where: str | None = None):
+    def __init__(
+        self,
+        times_ns: ArrayLike,
+        positions: ArrayLike,
+        rotations: Rotation | ArrayLike,
+        interpolation: Literal["spline", "linear"] = "spline",
+        where: str | None = None,
+    ):
         knots, positions, rotations = _checked_keys(times_ns, positions, rotations, where)
         self.t0_ns, self.t1_ns = int(knots[0]), int(knots[-1])
         if len(knots) == 1:
@@ -125,13 +131,17 @@ class KeyframePath:
         """Upper bound over [ta, tb] of |n . velocity| in units/s of the body's points within ``reach`` of its origin,
         for the world direction ``normal`` (unit). Zero (to rounding) for a body that slides and turns on a plane,
         where :meth:`speed_bound` says nothing useful."""
-        return _BOUND_MARGIN * _approach_bound(int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr, self._rot, normal, reach)
+        return _BOUND_MARGIN * _approach_bound(
+            int(ta_ns), int(tb_ns), self._knots, self._cp, self._cr, self._rot, normal, reach
+        )
 
 
 class SplinePath(KeyframePath):
     """C2 spline through way-points; arguments as in :class:`KeyframePath`."""
 
-    def __init__(self, times_ns: ArrayLike, positions: ArrayLike, rotations: Rotation | ArrayLike, where: str | None = None):
+    def __init__(
+        self, times_ns: ArrayLike, positions: ArrayLike, rotations: Rotation | ArrayLike, where: str | None = None
+    ):
         super().__init__(times_ns, positions, rotations, "spline", where)
 
 
@@ -199,8 +209,12 @@ def rigid(T: ArrayLike, where: str | None = None) -> np.ndarray:
         R = T[:3, :3]
         ok = np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0 and np.array_equal(T[3], [0, 0, 0, 1])
     if not ok:
-        raise ConfigError("pose is not rigid", where=where, value=T.tolist(),
-                          accepted="a 4x4 matrix of a rotation (determinant +1) and a finite translation")
+        raise ConfigError(
+            "pose is not rigid",
+            where=where,
+            value=T.tolist(),
+            accepted="a 4x4 matrix of a rotation (determinant +1) and a finite translation",
+        )
     return T
 
 
@@ -215,24 +229,43 @@ def _checked_keys(times_ns, positions, rotations, where):
         raise ConfigError("key-frame times have to be a list of whole nanoseconds, at least one", where=where)
     if (np.diff(knots) <= 0).any():
         at = int(np.argmax(np.diff(knots) <= 0)) + 1
-        raise ConfigError(f"key-frame times have to increase (key frame {at})", where=where, value=int(knots[at]),
-                          accepted=f"more than {int(knots[at - 1])} ns")
+        raise ConfigError(
+            f"key-frame times have to increase (key frame {at})",
+            where=where,
+            value=int(knots[at]),
+            accepted=f"more than {int(knots[at - 1])} ns",
+        )
     if positions.shape != (len(knots), 3) or not np.isfinite(positions).all():
-        raise ConfigError("key-frame positions have to be finite and three per time", where=where,
-                          value=f"shape {positions.shape}", accepted=f"shape ({len(knots)}, 3)")
+        raise ConfigError(
+            "key-frame positions have to be finite and three per time",
+            where=where,
+            value=f"shape {positions.shape}",
+            accepted=f"shape ({len(knots)}, 3)",
+        )
     if not isinstance(rotations, Rotation):
         try:
             quaternions = np.array(rotations, dtype=np.float64)
         except (TypeError, ValueError):
             raise ConfigError("key-frame rotations are not numbers", where=where) from None
-        if (quaternions.shape != (len(knots), 4) or not np.isfinite(quaternions).all()
-                or not (np.linalg.norm(quaternions, axis=1) > 1e-12).all()):
-            raise ConfigError("key-frame rotations have to be non-zero quaternions (x, y, z, w), one per time", where=where,
-                              value=f"shape {quaternions.shape}", accepted=f"shape ({len(knots)}, 4)")
+        if (
+            quaternions.shape != (len(knots), 4)
+            or not np.isfinite(quaternions).all()
+            or not (np.linalg.norm(quaternions, axis=1) > 1e-12).all()
+        ):
+            raise ConfigError(
+                "key-frame rotations have to be non-zero quaternions (x, y, z, w), one per time",
+                where=where,
+                value=f"shape {quaternions.shape}",
+                accepted=f"shape ({len(knots)}, 4)",
+            )
         rotations = Rotation.from_quat(quaternions)
     elif rotations.single or len(rotations) != len(knots):
-        raise ConfigError("key-frame rotations have to be one per time", where=where,
-                          value=1 if rotations.single else len(rotations), accepted=str(len(knots)))
+        raise ConfigError(
+            "key-frame rotations have to be one per time",
+            where=where,
+            value=1 if rotations.single else len(rotations),
+            accepted=str(len(knots)),
+        )
     return knots, positions, rotations
 
 

@@ -94,13 +94,24 @@ class FreeSpace:
         points = rng.uniform(self.low, self.high, (tries, 3))
         free = np.flatnonzero(self.depth(points, radius) <= 0.0)
         if not len(free):
-            raise ConfigError(f"no free space for a body of radius {radius:.3g} in {tries} tries", where="scene",
-                              accepted="fewer or smaller objects, or a larger world")
+            raise ConfigError(
+                f"no free space for a body of radius {radius:.3g} in {tries} tries",
+                where="scene",
+                accepted="fewer or smaller objects, or a larger world",
+            )
         return points[free[0]]
 
 
-def random_path(rng: np.random.Generator, t0_ns: int, t1_ns: int, config: ObjectMotion, space: FreeSpace, radius: float,
-                start_pose: ArrayLike | None = None, on_ground: bool = False) -> PosePath:
+def random_path(
+    rng: np.random.Generator,
+    t0_ns: int,
+    t1_ns: int,
+    config: ObjectMotion,
+    space: FreeSpace,
+    radius: float,
+    start_pose: ArrayLike | None = None,
+    on_ground: bool = False,
+) -> PosePath:
     """Motion of one object over [t0, t1].
 
     radius     : of its bounding sphere, kept clear of ``space``'s obstacles. Leave the object itself out of them.
@@ -119,8 +130,16 @@ def random_path(rng: np.random.Generator, t0_ns: int, t1_ns: int, config: Object
     return SplinePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
 
 
-def random_camera_path(rng: np.random.Generator, t0_ns: int, t1_ns: int, config: CameraMotion, space: FreeSpace, radius: float,
-                       target: PosePath | ArrayLike, start_pose: ArrayLike | None = None) -> PosePath:
+def random_camera_path(
+    rng: np.random.Generator,
+    t0_ns: int,
+    t1_ns: int,
+    config: CameraMotion,
+    space: FreeSpace,
+    radius: float,
+    target: PosePath | ArrayLike,
+    start_pose: ArrayLike | None = None,
+) -> PosePath:
     """Motion of the camera over [t0, t1], OpenCV axes.
 
     radius     : of the sphere round the camera centre that stays clear of obstacles (at least the near distance).
@@ -201,7 +220,9 @@ def _waypoints(rng, t0_ns, t1_ns, config, space, radius, start, speed, flat):
         times = np.linspace(0, t1_ns - t0_ns, config.waypoints).round().astype(np.int64) + t0_ns
         return times, np.tile(start, (config.waypoints, 1))
     if flat:
-        space = FreeSpace(np.r_[space.low[:2], -np.inf], np.r_[space.high[:2], np.inf], None, space.centres, space.radii)
+        space = FreeSpace(
+            np.r_[space.low[:2], -np.inf], np.r_[space.high[:2], np.inf], None, space.centres, space.radii
+        )
     entangled = np.linalg.norm(space.centres - start, axis=1) < space.radii + radius
     best, least = None, math.inf
     for _ in range(_REDRAWS):

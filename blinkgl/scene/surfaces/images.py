@@ -24,17 +24,29 @@ from blinkgl.scene.reading import contents, reading
 from blinkgl.srgb import DECODE_8BIT, to_srgb8
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr")
-MAX_SIDE = 16_384    # what the configuration's max_size allows, and what OpenGL implementations take
+MAX_SIDE = 16_384  # what the configuration's max_size allows, and what OpenGL implementations take
 MAX_PIXELS = MAX_SIDE**2
-MAX_HDR_PIXELS = MAX_PIXELS // 2    # 12 bytes each: a panorama of 16384x8192
+MAX_HDR_PIXELS = MAX_PIXELS // 2  # 12 bytes each: a panorama of 16384x8192
 _MAX_LINE = 1 << 20
 # Pillow knows many more; some of them run other programs (EPS), and none of them is a texture's.
 _FORMATS = ("PNG", "JPEG", "BMP", "WEBP", "TIFF", "PPM", "GIF", "TGA")
-_BLOCK_PIXELS = 1 << 22     # pixels converted or averaged at a time: bounds what a large image takes beside itself
-HDR_WHITE = 1.5     # brightest radiance kept of an HDR image: light sources would drown everything else
+_BLOCK_PIXELS = 1 << 22  # pixels converted or averaged at a time: bounds what a large image takes beside itself
+HDR_WHITE = 1.5  # brightest radiance kept of an HDR image: light sources would drown everything else
 # Not those that are mostly black (retina, hubble_deep_field): no light, no events.
-_PHOTOGRAPHS = ("astronaut.png", "brick.png", "camera.png", "chelsea.png", "coffee.png", "coins.png", "grass.png", "gravel.png",
-                "ihc.png", "moon.png", "motorcycle_left.png", "rocket.jpg")
+_PHOTOGRAPHS = (
+    "astronaut.png",
+    "brick.png",
+    "camera.png",
+    "chelsea.png",
+    "coffee.png",
+    "coins.png",
+    "grass.png",
+    "gravel.png",
+    "ihc.png",
+    "moon.png",
+    "motorcycle_left.png",
+    "rocket.jpg",
+)
 
 
 def content_hash(*chunks: bytes) -> str:
@@ -82,13 +94,17 @@ def _open(data: bytes, where: str) -> Image.Image:
         stream.seek(0)
         try:
             return factory(stream, "")
-        except Image.DecompressionBombError:        # some readers ask the guard themselves
-            raise AssetError(f"the image is too large for a {name} file", where=where,
-                             accepted="a PNG, or fewer pixels") from None
-        except (SyntaxError, IndexError, TypeError, struct.error):     # not this format after all: as Image.open does
+        except Image.DecompressionBombError:  # some readers ask the guard themselves
+            raise AssetError(
+                f"the image is too large for a {name} file", where=where, accepted="a PNG, or fewer pixels"
+            ) from None
+        except (SyntaxError, IndexError, TypeError, struct.error):  # not this format after all: as Image.open does
             continue
-    raise AssetError("the image is corrupt or of an unknown format", where=where,
-                     accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR")
+    raise AssetError(
+        "the image is corrupt or of an unknown format",
+        where=where,
+        accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR",
+    )
 
 
 def _decode_ldr(data: bytes, where: str) -> np.ndarray:
@@ -97,7 +113,7 @@ def _decode_ldr(data: bytes, where: str) -> np.ndarray:
         _check_size(*image.size, where)
         image.load()
         ImageOps.exif_transpose(image, in_place=True)
-        if image.mode.startswith("I") or image.mode == "F":     # 16-bit grey
+        if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey
             grey = np.asarray(image, np.float32)
             scale = 255 / (65535 if grey.max() > 255 else 255)
             return np.repeat((grey * scale).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
@@ -172,7 +188,7 @@ def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.
     height, width = panorama.shape[:2]
     s = ((np.arange(size) + 0.5) / size * 2 - 1) * (1 + margin)
     right, down = np.meshgrid(s, s)
-    padded = np.concatenate([panorama[:, -2:], panorama, panorama[:, :2]], axis=1)    # the seam is interpolated across
+    padded = np.concatenate([panorama[:, -2:], panorama, panorama[:, :2]], axis=1)  # the seam is interpolated across
     faces = []
     for forward, to_right, to_down in SKY_SIDES:
         ray = np.asarray(forward, float) + right[..., None] * to_right + down[..., None] * to_down
@@ -180,11 +196,23 @@ def cube_faces(panorama: np.ndarray, size: int, margin: float = 0.0) -> list[np.
         latitude = np.arctan2(ray[..., 2], np.hypot(ray[..., 0], ray[..., 1]))
         x = (longitude / (2 * np.pi) + 0.5) * width - 0.5 + 2
         y = (0.5 - latitude / np.pi) * height - 0.5
-        faces.append(cv2.remap(padded, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        faces.append(
+            cv2.remap(
+                padded, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+        )
     return faces
 
 
 # (forward, right, down) of the six sides for a viewer inside.
-SKY_SIDES = tuple(tuple(np.array(v, float) for v in side) for side in (
-    ((1, 0, 0), (0, -1, 0), (0, 0, -1)), ((-1, 0, 0), (0, 1, 0), (0, 0, -1)), ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
-    ((0, -1, 0), (-1, 0, 0), (0, 0, -1)), ((0, 0, 1), (0, -1, 0), (1, 0, 0)), ((0, 0, -1), (0, -1, 0), (-1, 0, 0))))
+SKY_SIDES = tuple(
+    tuple(np.array(v, float) for v in side)
+    for side in (
+        ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+        ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
+        ((0, 1, 0), (1, 0, 0), (0, 0, -1)),
+        ((0, -1, 0), (-1, 0, 0), (0, 0, -1)),
+        ((0, 0, 1), (0, -1, 0), (1, 0, 0)),
+        ((0, 0, -1), (0, -1, 0), (-1, 0, 0)),
+    )
+)

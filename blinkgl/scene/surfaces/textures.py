@@ -12,8 +12,8 @@ from blinkgl.config.scene import TEXTURE_KINDS
 from blinkgl.scene.geometry.primitives import parameter_hash
 from blinkgl.scene.types import Texture
 
-DARKEST, BRIGHTEST = 20, 240      # sRGB: radiance stays within about (0.007, 0.87)
-MIN_CONTRAST = 70                 # least difference in sRGB luma between a palette's darkest and brightest colour
+DARKEST, BRIGHTEST = 20, 240  # sRGB: radiance stays within about (0.007, 0.87)
+MIN_CONTRAST = 70  # least difference in sRGB luma between a palette's darkest and brightest colour
 
 
 def procedural_hash(kind: str, index: int) -> str:
@@ -60,7 +60,7 @@ def _coordinates(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _smooth(t: np.ndarray) -> np.ndarray:
-    return t * t * t * (t * (6 * t - 15) + 10)      # Perlin's quintic: C2 across cells
+    return t * t * t * (t * (6 * t - 15) + 10)  # Perlin's quintic: C2 across cells
 
 
 def _lattice(size: int, cells: int):
@@ -165,7 +165,10 @@ def _dots(rng, size):
 def _gradient(rng, size):
     """A few smooth waves: low contrast almost everywhere, what event cameras find hardest."""
     x, y = _coordinates(size)
-    waves = [rng.uniform(0.3, 1) * np.cos(2 * np.pi * (rng.integers(-2, 3) * x + rng.integers(-2, 3) * y + rng.random())) for _ in range(4)]
+    waves = [
+        rng.uniform(0.3, 1) * np.cos(2 * np.pi * (rng.integers(-2, 3) * x + rng.integers(-2, 3) * y + rng.random()))
+        for _ in range(4)
+    ]
     return _stretch(sum(waves) + 0.3 * np.cos(2 * np.pi * (x + rng.random())))
 
 
@@ -177,10 +180,21 @@ def _bricks(rng, size):
     brick = np.floor(along).astype(int) % columns
     tone = 0.35 + 0.6 * rng.random((rows, columns))[row, brick] + 0.25 * _perlin_noise(rng, size, 32)
     joint = rng.uniform(0.04, 0.1)
-    mortar = (np.minimum(along % 1, 1 - along % 1) * rows / columns < joint) | (np.minimum(y * rows % 1, 1 - y * rows % 1) < joint)
+    mortar = (np.minimum(along % 1, 1 - along % 1) * rows / columns < joint) | (
+        np.minimum(y * rows % 1, 1 - y * rows % 1) < joint
+    )
     return np.where(mortar, 0.0, np.clip(tone, 0.2, 1)).astype(np.float32)
 
 
-_FIELDS = {"value": _value, "perlin": _perlin, "fbm": _fbm, "stripes": _stripes, "checks": _checks, "glyphs": _glyphs,
-           "dots": _dots, "gradient": _gradient, "bricks": _bricks}
+_FIELDS = {
+    "value": _value,
+    "perlin": _perlin,
+    "fbm": _fbm,
+    "stripes": _stripes,
+    "checks": _checks,
+    "glyphs": _glyphs,
+    "dots": _dots,
+    "gradient": _gradient,
+    "bricks": _bricks,
+}
 assert tuple(_FIELDS) == TEXTURE_KINDS

@@ -47,21 +47,28 @@ class InMemory:
     textures: dict[str, Texture] = field(default_factory=dict)
 
 
-def explicit_scene(config: ExplicitSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()) -> Scene:
+def explicit_scene(
+    config: ExplicitSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, base: Path, memory: InMemory = InMemory()
+) -> Scene:
     """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
 
     Raises ConfigError (missing file, bad parameter; with ``collisions``,
     bodies that touch at the start) and AssetError."""
     log: list[str] = []
     omissions: dict[str, None] = {}
-    materials = {name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name)) for name, m in config.materials.items()}
+    materials = {
+        name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name))
+        for name, m in config.materials.items()
+    }
     assets: dict[tuple[str, bool], Asset] = {}
     objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
     for k, item in enumerate(config.objects):
         where = f"scene.objects.{k}"
         own = item.material is None
         if (item.mesh, own) not in assets:
-            assets[item.mesh, own] = _asset(config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes)
+            assets[item.mesh, own] = _asset(
+                config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes
+            )
             log += [line for line in assets[item.mesh, own].log if line not in log]
             omissions.update(dict.fromkeys(assets[item.mesh, own].omissions))
         matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
@@ -70,16 +77,29 @@ def explicit_scene(config: ExplicitSceneConfig, camera: CameraModel, t0_ns: int,
             material = part.material if own else materials[item.material]
             material = replace(material, unlit=material.unlit or config.light.unlit)
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
-        objects.append(SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category))
+        objects.append(
+            SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category)
+        )
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
     if config.collisions:
         result = resolve_collisions(tuple(objects), path, 1.01 * camera.near_corner, t0_ns, t1_ns)
         if result.at_start:
-            raise ConfigError(f"{result.at_start[0]}, at the start", where="scene.collisions",
-                              accepted="bodies apart at the start, or collisions: false")
+            raise ConfigError(
+                f"{result.at_start[0]}, at the start",
+                where="scene.collisions",
+                accepted="bodies apart at the start, or collisions: false",
+            )
         objects, path, log = result.objects, result.camera_path, log + list(result.log)
-    return Scene(tuple(objects), Rig.alone(camera, path), t0_ns, t1_ns, make_light(config.light), config.background,
-                 tuple(log), tuple(omissions))
+    return Scene(
+        tuple(objects),
+        Rig.alone(camera, path),
+        t0_ns,
+        t1_ns,
+        make_light(config.light),
+        config.background,
+        tuple(log),
+        tuple(omissions),
+    )
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
@@ -89,7 +109,9 @@ def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, c
         return StaticPath(pose_matrix(config, camera), t0_ns, t1_ns)
     poses = np.stack([pose_matrix(k, camera) for k in config.keyframes])
     times = [round(k.time * 1e9) for k in config.keyframes]
-    return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation, f"{where}.keyframes")
+    return KeyframePath(
+        times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), config.interpolation, f"{where}.keyframes"
+    )
 
 
 def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
@@ -120,11 +142,17 @@ def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
         return BUILDERS[config.primitive](**config.parameters)
     except AssetError as error:
         key = (error.where or "").partition(".")[2]
-        raise ConfigError(error.problem, where=f"scene.meshes.{name}.parameters" + (f".{key}" if key else ""), value=error.value,
-                          accepted=error.accepted) from None
+        raise ConfigError(
+            error.problem,
+            where=f"scene.meshes.{name}.parameters" + (f".{key}" if key else ""),
+            value=error.value,
+            accepted=error.accepted,
+        ) from None
 
 
-def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int, memory: Mapping[str, Mesh]) -> Asset:
+def _asset(
+    config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int, memory: Mapping[str, Mesh]
+) -> Asset:
     if name in memory or config.primitive is not None:
         mesh = memory[name] if name in memory else primitive_mesh(config, name)
         return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
@@ -132,8 +160,14 @@ def _asset(config: MeshConfig, name: str, own_materials: bool, base: Path, max_f
     path = resolve(config.file, base)
     if not path.is_file():
         raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a mesh file")
-    return load_asset(path, max_faces=max_faces, keep_materials=own_materials, project_uvs=config.project_uvs,
-                      uv_size=config.uv_size, up=config.up)
+    return load_asset(
+        path,
+        max_faces=max_faces,
+        keep_materials=own_materials,
+        project_uvs=config.project_uvs,
+        uv_size=config.uv_size,
+        up=config.up,
+    )
 
 
 def _material(config: MaterialConfig, base: Path, where: str, texture: Texture | None = None) -> Material:
@@ -144,8 +178,12 @@ def _material(config: MaterialConfig, base: Path, where: str, texture: Texture |
     elif config.photograph is not None:
         bundled = photographs()
         if config.photograph not in bundled:
-            raise ConfigError("no such photograph", where=f"{where}.photograph", value=config.photograph,
-                              accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'")
+            raise ConfigError(
+                "no such photograph",
+                where=f"{where}.photograph",
+                value=config.photograph,
+                accepted="one of: " + ", ".join(bundled) if bundled else "run 'pip install scikit-image'",
+            )
         texture = _texture(bundled[config.photograph], config.max_size, f"{where}.photograph", config.photograph)
     return Material(texture, config.color, config.uv_scale, config.unlit, config.double_sided)
 

@@ -38,8 +38,8 @@ from blinkgl.scene.worlds.random_world import make_light
 if TYPE_CHECKING:
     import trimesh
 
-CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])    # its own inverse
-_ANIMATION_STEP = 1 / 60                         # s between the samples that a spline is laid through
+CV_FROM_GL = np.diag([1.0, -1.0, -1.0, 1.0])  # its own inverse
+_ANIMATION_STEP = 1 / 60  # s between the samples that a spline is laid through
 _MAX_SAMPLES = 20_000
 
 
@@ -51,15 +51,38 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
     if path.suffix.lower() not in (".gltf", ".glb"):
         raise ConfigError("not a glTF scene", where="scene.path", value=config.path, accepted="a .gltf or .glb file")
     camera_path = None if config.pose is None else motion_path(config.pose, t0_ns, t1_ns, "scene.pose", camera=True)
-    scene = from_gltf(path, camera, t0_ns, t1_ns, camera_name=config.camera, camera_path=camera_path, intrinsics=config.intrinsics,
-                      animation=config.animation, light=make_light(config.light), background=config.background,
-                      max_faces=config.max_faces, max_texture=config.max_texture_size)
+    scene = from_gltf(
+        path,
+        camera,
+        t0_ns,
+        t1_ns,
+        camera_name=config.camera,
+        camera_path=camera_path,
+        intrinsics=config.intrinsics,
+        animation=config.animation,
+        light=make_light(config.light),
+        background=config.background,
+        max_faces=config.max_faces,
+        max_texture=config.max_texture_size,
+    )
     return unlit(scene) if config.light.unlit else scene
 
 
-def from_gltf(path: Path | str, camera: CameraModel, t0_ns: int, t1_ns: int, *, camera_name: str | int | None = None,
-              camera_path: PosePath | None = None, intrinsics: str = "config", animation: str | int | None = 0, light: Light = Light(), background: float = 0.2,
-              max_faces: int = 5_000_000, max_texture: int = 2048) -> Scene:
+def from_gltf(
+    path: Path | str,
+    camera: CameraModel,
+    t0_ns: int,
+    t1_ns: int,
+    *,
+    camera_name: str | int | None = None,
+    camera_path: PosePath | None = None,
+    intrinsics: str = "config",
+    animation: str | int | None = 0,
+    light: Light = Light(),
+    background: float = 0.2,
+    max_faces: int = 5_000_000,
+    max_texture: int = 2048,
+) -> Scene:
     """A glTF 2.0 file with its materials, cameras and node animations.
 
     camera_name : name or index of the file's camera (None: the first), unless ``camera_path`` is given.
@@ -71,12 +94,14 @@ def from_gltf(path: Path | str, camera: CameraModel, t0_ns: int, t1_ns: int, *, 
     """
     with reading("scene", str(path)):
         document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture)
-        return _from_document(document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light,
-                              background)
+        return _from_document(
+            document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light, background
+        )
 
 
-def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation,
-                   light, background) -> Scene:
+def _from_document(
+    document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light, background
+) -> Scene:
     channels = _channels(document, animation)
     objects = []
     for index, node in document.nodes.items():
@@ -97,13 +122,25 @@ def _from_document(document: gltf.Document, camera, t0_ns, t1_ns, camera_name, c
             camera_path, _ = _motion(document, index, channels, t0_ns, t1_ns, CV_FROM_GL)
         if intrinsics == "file":
             camera = _gltf_intrinsics(document, index, camera)
-    return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, document.log,
-                  document.omissions)
+    return _scene(
+        objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, document.log, document.omissions
+    )
 
 
-def from_trimesh(scene: trimesh.Scene | trimesh.Trimesh, camera: CameraModel | None = None, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None, up: str = "z",
-                 near: float = 0.05, light: Light = Light(), background: float = 0.2, max_faces: int = 5_000_000,
-                 max_texture: int = 2048) -> Scene:
+def from_trimesh(
+    scene: trimesh.Scene | trimesh.Trimesh,
+    camera: CameraModel | None = None,
+    t0_ns: int = 0,
+    t1_ns: int = 1_000_000_000,
+    *,
+    camera_path: PosePath | None = None,
+    up: str = "z",
+    near: float = 0.05,
+    light: Light = Light(),
+    background: float = 0.2,
+    max_faces: int = 5_000_000,
+    max_texture: int = 2048,
+) -> Scene:
     """A ``trimesh.Scene``.
 
     camera : intrinsics; None takes the scene's own camera (resolution, K).
@@ -121,12 +158,18 @@ def from_trimesh(scene: trimesh.Scene | trimesh.Trimesh, camera: CameraModel | N
             continue
         where = f"trimesh geometry '{geometry}'"
         if len(mesh.faces) > max_faces:
-            raise AssetError("the mesh has too many faces", where=where, value=len(mesh.faces), accepted=f"at most {max_faces}")
+            raise AssetError(
+                "the mesh has too many faces", where=where, value=len(mesh.faces), accepted=f"at most {max_faces}"
+            )
         rigid, baked = split_rigid(turn @ matrix)
         piece = piece_of_trimesh(mesh, max_texture=max_texture, where=where, file_normals=False, omissions=omissions)
         objects.append((str(name), _parts([piece], baked, str(name), where, log), StaticPath(rigid, t0_ns, t1_ns)))
     if (camera is None or camera_path is None) and not scene.has_camera:
-        raise ConfigError("the trimesh scene has no camera", where="from_trimesh", accepted="camera and camera_path, or scene.set_camera()")
+        raise ConfigError(
+            "the trimesh scene has no camera",
+            where="from_trimesh",
+            accepted="camera and camera_path, or scene.set_camera()",
+        )
     if camera_path is None:
         camera_path = StaticPath(split_rigid(turn @ scene.camera_transform)[0] @ CV_FROM_GL, t0_ns, t1_ns)
     if camera is None:
@@ -137,8 +180,19 @@ def from_trimesh(scene: trimesh.Scene | trimesh.Trimesh, camera: CameraModel | N
     return _scene(objects, Rig.alone(camera, camera_path), t0_ns, t1_ns, light, background, log, omissions)
 
 
-def from_pyrender(scene: Any, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 1_000_000_000, *, camera_path: PosePath | None = None,
-                  intrinsics: str = "file", up: str = "z", light: Light | None = None, background: float | None = None, max_texture: int = 2048) -> Scene:
+def from_pyrender(
+    scene: Any,
+    camera: CameraModel,
+    t0_ns: int = 0,
+    t1_ns: int = 1_000_000_000,
+    *,
+    camera_path: PosePath | None = None,
+    intrinsics: str = "file",
+    up: str = "z",
+    light: Light | None = None,
+    background: float | None = None,
+    max_texture: int = 2048,
+) -> Scene:
     """A ``pyrender.Scene`` (pyrender itself is not imported here).
 
     camera : width, height and, with intrinsics="config", the rest; "file" takes the main
@@ -150,8 +204,14 @@ def from_pyrender(scene: Any, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 
     log, omissions = [], Omissions("the pyrender scene")
     objects = []
     # pyrender keeps nodes in a set: order them by what they are.
-    order = sorted(scene.mesh_nodes, key=lambda n: (str(n.name or n.mesh.name or ""), np.asarray(scene.get_pose(n)).tobytes(),
-                                                    [np.asarray(p.positions).tobytes() for p in n.mesh.primitives]))
+    order = sorted(
+        scene.mesh_nodes,
+        key=lambda n: (
+            str(n.name or n.mesh.name or ""),
+            np.asarray(scene.get_pose(n)).tobytes(),
+            [np.asarray(p.positions).tobytes() for p in n.mesh.primitives],
+        ),
+    )
     for number, node in enumerate(order):
         name = str(node.name or node.mesh.name or f"mesh-{number}")
         pieces = [_pyrender_piece(p, max_texture, name) for p in node.mesh.primitives if getattr(p, "mode", 4) == 4]
@@ -161,13 +221,18 @@ def from_pyrender(scene: Any, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 
             continue
         _pyrender_omissions(node.mesh.primitives, omissions)
         rigid, baked = split_rigid(turn @ scene.get_pose(node))
-        objects.append((name, _parts(pieces, baked, name, f"pyrender mesh '{name}'", log), StaticPath(rigid, t0_ns, t1_ns)))
+        objects.append(
+            (name, _parts(pieces, baked, name, f"pyrender mesh '{name}'", log), StaticPath(rigid, t0_ns, t1_ns))
+        )
     if not objects:
         raise AssetError("the scene has no faces", where="from_pyrender", accepted="a scene with a mesh")
     node = scene.main_camera_node
     if node is None and (camera_path is None or intrinsics == "file"):
-        raise ConfigError("the pyrender scene has no camera", where="from_pyrender",
-                          accepted="a camera node, or camera_path and intrinsics='config'")
+        raise ConfigError(
+            "the pyrender scene has no camera",
+            where="from_pyrender",
+            accepted="a camera node, or camera_path and intrinsics='config'",
+        )
     if camera_path is None:
         camera_path = StaticPath(split_rigid(turn @ scene.get_pose(node))[0] @ CV_FROM_GL, t0_ns, t1_ns)
     if intrinsics == "file":
@@ -175,7 +240,7 @@ def from_pyrender(scene: Any, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 
     if light is None:
         suns = sorted(getattr(scene, "directional_light_nodes", ()), key=lambda n: str(n.name or ""))
         light = Light()
-        if suns:    # it shines along its -z axis
+        if suns:  # it shines along its -z axis
             T, _ = split_rigid(turn @ scene.get_pose(suns[0]))
             light = replace(light, sun_direction=tuple(float(v) for v in T[:3, 2]))
     if background is None:
@@ -185,6 +250,7 @@ def from_pyrender(scene: Any, camera: CameraModel, t0_ns: int = 0, t1_ns: int = 
 
 def unlit(scene: Scene) -> Scene:
     """The scene with radiance = albedo everywhere."""
+
     def of(parts):
         return tuple(Part(p.mesh, replace(p.material, unlit=True)) for p in parts)
 
@@ -219,9 +285,17 @@ def _parts(pieces: list[gltf.Piece], baked: np.ndarray, name: str, where: str, l
     parts = []
     for piece in (gltf.transformed(p, baked) for p in pieces if len(p.faces)):
         textured = piece.material is not None and piece.material.texture is not None
-        mesh = make_mesh(piece.vertices, piece.faces, normals=piece.normals, uvs=piece.uvs, name=name, where=where,
-                         source_hash=content_hash(piece.vertices.tobytes(), np.ascontiguousarray(piece.faces, np.int64).tobytes()),
-                         project_degenerate=not textured, log=log)
+        mesh = make_mesh(
+            piece.vertices,
+            piece.faces,
+            normals=piece.normals,
+            uvs=piece.uvs,
+            name=name,
+            where=where,
+            source_hash=content_hash(piece.vertices.tobytes(), np.ascontiguousarray(piece.faces, np.int64).tobytes()),
+            project_degenerate=not textured,
+            log=log,
+        )
         parts.append(Part(mesh, piece.material or Material()))
     if closed_together(tuple(p.mesh for p in parts)):
         parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]
@@ -244,7 +318,9 @@ def _channels(document: gltf.Document, animation: str | int | None) -> list[gltf
         document.omissions.add(f"animations beside '{names[0]}' (scene.animation chooses one of: {', '.join(names)})")
     index = names.index(animation) if animation in names else animation
     if not isinstance(index, int) or not 0 <= index < len(listed):
-        accepted = f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
+        accepted = (
+            f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
+        )
         raise ConfigError("no such animation in the file", where="scene.animation", value=animation, accepted=accepted)
     return document.channels(index)
 
@@ -252,7 +328,9 @@ def _channels(document: gltf.Document, animation: str | int | None) -> list[gltf
 _HERE = np.eye(4)
 
 
-def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0_ns: int, t1_ns: int, local: np.ndarray = _HERE):
+def _motion(
+    document: gltf.Document, node: int, channels: list[gltf.Channel], t0_ns: int, t1_ns: int, local: np.ndarray = _HERE
+):
     """(PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
     chain, step = set(), node
     while step is not None:
@@ -267,7 +345,7 @@ def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0
     keys = np.concatenate([c.times for c in mine])
     regular = np.linspace(start, end, int(min(max((end - start) / _ANIMATION_STEP, 1), _MAX_SAMPLES)) + 1)
     times = np.unique(np.round(np.concatenate([keys[(keys >= start) & (keys <= end)], regular]) * 1e9).astype(np.int64))
-    times = times[np.concatenate([[True], np.diff(times) > 100_000])]     # a key next to a sample adds nothing but ringing
+    times = times[np.concatenate([[True], np.diff(times) > 100_000])]  # a key next to a sample adds nothing but ringing
     poses, first = [], None
     for t in times:
         values: dict[int, dict] = {}
@@ -276,12 +354,16 @@ def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0
         T, A = split_rigid(gltf.Z_UP @ document.world(node, values))
         first = A if first is None else first
         if np.abs(A - first).max() > 1e-3 * np.abs(first).max():
-            line = (f"{document.path.name}: the changing scale of node '{document.nodes[node].name}' is not supported, "
-                    "its first one is kept")
+            line = (
+                f"{document.path.name}: the changing scale of node '{document.nodes[node].name}' is not supported, "
+                "its first one is kept"
+            )
             document.log.append(line)
         poses.append(T @ local)
     if any(c.interpolation == "STEP" for c in mine):
-        document.log.append(f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed")
+        document.log.append(
+            f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed"
+        )
     poses = np.stack(poses)
     return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), "spline", document.where), first
 
@@ -289,26 +371,37 @@ def _motion(document: gltf.Document, node: int, channels: list[gltf.Channel], t0
 def _camera_node(document: gltf.Document, name: str | int | None) -> int:
     found = {i: n for i, n in document.nodes.items() if n.camera is not None}
     if not found:
-        raise ConfigError("the file has no camera", where="scene.pose", accepted="a camera pose here, or a file with a camera")
+        raise ConfigError(
+            "the file has no camera", where="scene.pose", accepted="a camera pose here, or a file with a camera"
+        )
     names = {}
     for i, n in found.items():
         cameras = document.tree.get("cameras", [])
         if n.camera >= len(cameras):
-            raise AssetError("the file is no valid glTF (a reference to cameras that does not exist)",
-                             where=document.where, value=n.camera)
+            raise AssetError(
+                "the file is no valid glTF (a reference to cameras that does not exist)",
+                where=document.where,
+                value=n.camera,
+            )
         names.setdefault(str(cameras[n.camera].get("name", n.name)), i)
         names.setdefault(n.name, i)
     order = list(found)
     if name is None:
         if len(order) > 1:
-            document.omissions.add(f"cameras beside '{next(iter(names))}' (scene.camera chooses one of: {', '.join(names)})")
+            document.omissions.add(
+                f"cameras beside '{next(iter(names))}' (scene.camera chooses one of: {', '.join(names)})"
+            )
         return order[0]
     if isinstance(name, int) and 0 <= name < len(order):
         return order[name]
     if name in names:
         return names[name]
-    raise ConfigError("no such camera in the file", where="scene.camera", value=name,
-                      accepted=f"one of: {', '.join(names)}, or an index below {len(order)}")
+    raise ConfigError(
+        "no such camera in the file",
+        where="scene.camera",
+        value=name,
+        accepted=f"one of: {', '.join(names)}, or an index below {len(order)}",
+    )
 
 
 def _gltf_intrinsics(document: gltf.Document, node: int, camera: CameraModel) -> PinHole:
@@ -316,10 +409,19 @@ def _gltf_intrinsics(document: gltf.Document, node: int, camera: CameraModel) ->
     perspective = description.get("perspective", {})
     yfov = perspective.get("yfov")
     if description["type"] != "perspective" or yfov is None:
-        raise AssetError("the camera is not a perspective one with a valid yfov", where=document.where, value=yfov,
-                         accepted="intrinsics: config")
+        raise AssetError(
+            "the camera is not a perspective one with a valid yfov",
+            where=document.where,
+            value=yfov,
+            accepted="intrinsics: config",
+        )
     znear = perspective.get("znear", camera.near)
-    return PinHole.centred(camera.width, camera.height, focal_length(camera.height, yfov), near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near)
+    return PinHole.centred(
+        camera.width,
+        camera.height,
+        focal_length(camera.height, yfov),
+        near=float(znear) if 1e-9 <= znear <= 1e9 else camera.near,
+    )
 
 
 # ---- pyrender
@@ -338,8 +440,14 @@ def _pyrender_omissions(primitives, omissions: Omissions) -> None:
 
 def _pyrender_piece(primitive, max_texture: int, name: str) -> gltf.Piece:
     positions = np.asarray(primitive.positions, np.float64)
-    faces = np.arange(len(positions)).reshape(-1, 3) if primitive.indices is None else np.asarray(primitive.indices).reshape(-1, 3)
-    uvs = None if primitive.texcoord_0 is None else np.asarray(primitive.texcoord_0, np.float64)[:, :2] * [1, -1] + [0, 1]
+    faces = (
+        np.arange(len(positions)).reshape(-1, 3)
+        if primitive.indices is None
+        else np.asarray(primitive.indices).reshape(-1, 3)
+    )
+    uvs = (
+        None if primitive.texcoord_0 is None else np.asarray(primitive.texcoord_0, np.float64)[:, :2] * [1, -1] + [0, 1]
+    )
     source = primitive.material
     material = None
     if source is not None:
@@ -350,7 +458,9 @@ def _pyrender_piece(primitive, max_texture: int, name: str) -> gltf.Piece:
             image = np.round(image * 255).astype(np.uint8) if image.dtype.kind == "f" else image
             image = image[..., None] if image.ndim == 2 else image
             image = image[..., :3] if image.shape[2] >= 3 else np.repeat(image[..., :1], 3, axis=2)
-            texture = Texture(shrink(np.ascontiguousarray(image), max_texture), f"{name} texture", content_hash(image.tobytes()))
+            texture = Texture(
+                shrink(np.ascontiguousarray(image), max_texture), f"{name} texture", content_hash(image.tobytes())
+            )
         colour = (1.0, 1.0, 1.0) if factor is None else tuple(float(c) for c in np.asarray(factor, float)[:3])
         material = Material(texture, colour, double_sided=bool(getattr(source, "doubleSided", False)))
     normals = None if primitive.normals is None else np.asarray(primitive.normals, np.float64)
@@ -366,5 +476,15 @@ def _pyrender_intrinsics(source, camera: CameraModel) -> PinHole:
         return PinHole.centred(camera.width, camera.height, focal * camera.width / camera.height / aspect, focal, near)
     if hasattr(source, "fx"):
         # pyrender counts from the image's corner, we from the first pixel's centre.
-        return PinHole(camera.width, camera.height, float(source.fx), float(source.fy), float(source.cx) - 0.5, float(source.cy) - 0.5, near)
-    raise ConfigError("only perspective and intrinsics cameras are supported", where="from_pyrender", value=type(source).__name__)
+        return PinHole(
+            camera.width,
+            camera.height,
+            float(source.fx),
+            float(source.fy),
+            float(source.cx) - 0.5,
+            float(source.cy) - 0.5,
+            near,
+        )
+    raise ConfigError(
+        "only perspective and intrinsics cameras are supported", where="from_pyrender", value=type(source).__name__
+    )

@@ -40,7 +40,9 @@ class ChangedAsset(AssetError):
     depend on when it was looked at."""
 
     def __init__(self, file: Path):
-        super().__init__("the file has changed while it was in use", where=str(file), accepted="the file as it was, or a new run")
+        super().__init__(
+            "the file has changed while it was in use", where=str(file), accepted="the file as it was, or a new run"
+        )
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,17 @@ class Pool:
                 sides.setdefault(entry.source, []).append(entry)
         if not sides:
             if not self.entries:
-                raise ConfigError(f"the pool of {self.what} is empty", where=self.where, accepted=f"at least one source of {self.what}")
-            raise ConfigError(f"none of the {len(self.entries)} {self.what} falls to split '{split}'", where=f"{self.where}.test_fraction",
-                              value=self.test_fraction, accepted="another fraction, or a larger pool")
+                raise ConfigError(
+                    f"the pool of {self.what} is empty",
+                    where=self.where,
+                    accepted=f"at least one source of {self.what}",
+                )
+            raise ConfigError(
+                f"none of the {len(self.entries)} {self.what} falls to split '{split}'",
+                where=f"{self.where}.test_fraction",
+                value=self.test_fraction,
+                accepted="another fraction, or a larger pool",
+            )
         return {source: tuple(entries) for source, entries in sides.items()}
 
     def load(self, entry: Entry) -> Any:
@@ -123,7 +133,11 @@ def _bytes_of(loaded: Texture | Asset) -> int:
     if isinstance(loaded, Texture):
         return loaded.image.nbytes
     own = sum(a.nbytes for p in loaded.parts for a in (p.mesh.vertices, p.mesh.faces, p.mesh.normals, p.mesh.uvs))
-    return own + sum(t.image.nbytes for t in {id(p.material.texture): p.material.texture for p in loaded.parts}.values() if t is not None)
+    return own + sum(
+        t.image.nbytes
+        for t in {id(p.material.texture): p.material.texture for p in loaded.parts}.values()
+        if t is not None
+    )
 
 
 def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_texture: int = 1024) -> Pool:
@@ -134,7 +148,9 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
     entries = []
     for kind in kinds:
         for index in range(config.variants):
-            entries.append(Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index))
+            entries.append(
+                Entry(random_primitive_hash(kind, index), f"{kind}-{index}", "primitives", kind=kind, index=index)
+            )
     folders = [(resolve(folder, base), f"{where}.folders.{i}", folder) for i, folder in enumerate(config.folders)]
     urdfs = _random_urdfs(config.urdfs, f"{where}.urdfs")
     if urdfs is not None:
@@ -145,9 +161,18 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
-            return Asset(entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)).normalised()
-        asset = load_asset(entry.file, max_faces=config.max_faces, max_bytes=limit, keep_materials=config.keep_materials,
-                           max_texture=max_texture, source_hash=entry.source_hash, up=config.up)
+            return Asset(
+                entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)
+            ).normalised()
+        asset = load_asset(
+            entry.file,
+            max_faces=config.max_faces,
+            max_bytes=limit,
+            keep_materials=config.keep_materials,
+            max_texture=max_texture,
+            source_hash=entry.source_hash,
+            up=config.up,
+        )
         _same_content(entry, content_hash(contents(entry.file, "mesh", max_bytes=limit), *dependencies(entry.file)))
         return asset.normalised()
 
@@ -158,17 +183,25 @@ def texture_pool(config: TexturesConfig, base: Path, where: str = "scene.texture
     """Procedural textures, scikit-image's photographs and image folders. Loads
     :class:`~blinkgl.scene.types.Texture`."""
     kinds = TEXTURE_KINDS if config.procedural is True else config.procedural or ()
-    entries = [Entry(procedural_hash(kind, index), f"{kind}-{index}", "procedural", kind=kind, index=index)
-               for kind in kinds for index in range(config.variants)]
+    entries = [
+        Entry(procedural_hash(kind, index), f"{kind}-{index}", "procedural", kind=kind, index=index)
+        for kind in kinds
+        for index in range(config.variants)
+    ]
     if config.photographs:
         bundled = photographs()
         if not bundled:
-            raise ConfigError("scikit-image's photographs are not installed", where=f"{where}.photographs", value=True,
-                              accepted="run 'pip install scikit-image', or set it to false")
+            raise ConfigError(
+                "scikit-image's photographs are not installed",
+                where=f"{where}.photographs",
+                value=True,
+                accepted="run 'pip install scikit-image', or set it to false",
+            )
         entries += [Entry(content_hash(file.read_bytes()), name, "photographs", file) for name, file in bundled.items()]
     for i, folder in enumerate(config.folders):
-        entries += _folder_entries(resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, MAX_BYTES,
-                                   "image", config.bad_assets)
+        entries += _folder_entries(
+            resolve(folder, base), f"{where}.folders.{i}", folder, IMAGE_SUFFIXES, MAX_BYTES, "image", config.bad_assets
+        )
 
     def load(entry: Entry) -> Texture:
         if entry.file is None:
@@ -194,21 +227,30 @@ def resolve(path: str, base: Path) -> Path:
 def files_below(folder: Path, where: str, given: str, suffixes: tuple[str, ...], what: str) -> list[Path]:
     """Files with these suffixes, recursively, sorted by name. ConfigError when the folder is missing or holds none."""
     if not folder.is_dir():
-        raise ConfigError("is not a folder" if folder.exists() else "no such folder", where=where, value=given,
-                          accepted=f"a folder of {what}")
+        raise ConfigError(
+            "is not a folder" if folder.exists() else "no such folder",
+            where=where,
+            value=given,
+            accepted=f"a folder of {what}",
+        )
     try:
-        files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith("."))
+        files = sorted(
+            p for p in folder.rglob("*") if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
+        )
     except OSError as error:
         raise ConfigError(f"cannot read the folder: {error.strerror or error}", where=where, value=given) from None
     if not files:
-        raise ConfigError(f"the folder holds no {what}", where=where, value=given, accepted="files of " + " ".join(suffixes))
+        raise ConfigError(
+            f"the folder holds no {what}", where=where, value=given, accepted="files of " + " ".join(suffixes)
+        )
     if len(files) > _MAX_FILES:
         raise ConfigError(f"the folder holds more than {_MAX_FILES} {what}", where=where, value=given)
     return files
 
 
-def _folder_entries(folder: Path, where: str, given: str, suffixes, limit: int, what: str,
-                    bad_assets: str) -> Iterable[Entry]:
+def _folder_entries(
+    folder: Path, where: str, given: str, suffixes, limit: int, what: str, bad_assets: str
+) -> Iterable[Entry]:
     entries = []
     for file in files_below(folder, where, given, suffixes, "meshes" if what == "mesh" else "images"):
         try:
@@ -234,10 +276,16 @@ def _random_urdfs(setting, where: str) -> Path | None:
     if setting is False:
         return None
     spec = find_spec("pybullet_data")
-    folder = Path(spec.submodule_search_locations[0]) / "random_urdfs" if spec and spec.submodule_search_locations else None
+    folder = (
+        Path(spec.submodule_search_locations[0]) / "random_urdfs" if spec and spec.submodule_search_locations else None
+    )
     if folder is not None and folder.is_dir():
         return folder
     if setting is True:
-        raise ConfigError("pybullet's random_urdfs are not installed", where=where, value=True,
-                          accepted="run 'pip install pybullet', or set it to auto or false")
+        raise ConfigError(
+            "pybullet's random_urdfs are not installed",
+            where=where,
+            value=True,
+            accepted="run 'pip install pybullet', or set it to auto or false",
+        )
     return None

@@ -30,16 +30,27 @@ from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_has
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
 
-_PLACEMENTS = 300      # positions tried for an object before it is left out
-_CAMERA_PATHS = 6      # camera paths tried for one that runs into nothing; the last is cut where it does
-_GAP = 0.05            # m between bounding spheres at t0
-_STAND_OFF = 0.8       # m beyond the clearance that way-points keep from the camera: nothing should fill the view
+_PLACEMENTS = 300  # positions tried for an object before it is left out
+_CAMERA_PATHS = 6  # camera paths tried for one that runs into nothing; the last is cut where it does
+_GAP = 0.05  # m between bounding spheres at t0
+_STAND_OFF = 0.8  # m beyond the clearance that way-points keep from the camera: nothing should fill the view
 _PANORAMA_MARGIN = 1 / 16
 
 
-def random_world(config: RandomSceneConfig, camera: CameraModel, t0_ns: int, t1_ns: int, split: str, seed: int, sequence: int, base: Path) -> Scene:
+def random_world(
+    config: RandomSceneConfig,
+    camera: CameraModel,
+    t0_ns: int,
+    t1_ns: int,
+    split: str,
+    seed: int,
+    sequence: int,
+    base: Path,
+) -> Scene:
     """The ``sequence``-th random scene of a run; arguments as :func:`blinkgl.scene.build.build_scene`."""
-    rng, rng_motion, rng_texture = (generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE))
+    rng, rng_motion, rng_texture = (
+        generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE)
+    )
     objects, textures = pools(config, base)
     log: list[str] = []
     omissions: dict[str, None] = {}
@@ -49,9 +60,13 @@ def random_world(config: RandomSceneConfig, camera: CameraModel, t0_ns: int, t1_
     T_cam, target = _viewpoint(config, rng, floor)
     clearance = camera_radius(camera, config.camera_clearance)
     if clearance > config.region.height:
-        raise ConfigError("the region is too low for a camera that keeps this far from everything", where="scene.region.height",
-                          value=config.region.height, accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
-                          "distance of the near plane's corners: camera.near and camera.fov)")
+        raise ConfigError(
+            "the region is too low for a camera that keeps this far from everything",
+            where="scene.region.height",
+            value=config.region.height,
+            accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
+            "distance of the near plane's corners: camera.near and camera.fov)",
+        )
     backdrop = []
     if config.sky:
         parts = _sky(config.sky, textures, rng_texture, split, base, log)
@@ -62,8 +77,10 @@ def random_world(config: RandomSceneConfig, camera: CameraModel, t0_ns: int, t1_
         repeats = size / _log_uniform(rng_texture, config.ground.tile)
         material = Material(textures.draw(rng_texture, split, log), uv_scale=(repeats, repeats), unlit=unlit)
         backdrop.append(("ground", "ground", (Part(mesh, material),), StaticPath(_shift(floor), t0_ns, t1_ns)))
-    backdrop += [(f"wall-{k}", "wall", parts, StaticPath(T, t0_ns, t1_ns))
-                 for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))]
+    backdrop += [
+        (f"wall-{k}", "wall", parts, StaticPath(T, t0_ns, t1_ns))
+        for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))
+    ]
 
     placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log, omissions)
     centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
@@ -75,12 +92,22 @@ def random_world(config: RandomSceneConfig, camera: CameraModel, t0_ns: int, t1_
     items = list(backdrop)
     for k, (name, parts, T, radius, resting) in enumerate(placed):
         others = np.arange(len(placed)) != k
-        space = FreeSpace(low, high, ground_z, np.vstack([centres[others], T_cam[:3, 3]]), np.append(radii[others], clearance + _STAND_OFF))
+        space = FreeSpace(
+            low,
+            high,
+            ground_z,
+            np.vstack([centres[others], T_cam[:3, 3]]),
+            np.append(radii[others], clearance + _STAND_OFF),
+        )
         path = random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=resting)
         items.append((name, "object", parts, path))
-    scene_objects = tuple(SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items))
+    scene_objects = tuple(
+        SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items)
+    )
     space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
-    for _ in range(_CAMERA_PATHS):  # a camera that was stopped would see a still world from then on: another path is better
+    for _ in range(
+        _CAMERA_PATHS
+    ):  # a camera that was stopped would see a still world from then on: another path is better
         path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
         result = resolve_collisions(scene_objects, path, clearance, t0_ns, t1_ns)
         if not any("camera" in event.cut for event in result.events):
@@ -92,14 +119,23 @@ def random_world(config: RandomSceneConfig, camera: CameraModel, t0_ns: int, t1_
         result = resolve_collisions(tuple(o for o in scene_objects if o.name not in bad), path, clearance, t0_ns, t1_ns)
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
-    return Scene(objects=result.objects, rig=Rig.alone(camera, result.camera_path), t0_ns=t0_ns, t1_ns=t1_ns,
-                 light=make_light(config.light, rng), background=config.background, log=tuple(log),
-                 omissions=tuple(omissions))
+    return Scene(
+        objects=result.objects,
+        rig=Rig.alone(camera, result.camera_path),
+        t0_ns=t0_ns,
+        t1_ns=t1_ns,
+        light=make_light(config.light, rng),
+        background=config.background,
+        log=tuple(log),
+        omissions=tuple(omissions),
+    )
 
 
 def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
     """(object pool, texture pool); the same pools, with their caches, for the same configuration in one process."""
-    return _object_pool(config.pool, base.resolve(), config.textures.max_size), _texture_pool(config.textures, base.resolve())
+    return _object_pool(config.pool, base.resolve(), config.textures.max_size), _texture_pool(
+        config.textures, base.resolve()
+    )
 
 
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
@@ -117,16 +153,19 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
     half = config.region.width / 2
     around = rng.uniform(0, 2 * math.pi)
     low, high = config.region.camera_height
-    position = np.array([0, 0, floor]) + [*(rng.uniform(0.4, 0.85) * half * np.array([math.cos(around), math.sin(around)])),
-                                          rng.uniform(low, min(high, config.region.height))]
+    position = np.array([0, 0, floor]) + [
+        *(rng.uniform(0.4, 0.85) * half * np.array([math.cos(around), math.sin(around)])),
+        rng.uniform(low, min(high, config.region.height)),
+    ]
     target = np.array([*rng.uniform(-0.2, 0.2, 2) * half, floor + rng.uniform(0.05, 0.3) * config.region.height])
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = look_rotation(target - position), position
     return T, target
 
 
-def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log,
-           omissions):
+def _place(
+    config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log, omissions
+):
     """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
     placed: list[tuple] = []
@@ -148,10 +187,16 @@ def _place(config, camera, objects: Pool, textures: Pool, rng, rng_texture, spli
             elif not floor + (radius if config.ground else 0) + _GAP <= position[2] <= floor + region.height:
                 continue
             gap = np.linalg.norm(np.array(centres) - position, axis=1) - radii - radius
-            if (np.abs(position[:2]) <= region.width / 2).all() and gap.min() > _GAP and gap[0] > max(radius, _STAND_OFF):
+            if (
+                (np.abs(position[:2]) <= region.width / 2).all()
+                and gap.min() > _GAP
+                and gap[0] > max(radius, _STAND_OFF)
+            ):
                 break
         else:
-            log.append(f"object {k} ({asset.name}, radius {radius:.2f} m) left out: no free place in {_PLACEMENTS} tries")
+            log.append(
+                f"object {k} ({asset.name}, radius {radius:.2f} m) left out: no free place in {_PLACEMENTS} tries"
+            )
             continue
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = rotation, position
@@ -194,10 +239,15 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
     for part in asset.parts:
         mesh = scale_mesh(part.mesh, radius)
         if asset.has_materials:
-            material = replace(part.material, unlit=part.material.unlit or config.light.unlit,
-                               double_sided=part.material.double_sided or not mesh.closed)
+            material = replace(
+                part.material,
+                unlit=part.material.unlit or config.light.unlit,
+                double_sided=part.material.double_sided or not mesh.closed,
+            )
         else:
-            material = Material(texture, tuple(float(c) for c in tint), (repeats, repeats), config.light.unlit, not mesh.closed)
+            material = Material(
+                texture, tuple(float(c) for c in tint), (repeats, repeats), config.light.unlit, not mesh.closed
+            )
         parts.append(Part(mesh, material))
     return tuple(parts)
 
@@ -208,17 +258,29 @@ def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[Part
     brightness = float(rng.uniform(*config.brightness))
     repeats, inset = _log_uniform(rng, config.repeat), 1.0
     if config.panoramas:
-        images, repeats, inset = _panorama_faces(config, rng, split, textures.test_fraction, base), 1.0, 1 / (1 + _PANORAMA_MARGIN)
+        images, repeats, inset = (
+            _panorama_faces(config, rng, split, textures.test_fraction, base),
+            1.0,
+            1 / (1 + _PANORAMA_MARGIN),
+        )
     elif config.per_face:
         images = [textures.draw(rng, split, log) for _ in SKY_SIDES]
     else:
         images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
     parts = []
     for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
-        positions, normals, uvs, faces = square(half * (forward - right + down), 2 * half * right, -2 * half * down, n, n)
+        positions, normals, uvs, faces = square(
+            half * (forward - right + down), 2 * half * right, -2 * half * down, n, n
+        )
         uvs = 0.5 + (uvs - 0.5) * inset
-        mesh = Mesh(positions, faces.astype(np.int32), np.ascontiguousarray(normals, np.float32), uvs.astype(np.float32),
-                    name=f"sky {side}", source_hash=parameter_hash("sky", config.size, n, side, inset))
+        mesh = Mesh(
+            positions,
+            faces.astype(np.int32),
+            np.ascontiguousarray(normals, np.float32),
+            uvs.astype(np.float32),
+            name=f"sky {side}",
+            source_hash=parameter_hash("sky", config.size, n, side, inset),
+        )
         parts.append(Part(mesh, Material(texture, (brightness,) * 3, (repeats, repeats), unlit=True)))
     return tuple(parts)
 
@@ -229,18 +291,29 @@ def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[
     for i, given in enumerate(config.panoramas):
         path, where = resolve(given, base), f"scene.sky.panoramas.{i}"
         if not path.exists():
-            raise ConfigError("no such file or folder", where=where, value=given, accepted="an equirectangular image or a folder of them")
+            raise ConfigError(
+                "no such file or folder",
+                where=where,
+                value=given,
+                accepted="an equirectangular image or a folder of them",
+            )
         files += [path] if path.is_file() else files_below(path, where, given, IMAGE_SUFFIXES, "images")
     hashed = sorted({content_hash(contents(f, "image")): f for f in files}.items())
     mine = [(h, f) for h, f in hashed if split_of(h, test_fraction) == split]
     if not mine:
-        raise ConfigError(f"none of the {len(hashed)} panoramas falls to split '{split}'", where="scene.sky.panoramas",
-                          accepted="more panoramas, or another scene.textures.test_fraction")
+        raise ConfigError(
+            f"none of the {len(hashed)} panoramas falls to split '{split}'",
+            where="scene.sky.panoramas",
+            accepted="more panoramas, or another scene.textures.test_fraction",
+        )
     digest, file = mine[int(rng.integers(len(mine)))]
     image = shrink(load_image(file), 4096)
     image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
     sides = cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN)
-    return [Texture(side, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)]
+    return [
+        Texture(side, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k])))
+        for k, side in enumerate(sides)
+    ]
 
 
 def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_texture, split, floor, log):
@@ -250,7 +323,9 @@ def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_tex
         height, length = float(rng.uniform(*walls.height)), 2 * out
         mesh = cuboid(extents=(walls.thickness, length, height), subdivisions=8)
         tile = _log_uniform(rng_texture, walls.tile)
-        material = Material(textures.draw(rng_texture, split, log), uv_scale=(length / tile, height / tile), unlit=config.light.unlit)
+        material = Material(
+            textures.draw(rng_texture, split, log), uv_scale=(length / tile, height / tile), unlit=config.light.unlit
+        )
         turn = Rotation.from_rotvec([0, 0, math.pi / 2 * side])
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = np.round(turn.as_matrix()), turn.apply([out, 0, 0]) + [0, 0, floor + height / 2]

@@ -25,7 +25,9 @@ def stone(subdivisions=4, seed=0):
     """Bumpy, closed, smooth, with texture coordinates projected from six sides: seams all over it."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions)
     phase = ball.vertices @ np.random.default_rng(seed).normal(size=(3, 5)) * 3
-    return make_mesh(ball.vertices * (1 + 0.08 * np.sin(phase).mean(axis=1, keepdims=True)), ball.faces, name=f"stone{seed}")
+    return make_mesh(
+        ball.vertices * (1 + 0.08 * np.sin(phase).mean(axis=1, keepdims=True)), ball.faces, name=f"stone{seed}"
+    )
 
 
 def at(z):
@@ -51,7 +53,9 @@ def edges(mesh):
 def dense_points(mesh, per_face=6):
     """Points all over the surface, and their texture coordinates."""
     weights = np.random.default_rng(0).dirichlet(np.ones(3), (len(mesh.faces), per_face))
-    mix = lambda values: np.einsum("fkc,fcd->fkd", weights, values[mesh.faces].astype(float)).reshape(-1, values.shape[1])
+    mix = lambda values: np.einsum("fkc,fcd->fkd", weights, values[mesh.faces].astype(float)).reshape(
+        -1, values.shape[1]
+    )
     return mix(mesh.vertices), mix(mesh.uvs)
 
 
@@ -72,7 +76,9 @@ def test_walking_finds_the_nearest_point():
     grid = grid[grid[:, 2] >= -1e-12]
     brute = np.array([np.linalg.norm(np.einsum("gc,fcd->fgd", grid, points[index]) - q, axis=2).min() for q in p])
     assert (distance <= brute + 1e-12).all() and np.abs(distance - brute).max() < 5e-3
-    np.testing.assert_allclose(np.linalg.norm(np.einsum("nc,ncd->nd", weights, points[index[face]]) - p, axis=1), distance, atol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.einsum("nc,ncd->nd", weights, points[index[face]]) - p, axis=1), distance, atol=1e-9
+    )
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)
     assert (weights > -1e-9).all()
 
@@ -80,15 +86,16 @@ def test_walking_finds_the_nearest_point():
 # ---- levels ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mesh", [stone(), stone(seed=3), primitives.torus()],
-                         ids=["stone0", "stone3", "torus"])
+@pytest.mark.parametrize("mesh", [stone(), stone(seed=3), primitives.torus()], ids=["stone0", "stone3", "torus"])
 def test_a_level_is_as_wrong_as_it_says_and_no_more(mesh):
     """Hausdorff distance of densely sampled surfaces, both ways, and the texture at those
     points, against the level's own figure."""
     centre, radius = bounding_sphere(mesh)
     for k in (2, 4):
         level = level_of(mesh, k)
-        simple = replace(mesh, vertices=level.vertices * radius + centre, faces=level.faces, normals=level.normals, uvs=level.uvs)
+        simple = replace(
+            mesh, vertices=level.vertices * radius + centre, faces=level.faces, normals=level.normals, uvs=level.uvs
+        )
         assert len(simple.faces) <= len(mesh.faces) * 0.5 ** (k / 2) * 1.35 + 1
         a, _ = dense_points(mesh, 40)
         b, _ = dense_points(simple, 60)
@@ -132,8 +139,13 @@ def test_a_mesh_that_is_all_seams_is_kept():
     corners = soup.vertices[soup.faces].reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3)
     rng = np.random.default_rng(0)
-    mesh = replace(soup, vertices=corners, faces=faces.astype(np.int32), normals=np.repeat(soup.normals[soup.faces[:, 0]], 3, axis=0),
-                   uvs=rng.uniform(size=(len(corners), 2)).astype(np.float32))
+    mesh = replace(
+        soup,
+        vertices=corners,
+        faces=faces.astype(np.int32),
+        normals=np.repeat(soup.normals[soup.faces[:, 0]], 3, axis=0),
+        uvs=rng.uniform(size=(len(corners), 2)).astype(np.float32),
+    )
     assert drawn(at_level_of_detail(one(mesh, at(60.0)), ON)) is mesh
 
 
@@ -159,7 +171,9 @@ def test_scale_is_that_of_the_nearest_visible_moment():
     path = KeyframePath([0, SECOND], [(0, 0, 20), (0, 0, 5)], [(0, 0, 0, 1)] * 2, interpolation="linear")
     scene = one(mesh, path)
     corner = np.hypot(160 / 300, 120 / 300)
-    assert largest_scale(scene, scene.objects[0], scene.objects[0].parts[0]) == pytest.approx(300 * np.hypot(1, corner) / (5 - radius), rel=1e-9)
+    assert largest_scale(scene, scene.objects[0], scene.objects[0].parts[0]) == pytest.approx(
+        300 * np.hypot(1, corner) / (5 - radius), rel=1e-9
+    )
     behind = one(mesh, at(-5.0))
     assert largest_scale(behind, behind.objects[0], behind.objects[0].parts[0]) == 0.0
     inside = one(mesh, at(0.3))
@@ -178,8 +192,11 @@ def test_silhouettes_and_edges_in_the_image(distance, error_px):
     assert len(simple.faces) < len(mesh.faces)
     project = lambda v: 300 * v[:, :2] / (v[:, 2:] + distance)
     a, b = project(dense_points(mesh, 8)[0]), project(dense_points(simple, 60)[0])
-    hull_a, hull_b = (np.array([(p @ d).max() for d in np.stack([np.cos(t), np.sin(t)], 1)]) for p in (a, b)
-                      for t in [np.linspace(0, 2 * np.pi, 90)])
+    hull_a, hull_b = (
+        np.array([(p @ d).max() for d in np.stack([np.cos(t), np.sin(t)], 1)])
+        for p in (a, b)
+        for t in [np.linspace(0, 2 * np.pi, 90)]
+    )
     assert np.abs(hull_a - hull_b).max() < error_px + 0.1
     scale = largest_scale(scene, scene.objects[0], scene.objects[0].parts[0])
     assert faces_of_edge(simple, 5.0 / scale) <= len(simple.faces) * 1.02  # at most edge_px in the mean
@@ -206,7 +223,7 @@ def test_off_is_the_scene_itself_and_near_or_small_meshes_are_kept():
     scene = one(stone(), at(30.0))
     assert at_level_of_detail(scene, LodConfig()) is scene
     mesh = stone()
-    assert drawn(at_level_of_detail(one(mesh, at(1.0)), ON)) is mesh      # the camera is inside its bounding sphere
-    assert drawn(at_level_of_detail(one(mesh, at(1.3)), ON)) is mesh      # so near that edges are longer than edge_px
+    assert drawn(at_level_of_detail(one(mesh, at(1.0)), ON)) is mesh  # the camera is inside its bounding sphere
+    assert drawn(at_level_of_detail(one(mesh, at(1.3)), ON)) is mesh  # so near that edges are longer than edge_px
     cube = primitives.cuboid()
     assert drawn(at_level_of_detail(one(cube, at(50.0)), ON)) is cube

@@ -15,7 +15,11 @@ def test_a_cuboid_without_normals_stays_flat():
     assert len(mesh.vertices) == 24 and mesh.closed
     v = mesh.vertices[mesh.faces]
     flat = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
-    np.testing.assert_allclose(mesh.normals[mesh.faces], np.repeat(flat[:, None], 3, axis=1) / np.linalg.norm(flat, axis=1)[:, None, None], atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.normals[mesh.faces],
+        np.repeat(flat[:, None], 3, axis=1) / np.linalg.norm(flat, axis=1)[:, None, None],
+        atol=1e-6,
+    )
 
 
 def test_a_sphere_without_normals_is_smooth():
@@ -25,7 +29,7 @@ def test_a_sphere_without_normals_is_smooth():
 
 
 def test_crease_angle_decides():
-    prism = P.prism(sides=12)      # 30 degrees between neighbouring sides
+    prism = P.prism(sides=12)  # 30 degrees between neighbouring sides
     smooth, flat = (M.make_mesh(prism.vertices, prism.faces, crease_degrees=a) for a in (40, 20))
     side = np.abs(flat.normals[:, 2]) < 0.5
     radial = flat.vertices[side] * [1, 1, 0]
@@ -41,12 +45,14 @@ def test_box_projection_is_isometric_and_upright():
     mesh = M.make_mesh(CUBE.vertices * [1, 2, 3], CUBE.faces, uv_size=0.5)
     v, uv = mesh.vertices[mesh.faces], mesh.uvs[mesh.faces].astype(float)
     for a, b in ((0, 1), (1, 2), (2, 0)):
-        np.testing.assert_allclose(np.linalg.norm(uv[:, a] - uv[:, b], axis=1), np.linalg.norm(v[:, a] - v[:, b], axis=1) / 0.5, rtol=1e-5)
+        np.testing.assert_allclose(
+            np.linalg.norm(uv[:, a] - uv[:, b], axis=1), np.linalg.norm(v[:, a] - v[:, b], axis=1) / 0.5, rtol=1e-5
+        )
     e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    assert (e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0] < 0).all()      # not mirrored (v down)
+    assert (e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0] < 0).all()  # not mirrored (v down)
     side = np.abs(mesh.normals[:, 2]) < 0.5
     top = mesh.vertices[side][:, 2] > 0
-    assert mesh.uvs[side][top, 1].max() < mesh.uvs[side][~top, 1].min()      # the picture's top is up
+    assert mesh.uvs[side][top, 1].max() < mesh.uvs[side][~top, 1].min()  # the picture's top is up
 
 
 def test_projection_covers_the_texture_once_by_default():
@@ -54,7 +60,9 @@ def test_projection_covers_the_texture_once_by_default():
     assert mesh.uvs.min() == pytest.approx(0) and mesh.uvs.max() == pytest.approx(1)
 
 
-@pytest.mark.parametrize("uvs, line", [(np.zeros((8, 2)), "degenerate"), (np.full((8, 2), np.nan), "broken"), (np.zeros((5, 2)), "broken")])
+@pytest.mark.parametrize(
+    "uvs, line", [(np.zeros((8, 2)), "degenerate"), (np.full((8, 2), np.nan), "broken"), (np.zeros((5, 2)), "broken")]
+)
 def test_useless_texture_coordinates_are_projected(uvs, line):
     log = []
     mesh = M.make_mesh(CUBE.vertices, CUBE.faces, uvs=uvs, name="box", project_degenerate=True, log=log)
@@ -81,17 +89,20 @@ def test_closedness():
     flipped = CUBE.faces.copy()
     flipped[0] = flipped[0, ::-1]
     assert not M.make_mesh(CUBE.vertices, flipped).closed
-    soup = CUBE.vertices[CUBE.faces].reshape(-1, 3)      # every corner its own vertex, as in STL
+    soup = CUBE.vertices[CUBE.faces].reshape(-1, 3)  # every corner its own vertex, as in STL
     assert M.make_mesh(soup, np.arange(36).reshape(-1, 3)).closed
     two = np.concatenate([CUBE.vertices, CUBE.vertices + [1, 1, 0]]), np.concatenate([CUBE.faces, CUBE.faces + 8])
-    assert M.make_mesh(*two).closed      # touching along an edge
+    assert M.make_mesh(*two).closed  # touching along an edge
     hollow = np.concatenate([CUBE.vertices, CUBE.vertices / 2]), np.concatenate([CUBE.faces, CUBE.faces[:, ::-1] + 8])
     assert M.make_mesh(*hollow).closed
-    apart = np.concatenate([CUBE.vertices, CUBE.vertices / 2 + 5]), np.concatenate([CUBE.faces, CUBE.faces[:, ::-1] + 8])
-    assert not M.make_mesh(*apart).closed      # a shell turned inside out
+    apart = (
+        np.concatenate([CUBE.vertices, CUBE.vertices / 2 + 5]),
+        np.concatenate([CUBE.faces, CUBE.faces[:, ::-1] + 8]),
+    )
+    assert not M.make_mesh(*apart).closed  # a shell turned inside out
     rng = np.random.default_rng(0)
     quantised = soup + rng.uniform(-2e-4, 2e-4, soup.shape)
-    assert M.make_mesh(quantised, np.arange(36).reshape(-1, 3)).closed      # an exporter's gaps
+    assert M.make_mesh(quantised, np.arange(36).reshape(-1, 3)).closed  # an exporter's gaps
     assert not M.make_mesh(soup + rng.uniform(-0.02, 0.02, soup.shape), np.arange(36).reshape(-1, 3)).closed
 
 
@@ -133,15 +144,22 @@ def test_same_input_same_arrays():
         assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
 
 
-@pytest.mark.parametrize("vertices, faces, message", [
-    (np.where(np.arange(24).reshape(8, 3) == 4, np.nan, CUBE.vertices), CUBE.faces, "1 vertices are NaN, infinite or beyond 1e+15, the first is 1"),
-    (CUBE.vertices * 1e300, CUBE.faces, "8 vertices are NaN, infinite"),
-    (CUBE.vertices, CUBE.faces + 1, "a face refers to a vertex outside 0..7"),
-    (CUBE.vertices, CUBE.faces - 1, "a face refers to a vertex outside 0..7"),
-    (CUBE.vertices, np.zeros((0, 3), int), "the mesh has no faces"),
-    (CUBE.vertices * 0, CUBE.faces, "the mesh has no faces with an area"),
-    (CUBE.vertices[:, :2], CUBE.faces, "are no triangle mesh"),
-])
+@pytest.mark.parametrize(
+    "vertices, faces, message",
+    [
+        (
+            np.where(np.arange(24).reshape(8, 3) == 4, np.nan, CUBE.vertices),
+            CUBE.faces,
+            "1 vertices are NaN, infinite or beyond 1e+15, the first is 1",
+        ),
+        (CUBE.vertices * 1e300, CUBE.faces, "8 vertices are NaN, infinite"),
+        (CUBE.vertices, CUBE.faces + 1, "a face refers to a vertex outside 0..7"),
+        (CUBE.vertices, CUBE.faces - 1, "a face refers to a vertex outside 0..7"),
+        (CUBE.vertices, np.zeros((0, 3), int), "the mesh has no faces"),
+        (CUBE.vertices * 0, CUBE.faces, "the mesh has no faces with an area"),
+        (CUBE.vertices[:, :2], CUBE.faces, "are no triangle mesh"),
+    ],
+)
 def test_refused(vertices, faces, message):
     with pytest.raises(AssetError) as error:
         M.make_mesh(vertices, faces, where="broken.obj")

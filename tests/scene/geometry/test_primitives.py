@@ -52,8 +52,16 @@ CURVED = {
     "sphere": (lambda n: P.sphere(radius=1.0, segments=2 * n, rings=n), 4 / 3 * math.pi, 4 * math.pi),
     "cylinder": (lambda n: P.cylinder(radius=1.0, height=2.0, segments=n), 2 * math.pi, 6 * math.pi),
     "cone": (lambda n: P.cone(radius=1.0, height=2.0, segments=n), 2 * math.pi / 3, math.pi * (1 + math.sqrt(5))),
-    "torus": (lambda n: P.torus(radius=1.0, tube=0.4, segments=n, tube_segments=n), 2 * math.pi**2 * 0.16, 4 * math.pi**2 * 0.4),
-    "capsule": (lambda n: P.capsule(radius=1.0, height=2.0, segments=2 * n, rings=n), 4 / 3 * math.pi + 2 * math.pi, 8 * math.pi),
+    "torus": (
+        lambda n: P.torus(radius=1.0, tube=0.4, segments=n, tube_segments=n),
+        2 * math.pi**2 * 0.16,
+        4 * math.pi**2 * 0.4,
+    ),
+    "capsule": (
+        lambda n: P.capsule(radius=1.0, height=2.0, segments=2 * n, rings=n),
+        4 / 3 * math.pi + 2 * math.pi,
+        8 * math.pi,
+    ),
 }
 
 
@@ -62,7 +70,7 @@ def test_curved_solids_converge_with_order_two(kind):
     build, true_volume, true_area = CURVED[kind]
     sizes = np.array([16, 32, 64])
     errors = np.array([[true_volume - volume(build(int(n))), true_area - area(build(int(n)))] for n in sizes])
-    assert (errors > 0).all()      # inscribed
+    assert (errors > 0).all()  # inscribed
     for column in errors.T:
         order = -np.polyfit(np.log(sizes), np.log(column), 1)[0]
         assert order == pytest.approx(2, abs=0.1)
@@ -81,11 +89,15 @@ def test_icosphere_is_on_the_sphere_and_converges():
 
 @pytest.mark.parametrize("kind", ["sphere", "torus", "capsule", "cylinder", "cone"])
 def test_analytic_normals_against_angle_weighted_ones(kind):
-    fine = {"sphere": dict(segments=128, rings=64), "torus": dict(segments=128, tube_segments=64), "capsule": dict(segments=128, rings=64)}
+    fine = {
+        "sphere": dict(segments=128, rings=64),
+        "torus": dict(segments=128, tube_segments=64),
+        "capsule": dict(segments=128, rings=64),
+    }
     mesh = P.BUILDERS[kind](**fine.get(kind, dict(segments=128)))
     made = make_mesh(mesh.vertices, mesh.faces, uvs=mesh.uvs)
     cosine = (made.normals[made.faces] * mesh.normals[mesh.faces]).sum(axis=2)
-    if kind == "cone":      # at the tip the analytic normal differs from segment to segment
+    if kind == "cone":  # at the tip the analytic normal differs from segment to segment
         cosine = cosine[mesh.vertices[mesh.faces][:, :, 2].max(axis=1) < 0.49]
     assert cosine.min() > math.cos(math.radians(3))
 
@@ -96,18 +108,37 @@ def test_textures_are_not_mirrored():
         mesh = P.BUILDERS[kind]()
         uv = mesh.uvs[mesh.faces].astype(float)
         e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-        signed = -(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0])      # v grows downwards
+        signed = -(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0])  # v grows downwards
         assert (signed > -1e-9).all(), kind
 
 
-@pytest.mark.parametrize("kind, parameters, message", [
-    ("cuboid", {"extents": (1.0, -1.0, 1.0)}, "cuboid.extents: bad parameter (got (1.0, -1.0, 1.0)); expected 3 numbers greater than 0"),
-    ("sphere", {"segments": 2}, "sphere.segments: bad parameter (got 2); expected a whole number in 3..4096"),
-    ("sphere", {"radius": float("nan")}, "sphere.radius: bad parameter (got nan); expected a number greater than 0"),
-    ("torus", {"tube": 0.5}, "torus.tube: bad parameter (got 0.5); expected less than radius 0.35"),
-    ("icosphere", {"subdivisions": 12}, "icosphere.subdivisions: bad parameter (got 12); expected a whole number in 0..7"),
-    ("cone", {"hight": 2}, "cone: unknown parameter (got 'hight'); expected one of radius, height, segments, rings"),
-])
+@pytest.mark.parametrize(
+    "kind, parameters, message",
+    [
+        (
+            "cuboid",
+            {"extents": (1.0, -1.0, 1.0)},
+            "cuboid.extents: bad parameter (got (1.0, -1.0, 1.0)); expected 3 numbers greater than 0",
+        ),
+        ("sphere", {"segments": 2}, "sphere.segments: bad parameter (got 2); expected a whole number in 3..4096"),
+        (
+            "sphere",
+            {"radius": float("nan")},
+            "sphere.radius: bad parameter (got nan); expected a number greater than 0",
+        ),
+        ("torus", {"tube": 0.5}, "torus.tube: bad parameter (got 0.5); expected less than radius 0.35"),
+        (
+            "icosphere",
+            {"subdivisions": 12},
+            "icosphere.subdivisions: bad parameter (got 12); expected a whole number in 0..7",
+        ),
+        (
+            "cone",
+            {"hight": 2},
+            "cone: unknown parameter (got 'hight'); expected one of radius, height, segments, rings",
+        ),
+    ],
+)
 def test_bad_parameters(kind, parameters, message):
     with pytest.raises(AssetError) as error:
         P.BUILDERS[kind](**parameters)

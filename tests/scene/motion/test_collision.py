@@ -25,8 +25,18 @@ def body(name, shape, path, category="object", closed=None):
     parts = []
     for s in shapes:
         v, f = np.array(s.vertices, dtype=np.float64), np.array(s.faces, dtype=np.int32)
-        parts.append(Part(Mesh(v, f, np.zeros((len(v), 3), np.float32), np.zeros((len(v), 2), np.float32),
-                               s.is_watertight if closed is None else closed), Material()))
+        parts.append(
+            Part(
+                Mesh(
+                    v,
+                    f,
+                    np.zeros((len(v), 3), np.float32),
+                    np.zeros((len(v), 2), np.float32),
+                    s.is_watertight if closed is None else closed,
+                ),
+                Material(),
+            )
+        )
     return SceneObject(name, 1, tuple(parts), path, category)
 
 
@@ -40,12 +50,18 @@ def line(start, velocity, duration=1.0, spin=(0, 0, 0)):
     """Constant velocity and constant body rate; exact in a linear path when turns stay below pi per key."""
     n = max(2, int(np.linalg.norm(spin) * duration) + 2)
     s = np.linspace(0, duration, n)
-    return KeyframePath(np.rint(s * SECOND).astype(np.int64), np.asarray(start) + s[:, None] * np.asarray(velocity, float),
-                        Rotation.from_rotvec(s[:, None] * np.asarray(spin, float)), "linear")
+    return KeyframePath(
+        np.rint(s * SECOND).astype(np.int64),
+        np.asarray(start) + s[:, None] * np.asarray(velocity, float),
+        Rotation.from_rotvec(s[:, None] * np.asarray(spin, float)),
+        "linear",
+    )
 
 
 def plane(size=10.0, z=0.0):
-    return trimesh.Trimesh([[-size, -size, z], [size, -size, z], [size, size, z], [-size, size, z]], [[0, 1, 2], [0, 2, 3]], process=False)
+    return trimesh.Trimesh(
+        [[-size, -size, z], [size, -size, z], [size, size, z], [-size, size, z]], [[0, 1, 2], [0, 2, 3]], process=False
+    )
 
 
 def ground(size=10.0):
@@ -62,6 +78,7 @@ def only(result):
 
 
 # ---- closed-form times -----------------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize("speed, tolerance", [(3.0, 1e-3), (50.0, 1e-3), (3.0, 1e-6)])
 def test_cube_flies_into_a_wall(speed, tolerance):
@@ -88,8 +105,11 @@ def test_the_camera_falls_onto_the_ground():
     # A parabola is a cubic: the not-a-knot spline through four points is the fall itself.
     g, h, r = 9.81, 2.0, 0.25
     s = np.linspace(0, 1, 4)
-    fall = SplinePath(np.rint(s * SECOND).astype(np.int64), np.c_[0 * s, 0 * s, h - 0.5 * g * (np.rint(s * SECOND) * 1e-9) ** 2],
-                      Rotation.identity(4))
+    fall = SplinePath(
+        np.rint(s * SECOND).astype(np.int64),
+        np.c_[0 * s, 0 * s, h - 0.5 * g * (np.rint(s * SECOND) * 1e-9) ** 2],
+        Rotation.identity(4),
+    )
     result = resolve([ground()], fall, r)
     event = only(result)
     tol = 1e-3 * r
@@ -102,7 +122,9 @@ def test_two_spheres_meet_off_centre():
     # Camera spheres are exact; an icosphere's surface lies between its in- and circumsphere.
     ball = trimesh.creation.icosphere(4, radius=0.5)
     inner = np.abs(np.einsum("ij,ij->i", ball.face_normals, ball.triangles[:, 0])).min()
-    result = resolve([body("ball", ball, line((4, 0.4, 0), (-3, 0, 0), spin=(1, 2, 0)))], line((0, 0, 0), (1, 0, 0)), 0.3)
+    result = resolve(
+        [body("ball", ball, line((4, 0.4, 0), (-3, 0, 0), spin=(1, 2, 0)))], line((0, 0, 0), (1, 0, 0)), 0.3
+    )
     event = only(result)
 
     def meeting(reach):  # |(4 - 4 t, 0.4)| = reach
@@ -123,10 +145,15 @@ def test_head_on_both_stop_and_the_order_of_the_list_does_not_matter():
 
 # ---- no tunnelling ---------------------------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("speed", [1e2, 1e4, 1e6])
 def test_a_bullet_does_not_jump_over_a_thin_plate(speed):
     plate = body("plate", trimesh.creation.box((1e-4, 1, 1)), StaticPath())
-    bullet = body("bullet", trimesh.creation.icosphere(1, radius=0.01), line((-0.5 * speed, 0.1, 0), (speed, 0, 0), spin=(0, 0, 30)))
+    bullet = body(
+        "bullet",
+        trimesh.creation.icosphere(1, radius=0.01),
+        line((-0.5 * speed, 0.1, 0), (speed, 0, 0), spin=(0, 0, 30)),
+    )
     event = only(resolve([bullet, plate]))
     assert event.t_ns * 1e-9 == pytest.approx(0.5, abs=0.02 / speed + 2e-9)
 
@@ -154,6 +181,7 @@ def test_exact_triangles_let_a_ball_through_a_ring():
 
 # ---- later collisions see earlier cuts -------------------------------------------------------------------------------
 
+
 def test_a_stopped_body_is_an_obstacle_and_one_that_never_came_is_none():
     wall = body("wall", trimesh.creation.box((1, 9, 9)), StaticPath(at(5)), "wall")
     first = body("first", BOX, line((2, 0, 0), (4, 0, 0)))  # reaches the wall's face (4.5) at t = 0.5
@@ -170,18 +198,29 @@ def test_a_stopped_body_is_an_obstacle_and_one_that_never_came_is_none():
 
 # ---- rest ------------------------------------------------------------------------------------------------------------
 
+
 @pytest.mark.parametrize("support", ["plane", "slab"])
 def test_what_rests_on_the_ground_slides_lifts_off_and_sinks(support):
-    base = ground() if support == "plane" else body("ground", trimesh.creation.box((20, 20, 1)), StaticPath(at(z=-0.5)), "ground")
+    base = (
+        ground()
+        if support == "plane"
+        else body("ground", trimesh.creation.box((20, 20, 1)), StaticPath(at(z=-0.5)), "ground")
+    )
     rolled = line((0, 0, 0.5), (1, 0.5, 0), spin=(0, 0, 2))
     assert not resolve([body("slides", BOX, rolled), base]).events
     assert not resolve([body("just above", BOX, line((0, 0, 0.5 + 1e-9), (1, 0, 0))), base]).events
     assert not resolve([body("lifts off", BOX, line((0, 0, 0.5), (0, 0, 2))), base]).events
     hop = SplinePath([0, SECOND // 2, SECOND], [[0, 0, 0.5], [0, 0, 1], [0, 0, -2]], Rotation.identity(3))
-    for name, path in (("sinks", line((0, 0, 0.5), (0, 0, -1))), ("hops and dives", hop), ("tips", line((0, 0, 0.5), (0, 0, 0), spin=(1, 0, 0)))):
+    for name, path in (
+        ("sinks", line((0, 0, 0.5), (0, 0, -1))),
+        ("hops and dives", hop),
+        ("tips", line((0, 0, 0.5), (0, 0, 0), spin=(1, 0, 0))),
+    ):
         result = resolve([body(name, BOX, path), base])
         assert only(result).t_ns > 0
-        lowest = (BOX.vertices @ result.objects[0].path.pose(SECOND)[:3, :3].T)[:, 2].min() + result.objects[0].path.pose(SECOND)[2, 3]
+        lowest = (BOX.vertices @ result.objects[0].path.pose(SECOND)[:3, :3].T)[:, 2].min() + result.objects[
+            0
+        ].path.pose(SECOND)[2, 3]
         assert -0.0101 * math.sqrt(0.75) <= lowest < 0.0, name
 
 
@@ -201,10 +240,14 @@ def test_off_the_edge_of_the_ground_it_may_fall():
 
 # ---- containment -----------------------------------------------------------------------------------------------------
 
+
 def test_a_body_inside_another_is_reported_at_the_start():
     small, big = trimesh.creation.icosphere(1, radius=0.1), trimesh.creation.icosphere(2)
     moving = line((0.2, 0, 0), (0.1, 0, 0))
-    for objects in ([body("in", small, moving), body("out", big, StaticPath())], [body("out", big, StaticPath()), body("in", small, moving)]):
+    for objects in (
+        [body("in", small, moving), body("out", big, StaticPath())],
+        [body("out", big, StaticPath()), body("in", small, moving)],
+    ):
         event = only(resolve(objects))
         assert (event.kind, event.first, event.second, event.t_ns, event.cut) == ("inside", "in", "out", 0, ("in",))
     assert not resolve([body("in", small, moving), body("open", big, StaticPath(), closed=False)]).events
@@ -220,7 +263,9 @@ def test_the_camera_may_be_in_the_sky_but_in_no_object():
     for shape in (box, box.copy()):
         shape is box or shape.invert()
         assert not resolve([body("sky", shape, StaticPath(), "sky")], camera).events
-    assert only(resolve([body("sky", box, StaticPath(), "sky")], line((0, 0, 0), (40, 0, 0)))).t_ns * 1e-9 == pytest.approx(24.9 / 40, abs=1e-5)
+    assert only(
+        resolve([body("sky", box, StaticPath(), "sky")], line((0, 0, 0), (40, 0, 0)))
+    ).t_ns * 1e-9 == pytest.approx(24.9 / 40, abs=1e-5)
     for path in (camera, StaticPath()):  # standing still in there is as bad
         event = only(resolve([body("cube", trimesh.creation.box((3, 3, 3)), StaticPath())], path))
         assert event.kind == "inside" and event.first == "camera" and event.t_ns == 0
@@ -228,10 +273,15 @@ def test_the_camera_may_be_in_the_sky_but_in_no_object():
 
 # ---- random scenes against brute force -------------------------------------------------------------------------------
 
+
 def random_scene(seed, count=7):
     rng = np.random.default_rng(seed)
-    shapes = [trimesh.creation.icosphere(1), trimesh.creation.torus(0.8, 0.25, major_sections=12, minor_sections=8),
-              trimesh.creation.box((1.4, 1.4, 0.05)), trimesh.creation.cone(0.5, 1.5, sections=8)]
+    shapes = [
+        trimesh.creation.icosphere(1),
+        trimesh.creation.torus(0.8, 0.25, major_sections=12, minor_sections=8),
+        trimesh.creation.box((1.4, 1.4, 0.05)),
+        trimesh.creation.cone(0.5, 1.5, sections=8),
+    ]
     objects, centres, radii = [ground(6.0)], np.zeros((0, 3)), np.zeros(0)
     for k in range(count):
         shape = shapes[k % len(shapes)].copy()
@@ -239,10 +289,26 @@ def random_scene(seed, count=7):
         r = float(np.linalg.norm(shape.vertices, axis=1).max())
         start = at(rotvec=rng.normal(size=3))
         start[:3, 3] = FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0, centres, radii).sample(rng, r)
-        path = random_path(rng, 0, SECOND, ObjectMotion(speed=[2, 6], rotation_rate=[50, 900]), FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0), r, start)
+        path = random_path(
+            rng,
+            0,
+            SECOND,
+            ObjectMotion(speed=[2, 6], rotation_rate=[50, 900]),
+            FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0),
+            r,
+            start,
+        )
         centres, radii = np.vstack([centres, start[:3, 3]]), np.r_[radii, r]
         objects.append(body(f"object {k}", shape, path))
-    camera = random_camera_path(rng, 0, SECOND, CameraMotion(speed=3.0), FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0, centres, radii), 0.15, (0, 0, 1))
+    camera = random_camera_path(
+        rng,
+        0,
+        SECOND,
+        CameraMotion(speed=3.0),
+        FreeSpace((-2, -2, 0), (2, 2, 2.5), 0.0, centres, radii),
+        0.15,
+        (0, 0, 1),
+    )
     return objects, camera
 
 
@@ -307,13 +373,22 @@ def test_time_origin_does_not_matter():
     events = []
     for start in (0, late):
         path = SplinePath(np.array([0, SECOND // 2, SECOND]) + start, *keys)
-        result = resolve_collisions([body("a", BOX, path), body("b", BOX, StaticPath(at(1.5)))], FAR, 0.1, start, start + SECOND)
+        result = resolve_collisions(
+            [body("a", BOX, path), body("b", BOX, StaticPath(at(1.5)))], FAR, 0.1, start, start + SECOND
+        )
         events.append(only(result).t_ns - start)
     assert events[0] == events[1]
 
 
 def test_wrong_parameters_are_programming_errors():
-    for settings in ({"tolerance": 0}, {"tolerance": 0.101}, {"rest_margin": 0}, {"rest_margin": 0.101}, {"radius": 0}, {"t1": -1}):
+    for settings in (
+        {"tolerance": 0},
+        {"tolerance": 0.101},
+        {"rest_margin": 0},
+        {"rest_margin": 0.101},
+        {"radius": 0},
+        {"t1": -1},
+    ):
         with pytest.raises(ValueError, match="tolerance and rest_margin in"):
             resolve([ground()], **settings)
     for settings in ({"tolerance": 0.1}, {"rest_margin": 0.1}, {"t1": 0}):
@@ -323,4 +398,7 @@ def test_wrong_parameters_are_programming_errors():
 def test_how_many_exact_distances_it_took_is_said():
     """None for bodies whose bounding spheres never meet."""
     assert resolve([body("a", plane(1.0), StaticPath())]).distance_queries == 0
-    assert resolve([ground(), body("ball", trimesh.creation.icosphere(), line([0, 0, 3], [0, 0, -4]))]).distance_queries >= 1
+    assert (
+        resolve([ground(), body("ball", trimesh.creation.icosphere(), line([0, 0, 3], [0, 0, -4]))]).distance_queries
+        >= 1
+    )

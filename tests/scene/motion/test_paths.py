@@ -32,9 +32,13 @@ def every_kind():
     offset[:3, :3], offset[:3, 3] = Rotation.from_rotvec([0.3, -1, 0.2]).as_matrix(), [0.5, 0.1, -2]
     middle = (spline.t0_ns + spline.t1_ns) // 2
     return {
-        "static": StaticPath(offset, 0, SECOND), "spline": spline, "linear": KeyframePath(*random_keys(1), "linear"),
-        "one key": KeyframePath([5], [[1.0, 2, 3]], Rotation.identity(1)), "cut": CutPath(spline, middle),
-        "cut before": CutPath(spline, spline.t0_ns - 5), "offset": OffsetPath(spline, offset),
+        "static": StaticPath(offset, 0, SECOND),
+        "spline": spline,
+        "linear": KeyframePath(*random_keys(1), "linear"),
+        "one key": KeyframePath([5], [[1.0, 2, 3]], Rotation.identity(1)),
+        "cut": CutPath(spline, middle),
+        "cut before": CutPath(spline, spline.t0_ns - 5),
+        "offset": OffsetPath(spline, offset),
         "offset of cut": OffsetPath(CutPath(spline, middle), offset),
     }
 
@@ -108,8 +112,13 @@ def test_derivative_is_the_limit_of_differences_at_second_order(kind):
         errors.append(np.abs(numeric - np.stack([path.derivative(t) for t in middles])).max())
     if kind == "cut":  # one of the middles may be the cut; the others still have to converge
         inside = middles[middles < path.t_cut_ns - 2 * steps[0]]
-        errors = [np.abs((path.poses(inside + h) - path.poses(inside - h)) / (2e-9 * h)
-                         - np.stack([path.derivative(t) for t in inside])).max() for h in steps]
+        errors = [
+            np.abs(
+                (path.poses(inside + h) - path.poses(inside - h)) / (2e-9 * h)
+                - np.stack([path.derivative(t) for t in inside])
+            ).max()
+            for h in steps
+        ]
     order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert 1.7 < order < 2.3, errors
 
@@ -120,7 +129,9 @@ def test_second_derivative_is_continuous_at_the_keys_of_a_spline_only(interpolat
     steps = np.array([8, 4, 2, 1]) * 500_000
     jumps = []
     for h in steps:
-        jump = [path.derivative(k + h) - 2 * path.derivative(k) + path.derivative(k - h) for k in path.key_times_ns[1:-1]]
+        jump = [
+            path.derivative(k + h) - 2 * path.derivative(k) + path.derivative(k - h) for k in path.key_times_ns[1:-1]
+        ]
         jumps.append(np.abs(jump).max() / (h * 1e-9))
     fitted = np.polyfit(np.log(steps), np.log(jumps), 1)[0]
     assert abs(fitted - order) < 0.3, jumps  # continuous: O(h); a jump in velocity: O(1/h)
@@ -213,16 +224,22 @@ def test_an_offset_path_derivative_has_the_lever_arm():
     assert np.isclose(OffsetPath(spin, T).speed_bound(0, SECOND)[0], 6)
 
 
-@pytest.mark.parametrize("keys, message", [
-    (([], np.zeros((0, 3)), np.zeros((0, 4))), "at least one"),
-    (([0, 5, 5], np.zeros((3, 3)), np.tile([0, 0, 0, 1], (3, 1))), r"key-frame times have to increase \(key frame 2\) \(got 5\)"),
-    (([0, 0.5], np.zeros((2, 3)), np.tile([0, 0, 0, 1], (2, 1))), "whole nanoseconds"),
-    (([0, 1], np.zeros((2, 2)), np.tile([0, 0, 0, 1], (2, 1))), r"three per time .*expected shape \(2, 3\)"),
-    (([0, 1], [[0, 0, np.nan]] * 2, np.tile([0, 0, 0, 1], (2, 1))), "finite"),
-    (([0, 1], np.zeros((2, 3)), np.zeros((2, 4))), "non-zero quaternions"),
-    (([0, 1], np.zeros((2, 3)), Rotation.identity(3)), "one per time .*got 3"),
-    (([0, 1], "ab", np.zeros((2, 4))), "not numbers"),
-])
+@pytest.mark.parametrize(
+    "keys, message",
+    [
+        (([], np.zeros((0, 3)), np.zeros((0, 4))), "at least one"),
+        (
+            ([0, 5, 5], np.zeros((3, 3)), np.tile([0, 0, 0, 1], (3, 1))),
+            r"key-frame times have to increase \(key frame 2\) \(got 5\)",
+        ),
+        (([0, 0.5], np.zeros((2, 3)), np.tile([0, 0, 0, 1], (2, 1))), "whole nanoseconds"),
+        (([0, 1], np.zeros((2, 2)), np.tile([0, 0, 0, 1], (2, 1))), r"three per time .*expected shape \(2, 3\)"),
+        (([0, 1], [[0, 0, np.nan]] * 2, np.tile([0, 0, 0, 1], (2, 1))), "finite"),
+        (([0, 1], np.zeros((2, 3)), np.zeros((2, 4))), "non-zero quaternions"),
+        (([0, 1], np.zeros((2, 3)), Rotation.identity(3)), "one per time .*got 3"),
+        (([0, 1], "ab", np.zeros((2, 4))), "not numbers"),
+    ],
+)
 def test_bad_keys_are_named(keys, message):
     with pytest.raises(ConfigError, match="scene.objects.0.*" + message):
         KeyframePath(*keys, where="scene.objects.0")

@@ -28,7 +28,9 @@ def placed(x, y, z):
     return T
 
 
-@pytest.mark.parametrize("speed, rate, duration", [(1.0, 90.0, SECOND), (0.05, 5.0, SECOND), (8.0, 1500.0, SECOND), (1.0, 40.0, 20 * SECOND)])
+@pytest.mark.parametrize(
+    "speed, rate, duration", [(1.0, 90.0, SECOND), (0.05, 5.0, SECOND), (8.0, 1500.0, SECOND), (1.0, 40.0, 20 * SECOND)]
+)
 def test_mean_speed_and_rate_are_the_configured_ones(speed, rate, duration):
     config = ObjectMotion(speed=speed, rotation_rate=rate)
     for seed in range(4):
@@ -64,7 +66,9 @@ def test_the_start_pose_is_kept_exactly_and_hemmed_in_bodies_get_out():
     for seed in range(5):
         path = random_path(rng(seed), 7, SECOND, ObjectMotion(speed=1.0), SPACE, 0.2, start)
         assert np.abs(path.pose(7) - start).max() < 1e-14
-        distance = np.linalg.norm(path.poses(np.linspace(7, SECOND, 50).astype(np.int64))[:, :3, 3] - SPACE.centres[0], axis=1)
+        distance = np.linalg.norm(
+            path.poses(np.linspace(7, SECOND, 50).astype(np.int64))[:, :3, 3] - SPACE.centres[0], axis=1
+        )
         assert distance.max() > 0.5
     camera = random_camera_path(rng(1), 7, SECOND, CameraMotion(shake=1.0), SPACE, 0.1, TARGET, start_pose=start)
     assert np.abs(camera.pose(7) - start).max() < 1e-14
@@ -173,15 +177,21 @@ def test_no_free_space_is_said():
         random_path(rng(), 0, SECOND, ObjectMotion(), SPACE, 5.0)
 
 
-@pytest.mark.parametrize("data, message", [
-    ({"speeed": 1}, r"scene.object_motion.speeed: unknown key; expected 'speed'"),
-    ({"speed": [2, 1]}, r"scene.object_motion.speed: .*lower end"),
-    ({"speed": -1}, r"scene.object_motion.speed.0: too small \(got -1\); expected a number from 0 to"),
-    ({"speed": "fast"}, r"scene.object_motion.speed"),
-    ({"waypoints": 1}, r"scene.object_motion.waypoints: too small \(got 1\); expected a whole number from 2 to 1000"),
-    ({"smoothness": 1.5}, r"scene.object_motion.smoothness"),
-    ({"kind": "circle"}, r"scene.object_motion.kind.*'spline' or 'static'"),
-])
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        ({"speeed": 1}, r"scene.object_motion.speeed: unknown key; expected 'speed'"),
+        ({"speed": [2, 1]}, r"scene.object_motion.speed: .*lower end"),
+        ({"speed": -1}, r"scene.object_motion.speed.0: too small \(got -1\); expected a number from 0 to"),
+        ({"speed": "fast"}, r"scene.object_motion.speed"),
+        (
+            {"waypoints": 1},
+            r"scene.object_motion.waypoints: too small \(got 1\); expected a whole number from 2 to 1000",
+        ),
+        ({"smoothness": 1.5}, r"scene.object_motion.smoothness"),
+        ({"kind": "circle"}, r"scene.object_motion.kind.*'spline' or 'static'"),
+    ],
+)
 def test_bad_settings_are_named(data, message):
     with pytest.raises(ConfigError, match=message):
         validate(ObjectMotion, data, where="scene.object_motion")

@@ -22,7 +22,7 @@ def test_procedural(kind):
         again = procedural_texture(kind, index, 128)
         assert texture.image.shape == (128, 128, 3) and texture.image.dtype == np.uint8
         assert texture.image.tobytes() == again.image.tobytes() and texture.source_hash == procedural_hash(kind, index)
-        assert texture.image.min() >= 15 and texture.image.max() <= 245      # never black, never clipped
+        assert texture.image.min() >= 15 and texture.image.max() <= 245  # never black, never clipped
         assert (texture.image @ np.array([0.299, 0.587, 0.114])).std() > 5
     assert procedural_texture(kind, 0, 128).image.tobytes() != procedural_texture(kind, 1, 128).image.tobytes()
 
@@ -48,17 +48,19 @@ def test_a_texture_is_the_same_pattern_at_any_size(kind):
 def test_srgb_round_trip():
     codes = np.arange(256) / 255
     np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(codes)), codes, atol=1e-5)
-    assert linear_from_srgb(0.5) == pytest.approx(0.21404, abs=1e-5)      # IEC 61966-2-1
+    assert linear_from_srgb(0.5) == pytest.approx(0.21404, abs=1e-5)  # IEC 61966-2-1
 
 
 def test_shrinking_averages_light_not_codes():
     board = np.zeros((64, 64, 3), np.uint8)
     board[::2, ::2] = board[1::2, 1::2] = 255
-    assert (I.shrink(board, 32) == 188).all()      # half the light is code 188, not 128
+    assert (I.shrink(board, 32) == 188).all()  # half the light is code 188, not 128
 
 
 def write_image(path, mode="RGB", size=(8, 6), **options):
-    Image.fromarray((np.arange(size[0] * size[1] * 3) % 255).astype(np.uint8).reshape(size[1], size[0], 3)).convert(mode).save(path, **options)
+    Image.fromarray((np.arange(size[0] * size[1] * 3) % 255).astype(np.uint8).reshape(size[1], size[0], 3)).convert(
+        mode
+    ).save(path, **options)
     return path
 
 
@@ -75,14 +77,16 @@ def test_sixteen_bit_grey(tmp_path):
 
 def test_exif_orientation_is_applied(tmp_path):
     exif = Image.Exif()
-    exif[0x0112] = 6      # to be turned a quarter
+    exif[0x0112] = 6  # to be turned a quarter
     write_image(tmp_path / "a.jpg", exif=exif)
     assert I.load_image(tmp_path / "a.jpg").shape == (8, 6, 3)
 
 
 def test_hdr_is_linear_and_bounded():
     image = I.load_image(shared("data/assets/hdri/park.hdr"))
-    assert image.dtype == np.float32 and image.shape == (512, 1024, 3) and image.min() >= 0 and image.max() <= I.HDR_WHITE
+    assert (
+        image.dtype == np.float32 and image.shape == (512, 1024, 3) and image.min() >= 0 and image.max() <= I.HDR_WHITE
+    )
     assert np.percentile(image.max(axis=2), 90) == pytest.approx(0.8, rel=1e-3)
 
 
@@ -91,15 +95,21 @@ def test_cube_faces_look_where_they_should():
     h, w = 256, 512
     longitude = ((np.arange(w) + 0.5) / w - 0.5) * 2 * np.pi
     latitude = (0.5 - (np.arange(h) + 0.5) / h) * np.pi
-    direction = np.stack([np.cos(latitude)[:, None] * np.cos(longitude), -np.cos(latitude)[:, None] * np.sin(longitude),
-                          np.repeat(np.sin(latitude)[:, None], w, axis=1)], axis=2).astype(np.float32)
+    direction = np.stack(
+        [
+            np.cos(latitude)[:, None] * np.cos(longitude),
+            -np.cos(latitude)[:, None] * np.sin(longitude),
+            np.repeat(np.sin(latitude)[:, None], w, axis=1),
+        ],
+        axis=2,
+    ).astype(np.float32)
     s = (np.arange(32) + 0.5) / 32 * 2 - 1
     right, down = np.meshgrid(s, s)
     for face, (forward, to_right, to_down) in zip(I.cube_faces(direction, 32), I.SKY_SIDES):
         ray = forward + right[..., None] * to_right + down[..., None] * to_down
         ray /= np.linalg.norm(ray, axis=2, keepdims=True)
         assert np.abs(face - ray).max() < 0.02
-        assert np.cross(to_right, to_down) == pytest.approx(forward)      # not mirrored for the viewer inside
+        assert np.cross(to_right, to_down) == pytest.approx(forward)  # not mirrored for the viewer inside
 
 
 def png(**options) -> bytes:
@@ -108,16 +118,19 @@ def png(**options) -> bytes:
     return stream.getvalue()
 
 
-@pytest.mark.parametrize("data, problem", [
-    (b"", "corrupt or of an unknown format"),
-    (b"not an image at all", "corrupt or of an unknown format"),
-    (png(format="PNG")[:2000], "corrupt or of an unknown format"),
-    (png(format="JPEG")[:1500], "corrupt or of an unknown format"),
-    (png(format="PNG").replace(b"IDAT", b"JDAT"), "corrupt or of an unknown format"),
-    (b"#?RADIANCE\n\n-Y 90000 +X 90000\n", "too large (got '90000x90000')"),
-    (b"#?RADIANCE\n\n-Y 16 +X 16\nshort", "corrupt"),
-    (b"#?RADIANCE\nno size", "corrupt (no size"),
-])
+@pytest.mark.parametrize(
+    "data, problem",
+    [
+        (b"", "corrupt or of an unknown format"),
+        (b"not an image at all", "corrupt or of an unknown format"),
+        (png(format="PNG")[:2000], "corrupt or of an unknown format"),
+        (png(format="JPEG")[:1500], "corrupt or of an unknown format"),
+        (png(format="PNG").replace(b"IDAT", b"JDAT"), "corrupt or of an unknown format"),
+        (b"#?RADIANCE\n\n-Y 90000 +X 90000\n", "too large (got '90000x90000')"),
+        (b"#?RADIANCE\n\n-Y 16 +X 16\nshort", "corrupt"),
+        (b"#?RADIANCE\nno size", "corrupt (no size"),
+    ],
+)
 def test_bad_images_are_named(tmp_path, data, problem, capfd):
     path = tmp_path / "picture.jpg"
     path.write_bytes(data)
@@ -128,8 +141,9 @@ def test_bad_images_are_named(tmp_path, data, problem, capfd):
 
 def test_a_huge_claim_is_refused_before_decoding(tmp_path):
     data = bytearray(png(format="PNG"))
-    data[16:24] = (200_000).to_bytes(4, "big") * 2      # IHDR width and height
+    data[16:24] = (200_000).to_bytes(4, "big") * 2  # IHDR width and height
     import zlib
+
     data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
     (tmp_path / "a.png").write_bytes(bytes(data))
     with pytest.raises(AssetError, match="too large|corrupt"):
@@ -146,9 +160,12 @@ def large_png(width: int, height: int) -> bytes:
 
     packer, row = zlib.compressobj(9), b"\0" * (1 + (width + 7) // 8)
     data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR",
-                                        struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)) + chunk(b"IDAT",
-                                                                                                       data) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0))
+        + chunk(b"IDAT", data)
+        + chunk(b"IEND", b"")
+    )
 
 
 def test_pillows_guard_is_not_ours_and_stays_as_it_is(monkeypatch):
@@ -170,10 +187,14 @@ def test_a_claim_beyond_the_limit_names_size_and_limit(width, height):
     data = large_png(8, 8)
     data = data[:16] + width.to_bytes(4, "big") + height.to_bytes(4, "big") + data[24:]
     import zlib
+
     data = data[:29] + zlib.crc32(data[12:29]).to_bytes(4, "big") + data[33:]
     with pytest.raises(AssetError) as error:
         I.decode_image(data, 64, "a.png")
-    assert str(error.value) == f"a.png: the image is too large (got '{width}x{height}'); expected at most 268 Mpx, as 16384x16384 has"
+    assert (
+        str(error.value)
+        == f"a.png: the image is too large (got '{width}x{height}'); expected at most 268 Mpx, as 16384x16384 has"
+    )
 
 
 def test_shrinking_in_blocks_is_shrinking_at_once(monkeypatch):
@@ -182,12 +203,13 @@ def test_shrinking_in_blocks_is_shrinking_at_once(monkeypatch):
         whole = I.shrink(image, max_size)
         monkeypatch.setattr(I, "_BLOCK_PIXELS", 2000)
         assert len(I._blocks(301, 217)) > 10
-        assert np.abs(I.shrink(image,
-                               max_size).astype(int) - whole).max() <= 1      # the float32 sums differ in their last bit
+        assert (
+            np.abs(I.shrink(image, max_size).astype(int) - whole).max() <= 1
+        )  # the float32 sums differ in their last bit
         monkeypatch.undo()
         linear = linear_from_srgb(image / 255.0).astype(np.float32)
         reference = cv2.resize(linear, whole.shape[1::-1], interpolation=cv2.INTER_AREA)
-        assert np.abs(linear_from_srgb(whole / 255.0) - reference).max() < 6e-3       # half a code, at its widest
+        assert np.abs(linear_from_srgb(whole / 255.0) - reference).max() < 6e-3  # half a code, at its widest
 
 
 def test_no_other_program_is_run_for_a_texture():

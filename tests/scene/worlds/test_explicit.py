@@ -19,17 +19,25 @@ CAMERA = CameraConfig(width=64, height=48)
 
 
 def build(tmp_path, **tree):
-    tree = {"kind": "explicit", "meshes": {"box": {"primitive": "cuboid"}}, "objects": [{"mesh": "box"}], "camera": {"position": [-3, 0, 1]}, **tree}
+    tree = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box"}],
+        "camera": {"position": [-3, 0, 1]},
+        **tree,
+    }
     return build_scene(validate(ExplicitSceneConfig, tree, where="scene"), CAMERA, 0, 10**9, base=tmp_path)
 
 
 def test_camera_orientations():
     rest = pose_matrix(PoseConfig(), camera=True)[:3, :3]
-    np.testing.assert_allclose(rest, np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))      # z forward = +x, y down = -z
+    np.testing.assert_allclose(rest, np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))  # z forward = +x, y down = -z
     np.testing.assert_allclose(pose_matrix(PoseConfig(look_at=(5, 0, 0)), camera=True)[:3, :3], rest, atol=1e-12)
     turned = pose_matrix(PoseConfig(euler=(0, 0, 90)), camera=True)[:3, :3]
     np.testing.assert_allclose(turned[:, 2], [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(pose_matrix(PoseConfig(quaternion=(2, 0, 0, 0)), camera=True)[:3, :3], np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(
+        pose_matrix(PoseConfig(quaternion=(2, 0, 0, 0)), camera=True)[:3, :3], np.eye(3), atol=1e-12
+    )
 
 
 def test_object_orientations():
@@ -39,7 +47,9 @@ def test_object_orientations():
     axes = [Rotation.from_rotvec(np.radians(a) * np.eye(3)[k]).as_matrix() for k, a in enumerate((10, 20, 30))]
     np.testing.assert_allclose(euler, axes[2] @ axes[1] @ axes[0], atol=1e-12)
     q = (0.5, -0.5, 0.1, 0.7)
-    np.testing.assert_allclose(pose_matrix(PoseConfig(quaternion=q))[:3, :3], Rotation.from_quat([*q[1:], q[0]]).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(
+        pose_matrix(PoseConfig(quaternion=q))[:3, :3], Rotation.from_quat([*q[1:], q[0]]).as_matrix(), atol=1e-12
+    )
     for target in ((3, -2, 8), (0, 0, 4), (0, 0, -4)):
         R = pose_matrix(PoseConfig(look_at=target))[:3, :3]
         np.testing.assert_allclose(R[:, 0], np.array(target) / np.linalg.norm(target), atol=1e-12)
@@ -47,13 +57,27 @@ def test_object_orientations():
 
 
 def test_keyframes_are_met_and_ends_held(tmp_path):
-    frames = [{"time": 0.1, "position": [0, 0, 0]}, {"time": 0.5, "position": [1, 0, 0], "euler": [0, 0, 90]}, {"time": 0.9, "position": [1, 1, 0], "euler": [0, 0, 180]}]
-    scene = build(tmp_path, objects=[{"mesh": "box", "keyframes": frames}], camera={"keyframes": [
-        {"time": 0, "position": [-3, 0, 1], "look_at": [0, 0, 0]}, {"time": 1, "position": [0, -3, 1], "look_at": [0, 0, 0]}]})
+    frames = [
+        {"time": 0.1, "position": [0, 0, 0]},
+        {"time": 0.5, "position": [1, 0, 0], "euler": [0, 0, 90]},
+        {"time": 0.9, "position": [1, 1, 0], "euler": [0, 0, 180]},
+    ]
+    scene = build(
+        tmp_path,
+        objects=[{"mesh": "box", "keyframes": frames}],
+        camera={
+            "keyframes": [
+                {"time": 0, "position": [-3, 0, 1], "look_at": [0, 0, 0]},
+                {"time": 1, "position": [0, -3, 1], "look_at": [0, 0, 0]},
+            ]
+        },
+    )
     path = scene.objects[0].path
     for k in frames:
         T = path.pose(round(k["time"] * 1e9))
-        np.testing.assert_allclose(T, pose_matrix(PoseConfig(**{n: tuple(v) for n, v in k.items() if n != "time"})), atol=1e-9)
+        np.testing.assert_allclose(
+            T, pose_matrix(PoseConfig(**{n: tuple(v) for n, v in k.items() if n != "time"})), atol=1e-9
+        )
     np.testing.assert_array_equal(path.pose(0), path.pose(100_000_000))
     np.testing.assert_array_equal(path.pose(10**9), path.pose(900_000_000))
     assert not path.is_static
@@ -64,14 +88,24 @@ def test_keyframes_are_met_and_ends_held(tmp_path):
 
 
 def test_linear_interpolation(tmp_path):
-    frames = [{"time": 0, "position": [0, 0, 0]}, {"time": 0.5, "position": [1, 0, 0]}, {"time": 1, "position": [1, 4, 0]}]
+    frames = [
+        {"time": 0, "position": [0, 0, 0]},
+        {"time": 0.5, "position": [1, 0, 0]},
+        {"time": 1, "position": [1, 4, 0]},
+    ]
     scene = build(tmp_path, objects=[{"mesh": "box", "keyframes": frames, "interpolation": "linear"}])
     np.testing.assert_allclose(scene.objects[0].path.pose(750_000_000)[:3, 3], [1, 2, 0], atol=1e-12)
 
 
-CRASH = [{"mesh": "box", "name": "still", "position": [3, 0, 0]},
-         {"mesh": "box", "name": "moving", "interpolation": "linear",
-          "keyframes": [{"time": 0, "position": [0, 0, 0]}, {"time": 1, "position": [4, 0, 0]}]}]
+CRASH = [
+    {"mesh": "box", "name": "still", "position": [3, 0, 0]},
+    {
+        "mesh": "box",
+        "name": "moving",
+        "interpolation": "linear",
+        "keyframes": [{"time": 0, "position": [0, 0, 0]}, {"time": 1, "position": [4, 0, 0]}],
+    },
+]
 
 
 def test_collisions_are_found_when_asked_for(tmp_path):
@@ -84,7 +118,10 @@ def test_collisions_are_found_when_asked_for(tmp_path):
 
 
 def test_the_camera_is_stopped_by_a_solid(tmp_path):
-    keys = [{"time": 0, "position": [-3, 0, 0], "look_at": [5, 0, 0]}, {"time": 1, "position": [3, 0, 0], "look_at": [5, 0, 0]}]
+    keys = [
+        {"time": 0, "position": [-3, 0, 0], "look_at": [5, 0, 0]},
+        {"time": 1, "position": [3, 0, 0], "look_at": [5, 0, 0]},
+    ]
     scene = build(tmp_path, camera={"keyframes": keys, "interpolation": "linear"}, collisions=True)
     end = scene.camera_path.pose(10**9)[0, 3]
     assert -0.7 < end < -0.5, "in front of the cube's face at -0.5, by about the near distance"
@@ -98,27 +135,54 @@ def test_overlapping_bodies_with_collisions_are_refused(tmp_path):
 def test_materials_meshes_and_scale(tmp_path):
     Image.new("RGB", (40, 20), (255, 0, 0)).save(tmp_path / "red.png")
     trimesh.creation.icosphere(subdivisions=1).export(tmp_path / "ball.stl")
-    scene = build(tmp_path, meshes={"box": {"primitive": "cuboid", "parameters": {"extents": [1, 2, 3]}}, "ball": {"file": "ball.stl", "uv_size": 0.25},
-                                    "floor": {"primitive": "grid", "parameters": {"width": 20, "subdivisions": 8}}},
-                  materials={"red": {"texture": "red.png", "max_size": 10, "uv_scale": [2, 3], "color": [0.5, 1, 1]}, "noise": {"procedural": "perlin", "seed": 4, "max_size": 16},
-                             "screen": {"unlit": True, "double_sided": True}},
-                  objects=[{"mesh": "box", "material": "red", "scale": 2}, {"mesh": "ball", "material": "noise", "scale": [1, 1, 3], "name": "egg"},
-                           {"mesh": "floor", "material": "screen", "category": "ground"}, {"mesh": "box"}], light={"sun_elevation": 90, "sun": 2})
+    scene = build(
+        tmp_path,
+        meshes={
+            "box": {"primitive": "cuboid", "parameters": {"extents": [1, 2, 3]}},
+            "ball": {"file": "ball.stl", "uv_size": 0.25},
+            "floor": {"primitive": "grid", "parameters": {"width": 20, "subdivisions": 8}},
+        },
+        materials={
+            "red": {"texture": "red.png", "max_size": 10, "uv_scale": [2, 3], "color": [0.5, 1, 1]},
+            "noise": {"procedural": "perlin", "seed": 4, "max_size": 16},
+            "screen": {"unlit": True, "double_sided": True},
+        },
+        objects=[
+            {"mesh": "box", "material": "red", "scale": 2},
+            {"mesh": "ball", "material": "noise", "scale": [1, 1, 3], "name": "egg"},
+            {"mesh": "floor", "material": "screen", "category": "ground"},
+            {"mesh": "box"},
+        ],
+        light={"sun_elevation": 90, "sun": 2},
+    )
     box, egg, floor, second = scene.objects
-    assert [o.name for o in scene.objects] == ["box", "egg", "floor", "box#3"] and [o.instance_id for o in scene.objects] == [1, 2, 3, 4]
+    assert [o.name for o in scene.objects] == ["box", "egg", "floor", "box#3"] and [
+        o.instance_id for o in scene.objects
+    ] == [1, 2, 3, 4]
     np.testing.assert_allclose(np.ptp(box.parts[0].mesh.vertices, axis=0), [2, 4, 6])
     assert np.ptp(egg.parts[0].mesh.vertices[:, 2]) > 5.5 and egg.parts[0].mesh.closed
-    assert box.parts[0].material.texture.image.shape == (5, 10, 3) and box.parts[0].material.uv_scale == (2, 3) and box.parts[0].material.base_color == (0.5, 1, 1)
+    assert (
+        box.parts[0].material.texture.image.shape == (5, 10, 3)
+        and box.parts[0].material.uv_scale == (2, 3)
+        and box.parts[0].material.base_color == (0.5, 1, 1)
+    )
     assert egg.parts[0].material.texture.image.shape == (16, 16, 3)
     assert floor.category == "ground" and floor.parts[0].material.unlit and floor.parts[0].material.double_sided
     assert second.parts[0].material.texture is None
     assert scene.light.sun == 2 and scene.light.sun_direction == pytest.approx((0, 0, 1), abs=1e-12)
 
 
-@pytest.mark.parametrize("suffix, up, expected", [
-    ("glb", "auto", "y"), ("glb", "y", "y"), ("glb", "z", "z"), ("obj", "auto", "z"), ("obj", "z", "z"),
-    ("obj", "y", "y"),
-])
+@pytest.mark.parametrize(
+    "suffix, up, expected",
+    [
+        ("glb", "auto", "y"),
+        ("glb", "y", "y"),
+        ("glb", "z", "z"),
+        ("obj", "auto", "z"),
+        ("obj", "z", "z"),
+        ("obj", "y", "y"),
+    ],
+)
 def test_which_axis_of_a_file_points_up(tmp_path, suffix, up, expected):
     """The file's (x, y, z) = (1, 2, 3) is drawn there, or at (x, -z, y) when y points up."""
     corners = [[1, 2, 3], [2, 2, 3], [1, 5, 3]]
@@ -135,11 +199,15 @@ def test_which_axis_of_a_file_points_up(tmp_path, suffix, up, expected):
         build(tmp_path, meshes={"a": {"primitive": "cuboid", "up": "y"}}, objects=[{"mesh": "a"}])
 
 
-@pytest.mark.parametrize("before, after, step", [
-    ([0, 0, 0], [0, 0, 40000], "40000 degrees about z"), (None, [0, 200, 0], "200 degrees about y"),
-    ([-90, 0, 0], [90, 0, 0], "180 degrees about x"),
-    ([0, 0, 179], [0, 0, -179], "358 degrees about z"),
-])
+@pytest.mark.parametrize(
+    "before, after, step",
+    [
+        ([0, 0, 0], [0, 0, 40000], "40000 degrees about z"),
+        (None, [0, 200, 0], "200 degrees about y"),
+        ([-90, 0, 0], [90, 0, 0], "180 degrees about x"),
+        ([0, 0, 179], [0, 0, -179], "358 degrees about z"),
+    ],
+)
 def test_a_turn_that_has_no_shortest_way_is_refused(tmp_path, before, after, step):
     keys = [{"time": 0}, {"time": 0.5}, {"time": 1}]
     keys[1] |= {"euler": before} if before else {}
@@ -154,8 +222,9 @@ def test_a_turn_goes_as_far_as_is_said(tmp_path, interpolation):
     """Two and a half turns in steps of 150 degrees: the integrated rate is 900 degrees."""
     keys = [{"time": k / 6, "euler": [0, 0, 150 * k]} for k in range(7)]
     path = build(tmp_path, objects=[{"mesh": "box", "keyframes": keys, "interpolation": interpolation}]).objects[0].path
-    rates = [body_rate(path.pose(t), path.derivative(t))[2] for t in np.linspace(0, 1e9, 1000,
-                                                                                 endpoint=False).astype(int)]
+    rates = [
+        body_rate(path.pose(t), path.derivative(t))[2] for t in np.linspace(0, 1e9, 1000, endpoint=False).astype(int)
+    ]
     assert np.degrees(np.mean(rates)) == pytest.approx(900, rel=1e-3)
 
 
@@ -164,35 +233,84 @@ def test_a_file_keeps_its_own_materials_unless_told_otherwise(tmp_path):
     builder.tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0.5, 0.25, 1]}, "doubleSided": True}]
     builder.node(mesh=builder.mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], uvs=np.zeros((3, 2)), material=0))
     (tmp_path / "a.glb").write_bytes(builder.glb())
-    scene = build(tmp_path, meshes={"a": {"file": "a.glb"}}, materials={"checks": {"procedural": "checks", "max_size": 8}},
-                  objects=[{"mesh": "a"}, {"mesh": "a", "material": "checks"}])
+    scene = build(
+        tmp_path,
+        meshes={"a": {"file": "a.glb"}},
+        materials={"checks": {"procedural": "checks", "max_size": 8}},
+        objects=[{"mesh": "a"}, {"mesh": "a", "material": "checks"}],
+    )
     own, other = (o.parts[0] for o in scene.objects)
     assert own.material.base_color == (1, 0.5, 0.25) and own.material.double_sided
-    assert other.material.texture is not None and np.ptp(other.mesh.uvs) > 0.5      # degenerate ones were projected
+    assert other.material.texture is not None and np.ptp(other.mesh.uvs) > 0.5  # degenerate ones were projected
     assert scene.log == ("a: the texture coordinates are degenerate, projected new ones",)
 
 
-@pytest.mark.parametrize("tree, expected", [
-    ({"objects": [{"mesh": "bax"}]}, "scene.objects.0.mesh: no such name under scene.meshes (got 'bax'); expected one of: box"),
-    ({"objects": [{"mesh": "box", "material": "m"}]}, "scene.objects.0.material: no such name under scene.materials (got 'm')"),
-    ({"objects": [{"mesh": "box", "name": "a"}, {"mesh": "box", "name": "a"}]}, "scene.objects.1.name: the name is given to two objects (got 'a')"),
-    ({"objects": []}, "scene.objects: "),
-    ({"objects": [{"mesh": "box", "scale": 0}]}, "scene.objects.0.scale: must be greater than 0 and at most 1e9 (got 0)"),
-    ({"objects": [{"mesh": "box", "scale": [1, 2]}]}, "scene.objects.0.scale: must be a number or a list of three (got [1, 2])"),
-    ({"meshes": {"box": {"primitve": "cuboid"}}}, "scene.meshes.box.primitve: unknown key; expected 'primitive' (nearest)"),
-    ({"meshes": {"box": {"file": "gone.obj"}}}, "scene.meshes.box.file: no such file (got 'gone.obj'); expected a mesh file"),
-    ({"meshes": {"box": {}}}, "scene.meshes.box: give exactly one of primitive and file"),
-    ({"meshes": {"box": {"primitive": "sphere", "parameters": {"radius": -1}}}}, "scene.meshes.box.parameters.radius: bad parameter (got -1); expected a number greater than 0"),
-    ({"meshes": {"box": {"primitive": "sphere", "parameters": {"radios": 1}}}}, "scene.meshes.box.parameters: unknown parameter (got 'radios')"),
-    ({"materials": {"m": {"texture": "gone.png"}}}, "scene.materials.m.texture: no such file (got 'gone.png'); expected an image file"),
-    ({"materials": {"m": {"texture": "a.png", "procedural": "dots"}}}, "scene.materials.m: only one of texture, procedural, photograph may be given, not texture and procedural"),
-    ({"materials": {"m": {"photograph": "lena"}}}, "scene.materials.m.photograph: no such photograph (got 'lena')"),
-    ({"camera": {"euler": [0, 0, 0], "look_at": [1, 0, 0]}}, "scene.camera: only one of quaternion, euler, look_at may be given, not euler and look_at"),
-    ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera.quaternion: a quaternion must not be zero"),
-    ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera.keyframes: one key frame is no motion"),
-    ({"camera": {"keyframes": [{"time": 1}, {"time": 1}]}}, "scene.camera.keyframes.1.time: the key frames' times must increase"),
-    ({"camera": {"position": [1, 0, 0], "keyframes": [{"time": 0}, {"time": 1}]}}, "scene.camera: give a fixed pose or keyframes, not both"),
-])
+@pytest.mark.parametrize(
+    "tree, expected",
+    [
+        (
+            {"objects": [{"mesh": "bax"}]},
+            "scene.objects.0.mesh: no such name under scene.meshes (got 'bax'); expected one of: box",
+        ),
+        (
+            {"objects": [{"mesh": "box", "material": "m"}]},
+            "scene.objects.0.material: no such name under scene.materials (got 'm')",
+        ),
+        (
+            {"objects": [{"mesh": "box", "name": "a"}, {"mesh": "box", "name": "a"}]},
+            "scene.objects.1.name: the name is given to two objects (got 'a')",
+        ),
+        ({"objects": []}, "scene.objects: "),
+        (
+            {"objects": [{"mesh": "box", "scale": 0}]},
+            "scene.objects.0.scale: must be greater than 0 and at most 1e9 (got 0)",
+        ),
+        (
+            {"objects": [{"mesh": "box", "scale": [1, 2]}]},
+            "scene.objects.0.scale: must be a number or a list of three (got [1, 2])",
+        ),
+        (
+            {"meshes": {"box": {"primitve": "cuboid"}}},
+            "scene.meshes.box.primitve: unknown key; expected 'primitive' (nearest)",
+        ),
+        (
+            {"meshes": {"box": {"file": "gone.obj"}}},
+            "scene.meshes.box.file: no such file (got 'gone.obj'); expected a mesh file",
+        ),
+        ({"meshes": {"box": {}}}, "scene.meshes.box: give exactly one of primitive and file"),
+        (
+            {"meshes": {"box": {"primitive": "sphere", "parameters": {"radius": -1}}}},
+            "scene.meshes.box.parameters.radius: bad parameter (got -1); expected a number greater than 0",
+        ),
+        (
+            {"meshes": {"box": {"primitive": "sphere", "parameters": {"radios": 1}}}},
+            "scene.meshes.box.parameters: unknown parameter (got 'radios')",
+        ),
+        (
+            {"materials": {"m": {"texture": "gone.png"}}},
+            "scene.materials.m.texture: no such file (got 'gone.png'); expected an image file",
+        ),
+        (
+            {"materials": {"m": {"texture": "a.png", "procedural": "dots"}}},
+            "scene.materials.m: only one of texture, procedural, photograph may be given, not texture and procedural",
+        ),
+        ({"materials": {"m": {"photograph": "lena"}}}, "scene.materials.m.photograph: no such photograph (got 'lena')"),
+        (
+            {"camera": {"euler": [0, 0, 0], "look_at": [1, 0, 0]}},
+            "scene.camera: only one of quaternion, euler, look_at may be given, not euler and look_at",
+        ),
+        ({"camera": {"quaternion": [0, 0, 0, 0]}}, "scene.camera.quaternion: a quaternion must not be zero"),
+        ({"camera": {"keyframes": [{"time": 0}]}}, "scene.camera.keyframes: one key frame is no motion"),
+        (
+            {"camera": {"keyframes": [{"time": 1}, {"time": 1}]}},
+            "scene.camera.keyframes.1.time: the key frames' times must increase",
+        ),
+        (
+            {"camera": {"position": [1, 0, 0], "keyframes": [{"time": 0}, {"time": 1}]}},
+            "scene.camera: give a fixed pose or keyframes, not both",
+        ),
+    ],
+)
 def test_bad_input(tmp_path, tree, expected):
     with pytest.raises((ConfigError, AssetError)) as error:
         build(tmp_path, **tree)

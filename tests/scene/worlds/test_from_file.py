@@ -59,7 +59,9 @@ def test_split_rigid():
         T, A = split_rigid(M)
         np.testing.assert_allclose(T @ A, M, atol=1e-12)
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(T[:3, :3]) == pytest.approx(1) and np.sign(np.linalg.det(A)) == np.sign(np.linalg.det(M[:3, :3]))
+        assert np.linalg.det(T[:3, :3]) == pytest.approx(1) and np.sign(np.linalg.det(A)) == np.sign(
+            np.linalg.det(M[:3, :3])
+        )
     T, A = split_rigid(np.diag([2.0, 3, 4, 1]))
     np.testing.assert_allclose(T, np.eye(4), atol=1e-15)
 
@@ -67,7 +69,7 @@ def test_split_rigid():
 def test_the_hierarchy_is_composed_and_scale_is_baked(tmp_path):
     builder = with_camera(GltfBuilder())
     box = builder.mesh(BOX.vertices, BOX.faces)
-    quarter = [0, math.sin(math.pi / 4), 0, math.cos(math.pi / 4)]      # 90 degrees about the file's y
+    quarter = [0, math.sin(math.pi / 4), 0, math.cos(math.pi / 4)]  # 90 degrees about the file's y
     child = builder.node(root=False, mesh=box, name="child", translation=[1, 0, 0], scale=[2, 1, 1])
     builder.node(name="parent", translation=[0, 5, 0], rotation=quarter, scale=[3, 3, 3], children=[child])
     scene = load(tmp_path, builder)
@@ -84,7 +86,11 @@ def test_mirroring_nodes_face_outwards(tmp_path):
     builder = with_camera(GltfBuilder())
     builder.node(mesh=builder.mesh(BOX.vertices, BOX.faces), scale=[-1, 1, 1])
     mesh = load(tmp_path, builder).objects[0].parts[0].mesh
-    assert mesh.closed and volume(mesh) == pytest.approx(6, rel=1e-6) and ((mesh.normals * mesh.vertices).sum(axis=1) > 0).all()
+    assert (
+        mesh.closed
+        and volume(mesh) == pytest.approx(6, rel=1e-6)
+        and ((mesh.normals * mesh.vertices).sum(axis=1) > 0).all()
+    )
 
 
 def test_the_camera_sees_what_gltf_says(tmp_path):
@@ -107,12 +113,21 @@ def test_materials(tmp_path):
     pixels = np.zeros((2, 4, 3), np.uint8)
     pixels[0, 0] = (255, 128, 0)
     Image.fromarray(pixels).save(tmp_path / "t.png")
-    builder.tree["images"] = [{"bufferView": builder.view((tmp_path / "t.png").read_bytes()), "mimeType": "image/png", "name": "pic"}]
+    builder.tree["images"] = [
+        {"bufferView": builder.view((tmp_path / "t.png").read_bytes()), "mimeType": "image/png", "name": "pic"}
+    ]
     builder.tree["textures"] = [{"source": 0}]
     transform = {"KHR_texture_transform": {"offset": [0.25, 0.5], "scale": [2, 4]}}
     builder.tree["materials"] = [
-        {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 1, 0.5], "baseColorTexture": {"index": 0}}, "doubleSided": True},
-        {"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": transform}}}]
+        {
+            "pbrMetallicRoughness": {"baseColorFactor": [0.5, 0.25, 1, 0.5], "baseColorTexture": {"index": 0}},
+            "doubleSided": True,
+        },
+        {
+            "extensions": {"KHR_materials_unlit": {}},
+            "pbrMetallicRoughness": {"baseColorTexture": {"index": 0, "extensions": transform}},
+        },
+    ]
     uvs = [[0, 0], [1, 0], [0, 1]]
     for m in (0, 1):
         builder.node(mesh=triangle(builder, uvs=uvs, material=m))
@@ -136,10 +151,19 @@ def test_strips_fans_and_interleaved_buffers(tmp_path):
     view = builder.view(rows.tobytes())
     builder.tree["bufferViews"][view]["byteStride"] = 24
     for offset in (0, 12):
-        builder.tree["accessors"].append({"bufferView": view, "byteOffset": offset, "componentType": 5126, "count": 4, "type": "VEC3"})
+        builder.tree["accessors"].append(
+            {"bufferView": view, "byteOffset": offset, "componentType": 5126, "count": 4, "type": "VEC3"}
+        )
     fan = builder.array(np.array([0, 1, 3, 2], "u1"), "SCALAR")
-    builder.tree["meshes"] = [{"primitives": [{"attributes": {"POSITION": 0, "NORMAL": 1}, "mode": 5}, {"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": fan, "mode": 6}]},
-                              {"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}, {"attributes": {"POSITION": 0}, "mode": 5}]}]
+    builder.tree["meshes"] = [
+        {
+            "primitives": [
+                {"attributes": {"POSITION": 0, "NORMAL": 1}, "mode": 5},
+                {"attributes": {"POSITION": 0, "NORMAL": 1}, "indices": fan, "mode": 6},
+            ]
+        },
+        {"primitives": [{"attributes": {"POSITION": 0}, "mode": 1}, {"attributes": {"POSITION": 0}, "mode": 5}]},
+    ]
     builder.node(mesh=0)
     builder.node(mesh=1)
     scene = load(tmp_path, builder)
@@ -147,8 +171,12 @@ def test_strips_fans_and_interleaved_buffers(tmp_path):
         v = part.mesh.vertices[part.mesh.faces]
         cross = np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0])
         assert len(cross) == 2 and np.linalg.norm(cross, axis=1).sum() / 2 == pytest.approx(1)
-        assert (part.mesh.normals[part.mesh.faces].mean(axis=1) * cross).sum(axis=1).min() > 0      # both wound the same way
-    assert len(scene.objects[1].parts) == 1 and scene.omissions == ("scene.glb asks for what is not drawn: points and lines",)
+        assert (part.mesh.normals[part.mesh.faces].mean(axis=1) * cross).sum(
+            axis=1
+        ).min() > 0  # both wound the same way
+    assert len(scene.objects[1].parts) == 1 and scene.omissions == (
+        "scene.glb asks for what is not drawn: points and lines",
+    )
 
 
 def animated(interpolation="LINEAR", scale=False):
@@ -162,12 +190,26 @@ def animated(interpolation="LINEAR", scale=False):
     if interpolation == "CUBICSPLINE":
         slope = np.array([0, 2, 0], "f4")
         translations = np.stack([np.tile(slope, (3, 1)), translations, np.tile(slope, (3, 1))], axis=1).reshape(-1, 3)
-    samplers = [{"input": builder.array(times, "SCALAR"), "output": builder.array(translations, "VEC3"), "interpolation": interpolation},
-                {"input": 0, "output": builder.array(quaternions, "VEC4"), "interpolation": "LINEAR"}]
+    samplers = [
+        {
+            "input": builder.array(times, "SCALAR"),
+            "output": builder.array(translations, "VEC3"),
+            "interpolation": interpolation,
+        },
+        {"input": 0, "output": builder.array(quaternions, "VEC4"), "interpolation": "LINEAR"},
+    ]
     samplers[1]["input"] = samplers[0]["input"]
-    channels = [{"sampler": 0, "target": {"node": node, "path": "translation"}}, {"sampler": 1, "target": {"node": node, "path": "rotation"}}]
+    channels = [
+        {"sampler": 0, "target": {"node": node, "path": "translation"}},
+        {"sampler": 1, "target": {"node": node, "path": "rotation"}},
+    ]
     if scale:
-        samplers.append({"input": samplers[0]["input"], "output": builder.array(np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3]], "f4"), "VEC3")})
+        samplers.append(
+            {
+                "input": samplers[0]["input"],
+                "output": builder.array(np.array([[1, 1, 1], [2, 2, 2], [3, 3, 3]], "f4"), "VEC3"),
+            }
+        )
         channels.append({"sampler": 2, "target": {"node": node, "path": "scale"}})
     builder.tree["animations"] = [{"name": "turn", "samplers": samplers, "channels": channels}]
     return builder
@@ -182,7 +224,9 @@ def test_animation_moves_children_along(tmp_path, interpolation):
         expected = gltf.Z_UP[:3, :3] @ [2 * math.cos(w * t), 2 * t, -2 * math.sin(w * t)]
         np.testing.assert_allclose(moon.path.pose(round(t * 1e9))[:3, 3], expected, atol=1e-5)
     D = moon.path.derivative(370_000_000)[:3, 3]
-    np.testing.assert_allclose(D, gltf.Z_UP[:3, :3] @ [-2 * w * math.sin(w * 0.37), 2, -2 * w * math.cos(w * 0.37)], atol=1e-3)
+    np.testing.assert_allclose(
+        D, gltf.Z_UP[:3, :3] @ [-2 * w * math.sin(w * 0.37), 2, -2 * w * math.cos(w * 0.37)], atol=1e-3
+    )
 
 
 def test_cubic_splines_leave_a_key_by_its_out_tangent(tmp_path):
@@ -191,10 +235,18 @@ def test_cubic_splines_leave_a_key_by_its_out_tangent(tmp_path):
     node = builder.node(mesh=triangle(builder))
     into, values, out = ([0, 7, 0], [0, -3, 0]), ([0, 0, 0], [0, 1, 0]), ([0, 5, 0], [0, 9, 0])
     rows = np.array([into[0], values[0], out[0], into[1], values[1], out[1]], "f4")
-    builder.tree["animations"] = [{"samplers": [{"input": builder.array(np.array([0, 2], "f4"), "SCALAR"),
-                                                 "output": builder.array(rows, "VEC3"),
-                                                 "interpolation": "CUBICSPLINE"}],
-                                   "channels": [{"sampler": 0, "target": {"node": node, "path": "translation"}}]}]
+    builder.tree["animations"] = [
+        {
+            "samplers": [
+                {
+                    "input": builder.array(np.array([0, 2], "f4"), "SCALAR"),
+                    "output": builder.array(rows, "VEC3"),
+                    "interpolation": "CUBICSPLINE",
+                }
+            ],
+            "channels": [{"sampler": 0, "target": {"node": node, "path": "translation"}}],
+        }
+    ]
     (tmp_path / "a.glb").write_bytes(builder.glb())
     (channel,) = gltf.read(tmp_path / "a.glb").channels(0)
     for t in (0.0, 0.3, 1.0, 1.7, 2.0):
@@ -219,13 +271,15 @@ def test_a_mirrored_node_faces_and_shines_outwards(tmp_path, flip):
     # An ellipsoid's normal: its vertices' unit sphere stretched by the inverse factors. The y axis becomes z.
     size = np.abs([flip[0], flip[2], flip[1]])
     normal = points / size**2
-    np.testing.assert_allclose(part.mesh.normals @ turn.T, normal / np.linalg.norm(normal, axis=1, keepdims=True),
-                               atol=1e-5)
+    np.testing.assert_allclose(
+        part.mesh.normals @ turn.T, normal / np.linalg.norm(normal, axis=1, keepdims=True), atol=1e-5
+    )
     (piece,) = gltf.read(tmp_path / "scene.glb").pieces()
     assert (piece.normals * piece.vertices).sum(axis=1).min() > 0
-    corners = piece.vertices[piece.faces]       # before make_mesh, which would mend a closed body
-    assert (np.cross(corners[:, 1] - corners[:, 0],
-                     corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(axis=1).min() > 0
+    corners = piece.vertices[piece.faces]  # before make_mesh, which would mend a closed body
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(
+        axis=1
+    ).min() > 0
 
 
 def test_animation_choices_and_limits(tmp_path):
@@ -233,7 +287,9 @@ def test_animation_choices_and_limits(tmp_path):
     assert not load(tmp_path, animated(), animation="turn").objects[0].path.is_static
     assert "the changing scale of node 'moon' is not supported" in load(tmp_path, animated(scale=True)).log[0]
     assert "jumps in the animation" in load(tmp_path, animated("STEP")).log[0]
-    with pytest.raises(ConfigError, match="scene.animation: no such animation in the file .got 'spin'.; expected one of: turn"):
+    with pytest.raises(
+        ConfigError, match="scene.animation: no such animation in the file .got 'spin'.; expected one of: turn"
+    ):
         load(tmp_path, animated(), animation="spin")
 
 
@@ -246,20 +302,35 @@ def file_scene(tmp_path, builder=None, **tree):
 
 def test_file_scene(tmp_path):
     scene = file_scene(tmp_path, animated(), light={"unlit": True, "sun": 3}, background=0.7)
-    assert scene.background == 0.7 and scene.light.sun == 3 and all(p.material.unlit for o in scene.objects for p in o.parts)
+    assert (
+        scene.background == 0.7
+        and scene.light.sun == 3
+        and all(p.material.unlit for o in scene.objects for p in o.parts)
+    )
     posed = file_scene(tmp_path, pose={"position": [0, -5, 1], "look_at": [0, 0, 1]})
     np.testing.assert_allclose(posed.camera_path.pose(0)[:3, 2], [0, 1, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize("tree, builder, expected", [
-    ({"path": "gone.glb"}, None, "scene.path: no such file (got 'gone.glb'); expected a gltf or glb file"),
-    ({"path": "a.obj"}, None, "scene.path: not a glTF scene (got 'a.obj')"),
-    ({"camera": "side"}, animated, "scene.camera: no such camera in the file (got 'side'); expected one of: main, eye, or an index below 1"),
-    ({"camera": 3}, animated, "scene.camera: no such camera in the file (got 3)"),
-    ({}, lambda: (lambda b: (b.node(mesh=triangle(b)), b)[1])(GltfBuilder()), "scene.pose: the file has no camera"),
-    ({"max_faces": 1}, lambda: (lambda b: (b.node(mesh=b.mesh(BOX.vertices, BOX.faces)), b)[1])(with_camera(GltfBuilder())), "too many faces (got 12); expected at most 1"),
-    ({}, lambda: with_camera(GltfBuilder()), "the scene has no faces"),
-])
+@pytest.mark.parametrize(
+    "tree, builder, expected",
+    [
+        ({"path": "gone.glb"}, None, "scene.path: no such file (got 'gone.glb'); expected a gltf or glb file"),
+        ({"path": "a.obj"}, None, "scene.path: not a glTF scene (got 'a.obj')"),
+        (
+            {"camera": "side"},
+            animated,
+            "scene.camera: no such camera in the file (got 'side'); expected one of: main, eye, or an index below 1",
+        ),
+        ({"camera": 3}, animated, "scene.camera: no such camera in the file (got 3)"),
+        ({}, lambda: (lambda b: (b.node(mesh=triangle(b)), b)[1])(GltfBuilder()), "scene.pose: the file has no camera"),
+        (
+            {"max_faces": 1},
+            lambda: (lambda b: (b.node(mesh=b.mesh(BOX.vertices, BOX.faces)), b)[1])(with_camera(GltfBuilder())),
+            "too many faces (got 12); expected at most 1",
+        ),
+        ({}, lambda: with_camera(GltfBuilder()), "the scene has no faces"),
+    ],
+)
 def test_bad_file_scenes(tmp_path, tree, builder, expected):
     (tmp_path / "a.obj").write_text("")
     with pytest.raises((ConfigError, AssetError)) as error:
@@ -274,25 +345,37 @@ def broken(change):
     return builder
 
 
-@pytest.mark.parametrize("change, problem", [
-    (lambda t: t["nodes"].append({"children": [2]}) or t["scenes"][0]["nodes"].append(2), "the nodes are no tree"),
-    (lambda t: t["nodes"][1].update(mesh=9), "a reference to meshes that does not exist"),
-    (lambda t: t["nodes"][1].update(translation=[float("nan"), 0, 0]),
-     "nodes.1.translation.0: input should be a finite number"),
-    (lambda t: t["nodes"][1].update(scale=[0, 0, 0]), "singular"),
-    (lambda t: t["nodes"][1].update(rotation="no"), "no valid glTF"),
-    (lambda t: t["meshes"][0]["primitives"][0].update(material=4), "a reference to materials that does not exist"),
-    (lambda t: t["accessors"][0].update(bufferView=77), "a reference to bufferViews that does not exist"),
-    (lambda t: t["accessors"][0].update(byteOffset=-8),
-     "accessors.0.byteOffset: input should be greater than or equal to 0) (got -8)"),
-    (lambda t: t["accessors"][0].update(byteOffset=8), "reaches outside its buffer"),
-    (lambda t: t["accessors"][0].update(type="VEC9"), "accessors.0.type: input should be"),
-    (lambda t: t["accessors"][0].update(count="3"), "accessors.0.count: input should be a valid integer) (got '3')"),
-    (lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]),
-     "needs the extension KHR_draco_mesh_compression, which BlinkGL does not draw"),
-    (lambda t: t.update(meshes={"a": 1}), "no valid glTF"),
-    (lambda t: t["cameras"][0].update(type="orthographic"), "not a perspective one"),
-])
+@pytest.mark.parametrize(
+    "change, problem",
+    [
+        (lambda t: t["nodes"].append({"children": [2]}) or t["scenes"][0]["nodes"].append(2), "the nodes are no tree"),
+        (lambda t: t["nodes"][1].update(mesh=9), "a reference to meshes that does not exist"),
+        (
+            lambda t: t["nodes"][1].update(translation=[float("nan"), 0, 0]),
+            "nodes.1.translation.0: input should be a finite number",
+        ),
+        (lambda t: t["nodes"][1].update(scale=[0, 0, 0]), "singular"),
+        (lambda t: t["nodes"][1].update(rotation="no"), "no valid glTF"),
+        (lambda t: t["meshes"][0]["primitives"][0].update(material=4), "a reference to materials that does not exist"),
+        (lambda t: t["accessors"][0].update(bufferView=77), "a reference to bufferViews that does not exist"),
+        (
+            lambda t: t["accessors"][0].update(byteOffset=-8),
+            "accessors.0.byteOffset: input should be greater than or equal to 0) (got -8)",
+        ),
+        (lambda t: t["accessors"][0].update(byteOffset=8), "reaches outside its buffer"),
+        (lambda t: t["accessors"][0].update(type="VEC9"), "accessors.0.type: input should be"),
+        (
+            lambda t: t["accessors"][0].update(count="3"),
+            "accessors.0.count: input should be a valid integer) (got '3')",
+        ),
+        (
+            lambda t: t.update(extensionsRequired=["KHR_draco_mesh_compression"]),
+            "needs the extension KHR_draco_mesh_compression, which BlinkGL does not draw",
+        ),
+        (lambda t: t.update(meshes={"a": 1}), "no valid glTF"),
+        (lambda t: t["cameras"][0].update(type="orthographic"), "not a perspective one"),
+    ],
+)
 def test_broken_files_are_named(tmp_path, change, problem):
     with pytest.raises(AssetError) as error:
         load(tmp_path, broken(change), intrinsics="file")
@@ -309,9 +392,18 @@ def test_our_reader_agrees_with_trimesh_on_real_files():
             matrix, geometry = theirs.graph[name]
             g = theirs.geometry[geometry]
             matrix = gltf.Z_UP @ matrix
-            corners.append(np.hstack([trimesh.transform_points(g.vertices[g.faces].reshape(-1, 3), matrix), g.visual.uv[g.faces].reshape(-1, 2) * [1, -1] + [0, 1]]))
+            corners.append(
+                np.hstack(
+                    [
+                        trimesh.transform_points(g.vertices[g.faces].reshape(-1, 3), matrix),
+                        g.visual.uv[g.faces].reshape(-1, 2) * [1, -1] + [0, 1],
+                    ]
+                )
+            )
         corners = np.concatenate(corners)
-        ours = np.concatenate([np.hstack([p.vertices[p.faces].reshape(-1, 3), p.uvs[p.faces].reshape(-1, 2)]) for p in mine])
+        ours = np.concatenate(
+            [np.hstack([p.vertices[p.faces].reshape(-1, 3), p.uvs[p.faces].reshape(-1, 2)]) for p in mine]
+        )
         assert ours.shape == corners.shape, path.name
         order = lambda a: a[np.lexsort(np.round(a, 4).T)]
         np.testing.assert_allclose(order(ours), order(corners), atol=2e-4, err_msg=path.name)
@@ -321,27 +413,38 @@ def test_from_trimesh():
     box = BOX.copy()
     textured = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], process=False)
     image = Image.fromarray(np.full((4, 4, 3), 90, np.uint8))
-    textured.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [0, 1]], material=trimesh.visual.material.PBRMaterial(baseColorTexture=image, baseColorFactor=[128, 255, 255, 255]))
+    textured.visual = trimesh.visual.TextureVisuals(
+        uv=[[0, 0], [1, 0], [0, 1]],
+        material=trimesh.visual.material.PBRMaterial(baseColorTexture=image, baseColorFactor=[128, 255, 255, 255]),
+    )
     source = trimesh.Scene()
     place = trimesh.transformations.rotation_matrix(0.3, [1, 2, 3], [0.5, 0, 0]) @ np.diag([2, 1, 1, 1.0])
     source.add_geometry(box, node_name="box", transform=place)
     source.add_geometry(textured, node_name="card")
-    view = trimesh.transformations.rotation_matrix(0.7, [1, 0, 0]) @ trimesh.transformations.translation_matrix([0, 0, 9])
+    view = trimesh.transformations.rotation_matrix(0.7, [1, 0, 0]) @ trimesh.transformations.translation_matrix(
+        [0, 0, 9]
+    )
     source.camera = trimesh.scene.Camera(resolution=(80, 60), fov=(60, 45))
     source.camera_transform = view
     scene = from_trimesh(source)
     by_name = {o.name: o for o in scene.objects}
     expected = trimesh.transform_points(box.vertices, place)
     np.testing.assert_allclose(bounds(world(by_name["box"])), bounds(expected), atol=1e-9)
-    assert by_name["box"].parts[0].mesh.closed and len(by_name["box"].parts[0].mesh.vertices) == 24      # flat-shaded
+    assert by_name["box"].parts[0].mesh.closed and len(by_name["box"].parts[0].mesh.vertices) == 24  # flat-shaded
     card = by_name["card"].parts[0]
     assert card.material.base_color == pytest.approx((128 / 255, 1, 1)) and (card.material.texture.image == 90).all()
-    np.testing.assert_allclose(sorted(card.mesh.uvs.tolist()), sorted([[0, 1], [1, 1], [0, 0]]))      # v turned down
-    X = np.linalg.inv(scene.camera_path.pose(0)) @ view @ [1, 2, -5, 1]      # right, up, ahead for trimesh
+    np.testing.assert_allclose(sorted(card.mesh.uvs.tolist()), sorted([[0, 1], [1, 1], [0, 0]]))  # v turned down
+    X = np.linalg.inv(scene.camera_path.pose(0)) @ view @ [1, 2, -5, 1]  # right, up, ahead for trimesh
     np.testing.assert_allclose(X[:3], [1, -2, 5], atol=1e-12)
-    assert (scene.camera.width, scene.camera.height) == (80, 60) and scene.camera.fx == pytest.approx(40 / math.tan(math.radians(30)))
+    assert (scene.camera.width, scene.camera.height) == (80, 60) and scene.camera.fx == pytest.approx(
+        40 / math.tan(math.radians(30))
+    )
     other = from_trimesh(source, CAMERA, camera_path=StaticPath(np.eye(4)), up="y")
-    np.testing.assert_allclose(bounds(world({o.name: o for o in other.objects}["box"])), bounds(trimesh.transform_points(expected, gltf.Z_UP)), atol=1e-9)
+    np.testing.assert_allclose(
+        bounds(world({o.name: o for o in other.objects}["box"])),
+        bounds(trimesh.transform_points(expected, gltf.Z_UP)),
+        atol=1e-9,
+    )
     assert other.camera.fx == pytest.approx(CAMERA.fx)
 
 
@@ -357,13 +460,32 @@ def test_from_trimesh_refuses():
 def pyrender_like(camera, pose, indices=True):
     """What from_pyrender reads of a pyrender.Scene."""
     corners = BOX.vertices[BOX.faces].reshape(-1, 3)
-    primitive = SimpleNamespace(mode=4, positions=BOX.vertices if indices else corners, indices=BOX.faces if indices else None, normals=None,
-                                texcoord_0=np.tile([0.25, 0.75], (len(BOX.vertices if indices else corners), 1)),
-                                material=SimpleNamespace(baseColorFactor=np.array([0.5, 0.6, 0.7, 1]), baseColorTexture=SimpleNamespace(source=Image.new("RGB", (4, 2), (9, 8, 7))), doubleSided=False))
+    primitive = SimpleNamespace(
+        mode=4,
+        positions=BOX.vertices if indices else corners,
+        indices=BOX.faces if indices else None,
+        normals=None,
+        texcoord_0=np.tile([0.25, 0.75], (len(BOX.vertices if indices else corners), 1)),
+        material=SimpleNamespace(
+            baseColorFactor=np.array([0.5, 0.6, 0.7, 1]),
+            baseColorTexture=SimpleNamespace(source=Image.new("RGB", (4, 2), (9, 8, 7))),
+            doubleSided=False,
+        ),
+    )
     node = SimpleNamespace(name=None, mesh=SimpleNamespace(name="box", primitives=[primitive]))
     eye, sun = SimpleNamespace(name="eye", camera=camera), SimpleNamespace(name="sun")
-    poses = {id(node): trimesh.transformations.translation_matrix([1, 2, 3]), id(eye): pose, id(sun): trimesh.transformations.rotation_matrix(0.5, [1, 0, 0])}
-    return SimpleNamespace(mesh_nodes={node.name: node}.values(), main_camera_node=eye, directional_light_nodes=[sun], bg_color=[0.2, 0.4, 0.6, 1], get_pose=lambda n: poses[id(n)])
+    poses = {
+        id(node): trimesh.transformations.translation_matrix([1, 2, 3]),
+        id(eye): pose,
+        id(sun): trimesh.transformations.rotation_matrix(0.5, [1, 0, 0]),
+    }
+    return SimpleNamespace(
+        mesh_nodes={node.name: node}.values(),
+        main_camera_node=eye,
+        directional_light_nodes=[sun],
+        bg_color=[0.2, 0.4, 0.6, 1],
+        get_pose=lambda n: poses[id(n)],
+    )
 
 
 @pytest.mark.parametrize("indices", [True, False])
@@ -375,9 +497,15 @@ def test_from_pyrender(indices):
     assert box.name == "box" and box.parts[0].mesh.closed and box.parts[0].material.base_color == (0.5, 0.6, 0.7)
     np.testing.assert_allclose(box.parts[0].mesh.uvs, np.tile([0.25, 0.25], (24, 1)))
     assert box.parts[0].material.texture.image.shape == (2, 4, 3)
-    assert scene.camera.fy == pytest.approx(24 / math.tan(0.45)) and scene.camera.fx == pytest.approx(scene.camera.fy) and scene.camera.near == 0.1
+    assert (
+        scene.camera.fy == pytest.approx(24 / math.tan(0.45))
+        and scene.camera.fx == pytest.approx(scene.camera.fy)
+        and scene.camera.near == 0.1
+    )
     np.testing.assert_allclose(scene.camera_path.pose(0), pose @ np.diag([1, -1, -1, 1.0]), atol=1e-12)
-    assert scene.light.sun_direction == pytest.approx((0, -math.sin(0.5), math.cos(0.5))) and scene.background == pytest.approx(0.4)
+    assert scene.light.sun_direction == pytest.approx(
+        (0, -math.sin(0.5), math.cos(0.5))
+    ) and scene.background == pytest.approx(0.4)
     scene = from_pyrender(pyrender_like(SimpleNamespace(fx=50.0, fy=60.0, cx=32.0, cy=24.0, znear=0.05), pose), CAMERA)
     assert (scene.camera.fx, scene.camera.fy, scene.camera.cx, scene.camera.cy) == (50, 60, 31.5, 23.5)
 
@@ -385,7 +513,9 @@ def test_from_pyrender(indices):
 def test_from_real_pyrender():
     pyrender = pytest.importorskip("pyrender", reason="pyrender is not installed")
     source = pyrender.Scene(bg_color=[0.1, 0.1, 0.1, 1])
-    source.add(pyrender.Mesh.from_trimesh(BOX, smooth=False), pose=trimesh.transformations.translation_matrix([0, 0, -5]))
+    source.add(
+        pyrender.Mesh.from_trimesh(BOX, smooth=False), pose=trimesh.transformations.translation_matrix([0, 0, -5])
+    )
     source.add(pyrender.IntrinsicsCamera(fx=50, fy=50, cx=32, cy=24), pose=np.eye(4))
     scene = from_pyrender(source, CAMERA)
     np.testing.assert_allclose(bounds(world(scene.objects[0])), [[-0.5, -1, -6.5], [0.5, 1, -3.5]], atol=1e-6)

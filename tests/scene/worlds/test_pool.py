@@ -29,7 +29,7 @@ def test_split_is_a_fraction_of_hashes():
     hashes = [rng.bytes(16).hex() for _ in range(20_000)]
     tests = [h for h in hashes if split_of(h, 0.1) == "test"]
     assert abs(len(tests) - 2000) < 4 * np.sqrt(20_000 * 0.1 * 0.9)
-    assert set(tests) <= {h for h in hashes if split_of(h, 0.2) == "test"}      # a larger fraction only adds
+    assert set(tests) <= {h for h in hashes if split_of(h, 0.2) == "test"}  # a larger fraction only adds
     assert all(split_of(h, 0.0) == "train" and split_of(h, 1.0) == "test" for h in hashes[:100])
 
 
@@ -44,7 +44,10 @@ def test_splits_are_disjoint_and_complete():
 def test_generated_content_differs_between_splits():
     """Not only the hashes: no shape of one split is a shape of the other."""
     pool = object_pool(PoolConfig(primitives=("sphere", "icosphere", "prism"), test_fraction=0.5), ".")
-    shapes = {s: {np.round(pool.load(e).parts[0].mesh.vertices, 9).tobytes() for g in pool.split(s).values() for e in g} for s in ("train", "test")}
+    shapes = {
+        s: {np.round(pool.load(e).parts[0].mesh.vertices, 9).tobytes() for g in pool.split(s).values() for e in g}
+        for s in ("train", "test")
+    }
     assert shapes["train"] and shapes["test"] and not shapes["train"] & shapes["test"]
 
 
@@ -106,11 +109,16 @@ def test_loaded_objects_are_normalised():
 
 def test_all_real_models_load_both_ways():
     for keep in (False, True):
-        pool = object_pool(PoolConfig(folders=(str(shared("data/assets/models_cc0")),), keep_materials=keep, **NOTHING), ".")
+        pool = object_pool(
+            PoolConfig(folders=(str(shared("data/assets/models_cc0")),), keep_materials=keep, **NOTHING), "."
+        )
         assert len(pool.entries) == 81
         for entry in pool.entries:
             asset = pool.load(entry)
-            assert asset.parts and all(np.isfinite(p.mesh.uvs).all() and np.abs(np.linalg.norm(p.mesh.normals, axis=1) - 1).max() < 1e-5 for p in asset.parts)
+            assert asset.parts and all(
+                np.isfinite(p.mesh.uvs).all() and np.abs(np.linalg.norm(p.mesh.normals, axis=1) - 1).max() < 1e-5
+                for p in asset.parts
+            )
             assert len(asset.parts) == 1 or keep
 
 
@@ -135,17 +143,28 @@ def test_missing_folders_and_empty_pools(tmp_path):
     folders = lambda *f, **more: config_error(lambda: object_pool(PoolConfig(folders=f, **NOTHING, **more), tmp_path))
     assert folders("nowhere") == "scene.pool.folders.0: no such folder (got 'nowhere'); expected a folder of meshes"
     assert folders("file") == "scene.pool.folders.0: is not a folder (got 'file'); expected a folder of meshes"
-    assert folders("empty") == "scene.pool.folders.0: the folder holds no meshes (got 'empty'); expected files of .obj .ply .stl .glb .gltf"
+    assert (
+        folders("empty")
+        == "scene.pool.folders.0: the folder holds no meshes (got 'empty'); expected files of .obj .ply .stl .glb .gltf"
+    )
     box(tmp_path / "empty" / "a.ply")
     assert folders("empty", "nowhere").startswith("scene.pool.folders.1: no such folder")
     pool = object_pool(PoolConfig(**NOTHING), tmp_path)
-    assert config_error(lambda: pool.split("train")) == "scene.pool: the pool of meshes is empty; expected at least one source of meshes"
+    assert (
+        config_error(lambda: pool.split("train"))
+        == "scene.pool: the pool of meshes is empty; expected at least one source of meshes"
+    )
     pool = object_pool(PoolConfig(test_fraction=0), tmp_path)
-    assert config_error(lambda: pool.split("test")).startswith("scene.pool.test_fraction: none of the 216 meshes falls to split 'test' (got 0.0)")
+    assert config_error(lambda: pool.split("test")).startswith(
+        "scene.pool.test_fraction: none of the 216 meshes falls to split 'test' (got 0.0)"
+    )
     assert config_error(lambda: pool.split("val")) == "unknown split (got 'val'); expected train or test"
-    assert config_error(lambda: texture_pool(TexturesConfig(procedural=False, photographs=False), tmp_path).split("train")) == (
-        "scene.textures: the pool of textures is empty; expected at least one source of textures")
-    assert config_error(lambda: texture_pool(TexturesConfig(folders=("empty",)), tmp_path)).startswith("scene.textures.folders.0: the folder holds no images")
+    assert config_error(
+        lambda: texture_pool(TexturesConfig(procedural=False, photographs=False), tmp_path).split("train")
+    ) == ("scene.textures: the pool of textures is empty; expected at least one source of textures")
+    assert config_error(lambda: texture_pool(TexturesConfig(folders=("empty",)), tmp_path)).startswith(
+        "scene.textures.folders.0: the folder holds no images"
+    )
 
 
 def write_nan(path):
@@ -165,8 +184,10 @@ def write_truncated_stl(path):
 
 
 def write_billion_ply(path):
-    path.write_text("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-                    "element face 1000000000\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n")
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1000000000\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n"
+    )
 
 
 def write_billion_vertices(path):
@@ -212,27 +233,30 @@ def write_bad_index(path):
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n")
 
 
-@pytest.mark.parametrize("suffix, write, problem", [
-    ("obj", write_nan, "vertices are NaN, infinite"),
-    ("obj", write_no_faces, "no faces"),
-    ("obj", write_many_faces, "too many faces (got 2001); expected at most 1000"),
-    ("obj", write_bad_index, ""),
-    ("stl", write_billion_stl, "too many faces (got 1000000000)"),
-    ("stl", write_truncated_stl, "truncated: 100 faces need 5084 bytes (got 584)"),
-    ("ply", write_billion_ply, "too many faces (got 1000000000)"),
-    ("ply", write_billion_vertices, "too many vertex elements (got 999999999)"),
-    ("glb", write_billion_glb, "too many faces (got 1000000000)"),
-    ("glb", write_billion_virtual, "too many faces (got 1000000000)"),
-    ("glb", write_truncated_glb, "truncated"),
-    ("glb", write_short_accessor, "reaches outside its buffer"),
-    ("ply", lambda p: p.write_bytes(b"ply nonsense"), "no PLY header"),
-    ("glb", lambda p: p.write_bytes(b"glTF"), "truncated"),
-    ("gltf", lambda p: p.write_text("{"), "JSON cannot be read"),
-    ("gltf", lambda p: p.write_text('{"asset": {"version": "1.0"}}'), "no glTF 2"),
-    ("gltf", lambda p: p.write_text('{"asset": {"version": "2.0"}, "nodes": 7}'), "no valid glTF"),
-    ("obj", lambda p: p.write_bytes(b""), ""),
-    ("stl", lambda p: p.write_bytes(b""), ""),
-])
+@pytest.mark.parametrize(
+    "suffix, write, problem",
+    [
+        ("obj", write_nan, "vertices are NaN, infinite"),
+        ("obj", write_no_faces, "no faces"),
+        ("obj", write_many_faces, "too many faces (got 2001); expected at most 1000"),
+        ("obj", write_bad_index, ""),
+        ("stl", write_billion_stl, "too many faces (got 1000000000)"),
+        ("stl", write_truncated_stl, "truncated: 100 faces need 5084 bytes (got 584)"),
+        ("ply", write_billion_ply, "too many faces (got 1000000000)"),
+        ("ply", write_billion_vertices, "too many vertex elements (got 999999999)"),
+        ("glb", write_billion_glb, "too many faces (got 1000000000)"),
+        ("glb", write_billion_virtual, "too many faces (got 1000000000)"),
+        ("glb", write_truncated_glb, "truncated"),
+        ("glb", write_short_accessor, "reaches outside its buffer"),
+        ("ply", lambda p: p.write_bytes(b"ply nonsense"), "no PLY header"),
+        ("glb", lambda p: p.write_bytes(b"glTF"), "truncated"),
+        ("gltf", lambda p: p.write_text("{"), "JSON cannot be read"),
+        ("gltf", lambda p: p.write_text('{"asset": {"version": "1.0"}}'), "no glTF 2"),
+        ("gltf", lambda p: p.write_text('{"asset": {"version": "2.0"}, "nodes": 7}'), "no valid glTF"),
+        ("obj", lambda p: p.write_bytes(b""), ""),
+        ("stl", lambda p: p.write_bytes(b""), ""),
+    ],
+)
 def test_bad_meshes_are_named(tmp_path, suffix, write, problem):
     path = tmp_path / f"broken.{suffix}"
     write(path)
@@ -247,12 +271,23 @@ def test_bad_meshes_are_named(tmp_path, suffix, write, problem):
 
 def test_a_file_too_large_is_not_read(tmp_path):
     with open(tmp_path / "big.stl", "wb") as file:
-        file.truncate(10_000_000_000)      # sparse
+        file.truncate(10_000_000_000)  # sparse
     message = config_error(lambda: object_pool(PoolConfig(folders=(str(tmp_path),), **NOTHING), "."))
     assert message.endswith("big.stl: the mesh file is too large (got '10000 MB'); expected at most 512 MB")
 
 
-@pytest.mark.parametrize("uri", ["../secret.bin", "/etc/hostname", "sub/../../secret.bin", "..%2Fsecret.bin", "link.bin", "https://example.org/a.bin", "..\\secret.bin"])
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "../secret.bin",
+        "/etc/hostname",
+        "sub/../../secret.bin",
+        "..%2Fsecret.bin",
+        "link.bin",
+        "https://example.org/a.bin",
+        "..\\secret.bin",
+    ],
+)
 def test_gltf_cannot_leave_its_folder(tmp_path, uri):
     folder = tmp_path / "models"
     (folder / "sub").mkdir(parents=True)
@@ -262,6 +297,7 @@ def test_gltf_cannot_leave_its_folder(tmp_path, uri):
     builder.node(mesh=triangle(builder))
     builder.tree["buffers"] = [{"byteLength": 100, "uri": uri}]
     import json
+
     (folder / "a.gltf").write_text(json.dumps(builder.tree))
     message = config_error(lambda: object_pool(PoolConfig(folders=(str(folder),), **NOTHING), "."))
     assert message.startswith(str(folder / "a.gltf")) and ("outside its folder" in message or "on a network" in message)
@@ -273,40 +309,58 @@ def test_obj_materials_cannot_leave_their_folder(tmp_path):
     (tmp_path / "secret.mtl").write_text("newmtl a\nKd 1 0 0\n")
     (folder / "a.obj").write_text("mtllib ../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
     pool = object_pool(PoolConfig(folders=(str(folder),), keep_materials=True, **NOTHING), ".")
-    assert "refers to a file outside its folder (got '../secret.mtl')" in config_error(lambda: pool.load(pool.entries[0]))
+    assert "refers to a file outside its folder (got '../secret.mtl')" in config_error(
+        lambda: pool.load(pool.entries[0])
+    )
     plain = object_pool(PoolConfig(folders=(str(folder),), **NOTHING), ".")
-    assert len(plain.load(plain.entries[0]).parts[0].mesh.faces) == 1      # not asked for, not read
+    assert len(plain.load(plain.entries[0]).parts[0].mesh.faces) == 1  # not asked for, not read
 
 
 def test_obj_materials(tmp_path):
     Image.new("RGB", (4, 4), (10, 200, 30)).save(tmp_path / "t.png")
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0.5 0\nnewmtl tex\nKd 0.2 0.2 0.2\nmap_Kd t.png\n")
-    (tmp_path / "a.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\n"
-                                    "usemtl red\nf 1/1/1 2/2/1 3/3/1\nusemtl tex\nf 2/1/1 4/2/1 3/3/1\n")
+    (tmp_path / "a.obj").write_text(
+        "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\n"
+        "usemtl red\nf 1/1/1 2/2/1 3/3/1\nusemtl tex\nf 2/1/1 4/2/1 3/3/1\n"
+    )
     parts = {p.material.texture is not None: p for p in load_asset(tmp_path / "a.obj").parts}
-    assert parts[False].material.base_color == pytest.approx((1, 0.214, 0), abs=3e-3)      # Kd is a code, made linear
+    assert parts[False].material.base_color == pytest.approx((1, 0.214, 0), abs=3e-3)  # Kd is a code, made linear
     assert (parts[True].material.texture.image == (10, 200, 30)).all() and parts[True].material.base_color == (1, 1, 1)
     corner = (parts[False].mesh.vertices == [0, 0, 0]).all(axis=1)
-    np.testing.assert_array_equal(parts[False].mesh.uvs[corner], [[0, 1]])      # vt (0, 0) is the bottom left
+    np.testing.assert_array_equal(parts[False].mesh.uvs[corner], [[0, 1]])  # vt (0, 0) is the bottom left
     assert len(load_asset(tmp_path / "a.obj", keep_materials=False).parts) == 1
     (tmp_path / "b.obj").write_text("mtllib gone.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     plain = load_asset(tmp_path / "b.obj")
-    assert plain.omissions == ("b.obj asks for what is not drawn: 'gone.mtl', which is missing",
-                               ) and not plain.has_materials
+    assert (
+        plain.omissions == ("b.obj asks for what is not drawn: 'gone.mtl', which is missing",)
+        and not plain.has_materials
+    )
 
 
 def test_corrupt_image_in_a_folder_is_named_or_skipped(tmp_path):
     (tmp_path / "bad.jpg").write_bytes(b"\xff\xd8\xff broken")
-    pool = texture_pool(TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0), ".")
+    pool = texture_pool(
+        TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0), "."
+    )
     assert config_error(lambda: pool.draw(np.random.default_rng(0), "train")).startswith(str(tmp_path / "bad.jpg"))
     Image.new("RGB", (8, 8), (200, 100, 50)).save(tmp_path / "good.png")
-    pool = texture_pool(TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"), ".")
+    pool = texture_pool(
+        TexturesConfig(
+            procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"
+        ),
+        ".",
+    )
     log = []
     rng = np.random.default_rng(0)
     assert {pool.draw(rng, "train", log).name for _ in range(10)} == {"good.png"}
     assert log and all("bad.jpg" in line for line in log)
     (tmp_path / "good.png").unlink()
-    pool = texture_pool(TexturesConfig(procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"), ".")
+    pool = texture_pool(
+        TexturesConfig(
+            procedural=False, photographs=False, folders=(str(tmp_path),), test_fraction=0, bad_assets="skip"
+        ),
+        ".",
+    )
     assert "50 textures drawn in a row are unusable" in config_error(lambda: pool.draw(rng, "train"))
 
 

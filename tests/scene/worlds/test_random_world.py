@@ -39,12 +39,21 @@ def build(settings, sequence=0, seed=0, split="train", base="."):
 
 def fingerprint(scene) -> bytes:
     times = np.array([0, 123_456_789, T1])
-    chunks = [scene.camera_path.poses(times).tobytes(), repr((scene.light, scene.log, scene.camera.K.tolist())).encode()]
+    chunks = [
+        scene.camera_path.poses(times).tobytes(),
+        repr((scene.light, scene.log, scene.camera.K.tolist())).encode(),
+    ]
     for o in scene.objects:
         chunks += [o.name.encode(), bytes([o.instance_id]), o.path.poses(times).tobytes()]
         for p in o.parts:
             m = p.mesh
-            chunks += [m.vertices.tobytes(), m.faces.tobytes(), m.normals.tobytes(), m.uvs.tobytes(), repr(replace(p.material, texture=None)).encode()]
+            chunks += [
+                m.vertices.tobytes(),
+                m.faces.tobytes(),
+                m.normals.tobytes(),
+                m.uvs.tobytes(),
+                repr(replace(p.material, texture=None)).encode(),
+            ]
             chunks += [p.material.texture.image.tobytes()] if p.material.texture else []
     return b"".join(chunks)
 
@@ -56,7 +65,10 @@ def test_same_seed_same_arrays_whatever_was_built_before():
     assert fingerprint(build(config(walls=True), sequence=3)) == first
     build(config(walls=True), sequence=1)
     assert fingerprint(build(config(walls=True), sequence=3)) == first
-    others = [fingerprint(build(config(walls=True), **k)) for k in (dict(sequence=4), dict(sequence=3, seed=1), dict(sequence=3, split="test"))]
+    others = [
+        fingerprint(build(config(walls=True), **k))
+        for k in (dict(sequence=4), dict(sequence=3, seed=1), dict(sequence=3, split="test"))
+    ]
     assert first not in others and len(set(others)) == 3
 
 
@@ -126,7 +138,7 @@ def test_structure(worlds):
         sky, ground = scene.objects[:2]
         assert (sky.category, ground.category) == ("sky", "ground") and sky.path.is_static and ground.path.is_static
         assert all(p.material.unlit for p in sky.parts) and len(sky.parts) == 6
-        for p in sky.parts:      # faces look inwards, cells are small
+        for p in sky.parts:  # faces look inwards, cells are small
             v = p.mesh.vertices[p.mesh.faces]
             assert (np.cross(v[:, 1] - v[:, 0], v[:, 2] - v[:, 0]) * -v.mean(axis=1)).sum(axis=1).min() > 0
             assert np.linalg.norm(v[:, 1] - v[:, 0], axis=1).max() < 1.5 * SkyConfig().size / SkyConfig().subdivisions
@@ -134,7 +146,9 @@ def test_structure(worlds):
         for o in scene.objects:
             assert all(p.mesh.closed or o.category != "object" for p in o.parts)
             for p in o.parts:
-                top = np.asarray(p.material.base_color) * (scene.light.sun + scene.light.sky if not p.material.unlit else 1)
+                top = np.asarray(p.material.base_color) * (
+                    scene.light.sun + scene.light.sky if not p.material.unlit else 1
+                )
                 assert p.material.texture is not None and top.max() <= 1.5
         assert np.linalg.norm(scene.light.sun_direction) == pytest.approx(1) and scene.light.sun_direction[2] > 0.4
 
@@ -168,23 +182,35 @@ def test_crowded_worlds_leave_objects_out_and_say_so():
 def test_splits_share_neither_meshes_nor_textures():
     used = {}
     for split in ("train", "test"):
-        scenes = [build(config(pool=PoolConfig(test_fraction=0.5), textures=TexturesConfig(max_size=16, test_fraction=0.5)), k, split=split) for k in range(4)]
-        used[split] = ({p.mesh.source_hash for s in scenes for o in things(s) for p in o.parts},
-                       {p.material.texture.source_hash for s in scenes for o in s.objects for p in o.parts})
+        scenes = [
+            build(
+                config(pool=PoolConfig(test_fraction=0.5), textures=TexturesConfig(max_size=16, test_fraction=0.5)),
+                k,
+                split=split,
+            )
+            for k in range(4)
+        ]
+        used[split] = (
+            {p.mesh.source_hash for s in scenes for o in things(s) for p in o.parts},
+            {p.material.texture.source_hash for s in scenes for o in s.objects for p in o.parts},
+        )
     for train, test in zip(used["train"], used["test"]):
         assert train and test and not train & test
 
 
 def test_real_assets_with_their_materials_and_panorama_sky():
     base = shared("data/assets")
-    settings = config(pool=PoolConfig(primitives=(), folders=("models_cc0",), keep_materials=True),
-                      textures=TexturesConfig(max_size=64, folders=("textures_cc0",)), sky=SkyConfig(panoramas=("hdri",)))
+    settings = config(
+        pool=PoolConfig(primitives=(), folders=("models_cc0",), keep_materials=True),
+        textures=TexturesConfig(max_size=64, folders=("textures_cc0",)),
+        sky=SkyConfig(panoramas=("hdri",)),
+    )
     scene = build(settings, base=base)
     assert any(len(o.parts) > 1 for o in things(scene))
     assert any(p.material.base_color != (1.0, 1.0, 1.0) for o in things(scene) for p in o.parts)
     sky = scene.objects[0]
     assert all(p.material.texture.image.dtype == np.float32 and p.material.uv_scale == (1, 1) for p in sky.parts)
-    assert max(p.mesh.uvs.max() for p in sky.parts) < 1      # the margin keeps filtering away from the wrap
+    assert max(p.mesh.uvs.max() for p in sky.parts) < 1  # the margin keeps filtering away from the wrap
     assert fingerprint(build(settings, base=base)) == fingerprint(scene)
 
 
@@ -192,7 +218,9 @@ def test_light_from_angles():
     assert make_light(LightConfig(sun_elevation=90)).sun_direction == pytest.approx((0, 0, 1), abs=1e-12)
     assert make_light(LightConfig(sun_elevation=0, sun_azimuth=90)).sun_direction == pytest.approx((0, 1, 0), abs=1e-12)
     rng = np.random.default_rng(0)
-    assert make_light(LightConfig(sun_azimuth=0, sun_elevation=45), rng).sun_direction == pytest.approx((2**-0.5, 0, 2**-0.5))
+    assert make_light(LightConfig(sun_azimuth=0, sun_elevation=45), rng).sun_direction == pytest.approx(
+        (2**-0.5, 0, 2**-0.5)
+    )
 
 
 def message(make):
@@ -202,32 +230,66 @@ def message(make):
     return str(error.value)
 
 
-@pytest.mark.parametrize("tree, expected", [
-    ({"objects": {"cuont": 3}}, "scene.objects.cuont: unknown key; expected 'count' (nearest)"),
-    ({"objects": {"count": -1}}, "scene.objects.count: too small (got -1)"),
-    ({"objects": {"size": [2, 1]}}, "scene.objects.size: the range must be [smallest, largest] (got [2, 1])"),
-    ({"objects": {"size": [0, 1]}}, "scene.objects.size.0: too small (got 0)"),
-    ({"pool": {"primitives": ["cube"]}}, ("scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, "
-                                         "capsule, prism, pyramid (got ['cube'])")),
-    ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),
-    ({"pool": {"test_fraction": 1.5}}, "scene.pool.test_fraction: too large (got 1.5); expected a number from 0 to 1"),
-    ({"textures": {"procedural": ["noise"]}}, "scene.textures.procedural: must be true, false or a list of value, perlin,"),
-    ({"sky": {"size": 20}}, "scene.sky.size: must be at least 36 to hold the region and its objects (got 20.0)"),
-    ({"region": {"height": 0.5}}, "scene.region.camera_height: must begin below region.height 0.5 (got [1.0, 3.5])"),
-])
+@pytest.mark.parametrize(
+    "tree, expected",
+    [
+        ({"objects": {"cuont": 3}}, "scene.objects.cuont: unknown key; expected 'count' (nearest)"),
+        ({"objects": {"count": -1}}, "scene.objects.count: too small (got -1)"),
+        ({"objects": {"size": [2, 1]}}, "scene.objects.size: the range must be [smallest, largest] (got [2, 1])"),
+        ({"objects": {"size": [0, 1]}}, "scene.objects.size.0: too small (got 0)"),
+        (
+            {"pool": {"primitives": ["cube"]}},
+            (
+                "scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, "
+                "capsule, prism, pyramid (got ['cube'])"
+            ),
+        ),
+        ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),
+        (
+            {"pool": {"test_fraction": 1.5}},
+            "scene.pool.test_fraction: too large (got 1.5); expected a number from 0 to 1",
+        ),
+        (
+            {"textures": {"procedural": ["noise"]}},
+            "scene.textures.procedural: must be true, false or a list of value, perlin,",
+        ),
+        ({"sky": {"size": 20}}, "scene.sky.size: must be at least 36 to hold the region and its objects (got 20.0)"),
+        (
+            {"region": {"height": 0.5}},
+            "scene.region.camera_height: must begin below region.height 0.5 (got [1.0, 3.5])",
+        ),
+    ],
+)
 def test_configuration_errors(tree, expected):
     assert message(lambda: validate(RandomSceneConfig, tree, where="scene")).startswith(expected)
 
 
 def test_assets_are_checked_before_work_starts(tmp_path):
     check_assets(config(), tmp_path)
-    assert message(lambda: check_assets(config(pool=PoolConfig(folders=("gone",))), tmp_path)).startswith("scene.pool.folders.0: no such folder (got 'gone')")
-    assert message(lambda: check_assets(config(pool=PoolConfig(primitives=())), tmp_path)).startswith("scene.pool: the pool of meshes is empty")
-    assert message(lambda: check_assets(config(textures=TexturesConfig(folders=("gone",))), tmp_path)).startswith("scene.textures.folders.0: no such folder")
-    assert message(lambda: build(config(sky=SkyConfig(panoramas=("gone.hdr",))), base=tmp_path)).startswith("scene.sky.panoramas.0: no such file or folder")
-    explicit = validate(ExplicitSceneConfig, {"kind": "explicit", "meshes": {"a": {"file": "gone.obj"}}, "objects": [{"mesh": "a"}], "camera": {}})
-    assert message(lambda: check_assets(explicit, tmp_path)) == "scene.meshes.a.file: no such file (got 'gone.obj'); expected a mesh file"
-    assert message(lambda: build(config(), split="val")) == "output.split: unknown split (got 'val'); expected train or test"
+    assert message(lambda: check_assets(config(pool=PoolConfig(folders=("gone",))), tmp_path)).startswith(
+        "scene.pool.folders.0: no such folder (got 'gone')"
+    )
+    assert message(lambda: check_assets(config(pool=PoolConfig(primitives=())), tmp_path)).startswith(
+        "scene.pool: the pool of meshes is empty"
+    )
+    assert message(lambda: check_assets(config(textures=TexturesConfig(folders=("gone",))), tmp_path)).startswith(
+        "scene.textures.folders.0: no such folder"
+    )
+    assert message(lambda: build(config(sky=SkyConfig(panoramas=("gone.hdr",))), base=tmp_path)).startswith(
+        "scene.sky.panoramas.0: no such file or folder"
+    )
+    explicit = validate(
+        ExplicitSceneConfig,
+        {"kind": "explicit", "meshes": {"a": {"file": "gone.obj"}}, "objects": [{"mesh": "a"}], "camera": {}},
+    )
+    assert (
+        message(lambda: check_assets(explicit, tmp_path))
+        == "scene.meshes.a.file: no such file (got 'gone.obj'); expected a mesh file"
+    )
+    assert (
+        message(lambda: build(config(), split="val"))
+        == "output.split: unknown split (got 'val'); expected train or test"
+    )
 
 
 def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_path):
@@ -251,4 +313,6 @@ def test_a_camera_that_runs_into_something_gets_another_path(monkeypatch, tmp_pa
 
 
 def test_there_is_one_set_of_light_defaults():
-    assert Light() == make_light(LightConfig()) and Light().sun == LightConfig().sun and Light().sky == LightConfig().sky
+    assert (
+        Light() == make_light(LightConfig()) and Light().sun == LightConfig().sun and Light().sky == LightConfig().sky
+    )

@@ -462,6 +462,25 @@ def test_a_toy_label_is_generated_verified_shown_and_exported(made, capsys, tmp_
     assert "position/000001.npy: missing" in " ".join(capsys.readouterr().out.split())
 
 
+def test_the_preview_of_a_toy_emulator_beside_a_toy_label(toy, position, tmp_path):
+    """The events are in the pictures: with a dead time that leaves each pixel one, they look different."""
+    labels, previewed = {"position": True}, {"enabled": True, "rate": 50.0}
+    recipe = written(tmp_path, labels=labels, preview=previewed)
+    (made,) = generate_run(load_run(recipe), tmp_path / "out")
+    (silent,) = generate_run(load_run(recipe, ["events.dead_us=2e6"]), tmp_path / "silent")
+    shown, without = (cv2.VideoCapture(str(one.path / "preview.mp4")) for one in (made, silent))
+    pictures = 0
+    while (frames := (shown.read(), without.read())) and frames[0][0]:
+        (_, picture), (same_length, other) = frames
+        assert same_length and picture.shape == other.shape
+        differs = np.abs(picture.astype(int) - other).max(axis=2) > 60
+        columns = np.flatnonzero(differs.any(axis=0))
+        assert pictures == 0 or len(columns), "events of the toy are drawn"
+        pictures += 1
+    assert pictures == 8, "50 a second, of 0.1 s and the 0.05 s before the first label"
+    assert made.events > 1.5 * silent.events
+
+
 def test_what_verify_says_of_a_toy_label(position, made, monkeypatch):
     (_folder,) = (made / "train").iterdir()
     assert verify_dataset(made).clean

@@ -84,7 +84,10 @@ def test_a_training_that_its_clock_ends_is_validated(tmp_path, data):  # noqa: F
 
 def test_progress_tells_rate_and_time_left_by_steps_and_by_clock(capsys):
     now = [100.0]
-    lines = capsys.readouterr().err.splitlines
+
+    def lines():
+        return capsys.readouterr().err.splitlines()
+
     with TrainProgress(100, 0, 4, True, "cpu, fp32", clock=lambda: now[0]) as progress:
         assert lines() == ["training: 100 steps of 4 samples on cpu, fp32"]
         now[0] += 2.0

@@ -159,11 +159,11 @@ def test_meshes_without_area_or_normals(gl):
     ]
     world = scene(things)
     with Renderer(gl, world, RenderConfig()) as renderer:
-        labels = renderer.labels(0, replace(MOTION, normals=True, colour=True), MS)
+        labels = renderer.labels(0, LabelRequest(*MOTION, "normals", "images"), MS)
         luminance = renderer.luminance(0).read()
     assert (labels.ids == 3).mean() > 0.9
     np.testing.assert_allclose(luminance[labels.ids == 3], 0.5 * world.light.sky, rtol=1e-6)
-    assert np.isfinite(labels.normals).all() and np.isfinite(labels.colour).all() and np.isfinite(luminance).all()
+    assert np.isfinite(labels.normals).all() and np.isfinite(labels.images).all() and np.isfinite(luminance).all()
     np.testing.assert_allclose(reference.render(world, 0).luminance, luminance, rtol=1e-6)
 
 
@@ -194,7 +194,7 @@ def test_images_of_a_few_pixels(gl, promise, width, height):
     world = sized(width, height)
     true = reference.render(world, 300 * MS, forward_ns=310 * MS)
     with Renderer(gl, world, RenderConfig(antialiasing="ssaa4")) as renderer:
-        labels = renderer.labels(300 * MS, replace(MOTION, occlusion=True), 310 * MS)
+        labels = renderer.labels(300 * MS, LabelRequest(*MOTION, "occlusion_forward"), 310 * MS)
         assert renderer.luminance(300 * MS).read().shape == (height, width)
         assert renderer.velocity(300 * MS, 4).read().shape == (max(1, height // 4), max(1, width // 4), 2)
     same = labels.ids == true.instance

@@ -114,14 +114,14 @@ def test_every_door_gives_the_same(run, tmp_path):
 @pytest.mark.parametrize("run", ["linear", "motion"], indirect=True)
 def test_frames_of_a_folder_are_frames_of_any_source(run, tmp_path):
     """The same pictures given to the simulator of videos, with the sequence's own seed."""
-    from blinkgl.recordings.simulation import simulate
+    from blinkgl.recordings.simulation import frames_to_events
 
     config = run.sequence(0)
     frames = [cv2.imread(str(path)) for path in sorted((tmp_path / "clip/image_left").iterdir())]
     given = ((frame[..., 0], round(k * 1e9 / FPS)) for k, frame in enumerate(frames))
     events = Events.concatenate(
         list(
-            simulate(
+            frames_to_events(
                 given,
                 emulator=config.events,
                 gamma="srgb",

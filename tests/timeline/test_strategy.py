@@ -227,7 +227,10 @@ def test_as_many_events_are_beyond_the_target_as_the_percentile_says(fast, targe
 
 
 def test_a_frame_is_judged_by_the_speed_at_the_nearest_time_that_was_looked_at():
-    world, seen = SimpleNamespace(motion=lambda t, n: picture(np.full((2, 2, 2), (float(t), 0.0), np.float32))), []
+    seen = []
+    world = SimpleNamespace(
+        velocity_of_movers=lambda t, n: picture(np.full((2, 2, 2), (float(t), 0.0), np.float32)),
+    )
     timeline = make_timeline(BudgetTimeline(max_time_error_us=10.0), 0, 10 * MS, world, Esim.response(ESIM))
     timeline.error.observe = lambda t_ns, signal, slope, speed: seen.append((t_ns, speed.max()))
     timeline.observe(7, np.ones((2, 2), np.float32))  # nothing looked at yet: it looks itself

@@ -13,6 +13,7 @@ from blinkgl.config.sequence import load_run
 from blinkgl.dataset import run as run_module
 from blinkgl.dataset.executor import Inline, Local
 from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.plan import Plan
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.dataset.work import thread_environment
@@ -20,7 +21,7 @@ from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.io.index import read_index
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.worlds import random_world
-from runs import NAMES, alive, children, recipe_file, start, temporaries, tree, wait_for
+from runs import NAMES, RECIPE, alive, children, recipe_file, start, temporaries, tree, wait_for
 
 
 @pytest.fixture(scope="module")
@@ -368,3 +369,13 @@ def test_workers_that_differ_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"workers differ in version or hardware: numba 0\.1 and"):
         run_dataset(load_run(recipe_file(tmp_path)), tmp_path / "out", Odd())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_group_that_is_switched_off_is_not_planned(tmp_path):
+    groups = {**RECIPE["groups"], "probe": {**RECIPE["groups"]["probe"], "enabled": False}}
+    plan = Plan.of(load_run(recipe_file(tmp_path, groups=groups)))
+    assert [task.name for task in plan.tasks] == [name for name in NAMES if "fly" in name]
+    assert plan.tasks.number("test/probe_000000") is None and plan.tasks.splits == ["train"]
+    off = {name: {**group, "enabled": False} for name, group in RECIPE["groups"].items()}
+    with pytest.raises(ConfigError, match="groups: every group is switched off; expected enabled: true"):
+        Plan.of(load_run(recipe_file(tmp_path, groups=off)))

@@ -29,6 +29,18 @@ def test_every_part_is_done_once(count):
         assert (counts == 20).all()
 
 
+def test_the_helpers_are_there_and_take_part():
+    """Parts that wait for each other: only as many threads as there are parts get through."""
+    together, taken = threading.Barrier(3), []
+
+    def kernel(_, start):
+        together.wait(20)
+        taken.append(threading.current_thread())
+
+    threads.run(kernel, 3, (), 3)
+    assert len(set(taken)) == 3 and all(helper.is_alive() for helper in threads._helpers)
+
+
 def test_helpers_begin_at_places_of_their_own():
     seen = []
 

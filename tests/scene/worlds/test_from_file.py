@@ -308,6 +308,7 @@ def test_file_scene(tmp_path):
         and all(p.material.unlit for o in scene.objects for p in o.parts)
     )
     posed = file_scene(tmp_path, pose={"position": [0, -5, 1], "look_at": [0, 0, 1]})
+    assert not any(p.material.unlit for o in posed.objects for p in o.parts), "what the file lights stays lit"
     np.testing.assert_allclose(posed.camera_path.pose(0)[:3, 2], [0, 1, 0], atol=1e-12)
 
 

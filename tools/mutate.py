@@ -720,7 +720,7 @@ def _awaited(child: int, limit_s: float) -> str:
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # the child, if it still runs, and what it started
     _, status = os.waitpid(child, 0)
-    if not in_time or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGPROF):
+    if not in_time or (os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGPROF, signal.SIGALRM)):
         return "time"
     return "passed" if os.WIFEXITED(status) and os.WEXITSTATUS(status) == 0 else "failed"
 
@@ -749,7 +749,9 @@ def _run_tests(order: dict) -> int:
 
     status = pytest.main(
         ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *order["tests"]],
-        plugins=[_Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"])],
+        plugins=[
+            _Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"], order["wait_s"])
+        ],
     )
     sys.stdout.flush()
     sys.stderr.flush()
@@ -759,13 +761,16 @@ def _run_tests(order: dict) -> int:
 class _Witness:
     """A plugin of pytest that writes down which test failed, or which file could not be collected, and ends the process
     when a test takes many times the processor time that it took once (``seconds``; ``spare_s`` more
-    for kernels that have to be compiled)."""
+    for kernels that have to be compiled), or waits (``wait_s`` and 20 times as long as it took)."""
 
-    def __init__(self, path: Path, seconds: dict[str, float], spare_s: float):
-        self.path, self.seconds, self.spare_s = path, seconds, spare_s
+    def __init__(self, path: Path, seconds: dict[str, float], spare_s: float, wait_s: float):
+        self.path, self.seconds, self.spare_s, self.wait_s = path, seconds, spare_s, wait_s
 
     def pytest_runtest_logstart(self, nodeid, location) -> None:
-        signal.setitimer(signal.ITIMER_PROF, self.spare_s + 3 * self.seconds.get(nodeid, 10.0))
+        seconds = self.seconds.get(nodeid, 10.0)
+        signal.setitimer(signal.ITIMER_PROF, self.spare_s + 3 * seconds)
+        # Who waits for what never comes takes no processor time; a machine that is busy is no deadlock.
+        signal.setitimer(signal.ITIMER_REAL, self.wait_s + 20 * seconds)
 
     def pytest_runtest_logreport(self, report) -> None:
         if report.failed:
@@ -810,6 +815,7 @@ class Copy:
                     "tests": list(tests),
                     "seconds": tests,
                     "spare_s": spare_s,
+                    "wait_s": 120.0,
                     "limit_s": 10 * spare_s + 4 * sum(tests.values()),
                     "kernels": scratch,
                     "original": original or {},

@@ -173,16 +173,23 @@ def test_own_tests_are_asked_first():
 
 @pytest.mark.slow
 def test_verdicts(tmp_path):
-    """A test that passes, one that fails, one that never ends, a process that dies: each in a child
-    that sees the source as it is by then."""
+    """A test that passes, one that fails, one that never ends, one that waits for ever, a process that
+    dies: each in a child that sees the source as it is by then."""
     (tmp_path / "thing.py").write_text("VALUE = 1\n")
     (tmp_path / "test_thing.py").write_text(
         "import os, thing\ndef test_right(): assert thing.VALUE == 1\ndef test_spins():\n    while True: pass\n"
-        "def test_dies(): os._exit(3)\n"
+        "def test_dies(): os._exit(3)\ndef test_waits():\n    import threading; threading.Event().wait()\n"
     )
     server, seen = Server(tmp_path), []
     try:
-        for tests, value in ((["right"], 1), (["right"], 2), (["spins"], 1), (["right", "dies"], 1), (["right"], 1)):
+        for tests, value in (
+            (["right"], 1),
+            (["right"], 2),
+            (["spins"], 1),
+            (["waits"], 1),
+            (["right", "dies"], 1),
+            (["right"], 1),
+        ):
             (tmp_path / "thing.py").write_text(f"VALUE = {value}\n")
             (tmp_path / "output.failed").unlink(missing_ok=True)
             names = [f"test_thing.py::test_{name}" for name in tests]
@@ -191,6 +198,7 @@ def test_verdicts(tmp_path):
                     "tests": names,
                     "seconds": dict.fromkeys(names, 0.0),
                     "spare_s": 1,
+                    "wait_s": 2,
                     "limit_s": 60,
                     "kernels": str(tmp_path / "kernels"),
                     "original": {},
@@ -205,6 +213,7 @@ def test_verdicts(tmp_path):
     assert seen == [
         ("passed", ""),
         ("failed", "test_thing.py::test_right"),
+        ("time", ""),
         ("time", ""),
         ("failed", ""),
         ("passed", ""),

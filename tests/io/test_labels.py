@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -107,6 +109,32 @@ def test_pickled_arrays_are_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.array([{}], object), allow_pickle=True)
     with pytest.raises(AssetError, match="Python objects, which could run any code"):
         images.read_npy(tmp_path / "a.npy")
+
+
+class _Runs:
+    """What unpickles it makes a folder."""
+
+    def __init__(self, folder):
+        self.folder = str(folder)
+
+    def __reduce__(self):
+        return os.mkdir, (self.folder,)
+
+
+@pytest.mark.parametrize("checked", [True, False], ids=["by its header", "by NumPy, were the header not looked at"])
+def test_a_pickle_in_an_archive_does_not_run(tmp_path, monkeypatch, checked):
+    """Two locks, each alone enough."""
+    np.savez(tmp_path / "a.npz", fine=np.arange(3), trap=np.array([_Runs(tmp_path / "ran")], object))
+    if not checked:
+        monkeypatch.setattr(images, "npy_header", lambda *_: None)
+    with (
+        pytest.raises(AssetError),
+        images.numpy_errors(tmp_path / "a.npz"),
+        images.NpzReader(tmp_path / "a.npz") as npz,
+    ):
+        assert npz["fine"].tolist() == [0, 1, 2]
+        npz["trap"]
+    assert not (tmp_path / "ran").exists()
 
 
 def test_srgb_curve():

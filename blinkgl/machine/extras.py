@@ -21,6 +21,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     ),
     "viz": (("rerun-sdk",), "3D viewer"),
     "urdf": (("pybullet",), "its random meshes as an object pool"),
+    "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
 }
 _PINNED = {"torch": "torch==2.13.0", "bpy": "bpy>=4.5,<4.6"}

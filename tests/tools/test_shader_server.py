@@ -393,7 +393,7 @@ def test_broken_from_the_start_is_one_error(shader, config, tmp_path):
 
 def test_the_command_says_where_and_ends_on_interrupt(config):
     child = subprocess.Popen(
-        [sys.executable, "-m", "blinkgl.cli", "shader", "serve", config, "--port", "0"],
+        [sys.executable, "-X", "faulthandler", "-m", "blinkgl.cli", "shader", "serve", config, "--port", "0"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -406,8 +406,14 @@ def test_the_command_says_where_and_ends_on_interrupt(config):
         connection.request("GET", "/state")
         assert json.load(connection.getresponse())["width"] == WIDTH
         connection.close()
+        ignored = Path(f"/proc/{child.pid}/status").read_text()
         child.send_signal(signal.SIGINT)
-        _out, err = child.communicate(timeout=30)
+        try:
+            _out, err = child.communicate(timeout=30)
+        except subprocess.TimeoutExpired:  # seen twice, never when looked for: where does it stand?
+            child.send_signal(signal.SIGABRT)
+            _out, err = child.communicate(timeout=30)
+            pytest.fail(f"does not end:\n{err}\n{ignored}")
     finally:
         child.kill()
     assert child.returncode == 0 and err == ""

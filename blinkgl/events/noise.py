@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-_SIZES = np.array([0.2, 0.25, 0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.5])
-_K = np.array([0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
+RATE_SIZES = np.array([0.2, 0.25, 0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.5])
+RATE_K = np.array([0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
 _LOG_RATE = np.array(
     [
         [-6.166, -4.029, -2.931, -1.761, -1.109, -0.277, 0.505, 1.328, 2.301],
@@ -37,11 +37,11 @@ def noise_size(k: np.ndarray, events_per_time_constant: np.ndarray) -> np.ndarra
     k : time constants per frame. Beyond 10 the samples are independent and the rate per *frame* is what counts.
     """
     k, rate = np.broadcast_arrays(np.asarray(k, float), np.asarray(events_per_time_constant, float))
-    wanted = np.log(np.maximum(rate, 1e-300)) + np.log(np.maximum(k / _K[-1], 1.0))
-    place = np.interp(np.log(np.clip(k, _K[0], _K[-1])), np.log(_K), np.arange(len(_K)))
-    low = np.minimum(place.astype(int), len(_K) - 2)
+    wanted = np.log(np.maximum(rate, 1e-300)) + np.log(np.maximum(k / RATE_K[-1], 1.0))
+    place = np.interp(np.log(np.clip(k, RATE_K[0], RATE_K[-1])), np.log(RATE_K), np.arange(len(RATE_K)))
+    low = np.minimum(place.astype(int), len(RATE_K) - 2)
     rows = _LOG_RATE[low] + (place - low)[..., None] * (_LOG_RATE[low + 1] - _LOG_RATE[low])
-    q = 1 / _SIZES**2  # ln r is nearly linear in it
+    q = 1 / RATE_SIZES**2  # ln r is nearly linear in it
     out = np.empty(k.shape)
     for index in np.ndindex(k.shape):
         row, w = rows[index], wanted[index]
@@ -58,5 +58,5 @@ def noise_table(rate_hz: float, dt_s: float, threshold: float) -> np.ndarray:
 def start_sizes(rate_hz: float, corner_hz: np.ndarray, threshold: float) -> np.ndarray:
     """Noise sizes in ln units for pixels with these corner frequencies, whatever the frame spacing will be."""
     corners = np.exp(np.linspace(np.log(corner_hz.min()), np.log(corner_hz.max()) + 1e-9, 64))
-    sizes = noise_size(_K[0], rate_hz / (2 * np.pi * corners))
+    sizes = noise_size(RATE_K[0], rate_hz / (2 * np.pi * corners))
     return threshold * np.interp(np.log(corner_hz), np.log(corners), sizes)

@@ -16,7 +16,15 @@ from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import v2e_model as v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.noise import noise_table
-from blinkgl.events.philox import Stream, normal2, normal_and_uniform, pixel_counters, rough_normal, uniform2
+from blinkgl.events.philox import (
+    Stream,
+    normal2,
+    normal2_and_uniform,
+    normal_and_uniform,
+    pixel_counters,
+    rough_normal,
+    uniform2,
+)
 from blinkgl.events.types import Events
 
 
@@ -196,20 +204,19 @@ class ReferenceV2e:
         rows = []
         if self.t_ns is None:
             self.t_ns = self.epoch = t_ns
-            phase = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))[
-                0
-            ]
-            reference = x - phase.astype(np.float32) * self.on if self.leaks else x
-            self.upper, self.lower = reference + self.on, reference - self.off
+            start = v2e.draw_start(
+                self.config, intensity, self.on, self.off, self.leak if self.leaks else self.leak[:0], self.seed
+            )
+            if self.leaks:
+                self.leak = start.leak
+            reference = x + start.offset
             lag = np.zeros(self.pixels, np.float32)
             if self.hums:
-                start = v2e.draw_start_noise(intensity, self.config, self.seed)
-                self.hum = start
-                reference = x + start
-                if self.leaks:
-                    reference = reference - phase.astype(np.float32) * self.on
-                self.upper, self.lower = reference + self.on, reference - self.off
-            elif self.config.shot_noise_rate_hz:
+                self.hum = v2e.draw_start_noise(intensity, self.config, self.seed)
+                reference = x + self.hum + start.offset
+            self.upper, self.lower = reference + self.on, reference - self.off
+            self.release = [t_ns + int(left) if left else None for left in start.dead_ns] or self.release
+            if self.config.shot_noise_rate_hz and not self.hums:
                 self.clocks = [self.shot_times(b) for b in range(-(-self.pixels // v2e.BLOCK))]
                 self.pending = [next(clock) for clock in self.clocks]
         else:
@@ -333,11 +340,11 @@ class ReferenceV2e:
 
 
 class ReferenceVoltmeter:
-    """Lin et al. 2022, sections 3 and 4."""
+    """Lin et al. 2022, sections 3 and 4, as the docstring of :mod:`blinkgl.events.voltmeter` says it."""
 
     def __init__(self, height: int, width: int, config: VoltmeterConfig, seed: int = 0):
         self.width, self.config, self.seed = width, config, np.uint64(seed)
-        self.v = np.zeros(height * width, np.int32)
+        self.v, self.unspent = np.zeros(height * width, np.int32), np.zeros(height * width, np.float32)
         self.release: list[int | None] = [None] * (height * width)
         self.t_ns: int | None = None
         self.frame = 0
@@ -346,6 +353,9 @@ class ReferenceVoltmeter:
         c, f = self.config, np.float32
         intensity = (as_luminance(luminance) * f(c.full_scale)).ravel()
         rows = []
+        if self.t_ns is None and c.start == "stationary" and c.compat == "none":
+            self.v, left_us = voltmeter.start_voltage(intensity, c, self.seed)
+            self.release = [t_ns + int(us * 1e3) if us else None for us in left_us]
         if self.t_ns is not None:
             dt = (t_ns - self.t_ns) * 1e-3
             drift, noise = voltmeter.drift_and_noise(
@@ -359,42 +369,98 @@ class ReferenceVoltmeter:
                 f(c.k6),
                 f(np.sqrt(dt)),
             )
-            v_end = voltmeter.move(self.v, drift)
-            near = voltmeter.near_threshold(self.v, v_end, noise)
+            v_end, unspent = voltmeter.move(self.v, drift), self.unspent + noise * noise
+            near = voltmeter.near_threshold(self.v, v_end, unspent, noise * noise)
             for i in range(len(self.v)):
-                if near[i] or self.release[i] is not None:
-                    v_end[i] = self.pixel(i, np.float64(intensity[i]), dt, t_ns, rows)
-            self.v = v_end
+                if c.compat == "authors":
+                    v_end[i] = self.pixel_of_authors(i, np.float64(intensity[i]), dt, t_ns, rows)
+                elif near[i] or self.release[i] is not None:
+                    v_end[i], unspent[i] = self.pixel(i, np.float64(intensity[i]), dt, t_ns, rows)
+            self.v, self.unspent = v_end, unspent
         self.intensity, self.t_ns, self.frame = intensity, t_ns, self.frame + 1
         return sorted_events(rows)
 
-    def pixel(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> int:
-        """Draw the interval of one pixel; returns its voltage at the end."""
-        c, before, (y, x) = self.config, np.float64(self.intensity[i]), divmod(i, self.width)
+    def rates(self, i: int, after: np.float64, dt: float) -> tuple[float, float]:
+        """(mu, sigma) of one pixel, per us."""
+        c, before = self.config, np.float64(self.intensity[i])
         mean = 0.5 * (before + after)
         mu = c.k1 * (after - before) / dt / (mean + c.k2) + c.k4 + c.k5 * mean
-        sigma = c.k3 * np.sqrt(mean) / (mean + c.k2) + c.k6
-        v, t, refractory = np.float64(self.v[i] / voltmeter.V_ONE), 0.0, round(c.refractory_us * 1000)
+        return mu, c.k3 * np.sqrt(mean) / (mean + c.k2) + c.k6
+
+    def fire(self, i: int, up: bool, t: float, t_ns: int, rows: list) -> float | None:
+        """Notes an event; returns when the pixel goes on (us from the interval's start), None after its end."""
+        refractory, dt_ns = round(self.config.refractory_us * 1000), t_ns - self.t_ns
+        after_ns = min(int(t * 1e3), dt_ns)
+        y, x = divmod(i, self.width)
+        rows.append(((self.t_ns + after_ns) // 1000, y, x, int(up)))
+        if not refractory:
+            return t
+        if after_ns + refractory > dt_ns:
+            self.release[i] = self.t_ns + after_ns + refractory
+            return None
+        return (after_ns + refractory) * 1e-3
+
+    def pixel(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> tuple[int, float]:
+        """Draw the interval of one pixel; returns its voltage at the end and the variance that is unspent."""
+        mu, sigma = self.rates(i, after, dt)
+        v, variance, t = np.float64(self.v[i] / voltmeter.V_ONE), np.float64(self.unspent[i]), 0.0
+        if self.release[i] is not None:
+            if self.release[i] > t_ns:
+                return voltmeter.IN_DEAD_TIME, 0.0
+            v, variance, t, self.release[i] = np.float64(0), 0.0, max(self.release[i] - self.t_ns, 0) * 1e-3, None
+        held = lambda voltage: np.clip(voltage, -voltmeter.NEAREST, voltmeter.NEAREST)
+        draws = (
+            normal2_and_uniform(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64((self.frame << 20) + k))
+            for k in range(voltmeter.MAX_DRAWS)
+        )
+        first, normal, uniform = next(draws)
+        if variance > 0:
+            v, variance = held(v + np.sqrt(variance) * first), 0.0
+        while t < dt:
+            part, side = voltmeter.reach_of_part(v, mu, sigma, dt - t)
+            if side == 0 and part == dt - t:
+                v, variance = v + mu * part, sigma * sigma * part
+                break
+            noise = sigma * np.sqrt(part)
+            end = v + mu * part + noise * normal
+            distance, beyond = (1.0 - v, 1.0 - end) if side >= 0 else (1.0 + v, 1.0 + end)
+            chance = voltmeter.crosses(distance, beyond, noise) if side else 0.0
+            if uniform < chance:
+                which = uniform / chance
+                passed, normal, uniform = next(draws)
+                resumed = self.fire(i, side > 0, t + part * voltmeter.bridge_time(
+                    distance, beyond, noise, passed, which), t_ns, rows)
+                if resumed is None:
+                    return voltmeter.IN_DEAD_TIME, 0.0
+                v, t = np.float64(0), resumed
+            else:
+                v, whole, t = held(end), part == dt - t, t + part
+                if whole:
+                    break
+                _, normal, uniform = next(draws)
+        return int(v * voltmeter.V_ONE), np.float32(variance)
+
+    def pixel_of_authors(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> int:
+        """:meth:`pixel` of ``compat: authors``."""
+        mu, sigma = self.rates(i, after, dt)
+        v, t = np.float64(self.v[i] / voltmeter.V_ONE), 0.0
         if self.release[i] is not None:
             if self.release[i] > t_ns:
                 return voltmeter.IN_DEAD_TIME
             v, t, self.release[i] = np.float64(0), max(self.release[i] - self.t_ns, 0) * 1e-3, None
         draw = self.frame << 20
         while True:
-            if not voltmeter.in_reach(v, mu * (dt - t), sigma * np.sqrt(dt - t)):
-                return int((v + mu * (dt - t)) * voltmeter.V_ONE)
             normal, which = normal_and_uniform(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw))
             side, _ = uniform2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw + 1))
             draw += 2
-            p = int(side < voltmeter.on_first(1.0 - v, 1.0 + v, mu, sigma))
-            hit = t + voltmeter.hitting_time(1.0 - v if p else 1.0 + v, mu, sigma, normal, which)
-            if not hit <= dt:
-                return int(np.clip(v + mu * (dt - t), -voltmeter.NEAREST, voltmeter.NEAREST) * voltmeter.V_ONE)
-            v, t = np.float64(0), hit
-            after_ns = min(int(hit * 1e3), t_ns - self.t_ns)
-            rows.append(((self.t_ns + after_ns) // 1000, y, x, p))
-            if refractory:
-                if after_ns + refractory > t_ns - self.t_ns:
-                    self.release[i] = self.t_ns + after_ns + refractory
-                    return voltmeter.IN_DEAD_TIME
-                t = (after_ns + refractory) * 1e-3
+            up = side < voltmeter.on_first(1.0 - v, 1.0 + v, mu, sigma)
+            distance = 1.0 - v if up else 1.0 + v
+            hit = voltmeter.hitting_time(distance, mu, sigma, normal, which)
+            if not hit < dt - t:
+                moved = distance * (dt - t) / hit
+                v = v + moved if up else v - moved
+                return int(np.clip(v, -voltmeter.NEAREST, voltmeter.NEAREST) * voltmeter.V_ONE)
+            resumed = self.fire(i, up, t + hit, t_ns, rows)
+            if resumed is None:
+                return voltmeter.IN_DEAD_TIME
+            v, t = np.float64(0), resumed

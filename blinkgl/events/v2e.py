@@ -33,7 +33,7 @@ from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulato
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
 from blinkgl.events.packing import JIT, T_SHIFT
-from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
+from blinkgl.events.philox import Stream, normal2, rough_normal, uniform2
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
@@ -43,6 +43,7 @@ from blinkgl.events.v2e_model import (
     crossing_fraction,
     curve_of,
     draw_leaks,
+    draw_start,
     draw_start_noise,
     lin_log,
     next_noise,
@@ -543,12 +544,13 @@ class V2e(Emulator):
         if self._noise.size:
             self._noise[...] = draw_start_noise(intensity, self.config, self.seed)
             reference = reference + self._noise
-        if self._leak.size:  # else every pixel's first leak event would come at the same time
-            phase, _ = uniform2(
-                self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0)
-            )
-            reference = reference - phase.astype(np.float32) * self._on
+        start = draw_start(self.config, intensity, self._on, self._off, self._leak, self.seed)
+        reference = reference + start.offset
         self._upper[...], self._lower[...] = reference + self._on, reference - self._off
+        self._leak[...] = start.leak
+        dead = np.flatnonzero(start.dead_ns)
+        self._upper[dead], self._lower[dead] = -np.inf, np.inf
+        self._release[dead] = t_ns + start.dead_ns[dead]
         for block in range(len(self._clock_ns)):
             rate = self._shot_unit * float(self._shot_table[block, -1])
             gap, _ = shot_draw(self.seed, np.uint64(block), np.uint64(2**62), rate)

@@ -24,6 +24,9 @@ VARIANTS = {
     "very noisy": dict(k3=0.01, k6=0.002),
     "noiseless": dict(k3=0.0, k6=0.0),
     "leaky": dict(k4=2e-4, refractory_us=100.0),
+    "starting at 0": dict(start="zero", k6=1e-3),
+    "authors": dict(compat="authors", k6=1e-3),
+    "authors, dead time": dict(compat="authors", refractory_us=3000.0),
 }
 
 

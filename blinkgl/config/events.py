@@ -26,6 +26,11 @@ _MAX_EVENTS = Field(
     "is cut to the same number; levels still move, the cut events are counted in `emulator.saturated`. "
     "2^25 events need about 1 GB while they are sorted.",
 )
+_CAUSES = Field(
+    False,
+    description="Mark every event by what caused it (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): 0 signal, "
+    "1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
+)
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
@@ -105,6 +110,7 @@ class EsimConfig(EmulatorConfig):
         description="Dead time of a pixel after an event, microseconds; a level passed in it is lost, as in rpg_esim.",
     )
     max_events_per_step: int = _MAX_EVENTS
+    causes: bool = _CAUSES
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
@@ -201,6 +207,7 @@ class V2eConfig(EmulatorConfig):
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
     max_events_per_step: int = _MAX_EVENTS
+    causes: bool = _CAUSES
 
     @rule("photoreceptor_noise", "cutoff_hz")
     def _noise_needs_bandwidth(noise, cutoff_hz):
@@ -261,6 +268,7 @@ class VoltmeterConfig(EmulatorConfig):
         "starts at 0, and its noise depends on the frame rate.",
     )
     max_events_per_step: int = _MAX_EVENTS
+    causes: bool = _CAUSES
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:

@@ -208,6 +208,8 @@ class Start(NamedTuple):
     offset: np.ndarray  # float32: reference less signal, ln units
     leak: np.ndarray  # float32, of the interval that is under way; [] without leak
     dead_ns: np.ndarray  # int64: what is left of the dead time; [] without one, 0 for most
+    age_ns: np.ndarray  # int64: how long leak has been moving the pixel
+    by_noise: np.ndarray  # float32: what of the offset is the photoreceptor noise's doing
 
 
 _JITTER_TURN, _TURNS, _MOST_ROUGH = 1000, 200, 3.5
@@ -225,12 +227,13 @@ def draw_start(
     density e^-Ra up to T."""
     pixels = np.arange(len(on), dtype=np.uint64)
     offset, dead_ns = np.zeros(len(on), np.float32), np.zeros(len(on) if config.refractory_us else 0, np.int64)
+    age_ns, by_noise = np.zeros(len(on), np.int64), np.zeros(len(on), np.float32)
     first, second = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(0))
     if config.start == "balanced":
         place = first - second  # triangular: where a Brownian motion that is put back to 0 at -1 and 1 is found
         offset = (-place * np.where(place > 0, on, off)).astype(np.float32)
     if config.start != "stationary" or not (leak.size or config.shot_noise_rate_hz):
-        return Start(offset, leak, dead_ns)
+        return Start(offset, leak, dead_ns, age_ns, by_noise)
     nominal_off = config.contrast_threshold_off or config.contrast_threshold
     shot = np.zeros(len(on))
     if config.shot_noise_rate_hz and not config.photoreceptor_noise:
@@ -248,11 +251,18 @@ def draw_start(
         age = _age(first[moving], rate * time) * time
         offset[moving] = -(age / time * on[moving]).astype(np.float32)
         leak[moving] = (on[moving] / time).astype(np.float32)
+        age_ns[moving] = np.minimum(age * 1e9, 2.0**61).astype(np.int64)
     if dead_ns.size:
         u, v = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(_TURNS))
         dead_s = config.refractory_us * 1e-6
         dead_ns = np.where(u * (dead_s + between) < dead_s, np.ceil(v * dead_s * 1e9), 0.0).astype(np.int64)
-    return Start(offset, leak, dead_ns)
+    if config.photoreceptor_noise and config.shot_noise_rate_hz:
+        # Where a pixel's ladder of levels stands the noise itself never changes: without leak, as leak would leave it.
+        still = np.ones(len(on), bool)
+        still[moving] = False
+        by_noise = np.where(still, np.where(second < 0.5, -first * on, first * off), 0.0).astype(np.float32)
+        offset += by_noise
+    return Start(offset, leak, dead_ns, age_ns, by_noise)
 
 
 def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:
@@ -292,6 +302,12 @@ def _length_of_interval(jitter: float, q: np.ndarray, pixels: np.ndarray, seed: 
 
 MAX_LEAK_HZ = 1e6
 """One event per microsecond, the resolution of event times."""
+
+
+def draw_hot(height: int, width: int, config: V2eConfig, seed: np.uint64) -> np.ndarray:
+    """Which pixels are hot, (H*W,) uint8."""
+    u, _ = uniform2(seed, pixel_counters(height, width), np.uint64(Stream.HOT), np.uint64(0))
+    return (u < config.hot_pixel_fraction).astype(np.uint8)
 
 
 def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:

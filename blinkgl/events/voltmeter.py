@@ -42,7 +42,7 @@ from blinkgl.config.events import EsimConfig, VoltmeterConfig
 from blinkgl.events.arith import exp_f64, select
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.packing import JIT, T_SHIFT
+from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
 from blinkgl.events.philox import Stream, normal2_and_uniform, normal_and_uniform, uniform2
 from blinkgl.events.response import Response
 from blinkgl.events.threads import take_part
@@ -230,6 +230,19 @@ def start_voltage(
     return (np.clip(v, -NEAREST, NEAREST) * V_ONE).astype(np.int32), left
 
 
+def start_by_leak(v: np.ndarray, intensity: np.ndarray, config: VoltmeterConfig) -> np.ndarray:
+    """What of the V of :func:`start_voltage` is leak's doing, float32: the share tanh(r/2) that drift has of the way
+    from event to event in the mean, where V lies on the drift's side."""
+    level = intensity.astype(np.float64)
+    mu = config.k4 + config.k5 * level
+    sigma = config.k3 * np.sqrt(level) / (level + config.k2) + config.k6
+    with np.errstate(divide="ignore", invalid="ignore"):
+        e = exp_f64(-np.minimum(2.0 * np.abs(mu) / sigma**2, 700.0))
+    share = np.where(mu == 0, 0.0, (1.0 - e) / (1.0 + e))
+    held = np.where(np.abs(v) < V_ONE, v / V_ONE, 0.0)
+    return np.where(held * mu > 0, held * share, 0.0).astype(np.float32)
+
+
 class Pixels(NamedTuple):
     """Per-pixel arrays, flat."""
 
@@ -237,6 +250,8 @@ class Pixels(NamedTuple):
     v: np.ndarray  # int32 mean voltage, 2^-29 thresholds
     unspent: np.ndarray  # float32 variance of the voltage around it, thresholds^2; 0 where V is known
     release: np.ndarray  # int64 ns, end of the dead time or NEVER; [] without dead time
+    by_light: np.ndarray  # float32: what light and leak have moved V by since it was 0; [] unless causes are asked for
+    by_leak: np.ndarray
 
 
 class Interval(NamedTuple):
@@ -283,16 +298,35 @@ def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
     return np.int32(most).view(np.float32)
 
 
+@numba.njit(**JIT)
+def _share_block(before, now, by_light, by_leak, interval, light_end, leak_end):
+    """What light and leak will have moved V by at the interval's end, if nothing fires."""
+    dt_us = interval.dt_ns * 1e-3
+    k1, k2, k4_dt, k5_dt = _F(interval.k1), _F(interval.k2), _F(interval.k4 * dt_us), _F(interval.k5 * dt_us)
+    for i in range(now.size):
+        mean = _HALF * (before[i] + now[i])
+        light_end[i] = by_light[i] + k1 * (now[i] - before[i]) / (mean + k2)
+        leak_end[i] = by_leak[i] + (k4_dt + k5_dt * mean)
+
+
 @register_jitable
-def rates(before: float, after: float, dt_us: float, v: Interval) -> tuple[float, float]:
-    """(mu, sigma) per us: :func:`drift_and_noise` in double precision, since a pixel may fire at any time."""
+def rates(before: float, after: float, dt_us: float, v: Interval) -> tuple[float, float, float]:
+    """(mu, what of it is leak, sigma) per us: :func:`drift_and_noise` in double precision, since a pixel may fire at
+    any time."""
     mean = 0.5 * (before + after)
-    mu = v.k1 * (after - before) / dt_us / (mean + v.k2) + v.k4 + v.k5 * mean
-    return mu, v.k3 * np.sqrt(mean) / (mean + v.k2) + v.k6
+    leak = v.k4 + v.k5 * mean
+    return v.k1 * (after - before) / dt_us / (mean + v.k2) + leak, leak, v.k3 * np.sqrt(mean) / (mean + v.k2) + v.k6
+
+
+@register_jitable
+def cause_at(side: int, since_us: float, light: float, leak: float, mu: float, leak_rate: float) -> int:
+    """Of an event at the threshold ``side`` (1, -1), ``since_us`` after V's parts were ``light`` and ``leak``."""
+    by_light, by_leak = light + (mu - leak_rate) * since_us, leak + leak_rate * since_us
+    return cause_of(side * by_light, side * by_leak, 1.0 - side * (by_light + by_leak))
 
 
 @numba.njit(**JIT)
-def _emit_block(active, count, first, now, v_end, unspent_end, p, v, cap, packed, begin):
+def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, begin):
     """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves their voltages.
 
     Returns (end of the events, events cut)."""
@@ -307,15 +341,20 @@ def _emit_block(active, count, first, now, v_end, unspent_end, p, v, cap, packed
             y += 1
             row_end += v.width
         pixel = (y << 17) | ((i - row_end + v.width) << 1)
-        mu, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
+        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
         voltage, variance = p.v[i] / V_ONE, np.float64(p.unspent[i])
         t_us = 0.0
         if p.release.size and p.release[i] != NEVER_NS:
             if p.release[i] > v.t0_ns + v.dt_ns:
                 v_end[i - first], unspent_end[i - first] = IN_DEAD_TIME, _ZERO
+                if p.by_light.size:
+                    light_end[i - first] = leak_end[i - first] = _ZERO
                 continue
             t_us, voltage, variance = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0, 0.0
             p.release[i] = NEVER_NS
+        since_us, light, leak = t_us, 0.0, 0.0
+        if p.by_light.size:
+            light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
         emitted, dead = 0, False
         # One block of random numbers: a normal that the last event's time takes (here: V at the interval's start), one
         # for the next end, and a uniform for whether there is an event before it.
@@ -347,9 +386,10 @@ def _emit_block(active, count, first, now, v_end, unspent_end, p, v, cap, packed
                 if emitted == cap or draw >= last:  # too many to draw them all: count what is to be expected
                     cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
                     break
-                packed[out] = (
-                    (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | pixel | np.int64(side > 0)
-                )
+                word = pixel | np.int64(side > 0)
+                if p.by_light.size:
+                    word |= cause_at(side, t_us - since_us, light, leak, mu, leak_rate) << CAUSE_SHIFT
+                packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
                 out += 1
                 emitted += 1
                 if p.release.size:
@@ -359,18 +399,23 @@ def _emit_block(active, count, first, now, v_end, unspent_end, p, v, cap, packed
                         dead = True
                         break
                     t_us = release_ns * 1e-3
+                since_us, light, leak = t_us, 0.0, 0.0
             else:
                 t_us, voltage = t_us + part_us, max(min(end, NEAREST), -NEAREST)
                 if part_us == left_us or draw >= last:
                     break
                 _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
         v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)
+        if p.by_light.size:
+            rest_us = 0.0 if dead else dt_us - since_us
+            light_end[i - first] = np.float32(0.0 if dead else light + (mu - leak_rate) * rest_us)
+            leak_end[i - first] = np.float32(0.0 if dead else leak + leak_rate * rest_us)
         unspent_end[i - first] = _ZERO if dead else np.float32(variance)
     return out, cut
 
 
 @numba.njit(**JIT)
-def _emit_block_authors(active, count, first, now, v_end, p, v, cap, packed, begin):
+def _emit_block_authors(active, count, first, now, v_end, light_end, leak_end, p, v, cap, packed, begin):
     """:func:`_emit_block` of ``compat: authors``; every pixel is listed."""
     out, cut = begin, 0
     dt_us = v.dt_ns * 1e-3
@@ -383,14 +428,19 @@ def _emit_block_authors(active, count, first, now, v_end, p, v, cap, packed, beg
             y += 1
             row_end += v.width
         pixel = (y << 17) | ((i - row_end + v.width) << 1)
-        mu, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
+        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
         voltage, t_us = p.v[i] / V_ONE, 0.0
         if p.release.size and p.release[i] != NEVER_NS:
             if p.release[i] > v.t0_ns + v.dt_ns:
                 v_end[i - first] = IN_DEAD_TIME
+                if p.by_light.size:
+                    light_end[i - first] = leak_end[i - first] = _ZERO
                 continue
             t_us, voltage = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0
             p.release[i] = NEVER_NS
+        since_us, light, leak = t_us, 0.0, 0.0
+        if p.by_light.size:
+            light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
         emitted, dead = 0, False
         draw = np.uint64(v.step) << _U20
         last = draw + _MAX_DRAWS
@@ -412,7 +462,10 @@ def _emit_block_authors(active, count, first, now, v_end, p, v, cap, packed, beg
             if emitted == cap or draw >= last:
                 cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
                 break
-            packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | pixel | np.int64(up)
+            word = pixel | np.int64(up)
+            if p.by_light.size:
+                word |= cause_at(1 if up else -1, t_us - since_us, light, leak, mu, leak_rate) << CAUSE_SHIFT
+            packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
             out += 1
             emitted += 1
             if p.release.size:
@@ -422,7 +475,12 @@ def _emit_block_authors(active, count, first, now, v_end, p, v, cap, packed, beg
                     dead = True
                     break
                 t_us = release_ns * 1e-3
+            since_us, light, leak = t_us, 0.0, 0.0
         v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)
+        if p.by_light.size:
+            rest_us = 0.0 if dead else dt_us - since_us
+            light_end[i - first] = np.float32(0.0 if dead else light + (mu - leak_rate) * rest_us)
+            leak_end[i - first] = np.float32(0.0 if dead else leak + leak_rate * rest_us)
     return out, cut
 
 
@@ -432,6 +490,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
     cut, pixels = 0, p.v.size
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
     now, v_end, unspent_end = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+    shares = BLOCK if p.by_light.size else 0
+    light_end, leak_end = np.empty(shares, np.float32), np.empty(shares, np.float32)
     for block in range(first_block, stop_block):
         s = block * BLOCK
         e = min(s + BLOCK, pixels)
@@ -445,6 +505,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = _sense_block(p.intensity[s:e], now[:n], p.v[s:e], p.unspent[s:e], v, v_end, unspent_end, flags)
         if v.authors:
             flags[:n] = 1
+        if p.by_light.size:
+            _share_block(p.intensity[s:e], now[:n], p.by_light[s:e], p.by_leak[s:e], v, light_end[:n], leak_end[:n])
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
@@ -456,16 +518,21 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             if filled + count * cap > packed.size:
                 return block, filled, cut
             if v.authors:
-                filled, cut_here = _emit_block_authors(active, count, s, now, v_end, p, v, cap, packed, filled)
+                filled, cut_here = _emit_block_authors(
+                    active, count, s, now, v_end, light_end, leak_end, p, v, cap, packed, filled
+                )
             else:
                 filled, cut_here = _emit_block(
-                    active, count, s, now, v_end, unspent_end, p, v, cap, packed, filled
+                    active, count, s, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, filled
                 )
             cut += cut_here
         copy_block(now[:n], p.intensity[s:e])
         copy_block(v_end[:n], p.v[s:e])
         if not v.authors:
             copy_block(unspent_end[:n], p.unspent[s:e])
+        if p.by_light.size:
+            copy_block(light_end[:n], p.by_light[s:e])
+            copy_block(leak_end[:n], p.by_leak[s:e])
     return stop_block, filled, cut
 
 
@@ -484,11 +551,11 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
 class DvsVoltmeter(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
-    State: 12 bytes per pixel, 8 more with a dead time. ``saturated`` counts the expected number of the events that
+    State: 12 bytes per pixel, 8 more with a dead time, 8 more with causes. ``saturated`` counts the expected number of the events that
     were not drawn."""
 
     Config = VoltmeterConfig
-    _state = ("_intensity", "_v", "_unspent", "_release")
+    _state = ("_intensity", "_v", "_unspent", "_release", "_by_light", "_by_leak")
 
     @classmethod
     def response(cls, config: VoltmeterConfig) -> Response:
@@ -512,6 +579,7 @@ class DvsVoltmeter(Emulator):
         self._intensity, self._v = np.zeros(pixels, np.float32), np.zeros(pixels, np.int32)
         self._unspent = np.zeros(pixels, np.float32)
         self._authors = config.compat == "authors"
+        self._by_light, self._by_leak = (np.zeros(pixels if config.causes else 0, np.float32) for _ in range(2))
         self._refractory_ns = round(config.refractory_us * 1000)
         self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
         self._scale = np.float32(config.full_scale)
@@ -527,11 +595,15 @@ class DvsVoltmeter(Emulator):
             dead = np.flatnonzero(left_us)
             self._v[dead] = IN_DEAD_TIME
             self._release[dead] = t_ns + (left_us[dead] * 1e3).astype(np.int64)
+            if self.causes:
+                self._by_leak[...] = start_by_leak(self._v, self._intensity, self.config)
         return Events.empty()
 
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         c, dt_ns, base_us = self.config, t_ns - self.t_ns, self.t_ns // 1000
-        pixels = Pixels(self._intensity, self._v, self._unspent, self._release)
+        pixels = Pixels(
+            self._intensity, self._v, self._unspent, self._release, self._by_light, self._by_leak
+        )
         interval = Interval(
             self.t_ns,
             dt_ns,

@@ -50,7 +50,7 @@ class ArrayReader:
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         for i in range(0, len(self._events), size):
-            yield Events(*(getattr(self._events, k)[i : i + size] for k in "xytp"))
+            yield self._events.part(slice(i, i + size))
 
 
 class ArrayWriter:
@@ -65,7 +65,7 @@ class ArrayWriter:
             events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
         )
         self._count += len(events)
-        self._chunks.append(Events(*(getattr(events, k).copy() for k in "xytp")))
+        self._chunks.append(events.copy())
 
     def close(self, t_end_us: int | None = None) -> None:
         e = Events.concatenate(self._chunks)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mpmath
 import numba
 import numpy as np
@@ -35,10 +37,12 @@ VARIANTS = {
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_equals_slow_twin(variant, dtype, threads):  # noqa: F811
     clip, times = random_clip(1, frames=5, dtype=dtype)
-    config = VoltmeterConfig(**VARIANTS[variant])
+    config = VoltmeterConfig(**VARIANTS[variant], causes=True)
     fast = run(DvsVoltmeter(37, 45, config, seed=9), clip, times)
     assert len(fast) > 1000
     assert_same(fast, run(ReferenceVoltmeter(37, 45, config, seed=9), clip, times))
+    untold = run(DvsVoltmeter(37, 45, VoltmeterConfig(**VARIANTS[variant]), seed=9), clip, times)
+    assert_same(replace(fast, cause=None), untold)
 
 
 def test_resumes_bit_identically():

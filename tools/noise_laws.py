@@ -207,7 +207,9 @@ def judge(events: Events, case: Case, side: int) -> Seen:
     mean = float(integrate.trapezoid(survival, grid))
     square = float(2 * integrate.trapezoid(survival * grid, grid))
     wait = integrate.cumulative_trapezoid(survival, grid, initial=0) / mean
-    ks_first = stats.kstest(first, (lambda x: 1 - law.survival(x)) if law.fresh else (lambda x: np.interp(x, grid, wait)))
+    ks_first = stats.kstest(
+        first, (lambda x: 1 - law.survival(x)) if law.fresh else (lambda x: np.interp(x, grid, wait))
+    )
     counts = np.bincount(pixel, minlength=pixels)
     expected = seconds / mean + ((square / mean**2 - 2) / 2 if law.fresh else 0)  # renewal theory, long clips
     error = max(counts.std(), 1e-9) / np.sqrt(pixels)

@@ -27,7 +27,8 @@ def rate_per_step(size: float, k: float, place: float, cells: int) -> float:
     edges[0], edges[-1] = -np.inf, np.inf
     # Within a cell the noise has nearly the density of its ends; the mean over two points in it is good to fourth order.
     move = 0.5 * sum(
-        np.diff(ndtr((edges[None, :] - a * (n + d / cells)[:, None]) / fresh), axis=1) for d in (-0.5 / 3**0.5, 0.5 / 3**0.5)
+        np.diff(ndtr((edges[None, :] - a * (n + d / cells)[:, None]) / fresh), axis=1)
+        for d in (-0.5 / 3**0.5, 0.5 / 3**0.5)
     )
     cell = np.arange(n.size)
     after, counts = np.zeros((2 * n.size, 2 * n.size)), np.zeros(2 * n.size)

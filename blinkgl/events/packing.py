@@ -30,7 +30,6 @@ _EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
 JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
 
 
-
 @register_jitable
 def cause_of(light: float, leak: float, noise: float) -> int:
     """The :class:`~blinkgl.events.types.Cause` of a crossing: the largest part, all in its direction."""

@@ -223,7 +223,10 @@ class ReferenceV2e:
                 reference = x + self.hum + start.offset
             self.upper, self.lower = reference + self.on, reference - self.off
             self.release = [t_ns + int(left) if left else None for left in start.dead_ns] or self.release
-            self.since, self.noise_then = t_ns - start.age_ns, start.by_noise + (self.hum if self.hums else np.float32(0))
+            self.since, self.noise_then = (
+                t_ns - start.age_ns,
+                start.by_noise + (self.hum if self.hums else np.float32(0)),
+            )
             self.hot = v2e.draw_hot(self.height, self.width, self.config, self.seed)
             if self.config.shot_noise_rate_hz and not self.hums:
                 self.clocks = [self.shot_times(b) for b in range(-(-self.pixels // v2e.BLOCK))]
@@ -470,8 +473,9 @@ class ReferenceVoltmeter:
             if uniform < chance:
                 which = uniform / chance
                 passed, normal, uniform = next(draws)
-                resumed = self.fire(i, side > 0, t + part * voltmeter.bridge_time(
-                    distance, beyond, noise, passed, which), t_ns, rows)
+                resumed = self.fire(
+                    i, side > 0, t + part * voltmeter.bridge_time(distance, beyond, noise, passed, which), t_ns, rows
+                )
                 if resumed is None:
                     return voltmeter.IN_DEAD_TIME, 0.0
                 v, t = np.float64(0), resumed

@@ -103,6 +103,11 @@ class Events:
         return self.part(slice(cut)), self.part(slice(cut, None))
 
 
+def named_causes(counts: np.ndarray) -> dict[str, int]:
+    """Of :func:`count_causes`: {"signal": n, "leak": n, "shot": n, "hot": n}."""
+    return {cause.name.lower(): int(counts[cause]) for cause in Cause}
+
+
 def count_causes(events: Events) -> np.ndarray:
     """(4,) int64, events by :class:`Cause`; zeros without causes."""
     counts = np.zeros(len(Cause), np.int64)

@@ -188,9 +188,7 @@ def crosses(before: float, after: float, noise: float) -> float:
     return exp_f64(-2.0 * before * after / variance) if variance > 0.0 else 0.0
 
 
-def start_voltage(
-    intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint64
-) -> tuple[np.ndarray, np.ndarray]:
+def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint64) -> tuple[np.ndarray, np.ndarray]:
     """V of a scene that has stood still for long, int32 (2^-29), and µs left of the dead time, 0 for most.
 
     intensity : (H*W,) DN.   Where there is neither drift nor noise nothing moves, and V is 0.
@@ -601,9 +599,7 @@ class DvsVoltmeter(Emulator):
 
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         c, dt_ns, base_us = self.config, t_ns - self.t_ns, self.t_ns // 1000
-        pixels = Pixels(
-            self._intensity, self._v, self._unspent, self._release, self._by_light, self._by_leak
-        )
+        pixels = Pixels(self._intensity, self._v, self._unspent, self._release, self._by_light, self._by_leak)
         interval = Interval(
             self.t_ns,
             dt_ns,

@@ -20,7 +20,7 @@ from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io import aedat4_decode
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size, events_of
+from blinkgl.io.columns import check_events, check_size, events_of, refuse_causes
 from blinkgl.machine.extras import install
 
 MAGIC = b"#!AER-DAT4"
@@ -152,6 +152,7 @@ class Aedat4Writer:
                 raise OutputError(f"cannot write: {' '.join(str(error).split())}", where=str(path)) from error
 
     def append(self, events: Events) -> None:
+        refuse_causes(events, "AEDAT4", str(self.path))
         if not len(events):
             return
         self._last = check_events(

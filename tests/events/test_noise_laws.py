@@ -109,7 +109,12 @@ def test_v2e_starts_as_a_scene_that_was_watched():
     """Shot noise that comes more often than leak holds leak back, from the first frame on."""
     law = v2e_law(4.0, 0.1, shot_rate(60.0, 0.4))
     config = V2eConfig(
-        preset="clean", threshold_sigma=0.0, leak_rate_hz=4.0, leak_cov_decades=0.0, leak_jitter=0.1, shot_noise_rate_hz=60.0
+        preset="clean",
+        threshold_sigma=0.0,
+        leak_rate_hz=4.0,
+        leak_cov_decades=0.0,
+        leak_jitter=0.1,
+        shot_noise_rate_hz=60.0,
     )
     case = Case(config, 0.4, law, 0.5)
     seen = judge(watch(case, 200.0, 60, seed=1), case, 60)

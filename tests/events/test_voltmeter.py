@@ -138,7 +138,9 @@ def _bridge_times(n, before, after, noise):
     return out
 
 
-@pytest.mark.parametrize("before, after, noise", [(0.5, -0.7, 0.9), (0.2, 0.3, 0.5), (1.0, -0.02, 0.4), (1.0, -3.0, 0.01)])
+@pytest.mark.parametrize(
+    "before, after, noise", [(0.5, -0.7, 0.9), (0.2, 0.3, 0.5), (1.0, -0.02, 0.4), (1.0, -3.0, 0.01)]
+)
 def test_bridges_cross_when_brownian_bridges_do(before, after, noise):
     """Against the law by the reflection principle: the density of meeting the threshold at t, and then of the end."""
     t = np.linspace(0, 1, 200_002)[1:-1]

@@ -211,16 +211,15 @@ class ReferenceV2e:
         rows = []
         if self.t_ns is None:
             self.t_ns = self.epoch = t_ns
-            start = v2e.draw_start(
-                self.config, intensity, self.on, self.off, self.leak if self.leaks else self.leak[:0], self.seed
-            )
-            if self.leaks:
-                self.leak = start.leak
-            reference = x + start.offset
-            lag = np.zeros(self.pixels, np.float32)
+            self.hum = np.zeros(0, np.float32)
             if self.hums:
                 self.hum = v2e.draw_start_noise(intensity, self.config, self.seed)
-                reference = x + self.hum + start.offset
+            leak = self.leak if self.leaks else self.leak[:0]
+            start = v2e.draw_start(self.config, intensity, self.on, self.off, leak, self.hum, self.seed)
+            if self.leaks:
+                self.leak = start.leak
+            reference = (x + self.hum if self.hums else x) + start.offset
+            lag = np.zeros(self.pixels, np.float32)
             self.upper, self.lower = reference + self.on, reference - self.off
             self.release = [t_ns + int(left) if left else None for left in start.dead_ns] or self.release
             self.since, self.noise_then = (
@@ -277,7 +276,7 @@ class ReferenceV2e:
         )
         normals = np.stack(pairs, axis=1).ravel()[: self.pixels].astype(f)
         k = kappa * (f(0.5) * (self.intensity + intensity) + f(20))
-        sizes = noise_table(c.shot_noise_rate_hz, dt_s, c.contrast_threshold)
+        sizes = noise_table(c.shot_noise_rate_hz, dt_s, v2e.noise_threshold(c))
         below, part = v2e.noise_place(k)
         return v2e.next_noise(self.hum, k, sizes[below] + part * (sizes[below + 1] - sizes[below]), normals)
 
@@ -459,6 +458,7 @@ class ReferenceVoltmeter:
             for k in range(voltmeter.MAX_DRAWS)
         )
         first, normal, uniform = next(draws)
+        drawn = True
         if variance > 0:
             v, variance = held(v + np.sqrt(variance) * first), 0.0
         while t < dt:
@@ -466,24 +466,27 @@ class ReferenceVoltmeter:
             if side == 0 and part == dt - t:
                 v, variance = v + mu * part, sigma * sigma * part
                 break
-            noise = sigma * np.sqrt(part)
-            end = v + mu * part + noise * normal
-            distance, beyond = (1.0 - v, 1.0 - end) if side >= 0 else (1.0 + v, 1.0 + end)
-            chance = voltmeter.crosses(distance, beyond, noise) if side else 0.0
+            if not drawn:
+                _, normal, uniform = next(draws)
+            drawn, distance, hit = False, 1.0 - side * v, np.inf
+            chance = voltmeter.reached(distance, side * mu, sigma) if side else 0.0
             if uniform < chance:
-                which = uniform / chance
-                passed, normal, uniform = next(draws)
-                resumed = self.fire(
-                    i, side > 0, t + part * voltmeter.bridge_time(distance, beyond, noise, passed, which), t_ns, rows
-                )
+                hit = voltmeter.hitting_time(distance, side * mu, sigma, normal, uniform / chance)
+            if hit <= part:
+                resumed = self.fire(i, side > 0, t + hit, t_ns, rows)
                 if resumed is None:
                     return voltmeter.IN_DEAD_TIME, 0.0
                 v, t = np.float64(0), resumed
-            else:
-                v, whole, t = held(end), part == dt - t, t + part
-                if whole:
+                continue
+            noise = sigma * np.sqrt(part)
+            for _ in range(voltmeter.TRIES):
+                normal, _, uniform = next(draws)
+                end = v + mu * part + noise * normal
+                if not side or uniform >= voltmeter.crosses(distance, 1.0 - side * end, noise):
                     break
-                _, normal, uniform = next(draws)
+            v, whole, t = held(end), part == dt - t, t + part
+            if whole:
+                break
         return int(v * voltmeter.V_ONE), np.float32(variance)
 
     def pixel_of_authors(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> int:

@@ -49,6 +49,7 @@ from blinkgl.events.v2e_model import (
     lin_log,
     next_noise,
     noise_place,
+    noise_threshold,
     relax,
     relax_gently,
     shot_draw,
@@ -578,7 +579,7 @@ class V2e(Emulator):
         if self._noise.size:
             self._noise[...] = draw_start_noise(intensity, self.config, self.seed)
             reference = reference + self._noise
-        start = draw_start(self.config, intensity, self._on, self._off, self._leak, self.seed)
+        start = draw_start(self.config, intensity, self._on, self._off, self._leak, self._noise, self.seed)
         reference = reference + start.offset
         self._upper[...], self._lower[...] = reference + self._on, reference - self._off
         self._leak[...] = start.leak
@@ -606,7 +607,7 @@ class V2e(Emulator):
                 accepted="a shorter interval or a lower shot_noise_rate_hz",
             )
         if self._noise.size and dt_ns != self._sizes_dt_ns:
-            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, config.contrast_threshold)
+            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, noise_threshold(config))
             self._sizes_dt_ns = dt_ns
         pixels = Pixels(
             self._intensity,

@@ -14,7 +14,7 @@ from numba.extending import register_jitable
 from blinkgl.config.events import V2eConfig
 from blinkgl.events.arith import exp_f32, exp_f64, fall_f64, log_f32, log_f64, select
 from blinkgl.events.emulator import BLOCK
-from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_sizes
+from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_places, start_sizes
 from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
 
 _F = np.float32
@@ -194,12 +194,17 @@ def noise_place(k: float) -> tuple[int, float]:
     return below, _F(np.minimum(place, _TABLE_LAST) - _F(below))
 
 
+def noise_threshold(config: V2eConfig) -> float:
+    """The threshold that the size of the noise is made for: the mean of ON and OFF, as v2e does."""
+    return 0.5 * (config.contrast_threshold + (config.contrast_threshold_off or config.contrast_threshold))
+
+
 # --- what is drawn once ------------------------------------------------------------------------------------
 def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
     """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
     corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
     _, normal = normal2(seed, np.arange(len(intensity), dtype=np.uint64), np.uint64(Stream.START), np.uint64(1))
-    return (start_sizes(config.shot_noise_rate_hz, corner, config.contrast_threshold) * normal).astype(np.float32)
+    return (start_sizes(config.shot_noise_rate_hz, corner, noise_threshold(config)) * normal).astype(np.float32)
 
 
 class Start(NamedTuple):
@@ -216,11 +221,18 @@ _JITTER_TURN, _TURNS, _MOST_ROUGH = 1000, 200, 3.5
 
 
 def draw_start(
-    config: V2eConfig, intensity: np.ndarray, on: np.ndarray, off: np.ndarray, leak: np.ndarray, seed: np.uint64
+    config: V2eConfig,
+    intensity: np.ndarray,
+    on: np.ndarray,
+    off: np.ndarray,
+    leak: np.ndarray,
+    noise: np.ndarray,
+    seed: np.uint64,
 ) -> Start:
     """The state of pixels at the first frame, see ``V2eConfig.start``.
 
     intensity : (H*W,) DN.   on, off : thresholds.   leak : mean drift, ln units per second; [].
+    noise : the photoreceptor noise; [].
 
     ``stationary``: a still scene, watched for long. Leak takes a time T from one event to the next, and shot noise of
     rate R begins it anew: the T under way has the weight (1 - e^-RT)/R (of a long one more is seen), its age a the
@@ -256,12 +268,17 @@ def draw_start(
         u, v = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(_TURNS))
         dead_s = config.refractory_us * 1e-6
         dead_ns = np.where(u * (dead_s + between) < dead_s, np.ceil(v * dead_s * 1e9), 0.0).astype(np.int64)
-    if config.photoreceptor_noise and config.shot_noise_rate_hz:
-        # Where a pixel's ladder of levels stands the noise itself never changes: without leak, as leak would leave it.
-        still = np.ones(len(on), bool)
-        still[moving] = False
-        by_noise = np.where(still, np.where(second < 0.5, -first * on, first * off), 0.0).astype(np.float32)
-        offset += by_noise
+    if noise.size:
+        # Where noise fires more often than leak: the rung next to its mean, or the last one that the noise has passed.
+        often = np.ones(len(on), bool)
+        often[moving] = mean * config.shot_noise_rate_hz > 1.0 if moving.size else False
+        corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
+        place = start_places(config.shot_noise_rate_hz, corner, first) * np.where(first > 0.5, on, off)
+        up, down = np.floor((noise - place) / on), np.floor((place - noise) / off)
+        rung = place + np.maximum(up, 0.0) * on - np.maximum(down, 0.0) * off
+        by_noise = np.where(often, rung - noise, 0.0).astype(np.float32)
+        offset = np.where(often, by_noise, offset)
+        age_ns[often] = 0
     return Start(offset, leak, dead_ns, age_ns, by_noise)
 
 

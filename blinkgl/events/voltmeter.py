@@ -14,11 +14,12 @@ That equation is followed exactly, so that noise is the same at any frame rate:
   sigma^2 dt since V was last known. Where the mean path comes within 6.5 standard deviations of a threshold the pixel
   is looked at: V is drawn at the interval's start, and the variance is spent. A path is missed that has crossed and
   come back while nobody looked: with probability below 1.6e-10 an interval (4 Q(6.5), both sides).
-* A pixel that is looked at draws V at the interval's end. The path between two known ends is a Brownian bridge, which
-  has crossed a threshold at distances a and b (before, after) with probability exp(-2 a b / (sigma^2 dt)), and first
-  did so at the time t for which t / (dt - t) is inverse Gaussian (:func:`bridge_time`). What follows an event knows
-  nothing of the end that was drawn before it, which is thrown away (strong Markov property). Where both thresholds can
-  be reached the interval is taken in parts, short enough that one of them cannot (again to 1.6e-10).
+* A pixel that is looked at draws the time at which it meets the threshold that is in reach: inverse Gaussian with mean
+  a/|mu| and shape a^2/sigma^2 for a distance a (the law against the drift, met with probability exp(-2 |mu| a/sigma^2),
+  is the same; without drift it is Levy's). Where that is beyond the interval's end V at the end is drawn, given that it
+  was not met: normal, kept with the probability 1 - exp(-2 a b/sigma^2 dt) that a Brownian bridge to the distance b has
+  not met it. Where both thresholds can be reached the interval is taken in parts, short enough that one of them
+  cannot (again to 1.6e-10).
 * V starts at the stationary law of a still scene (:func:`start_voltage`), not at 0 everywhere, where all pixels of a
   flat image would have their first leak event together.
 
@@ -63,7 +64,9 @@ NEAREST = 1.0 - 1e-6
 IN_DEAD_TIME = np.int32(2 * V_ONE - 1)
 """Voltage of a pixel in its dead time: never far from a threshold, so that the pixel is looked at."""
 MAX_DRAWS = 2**19
-_MAX_DRAWS = np.uint64(MAX_DRAWS)
+TRIES = 500
+"""At an end that is drawn until it fits: it does at once, or the time before it was a rounding error's."""
+_MAX_DRAWS, _TRIES = np.uint64(MAX_DRAWS), np.uint64(TRIES)
 
 
 @register_jitable
@@ -72,8 +75,8 @@ def drift_and_noise(
 ) -> tuple[float, float]:
     """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
-    room = mean + k2  # (L + k2): the gain of the logarithm
-    return k1 * (now - before) / room + k4_dt + k5_dt * mean, (k3 * np.sqrt(mean) / room + k6) * root_dt
+    gain = _ONE / (mean + k2)  # of the logarithm
+    return k1 * (now - before) * gain + k4_dt + k5_dt * mean, (k3 * np.sqrt(mean) * gain + k6) * root_dt
 
 
 @register_jitable
@@ -155,33 +158,28 @@ def reach_of_part(v: float, mu: float, sigma: float, left: float) -> tuple[float
     """(us of the next part, the threshold that it may reach: 1, -1, or 0 where neither can be and the part is all).
 
     ``left`` is halved until at most one threshold is in reach of 6.5 sigma sqrt(part)."""
-    part = left
+    part, rate = left, _FAR_64 * _FAR_64 * sigma * sigma
     while True:
-        noise, drift = _FAR_64 * sigma * np.sqrt(part), mu * part
-        up = max(v, v + drift) + noise >= 1.0
-        down = min(v, v + drift) - noise <= -1.0
+        drift, squared = mu * part, rate * part
+        above, below = 1.0 - max(v, v + drift), 1.0 + min(v, v + drift)  # negative where the mean path crosses
+        up, down = above * abs(above) <= squared, below * abs(below) <= squared
         if not (up and down):
             return part, 1 if up else (-1 if down else 0)
         part *= 0.5
 
 
 @register_jitable
-def bridge_time(before: float, after: float, noise: float, normal: float, uniform: float) -> float:
-    """When, as a fraction of the interval, a Brownian bridge first meets a threshold that it meets.
-
-    before > 0, after : distance to the threshold at both ends, negative beyond it.   noise : sigma sqrt(dt).
-
-    With u = t/(dt - t) the bridge is a Brownian motion with drift towards a fixed threshold, at distance before/noise
-    with drift -after/noise: u is inverse Gaussian."""
-    if noise == 0.0:
-        return before / (before - after)
-    u = hitting_time(before / noise, after / noise, 1.0, normal, uniform)
-    return u / (1.0 + u) if u < 1e300 else 1.0
+def reached(distance: float, toward: float, sigma: float) -> float:
+    """Probability that a threshold is ever met; ``toward`` is the drift towards it."""
+    if toward >= 0.0:
+        return 1.0
+    return exp_f64(2.0 * toward * distance / (sigma * sigma)) if sigma > 0.0 else 0.0
 
 
 @register_jitable
 def crosses(before: float, after: float, noise: float) -> float:
-    """Probability that the bridge of :func:`bridge_time` meets the threshold."""
+    """Probability that a Brownian motion between two known ends meets a threshold: ``before`` > 0 and ``after`` are the
+    distances there, ``noise`` is sigma sqrt(dt)."""
     if after <= 0.0:
         return 1.0
     variance = noise * noise
@@ -354,11 +352,12 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
         if p.by_light.size:
             light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
         emitted, dead = 0, False
-        # One block of random numbers: a normal that the last event's time takes (here: V at the interval's start), one
-        # for the next end, and a uniform for whether there is an event before it.
+        # The first block of random numbers: V at the interval's start, the time of the first event, which of its two
+        # roots. One more for each event that follows, and for each end that is drawn.
         draw = np.uint64(v.step) << _U20
         last = draw + _MAX_DRAWS
         past, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+        unused = True
         if variance > 0.0:
             voltage = max(min(voltage + np.sqrt(variance) * past, NEAREST), -NEAREST)
             variance = 0.0
@@ -370,17 +369,20 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                 voltage += mu * left_us
                 variance = sigma * sigma * left_us
                 break
-            noise = sigma * np.sqrt(part_us)
-            end = voltage + mu * part_us + noise * normal
-            before, after = (1.0 - voltage, 1.0 - end) if side >= 0 else (1.0 + voltage, 1.0 + end)
-            chance = crosses(before, after, noise) if side else 0.0
-            draw += _U1
+            if not unused:
+                draw += _U1
+                _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+            unused = False
+            distance, toward, fires = 1.0 - side * voltage, side * mu, False
+            chance = reached(distance, toward, sigma) if side else 0.0
             if uniform < chance:
-                which = uniform / chance
-                passed, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
-                t_us += part_us * bridge_time(before, after, noise, passed, which)
-                voltage = 0.0
+                which = uniform if chance == 1.0 else uniform / chance
+                after_us = hitting_time(distance, toward, sigma, normal, which)
+                fires = after_us <= part_us
+            if fires:
+                t_us += after_us
                 event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
+                voltage = 0.0
                 if emitted == cap or draw >= last:  # too many to draw them all: count what is to be expected
                     cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
                     break
@@ -399,10 +401,16 @@ def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_e
                     t_us = release_ns * 1e-3
                 since_us, light, leak = t_us, 0.0, 0.0
             else:
-                t_us, voltage = t_us + part_us, max(min(end, NEAREST), -NEAREST)
+                noise, stop = sigma * np.sqrt(part_us), draw + _TRIES
+                while True:
+                    draw += _U1
+                    normal, _, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+                    end = voltage + mu * part_us + noise * normal
+                    if side == 0 or draw >= stop or uniform >= crosses(distance, 1.0 - side * end, noise):
+                        break
+                voltage, t_us = max(min(end, NEAREST), -NEAREST), t_us + part_us
                 if part_us == left_us or draw >= last:
                     break
-                _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
         v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)
         if p.by_light.size:
             rest_us = 0.0 if dead else dt_us - since_us

@@ -12,9 +12,9 @@ from scipy import stats
 
 from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, Events
-from blinkgl.events.philox import normal2_and_uniform, normal_and_uniform
+from blinkgl.events.philox import normal_and_uniform
 from blinkgl.events.reference import ReferenceVoltmeter
-from blinkgl.events.voltmeter import bridge_time, crosses, hitting_time, on_first, one_minus_exp, start_voltage
+from blinkgl.events.voltmeter import crosses, hitting_time, on_first, one_minus_exp, reached, start_voltage
 from blinkgl.tools.noise_laws import exit_survival
 from tests.events.clips import assert_same, random_clip, run
 from tests.events.test_esim import threads  # noqa: F401  (fixture)
@@ -129,34 +129,16 @@ def test_kernel_event_times_are_first_exits():
     assert stats.kstest(t, lambda x: (1 - survival(x * 1e-6)) / (1 - left)).pvalue > 1e-3
 
 
-@numba.njit
-def _bridge_times(n, before, after, noise):
-    out = np.empty(n)
-    for i in range(n):
-        z, _, u = normal2_and_uniform(np.uint64(5), np.uint64(i), np.uint64(7), np.uint64(0))
-        out[i] = bridge_time(before, after, noise, z, u)
-    return out
-
-
-@pytest.mark.parametrize(
-    "before, after, noise", [(0.5, -0.7, 0.9), (0.2, 0.3, 0.5), (1.0, -0.02, 0.4), (1.0, -3.0, 0.01)]
-)
-def test_bridges_cross_when_brownian_bridges_do(before, after, noise):
-    """Against the law by the reflection principle: the density of meeting the threshold at t, and then of the end."""
-    t = np.linspace(0, 1, 200_002)[1:-1]
-    exponent = (before - after) ** 2 - before**2 / t - after**2 / (1 - t)
-    density = before / t**1.5 * np.exp(exponent / (2 * noise**2)) / np.sqrt(1 - t) / (noise * np.sqrt(2 * np.pi))
-    whole = np.cumsum(density) * (t[1] - t[0])
-    assert abs(whole[-1] / crosses(before, after, noise) - 1) < 2e-3
-    drawn = _bridge_times(50_000, before, after, noise)
-    assert stats.kstest(drawn, lambda x: np.interp(x, t, whole / whole[-1])).pvalue > 1e-3
-
-
-def test_bridges_at_the_edges():
-    assert bridge_time(0.5, -0.5, 0.0, 1.3, 0.5) == 0.5  # no noise: a straight line
+def test_crossings_of_bridges_and_thresholds_that_may_never_be_met():
+    """By simulation in 20,000 small steps; and where there is no noise."""
+    rng, noise = np.random.default_rng(0), 0.6
+    steps = rng.normal(0, noise / 100, (2000, 10_000)).cumsum(axis=1)
+    bridge = steps - np.linspace(0, 1, 10_000) * (steps[:, -1:] + 0.1)  # ends 0.1 lower
+    assert abs((bridge.max(axis=1) > 0.4 - 0.58 * noise / 100).mean() - crosses(0.4, 0.5, noise)) < 0.04
     assert crosses(0.5, 0.5, 0.0) == 0.0 and crosses(0.5, -0.1, 0.0) == 1.0 and crosses(0.5, 0.0, 1.0) == 1.0
-    assert 0 <= bridge_time(1e-6, 1e-9, 1e-3, 1e-9, 0.999999) <= 1.0
-    assert 0 <= bridge_time(1.0, -1e-300, 1e-6, 0.0, 0.5) <= 1.0
+    away = (steps - np.linspace(0, 0.5, 10_000)).max(axis=1) > 0.3  # until t = 1; most never do later
+    assert abs(away.mean() - reached(0.3, -0.5, noise)) < 0.08
+    assert reached(0.3, 0.0, 0.0) == reached(0.3, 1.0, 0.0) == 1.0 and reached(0.3, -1e-9, 0.0) == 0.0
 
 
 @pytest.mark.parametrize("r", [0.0, 1e-3, 1.0, 30.0, 5e3, np.inf])

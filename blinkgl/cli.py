@@ -381,6 +381,10 @@ def import_(
     frames: Annotated[
         tuple[int, int] | None, typer.Option("--frames", metavar="FIRST LAST", help="Default: the scene's range.")
     ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option("--fps", help="Frames per second (default: the file's; 24 for USD, Collada and Alembic)."),
+    ] = None,
     keys_per_frame: Annotated[
         int,
         typer.Option("--keys-per-frame", min=1, max=64, help="Key frames per frame; between them motion is straight."),
@@ -412,6 +416,7 @@ def import_(
         quiet=quiet,
         scene=scene,
         frames=frames,
+        fps=fps,
         keys_per_frame=keys_per_frame,
         clips=clips,
         texture_size=texture_size,

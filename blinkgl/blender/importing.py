@@ -80,6 +80,7 @@ def import_scene(
     *,
     scene: str | None = None,
     frames: Sequence[int] | None = None,
+    fps: float | None = None,
     keys_per_frame: int = 1,
     clips: bool = False,
     texture_size: int = 1024,
@@ -91,6 +92,7 @@ def import_scene(
     """Writes the GLB ``out``, whole or not at all.
 
     scene : name of the file's scene; None: the one it was saved in.   frames : (first, last); None: the scene's.
+    fps : frames per second; None: the file's, 24 where its format does not say (USD, Collada, Alembic).
     keys_per_frame : key frames written per frame; between them glTF goes straight.
     clips : an animation per action instead of one of the scene as it plays.
     texture_size : px of a side of a baked picture.   bake_s : seconds after which none is begun any more.
@@ -98,7 +100,7 @@ def import_scene(
     Raises AssetError (the file), ConfigError (an option), OutputError, BlinkGLError (no Blender, or it crashed).
     """
     source, out = Path(source), Path(out)
-    _check_options(source, out, frames, keys_per_frame, texture_size, bake_s, time_limit_s)
+    _check_options(source, out, frames, fps, keys_per_frame, texture_size, bake_s, time_limit_s)
     with atomic_file(out, overwrite=overwrite) as temporary:
         with output_errors(temporary):
             temporary.touch()  # now, not after minutes
@@ -106,8 +108,10 @@ def import_scene(
             folder = Path(name)
             job = {
                 "source": str(source.absolute()),
+                "shown": str(source),
                 "scene": scene,
                 "frames": None if frames is None else [int(f) for f in frames],
+                "fps": fps,
                 "keys_per_frame": keys_per_frame,
                 "clips": clips,
                 "bake": {"size": texture_size, "seconds": bake_s},
@@ -131,7 +135,7 @@ def import_scene(
     )
 
 
-def _check_options(source: Path, out: Path, frames, keys_per_frame, texture_size, bake_s, time_limit_s) -> None:
+def _check_options(source: Path, out: Path, frames, fps, keys_per_frame, texture_size, bake_s, time_limit_s) -> None:
     if source.suffix.lower() not in ENDINGS:
         accepted = ", ".join(ENDINGS)
         if source.suffix.lower() in (".glb", ".gltf"):
@@ -149,6 +153,7 @@ def _check_options(source: Path, out: Path, frames, keys_per_frame, texture_size
     if frames is not None and (len(frames) != 2 or not -_FRAME <= frames[0] <= frames[1] <= _FRAME):
         raise ConfigError("no range of frames", where="--frames", value=tuple(frames), accepted="FIRST LAST")
     for option, value, low, high in (
+        ("--fps", 24.0 if fps is None else fps, 1, 10_000),
         ("--keys-per-frame", keys_per_frame, 1, 64),
         ("--texture-size", texture_size, 16, 8192),
         ("--bake-seconds", bake_s, 0, 1e6),

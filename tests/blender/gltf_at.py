@@ -63,7 +63,10 @@ class Played:
 
     def positions(self, name: str, t: float) -> np.ndarray:
         """(V, 3) of all primitives of a node, one after the other, in Blender's world."""
-        index = self.node(name)
+        return self.of(self.node(name), t)
+
+    def of(self, index: int, t: float) -> np.ndarray:
+        """The same of a node by its index."""
         raw = self.tree["nodes"][index]
         mesh = self.tree["meshes"][raw["mesh"]]
         found = []

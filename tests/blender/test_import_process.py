@@ -62,6 +62,7 @@ def test_blender_stays_in_its_own_programs():
         ("folder.fbx", {}, AssetError, "folder.fbx: cannot read the scene: Is a directory"),
         ("empty.usd", {}, AssetError, "empty.usd: the file is empty"),
         ("a.blend", {"frames": (9, 2)}, ConfigError, r"--frames: no range of frames \(got \(9, 2\)\)"),
+        ("a.blend", {"fps": 0.0}, ConfigError, "--fps: out of range"),
         ("a.blend", {"keys_per_frame": 0}, ConfigError, "--keys-per-frame: out of range"),
         ("a.blend", {"texture_size": 10**6}, ConfigError, "--texture-size: out of range"),
         ("a.blend", {"time_limit_s": float("nan")}, ConfigError, "--time-limit: out of range"),
@@ -128,12 +129,12 @@ def test_what_blender_is_asked_and_what_it_is_given(blend, tmp_path, fake, monke
     fake(f"Path({str(kept)!r}).write_text(json.dumps([job, dict(os.environ), sys.argv, str(folder)]))\n" + WRITES)
     told = []
     came = import_scene(
-        blend, tmp_path / "new" / "out.glb", scene="S", frames=(3, 7), keys_per_frame=4, clips=True, texture_size=64,
+        blend, tmp_path / "new" / "out.glb", scene="S", frames=(3, 7), fps=25.0, keys_per_frame=4, clips=True, texture_size=64,
         bake_s=5, progress=told.append,
     )  # fmt: skip
     job, environment, argv, folder = json.loads(kept.read_text())
     assert job == {
-        "source": str(blend), "scene": "S", "frames": [3, 7], "keys_per_frame": 4, "clips": True,
+        "source": str(blend), "shown": str(blend), "scene": "S", "frames": [3, 7], "fps": 25.0, "keys_per_frame": 4, "clips": True,
         "bake": {"size": 64, "seconds": 5},
     }  # fmt: skip
     home = f"{folder}/home"
@@ -183,7 +184,7 @@ def test_the_table_and_the_recipe(blend, tmp_path, fake, monkeypatch, capsys):
         (WRITES + "os.abort()", r"crashed \(SIGABRT\)"),
         ("print('[1, 2')", r"answer cannot be read"),
         (
-            "say(error='the scene shows no shape', where=job['source'], accepted='a scene with a mesh')",
+            "say(error='the scene shows no shape', where=job['shown'], accepted='a scene with a mesh')",
             r"a scene\.blend: the scene shows no shape; expected a scene with a mesh$",
         ),
         ("(folder / 'scene.glb').write_bytes(glb[:-4]); say(report=REPORT)", r"what Blender wrote cannot be read"),

@@ -3,8 +3,8 @@
     python blinkgl/blender/inside FOLDER        FOLDER/job.json in; FOLDER/scene.glb out
 
 Programs of Blender's side: they need nothing but ``bpy`` and NumPy and import nothing of BlinkGL (Blender is GPL).
-job.json: source (absolute path), scene (name or null), frames ([first, last] or null), keys_per_frame, clips, bake
-{size, seconds}. ``blinkgl.blender.importing`` writes it.
+job.json: source (absolute path), shown (as the user wrote it), scene (name or null), frames ([first, last] or null),
+fps (or null), keys_per_frame, clips, bake {size, seconds}. ``blinkgl.blender.importing`` writes it.
 
 Standard output carries one JSON object per line: ``{"blender"}``, ``{"doing"}`` as it goes on, ``{"report"}`` when
 scene.glb is whole, or ``{"error", "where", "accepted"}``. What Blender itself prints goes to standard error.
@@ -44,12 +44,12 @@ def main(folder: Path) -> int:
     try:
         say(report=pipeline.run(job, folder / "scene.glb", lambda doing: say(doing=doing)))
     except Refused as problem:
-        say(error=problem.problem, where=problem.where or job["source"], accepted=problem.accepted)
+        say(error=problem.problem, where=problem.where or job["shown"], accepted=problem.accepted)
         return 1
     except Exception as problem:  # noqa: BLE001 - one line for the user, whatever Blender makes of the file
         traceback.print_exc()
         text = " ".join(str(problem).split())[:300]
-        say(error=f"Blender cannot import it ({type(problem).__name__}: {text})", where=job["source"], accepted=None)
+        say(error=f"Blender cannot import it ({type(problem).__name__}: {text})", where=job["shown"], accepted=None)
         return 1
     return 0
 
@@ -63,4 +63,6 @@ def end_with_the_parent() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    status = main(Path(sys.argv[1]))
+    sys.stderr.flush()
+    os._exit(status)  # not through Blender's own end, which now and then waits for itself for ever

@@ -13,7 +13,6 @@ from said import Table, names
 UV = "BlinkGL bake"
 _MOST_UVS = 8  # Blender's
 _MOST_FACES = 400_000  # of a mesh that is unwrapped
-_MARGIN = 8  # px around an island
 _SAMPLES = 4  # per texel: edges of a pattern, nothing is noisy
 _COLOUR_INPUTS = ("Base Color", "Color")
 _SEEN_THROUGH = ("BSDF_TRANSPARENT", "HOLDOUT")
@@ -333,7 +332,8 @@ def _bake_mesh(thing: bpy.types.Object, materials: dict, size: int) -> None:
     """One picture for all of a mesh's materials that need one."""
     mesh = thing.data
     layer = _unwrap(thing)
-    image = bpy.data.images.new(f"{mesh.name} colours", size, size, alpha=False)
+    image = bpy.data.images.new(f"{mesh.name} colours", size, size, alpha=True)
+    image.generated_color = (0.0, 0.0, 0.0, 0.0)  # what nothing is baked to keeps its alpha
     idle = bpy.data.images.new("idle", 8, 8)
     originals, made = list(mesh.materials), []
     for k, material in enumerate(originals):
@@ -361,22 +361,58 @@ def _bake_mesh(thing: bpy.types.Object, materials: dict, size: int) -> None:
         mesh.materials[k] = baked
         made.append((k, material, baked, wanted, shining))
     _activate(thing)
-    bpy.ops.object.bake(type="EMIT", margin=_MARGIN, use_clear=True, target="IMAGE_TEXTURES", uv_layer=layer)
-    image.pack()
-    pixels = np.empty((size * size, 4), np.float32)
+    bpy.ops.object.bake(type="EMIT", margin=0, use_clear=False, target="IMAGE_TEXTURES", uv_layer=layer)
+    pixels = np.empty((size, size, 4), np.float32)
     image.pixels.foreach_get(pixels.ravel())
+    seen = pixels[..., 3] > 0.5
+    if seen.any():
+        pixels[..., :3] = filled(pixels[..., :3], seen)
+    pixels[..., 3] = 1.0
+    image.pixels.foreach_set(pixels.ravel())
+    image.pack()
+    # Nothing but one colour: no picture.
+    even = pixels[..., :3].max(axis=(0, 1)) - pixels[..., :3].min(axis=(0, 1))
+    plain = image_colour(pixels[0, 0, :3]) if (even <= 1.5 / 255).all() else None
     for k, material, baked, wanted, shining in made:
         mesh.materials[k] = material
         if wanted:
-            mesh.materials[k] = _with_picture(material, image, layer, shining)
+            mesh.materials[k] = _with_picture(material, image, layer, shining, plain)
         bpy.data.materials.remove(baked)
     bpy.data.images.remove(idle)
 
 
-def _with_picture(material, image, layer: str, shining: bool) -> bpy.types.Material:
-    """A copy of the material whose colour is the picture; a principled surface keeps the rest of itself."""
+def filled(pixels: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(H, W, 3) with what was not ``seen`` (H, W) as its surroundings are, further away the coarser: mip levels then
+    mix in nothing that is not on the surface."""
+    if seen.all() or min(seen.shape) <= 1:
+        return (
+            pixels if seen.all() else np.where(seen[..., None], pixels, pixels[seen].mean(axis=0) if seen.any() else 0)
+        )
+    height, width = seen.shape
+    even = np.pad(np.where(seen[..., None], pixels, 0.0), ((0, height % 2), (0, width % 2), (0, 0)))
+    count = np.pad(seen, ((0, height % 2), (0, width % 2))).astype(np.float32)
+    blocks = (even.shape[0] // 2, 2, even.shape[1] // 2, 2)
+    total, number = even.reshape(*blocks, 3).sum(axis=(1, 3)), count.reshape(blocks).sum(axis=(1, 3))
+    coarse = filled(total / np.maximum(number, 1)[..., None], number > 0)
+    there = coarse.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
+    return np.where(seen[..., None], pixels, there)
+
+
+def image_colour(texel: np.ndarray) -> tuple[float, ...]:
+    """Linear colour (with alpha 1) of a texel in sRGB."""
+    c = np.asarray(texel, float)
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return (*(float(v) for v in linear), 1.0)
+
+
+def _with_picture(material, image, layer: str, shining: bool, plain: tuple | None) -> bpy.types.Material:
+    """A copy of the material whose colour is the picture, or plain; a principled surface keeps the rest of itself."""
     painted = material.copy()
+    painted.name = f"{material.name} baked"
     tree = painted.node_tree
+    if plain is not None:
+        _replace_surface(painted, None, plain, shining)
+        return painted
     picture, coordinates = tree.nodes.new("ShaderNodeTexImage"), tree.nodes.new("ShaderNodeUVMap")
     picture.image, coordinates.uv_map = image, layer
     tree.links.new(coordinates.outputs["UV"], picture.inputs["Vector"])

@@ -16,9 +16,9 @@ from said import Refused, Table
 _CONSTANT = 1e-7  # relative: noise of float32 matrices. The exporter's own is 1e-4, absolute: slow motions were lost.
 
 
-def _hooks(outside: set[str], inside: set[str]) -> type:
+def _hooks(outside: set[str], inside: set[str], unseen: set[str]) -> type:
     """What the exporter asks: only what is in the picture, and no surface twice. Names of objects that the scene shows
-    itself, and of those that its instances of collections show."""
+    itself, of those that its instances of collections show, and of those that are no surface themselves."""
 
     class Hooks:
         def gather_tree_filter_tag_hook(self, tree: object, settings: dict) -> None:
@@ -33,7 +33,7 @@ def _hooks(outside: set[str], inside: set[str]) -> type:
                 node.keep_tag = thing.name_full in (inside if instanced else outside)
 
         def gather_node_mesh_hook(self, hook: object, thing: bpy.types.Object, settings: dict) -> None:
-            if thing is not None and thing.type in MESH_LIKE and thing.type != "MESH":
+            if thing is not None and (thing.name_full in unseen or (thing.type in MESH_LIKE and thing.type != "MESH")):
                 hook.export_mesh = False
 
     return Hooks
@@ -44,6 +44,7 @@ def export(
     things: list[bpy.types.Object],
     everything: list[bpy.types.Object],
     made: list[bpy.types.Object],
+    unseen: set[str],
     clips: bool,
     table: Table,
 ) -> None:
@@ -51,7 +52,7 @@ def export(
     added = {o.name_full for o in made}
     addon = sys.modules.get("io_scene_gltf2") or import_module("io_scene_gltf2")
     addon.glTF2ExportUserExtension = _hooks(
-        {o.name_full for o in things} | added, {o.name_full for o in everything} | added
+        {o.name_full for o in things} | added, {o.name_full for o in everything} | added, unseen
     )
     for part in ("object", "armature", "shapekeys"):
         import_module(f"io_scene_gltf2.blender.exp.animation.sampled.{part}.keyframes").fcurve_is_constant = is_constant

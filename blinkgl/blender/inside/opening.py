@@ -12,7 +12,7 @@ from said import Refused
 _HEADER = re.compile(rb"BLENDER(?:[-_][vV](\d{3})|\d\d-\d\d[vV](\d{4}))")
 
 
-def open_file(source: Path) -> None:
+def open_file(source: Path, fps: float | None) -> None:
     """The file as Blender's own data. Refused: not of its kind, damaged, or saved by a newer Blender."""
     ending = source.suffix.lower()
     bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -24,6 +24,7 @@ def open_file(source: Path) -> None:
             bpy.ops.wm.open_mainfile(filepath=str(source), load_ui=False, use_scripts=False)
             check_version(tuple(bpy.data.version[:2]))
         else:
+            set_rate(24.0 if fps is None else fps)  # Alembic's seconds become frames while it is read
             done = _OPENERS[ending](str(source))
             if "FINISHED" not in done:
                 raise Refused(f"Blender cannot read it as {ending[1:].upper()}", accepted="a whole file of that kind")
@@ -32,8 +33,17 @@ def open_file(source: Path) -> None:
     except RuntimeError as problem:  # what operators report as an error
         text = " ".join(str(problem).split()).removeprefix("Error: ")
         raise Refused(f"Blender cannot read it ({text[:200]})", accepted="a whole file") from problem
+    if fps is not None:
+        set_rate(fps)
     if bpy.context.preferences.filepaths.use_scripts_auto_execute:
         raise Refused("the file's scripts could not be switched off")
+
+
+def set_rate(fps: float) -> None:
+    """Frames per second of the scene, which Blender keeps as a whole number over a divisor."""
+    render = bpy.context.scene.render
+    render.fps = max(round(fps), 1)
+    render.fps_base = render.fps / fps
 
 
 def fbx(path: str) -> set[str]:

@@ -20,7 +20,7 @@ import motion
 def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:
     """Writes ``out``; the report: blender, rows, cameras, camera, size, first, last, fps, duration_s."""
     doing("opening the file")
-    opening.open_file(Path(job["source"]))
+    opening.open_file(Path(job["source"]), job["fps"])
     scene = motion.choose_scene(job["scene"])
     view_layer = bpy.context.view_layer
     table = Table()
@@ -37,8 +37,10 @@ def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:
     scene.frame_set(clock.first)
 
     doing("making meshes")
-    made = shapes.meshes_of_others(everything, table)
-    made += shapes.instances_as_objects(everything, made, table)
+    made = shapes.even_offsets(everything)
+    meshes = shapes.meshes_of_others(everything, table)
+    more, unseen = shapes.instances_as_objects(everything, meshes, table)
+    made += [*meshes.values(), *more]
     twins = shapes.twins(everything)
     shapes.apply_modifiers(everything, table)
     scene.frame_set(clock.first)
@@ -54,7 +56,7 @@ def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:
     scene.frame_set(clock.first)
 
     doing("writing the GLB")
-    exporting.export(out, things, everything, made, job["clips"], table)
+    exporting.export(out, things, everything, made, unseen, job["clips"], table)
     cameras = [o for o in things if o.type == "CAMERA"]
     return {
         "blender": bpy.app.version_string,

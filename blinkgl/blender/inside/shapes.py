@@ -44,20 +44,17 @@ def stop_simulations(things: Iterable[bpy.types.Object], table: Table) -> None:
             kind = table["hair systems" if hair else "particle systems"]
             kind.found += 1
             kind.notes.append(f"'{system.name}' of '{thing.name}' left out")
-    for thing in bpy.data.objects:
-        for modifier in thing.modifiers:
-            for cache in (getattr(modifier, "point_cache", None),):
-                if cache is not None:
-                    cache.use_disk_cache = False
     world = bpy.context.scene.rigidbody_world
     if world is not None:
-        if world.point_cache is not None:
-            world.point_cache.use_disk_cache = False
+        on_disk = world.point_cache is not None and world.point_cache.use_disk_cache
+        if on_disk:  # would be written beside the user's file
+            world.enabled = False
         bodies = [] if world.collection is None else list(world.collection.objects)
         row.found += len(bodies)
-        row.came += len(bodies)
+        row.came += 0 if on_disk else len(bodies)
         if bodies:
-            row.notes.append(f"{len(bodies)} rigid bodies as key frames")
+            how = "with their cache on disk left out" if on_disk else "as key frames"
+            row.notes.append(f"{len(bodies)} rigid bodies {how}")
 
 
 # ---------------------------------------------------------------------------------------------------------- evaluation
@@ -230,10 +227,19 @@ def _same_animation(old: bpy.types.ID, new: bpy.types.ID) -> None:
 # ------------------------------------------------------------------------------------------------- what is not a mesh
 
 
-def meshes_of_others(things: list[bpy.types.Object], table: Table) -> list[bpy.types.Object]:
-    """Curves, surfaces, texts and metaballs get a child that is their mesh; the new objects. They stay themselves,
-    because others may follow them."""
-    made = []
+def _follow(child: bpy.types.Object, other: bpy.types.Object) -> None:
+    """As a child that stands where ``other`` does. (A curve's children would run along it.)"""
+    if other.type in ("CURVE", "SURFACE"):
+        bond = child.constraints.new("CHILD_OF")
+        bond.target, bond.inverse_matrix = other, Matrix.Identity(4)
+    else:
+        child.parent, child.matrix_parent_inverse = other, Matrix.Identity(4)
+
+
+def meshes_of_others(things: list[bpy.types.Object], table: Table) -> dict[str, bpy.types.Object]:
+    """Curves, surfaces, texts and metaballs get a companion that is their mesh; those, by the names of their owners.
+    They stay themselves, because others may follow them."""
+    made = {}
     for thing in [o for o in things if o.type in MESH_LIKE and o.type != "MESH"]:
         row = table["curves, texts, metaballs"]
         row.found += 1
@@ -246,22 +252,22 @@ def meshes_of_others(things: list[bpy.types.Object], table: Table) -> list[bpy.t
         shape = bpy.data.objects.new(f"{thing.name} mesh", mesh)
         for collection in thing.users_collection:
             collection.objects.link(shape)
-        shape.parent = thing
-        shape.matrix_parent_inverse = Matrix.Identity(4)
-        made.append(shape)
+        _follow(shape, thing)
+        made[thing.name_full] = shape
     if made:
         table["curves, texts, metaballs"].notes.insert(0, "as meshes")
     return made
 
 
 def instances_as_objects(
-    things: list[bpy.types.Object], meshes: list[bpy.types.Object], table: Table
-) -> list[bpy.types.Object]:
+    things: list[bpy.types.Object], meshes: dict[str, bpy.types.Object], table: Table
+) -> tuple[list[bpy.types.Object], set[str]]:
     """Instances of vertices, faces and geometry nodes become objects, children of what made them, where they are now.
-    (Instances of collections are exported as such.) ``meshes``: what :func:`meshes_of_others` made."""
+    (Instances of collections are exported as such.)
+    ``meshes``: what :func:`meshes_of_others` made. Also the names of what is only there to be instanced."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     shown = {o.name_full for o in things}
-    own = {o.parent.name_full: len(o.data.vertices) for o in meshes}
+    own = {name: len(o.data.vertices) for name, o in meshes.items()}
     found, made, copies = [], [], {}
     for instance in depsgraph.object_instances:
         if not instance.is_instance or instance.particle_system is not None:
@@ -274,9 +280,11 @@ def instances_as_objects(
             continue  # how Blender lists the surface of a curve or text itself
         key = instance.object.original.name_full, 0 if data is None else data.as_pointer()
         if key not in copies:  # now: the iterator's objects do not outlive its next step
-            copies[key] = bpy.data.meshes.new_from_object(
-                instance.object, preserve_all_data_layers=True, depsgraph=depsgraph
-            )
+            # (Asked to preserve all layers, it would give the mesh of the object that makes the instances.)
+            copies[key] = mesh = instance.object.to_mesh().copy()
+            for k, material in enumerate(mesh.materials):
+                mesh.materials[k] = None if material is None else material.original
+            instance.object.to_mesh_clear()
         found.append((maker, copies[key], instance.matrix_world.copy()))
     row = table["instances"]
     for maker, mesh, matrix in found:
@@ -287,15 +295,40 @@ def instances_as_objects(
         thing = bpy.data.objects.new(f"{maker.name} instance", mesh)
         for collection in maker.users_collection:
             collection.objects.link(thing)
-        thing.parent = maker
-        thing.matrix_parent_inverse = Matrix.Identity(4)
+        _follow(thing, maker)
         thing.matrix_basis = maker.matrix_world.inverted_safe() @ matrix
         made.append(thing)
     if made:
         row.notes.append("as objects, where they stand in the first frame")
+    unseen = set()
     for thing in things:
         if thing.instance_type in ("VERTS", "FACES"):
             thing.instance_type = "NONE"
+            unseen |= {child.name_full for child in thing.children_recursive if child not in made}
+            if not thing.show_instancer_for_render:
+                unseen.add(thing.name_full)
+    return made, unseen
+
+
+def even_offsets(things: list[bpy.types.Object]) -> list[bpy.types.Object]:
+    """Collections that are instanced about a point of their own: their instancers hand that over to a child. (The
+    exporter forgets it where an instancer moves.) The new objects."""
+    made, offsets = [], {}
+    for thing in list(things):
+        collection = thing.instance_collection if thing.instance_type == "COLLECTION" else None
+        if collection is None or not any(collection.instance_offset):
+            continue
+        offsets[collection.name_full] = collection
+        child = bpy.data.objects.new(f"{thing.name} origin", None)
+        for owner in thing.users_collection:
+            owner.objects.link(child)
+        child.parent, child.matrix_parent_inverse = thing, Matrix.Identity(4)
+        child.location = -collection.instance_offset
+        thing.instance_type, thing.instance_collection = "NONE", None
+        child.instance_type, child.instance_collection = "COLLECTION", collection
+        made.append(child)
+    for collection in offsets.values():
+        collection.instance_offset = (0.0, 0.0, 0.0)
     return made
 
 

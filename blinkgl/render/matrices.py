@@ -46,6 +46,11 @@ def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
     return np.ascontiguousarray(matrix[[0, 1, 3]].T, dtype=np.float32).tobytes()
 
 
+def linear_xyw_bytes(matrix: np.ndarray) -> bytes:
+    """GLSL mat3 with the x, y, w rows of the linear part of a (4, 4) clip-space matrix: of differences of positions."""
+    return np.ascontiguousarray(matrix[[0, 1, 3], :3].T, dtype=np.float32).tobytes()
+
+
 DEPTH_ROOM = 2.0
 """A fragment may lie a fraction of a pixel outside of its triangle, and outside of the
 part's depths by the slope there."""

@@ -66,7 +66,7 @@ class Renderer:
         self._canvases: dict[Pass, Canvas] = {}
         self._labels = Labels(self)
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
-        some_stand = any(o.path.is_static for o in scene.objects)
+        some_stand = any(o.is_static for o in scene.objects)
         self.whole = whole or not (scene.camera_path.is_static and some_stand)
 
     def __enter__(self) -> Renderer:

@@ -4,6 +4,7 @@ content, and released together."""
 from __future__ import annotations
 
 import ctypes
+import itertools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,13 +32,18 @@ class Kind(NamedTuple):
         return {name: 1 for name, on in zip(("TEXTURED", "LIT", "TWO_SIDED"), self) if on}
 
 
+def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(8, 3) of the box between two of its corners, (3,) each."""
+    return np.array(list(itertools.product(*zip(low, high))))
+
+
 @dataclass(eq=False)
 class DrawItem:
     """One part of one object, ready to draw.
 
     object_index : row of a moment's matrices.   part : number of the part among those of the scene, object by object.
     number : of this item among all, in the order of the layers.   moves : whether the object does.
-    centre, radius; low, high : bounding sphere and box, object frame.
+    centre, radius; low, high : bounding sphere and box, object frame.   corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.
     """
@@ -56,13 +62,10 @@ class DrawItem:
     part: int = -1
     number: int = -1
 
-    @property
-    def textured(self) -> bool:
-        return self.material.texture is not None
-
-    @property
-    def kind(self) -> Kind:
-        return Kind(self.textured, self.lit, self.two_sided)
+    def __post_init__(self) -> None:
+        self.textured = self.material.texture is not None
+        self.kind = Kind(self.textured, self.lit, self.two_sided)
+        self.corners = box_corners(self.low, self.high)
 
 
 MAX_RADIUS = 1e18

@@ -52,9 +52,7 @@ class Painter:
         """Draw into ``target`` from now on, which is cleared: the first attachment to
         ``background``, 0 where it ends, the others to 0."""
         self.prepare(target)
-        target.clear(
-            *([*background, 0.0, 0.0, 0.0, 0.0][: pixel.components] for pixel in target.formats[:1]), depth=0.0
-        )
+        target.clear(*((*background, 0.0, 0.0, 0.0, 0.0)[: pixel.components] for pixel in target.formats[:1]))
         self.stats.frames += 1
 
     def prepare(self, target: Target) -> None:
@@ -69,9 +67,10 @@ class Painter:
         self._culling = False
 
     def programs(self, pass_: Pass) -> Programs:
-        if pass_ not in self._programs:
-            self._programs[pass_] = Programs(self, pass_)
-        return self._programs[pass_]
+        programs = self._programs.get(pass_)
+        if programs is None:
+            programs = self._programs[pass_] = Programs(self, pass_)
+        return programs
 
     def uniforms(self, program: moderngl.Program) -> Uniforms:
         """The table that a pass sets values in."""

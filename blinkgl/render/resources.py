@@ -4,6 +4,7 @@ content, and released together."""
 from __future__ import annotations
 
 import ctypes
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -57,6 +58,11 @@ def padded_rows(deformer: Deformer) -> int:
     return 1 << max(deformer.rows - 1, 3).bit_length()
 
 
+def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(8, 3) of the box between two of its corners, (3,) each."""
+    return np.array(list(itertools.product(*zip(low, high))))
+
+
 @dataclass(eq=False)
 class DrawItem:
     """One part of one object, ready to draw.
@@ -64,9 +70,9 @@ class DrawItem:
     object_index : row of a moment's matrices.   part : number of the part among those of the scene, object by object.
     number : of this item among all, in the order of the layers.   moves : whether the object does.
     centre, radius; low, high : bounding sphere and box, object frame; of a shape that changes those of all that it
-    sweeps.
+    sweeps.   corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
-    two_sided : no culling, and the normal is turned towards the camera.   shape : :func:`shape_of` its deformer.
+    two_sided : no culling, and the normal is turned towards the camera.
     """
 
     object_index: int
@@ -80,21 +86,14 @@ class DrawItem:
     two_sided: bool
     lit: bool
     moves: bool
-    shape: tuple[tuple[str, int], ...] = ()
     part: int = -1
     number: int = -1
 
-    @property
-    def textured(self) -> bool:
-        return self.material.texture is not None
-
-    @property
-    def kind(self) -> Kind:
-        return Kind(self.textured, self.lit, self.two_sided, self.shape)
-
-    @property
-    def deformer(self) -> Deformer | None:
-        return self.mesh.deformer
+    def __post_init__(self) -> None:
+        self.textured = self.material.texture is not None
+        self.deformer = self.mesh.deformer
+        self.kind = Kind(self.textured, self.lit, self.two_sided, shape_of(self.deformer))
+        self.corners = box_corners(self.low, self.high)
 
 
 MAX_RADIUS = 1e18
@@ -345,5 +344,4 @@ def _draw_item(
         two_sided,
         not material.unlit,
         moves,
-        shape_of(mesh.deformer),
     )

@@ -185,10 +185,8 @@ class Sweep:
                 [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
             )
             return corners, _BOX
-        kept, faces = (
-            kept[hull.vertices],
-            np.searchsorted(hull.vertices, hull.simplices),
-        )  # vertices are sorted in three dimensions
+        # Vertices are sorted in three dimensions.
+        kept, faces = (kept[hull.vertices], np.searchsorted(hull.vertices, hull.simplices))
         a, b, c = (kept[faces[:, k]] for k in range(3))
         inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
         faces[inwards] = faces[inwards, ::-1]

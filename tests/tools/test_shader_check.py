@@ -40,12 +40,12 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
     assert result["programs"] == {
-        "colour.glsl": 16,
-        "debug.glsl": 8,
+        "colour.glsl": 26,
+        "debug.glsl": 13,
         "downsample.glsl": 2,
-        "label.glsl": 504,
-        "luminance.glsl": 40,
-        "velocity.glsl": 16,
+        "label.glsl": 819,
+        "luminance.glsl": 70,
+        "velocity.glsl": 26,
     }
 
 

@@ -129,13 +129,13 @@ def test_what_blender_is_asked_and_what_it_is_given(blend, tmp_path, fake, monke
     fake(f"Path({str(kept)!r}).write_text(json.dumps([job, dict(os.environ), sys.argv, str(folder)]))\n" + WRITES)
     told = []
     came = import_scene(
-        blend, tmp_path / "new" / "out.glb", scene="S", frames=(3, 7), fps=25.0, keys_per_frame=4, clips=True, texture_size=64,
-        bake_s=5, progress=told.append,
+        blend, tmp_path / "new" / "out.glb", scene="S", frames=(3, 7), fps=25.0, keys_per_frame=4, clips=True,
+        texture_size=64, bake_s=5, progress=told.append,
     )  # fmt: skip
     job, environment, argv, folder = json.loads(kept.read_text())
     assert job == {
-        "source": str(blend), "shown": str(blend), "scene": "S", "frames": [3, 7], "fps": 25.0, "keys_per_frame": 4, "clips": True,
-        "bake": {"size": 64, "seconds": 5},
+        "source": str(blend), "shown": str(blend), "scene": "S", "frames": [3, 7], "fps": 25.0, "keys_per_frame": 4,
+        "clips": True, "bake": {"size": 64, "seconds": 5},
     }  # fmt: skip
     home = f"{folder}/home"
     assert environment["HOME"] == environment["BLENDER_USER_RESOURCES"] == environment["TMPDIR"] == home

@@ -26,7 +26,8 @@ SIMULATED = {
 _NOTHING_TO_SEE = ("COLLISION", "SURFACE")
 TOLERANCE = 1e-5  # of the shape's size: what a float32 chain of matrices costs
 _MOST_COMPARED = 4_000_000  # vertices times frames
-_MOST_BAKED = 64_000_000  # vertices times frames of one shape
+_MOST_BAKED = 64_000_000  # vertices times shapes of one mesh
+_MOST_SHAPES = 200  # of one mesh: BlinkGL takes a thousand numbers per time, of all joints and shapes
 
 
 def stop_simulations(things: Iterable[bpy.types.Object], table: Table) -> None:
@@ -382,8 +383,8 @@ def bake(things: list[bpy.types.Object], made: dict[str, bpy.types.Object], fram
     shapes: dict[str, list[np.ndarray]] = {o.name_full: [] for o in things}
     steps = {}
     for thing in things:
-        least = -(-len(frames) * len(thing.data.vertices) // _MOST_BAKED)
-        steps[thing.name_full] = frames[:: max(least, 1)]
+        most = max(min(_MOST_SHAPES, _MOST_BAKED // max(len(thing.data.vertices), 1)), 1)
+        steps[thing.name_full] = frames[:: -(-len(frames) // most)]
     for frame in frames:
         bpy.context.scene.frame_set(frame)
         for name, found in shapes.items():
@@ -414,7 +415,8 @@ def bake(things: list[bpy.types.Object], made: dict[str, bpy.types.Object], fram
                     for curve in bag.fcurves:
                         for point in curve.keyframe_points:
                             point.interpolation = "LINEAR"
-        row.notes.append(f"'{thing.name}' as {len(found) - 1} shapes")
+        apart = f", {times[1] - times[0]} keys apart" if len(times) > 1 and len(times) < len(frames) else ""
+        row.notes.append(f"'{thing.name}' as {len(found) - 1} shapes{apart}")
 
 
 def remove(made: dict[str, bpy.types.Object]) -> None:

@@ -10,11 +10,11 @@ import colours
 import exporting
 import kept
 import opening
-import shapes
 import survey
 from said import Refused, Table
 
 import motion
+import shapes
 
 
 def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:

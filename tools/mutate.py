@@ -71,6 +71,8 @@ SHARED_CODE = (
 )
 DEBUGGERS = "shaders/include/lookup.glsl"
 """the include that only the shader debugger asks for"""
+RECORDS = ("tests/test_rooms.py::test_a_record", "tests/test_rooms.py::test_records")
+"""tests that look at every dataclass of the package, whichever test it was that imported it first"""
 MOST_TESTS, MOST_S = 300, 120.0
 """of the tests that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
@@ -539,6 +541,14 @@ def _remembered(mutant: Mutant) -> bool:
     )
 
 
+def _of_a_record(mutant: Mutant) -> bool:
+    """Whether it stands in a class's decorator: frozen or not, compared by value or not."""
+    return any(
+        isinstance(node, ast.ClassDef) and any(d.lineno <= mutant.line <= d.end_lineno for d in node.decorator_list)
+        for node in ast.walk(ast.parse((ROOT / mutant.path).read_text()))
+    )
+
+
 class Reach:
     """Test ids by line, from :func:`make_map`."""
 
@@ -600,6 +610,8 @@ class Reach:
                 contexts = set().union(*(self.anywhere(path) for path in callers))
             else:
                 contexts = reached if _remembered(mutant) else self._around(mutant)
+                if _of_a_record(mutant):
+                    contexts = [*contexts, *(t for t in self.seconds if t.startswith(RECORDS))]
         ids = (set(contexts) & self.seconds.keys()) - self.idle
         chosen, together = [], 0.0
         for test in sorted(ids, key=lambda t: (self._distance(mutant, t), self.seconds.get(t, 1.0), t)):
@@ -626,7 +638,7 @@ class Reach:
     def _distance(mutant: Mutant, test: str) -> int:
         """0: a test of the module, 1: of its room, 2: of another."""
         path, file = Path(mutant.path), Path(test.split("::")[0])
-        if file.stem == f"test_{path.stem}":
+        if file.stem == f"test_{path.stem}" or test.startswith(RECORDS):
             return 0
         return 1 if file.parts[1] == ("render" if path.suffix == ".glsl" else path.parts[1]) else 2
 

@@ -18,6 +18,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
+from blinkgl.machine.interrupts import interruptible
 from blinkgl.show.terminal import never_fail_to_print
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
@@ -381,7 +382,8 @@ def run(arguments: list[str]) -> int:
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:
         # Not standalone: typer then hands errors up instead of printing its own boxes.
-        status = app(arguments, prog_name="blinkgl", standalone_mode=False)
+        with interruptible():
+            status = app(arguments, prog_name="blinkgl", standalone_mode=False)
         return status if isinstance(status, int) else 0
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)

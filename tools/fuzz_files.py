@@ -2,8 +2,8 @@
 die, under a clock and a memory limit.
 
     python -m blinkgl.tools.fuzz_files [--mutants 1000] [--formats "events*" "mesh*"] [--seed 0] [--out out/fuzz]
-    [--json FILE] python -m blinkgl.tools.fuzz_files --formats "mesh ply" --only 317
-    # one mutant again, with its traceback
+                                       [--json FILE]
+    python -m blinkgl.tools.fuzz_files --formats "mesh ply" --only 317  # one mutant again, with its traceback
 
 What may come of a mutant: it is read (and what was read is looked at, see :mod:`blinkgl.tools.fuzz_formats`), or
 refused with the one line of the command line. Everything else is a defect: a traceback, a crash, more than --cpu

@@ -1,11 +1,11 @@
 """A small mutation run: are there tests that notice when a line is wrong?
 
-    python -m blinkgl.tools.mutate --map                      # once per commit: which test
-                                                              runs which line (the suite under coverage)
-    python -m blinkgl.tools.mutate --count 200 --seed 1       # draw mutants, run the tests that reach each, print the
-    survivors python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py    # the mutants of a module, without
-    running any python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41 # those of a line
+    python -m blinkgl.tools.mutate --map                 # once per commit: which test runs which line
+    python -m blinkgl.tools.mutate --count 200 --seed 1  # draw mutants, run the tests that reach each, print survivors
+    python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py     # the mutants of a module, without running any
+    python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41  # those of a line
 
+``--map`` runs the suite under coverage.
 A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is
 made in a copy of the tree, so nothing here is touched. The tests that reached its line run, its module's own first,
 until one fails (killed), the time is up (killed: "time"), or all passed (survived). Lines that no test reaches are
@@ -724,9 +724,8 @@ def serve() -> int:
 
 def _awaited(child: int, limit_s: float) -> str:
     handle = os.pidfd_open(child)
-    ready = select.select([handle, sys.stdin], [], [], limit_s)[
-        0
-    ]  # no order comes while one is carried out: readable is who gives them gone
+    # No order comes while one is carried out: when stdin can be read, who gives them is gone.
+    ready, _, _ = select.select([handle, sys.stdin], [], [], limit_s)
     in_time = handle in ready
     os.close(handle)
     with contextlib.suppress(ProcessLookupError, PermissionError):

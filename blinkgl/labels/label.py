@@ -89,8 +89,8 @@ class View:
 class Drawn(Protocol):
     """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
 
-    scene : as it is drawn.   raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.
-                              value(name) : what that label made of its.
+    scene : as it is drawn.
+    raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
     there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
 
     scene: Scene
@@ -110,8 +110,8 @@ class Label:
         name : key of ``labels:`` (unless it says other ``keys``), folder, attribute of a
         :class:`~blinkgl.labels.LabelFrame`.
         about : what it is and how it is written, for the page of keys.   default : written when nothing is said.
-        title, unit : for tables.   kind : how a picture shows it, one of KINDS.   off : what
-                                    ``explain`` says of it when it is not asked for.
+        title, unit : for tables.   kind : how a picture shows it, one of KINDS.
+        off : what ``explain`` says of it when it is not asked for.
 
     What is drawn
         buffer : a key of BUFFERS; None: no output of the label shader.

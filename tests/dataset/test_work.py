@@ -21,7 +21,7 @@ from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.sockets import Listening, descendants, listening
 from blinkgl.dataset.work import Job, Maker, SequenceLog, environment_differences, thread_environment
-from blinkgl.errors import ConfigError, OutputError
+from blinkgl.errors import ConfigError, OutputError, may_pass
 from blinkgl.sequence import Picture
 from blinkgl.sequence.clock import StageClock
 
@@ -267,7 +267,7 @@ EXPLAINED = {
         (
             {
                 "timeline": {"kind": "uniform", "fps": 100, "reconstruction": "hermite"},
-                "render": {"antialiasing": "ssaa2"},
+                "render": {"antialiasing": "ssaa2", "lod": {"enabled": True}},
             },
             26,
             4,
@@ -297,6 +297,8 @@ def test_what_each_pass_holds_and_how_often_it_is_drawn(tmp_path, changes, frame
     )
     assert told.seconds_per_simulated_second == pytest.approx(told.seconds / 0.25)
     assert told.scene["bodies"].startswith("3 objects") and told.scene["camera"].endswith(", moving")
+    assert told.scene["triangles"].endswith(" (level of detail: see notes)") == (samples == 4)
+    assert ("level of detail" in dict(told.left_out)) == (samples == 1)
     assert PROBES == 12 and told.machine and "velocity pass" in dict(told.left_out)
     assert ("anti-aliasing of event frames" in dict(told.left_out)) == (samples == 1)
     labels = next(p for p in told.passes if p.name == "labels")
@@ -308,3 +310,81 @@ def test_what_each_pass_holds_and_how_often_it_is_drawn(tmp_path, changes, frame
         "depth",
         "ids",
     }
+
+
+# --- one task ---------------------------------------------------------------------------------------------------------
+
+
+def made(tmp_path, monkeypatch, make):
+    """(message or exception, log, progress messages) of the first task, with ``make`` in the place of the renderer."""
+    told = []
+    monkeypatch.setattr(work, "generate_sequence", make)
+    try:
+        outcome = Maker(recipe(tmp_path, a={})).make(1, 2, told.append)
+    except BaseException as error:  # noqa: BLE001 - it is what is asked for
+        outcome = error
+    return outcome, (tmp_path / "out/.run/logs/train/a_000001.log").read_text(), told
+
+
+def test_a_sequence_that_is_made(tmp_path, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(work.time, "monotonic", lambda: now[0])
+
+    def make(config, index, out, gl, *, base, progress):
+        assert (index, out, gl, base) == (1, str(tmp_path / "out"), None, tmp_path) and config.output.name == "a"
+        report = SequenceReport(index, tmp_path / "seq", 0.5, 10, 1000, 7, 3, {"render": 1.5}, 2.0, omissions=("lamp",))
+        for step in (1.0, 0.1, 0.15, 0.16, 0.26):  # news after more than a quarter of a second
+            now[0] += step
+            progress(report, now[0] / 10)
+        (tmp_path / "seq/sub").mkdir(parents=True)
+        (tmp_path / "seq/a").write_bytes(b"12345")
+        (tmp_path / "seq/sub/b").write_bytes(b"1")
+        return report
+
+    message, log, told = made(tmp_path, monkeypatch, make)
+    assert (message["kind"], message["task"], message["bytes"]) == ("done", 1, 6)
+    assert (
+        message["report"]["path"] == str(tmp_path / "seq") and message["cpu_s"] >= 0 and message["peak_rss_kib"] > 1000
+    )
+    assert work.report_of(message).path == tmp_path / "seq" and work.report_of(message).events == 1000
+    assert [m["fraction"] for m in told] == pytest.approx([0.1, 0.141, 0.167]) and told[0] == {
+        "kind": "progress", "task": 1, "frames": 10, "events": 1000, "fraction": 0.1,
+        "seconds": {"render": 1.5}, "omissions": ["lamp"],
+    }  # fmt: skip
+    assert f"attempt 2, pid {os.getpid()} on " in log
+    assert "done in 2.00 s: 10 frames, 1000 events, 3 labels, 6 bytes; render 1.50 s\n" in log
+
+
+@pytest.mark.parametrize(
+    "error, line, expected, stop",
+    [
+        (ConfigError("bad", where="a.b", value=3), "a.b: bad (got 3)", True, False),
+        (
+            OutputError("cannot write: no space left on the device"),
+            "cannot write: no space left on the device",
+            True,
+            True,
+        ),
+        (ValueError("odd\n  words"), "ValueError: odd words", False, False),
+    ],
+)
+def test_a_sequence_that_cannot_be_made(tmp_path, monkeypatch, error, line, expected, stop):
+    """The reason in one line, in the message and in the log, which has the traceback besides."""
+
+    def make(*_, **__):
+        raise error
+
+    message, log, told = made(tmp_path, monkeypatch, make)
+    assert message == {
+        "kind": "failed", "task": 1, "error": line, "expected": expected, "final": not may_pass(error), "stop": stop
+    }  # fmt: skip
+    assert f"failed: {line}\n" in log and "Traceback (most recent call last)" in log and told == []
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit])
+def test_a_sequence_that_is_interrupted(tmp_path, monkeypatch, error):
+    def make(*_, **__):
+        raise error
+
+    outcome, log, _ = made(tmp_path, monkeypatch, make)
+    assert type(outcome) is error and log.endswith(" interrupted\n") and "Traceback" not in log

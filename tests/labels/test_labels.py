@@ -273,3 +273,10 @@ def test_how_strictly_each_is_judged():
     loose = {v.name for label in LABELS.values() for v in label.views if not v.same_triangle}
     assert loose == {"id", "occluded_forward", "occluded_backward"}
     assert {v.name for label in LABELS.values() for v in label.views if v.band_there} == loose - {"id"}
+
+
+def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():
+    """Then whoever asks for one all the same is told."""
+    with pytest.raises(NotImplementedError):
+        LABELS["images"].reference(None, None)
+    assert LABELS["images"].views == ()

@@ -117,3 +117,39 @@ def test_records_that_hold_arrays_are_compared_by_identity():
         holders |= new  # what holds such a record
     wrong = [t.__qualname__ for t in everything if t.__dataclass_params__.eq == (t.__name__ in holders)]
     assert not wrong, "@dataclass(…, eq=False) is for those that hold arrays, and for no other"
+
+
+# --- defaults ---------------------------------------------------------------------------------------------------------
+
+DOORS = {
+    "simulate": """blinkgl.cli.simulate blinkgl.simulate blinkgl.simulate_file
+        blinkgl.recordings.simulation.frames_to_events blinkgl.recordings.simulation.simulated_steps
+        blinkgl.recordings.simulation.file_to_events""",
+    "compare": "blinkgl.cli.compare blinkgl.compare blinkgl.recordings.comparison.compare",
+    "convert": "blinkgl.cli.convert blinkgl.convert blinkgl.io.formats.convert",
+    "write": "blinkgl.write_events blinkgl.io.formats.event_writer",
+    "verify": "blinkgl.cli.verify blinkgl.verify blinkgl.dataset.verify.verify_dataset",
+    "generate": "blinkgl.cli.generate blinkgl.generate blinkgl.dataset.run.run_dataset",
+    "explain": "blinkgl.cli.explain blinkgl.dataset.explain.explain",
+    "sequence": "blinkgl.simulate_sequence blinkgl.sequence.simulate.simulate_sequence",
+    "report": "blinkgl.cli.report blinkgl.report.page.write_report",
+}
+OTHERWISE = {
+    "overwrite": "a command asks first",
+    "workers": "a command's own word for one process",
+    "executor": "a name, or the thing itself",
+    "labels": "which ones, or whether any",
+}
+
+
+@pytest.mark.parametrize("what", DOORS)
+def test_doors_to_one_thing_have_the_same_defaults(what):
+    """A command, the function of the front door and the one of the room behind it."""
+    said: dict[str, dict[str, object]] = {}
+    for name in DOORS[what].split():
+        place, _, function = name.rpartition(".")
+        for parameter in inspect.signature(getattr(importlib.import_module(place), function)).parameters.values():
+            if parameter.default is not parameter.empty and parameter.name not in OTHERWISE:
+                said.setdefault(parameter.name, {})[name] = parameter.default
+    assert any(len(doors) > 1 for doors in said.values())
+    assert {name: doors for name, doors in said.items() if len(set(doors.values())) > 1} == {}

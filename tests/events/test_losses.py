@@ -5,6 +5,7 @@ import pytest
 
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import make_emulator
+from blinkgl.events.v2e import _flag_block
 from tests.events.clips import random_clip, run
 
 KINDS = {
@@ -64,3 +65,14 @@ def test_a_path_that_is_behind_is_flushed_once(reconstruction):
         assert len(last) and last.t.min() >= behind // 1000 and last.t.max() <= times[3] // 1000
         assert last.t.max() > (behind + times[3]) // 2000, "to the end of the interval"
     assert len(fresh.flush()) == 0 and fresh.done_ns == times[3]
+
+
+def test_at_a_level_exactly_an_event_is_due():
+    """Not one unit in the last place before it."""
+    before = np.nextafter(np.float32(1), np.float32(0))
+    z = np.array([1, before, -1, -before, 0, 1.5], np.float32)
+    flags = np.full(6, 7, np.uint8)
+    farthest = _flag_block(z, np.ones(6, np.float32), -np.ones(6, np.float32), flags)
+    assert flags.tolist() == [1, 0, 1, 0, 0, 1] and farthest == 0.5
+    assert _flag_block(z[:1], np.ones(1, np.float32), -np.ones(1, np.float32), flags[:1]) == 0
+    assert _flag_block(z[1:2], np.ones(1, np.float32), -np.ones(1, np.float32), flags[:1]) < 0

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
+from blinkgl.config.deform import DeformConfig
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
 PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
@@ -400,6 +401,9 @@ class ObjectConfig(KeyedMotionConfig):
     )
     category: Literal["object", "ground", "wall", "sky"] = Field(
         "object", description="what it is: collisions and drawing order"
+    )
+    deform: DeformConfig | None = Field(
+        None, description="how its shape changes with time, by formula; null: it is rigid"
     )
 
 

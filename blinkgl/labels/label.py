@@ -44,7 +44,7 @@ BUFFERS = {
     "RGBA32F": Buffer("vec4", 4, np.dtype(np.float32)),
     "R32UI": Buffer("uint", 1, np.dtype(np.uint32)),
 }
-VARYINGS = ("local", "normal")
+VARYINGS = ("local", "normal", "rate", "forward", "backward")
 _NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
 KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
 
@@ -118,7 +118,8 @@ class Label:
         glsl : source of ``TYPE label_NAME()``, TYPE being the buffer's, with uniforms of its own and, by name,
         ``local`` (object-local position) and ``facing()`` (the surface's normal, object axes, on the camera's side),
         where ``varyings`` names "local" or "normal", and ``#include``; None: it stands in
-        ``shaders/include/labels/NAME.glsl``.
+        ``shaders/include/labels/NAME.glsl``. "rate", "forward", "backward": how a shape that changes with time moves
+        (``DEFORM`` is defined then), as ``shaders/include/vertex.glsl`` says; "rate" is all that ``velocity()`` needs.
         needs : labels whose buffers are drawn with it.   there : labels whose buffers it reads at the other time.
         towards : "forward" or "backward": it leads from one label's time to the next or the
         one before; None: it is of one time.

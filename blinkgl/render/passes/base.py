@@ -134,6 +134,8 @@ class ScenePass(Pass):
         for item in self.items(shot.moment) if items is None else items:
             uniforms = programs[item.kind]
             painter.place(uniforms, item, shot.moment)
+            if item.deformer is not None:
+                painter.deform(uniforms, item, shot)
             self.bind(uniforms, shot)
             self.set(painter, uniforms, item, shot)
             painter.draw(uniforms, item)

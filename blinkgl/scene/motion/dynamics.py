@@ -250,7 +250,7 @@ class _World:
         """See :func:`simulate`. Steps are done one ahead of the poses that are kept: the velocity at a pose is the mean
         of the velocities before and after it."""
         model, data = self.model, self.data
-        count = math.ceil((self.t1_ns - self.t0_ns) * 1e-9 * self.settings.rate)
+        count = math.ceil((self.t1_ns - self.t0_ns) * 1e-9 * self.settings.rate - 1e-6)
         qpos, qvel = np.empty((_CHUNK + 2, model.nq)), np.empty((_CHUNK + 2, model.nv))
         pushed = self._pushed(0)
         for body in self.dynamic:

@@ -18,6 +18,7 @@ import typer
 
 from blinkgl import __version__
 from blinkgl.errors import BlinkGLError
+from blinkgl.machine.interrupts import interruptible
 from blinkgl.show.terminal import never_fail_to_print
 from blinkgl.tools.shader_debugger.cli import app as shader_app
 
@@ -381,7 +382,8 @@ def run(arguments: list[str]) -> int:
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:
         # Not standalone: typer then hands errors up instead of printing its own boxes.
-        status = app(arguments, prog_name="blinkgl", standalone_mode=False)
+        with interruptible():
+            status = app(arguments, prog_name="blinkgl", standalone_mode=False)
         return status if isinstance(status, int) else 0
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)
@@ -426,9 +428,8 @@ def _user_line(error: Exception) -> str | None:
     """The line for an error that the user or the machine caused; None for a bug."""
     if isinstance(error, BlinkGLError):
         return str(error)
-    if hasattr(error, "format_message") and hasattr(
-        error, "exit_code"
-    ):  # typer's usage errors; their class moved between versions
+    # typer's usage errors; their class moved between versions.
+    if hasattr(error, "format_message") and hasattr(error, "exit_code"):
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "blinkgl"
         message = " ".join(error.format_message().split()).rstrip(".")

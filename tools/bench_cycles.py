@@ -2,14 +2,14 @@
 ``peer_cycles.py``) on the default random scene.
 
     python -m blinkgl.tools.bench_cycles [CONFIG] [--frames 32] [--samples 128] [--set a.b=c …]
-    [--json FILE] [--pictures FOLDER]
+                                         [--json FILE] [--pictures FOLDER]
 
 1. A short clip at low resolution (--width; the camera of the configuration, shrunk), frame times with at most --max-px
    of motion between two, the same for every renderer; ESIM with the same thresholds on each, linear in time. Errors of
    the events, one cause at a time:
 
-   filtering   our frames against path-traced ones under our own light model (no shadows, no
-               bounces): mip maps, anti-aliasing
+   filtering   our frames against path-traced ones under our own light model (no shadows,
+               no bounces): mip maps, anti-aliasing
    shadows     without them against with them, both path-traced
    bounces     direct light against four diffuse bounces, both path-traced
    all         our frames against everything

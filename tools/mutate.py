@@ -1,11 +1,11 @@
 """A small mutation run: are there tests that notice when a line is wrong?
 
-    python -m blinkgl.tools.mutate --map                      # once per commit: which test
-                                                              runs which line (the suite under coverage)
-    python -m blinkgl.tools.mutate --count 200 --seed 1       # draw mutants, run the tests that reach each, print the
-    survivors python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py    # the mutants of a module, without
-    running any python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41 # those of a line
+    python -m blinkgl.tools.mutate --map                 # once per commit: which test runs which line
+    python -m blinkgl.tools.mutate --count 200 --seed 1  # draw mutants, run the tests that reach each, print survivors
+    python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py     # the mutants of a module, without running any
+    python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41  # those of a line
 
+``--map`` runs the suite under coverage.
 A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is
 made in a copy of the tree, so nothing here is touched. The tests that reached its line run, its module's own first,
 until one fails (killed), the time is up (killed: "time"), or all passed (survived). Lines that no test reaches are
@@ -327,12 +327,8 @@ class _Finder(ast.NodeVisitor):
         self.visit(node.value)
 
     def visit_keyword(self, node) -> None:
-        if node.arg not in (
-            "description",
-            "accepted",
-            "where",
-            "value",
-        ):  # what an error says is golden text, tested as such
+        # What an error says is golden text, tested as such.
+        if node.arg not in ("description", "accepted", "where", "value"):
             self.visit(node.value)
 
 
@@ -688,9 +684,8 @@ def serve() -> int:
             importlib.import_module(name)
     import numba
 
-    numba.njit("f8(f8)")(
-        lambda x: x + 1.0
-    )  # fills numba's tables of types, which it does when it compiles or loads the first kernel
+    # Fills numba's tables of types, which it does when it compiles or loads the first kernel.
+    numba.njit("f8(f8)")(lambda x: x + 1.0)
     taken = sorted(m for m in sys.modules if m.split(".")[0] in ("blinkgl", "eflow", "tests"))
     assert not taken, f"of the tree, before it is edited: {taken}"
     gc.collect()
@@ -712,9 +707,8 @@ def serve() -> int:
 
 def _awaited(child: int, limit_s: float) -> str:
     handle = os.pidfd_open(child)
-    ready = select.select([handle, sys.stdin], [], [], limit_s)[
-        0
-    ]  # no order comes while one is carried out: readable is who gives them gone
+    # No order comes while one is carried out: when stdin can be read, who gives them is gone.
+    ready, _, _ = select.select([handle, sys.stdin], [], [], limit_s)
     in_time = handle in ready
     os.close(handle)
     with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -732,9 +726,8 @@ def _run_tests(order: dict) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for old, new in ((nothing, 0), (output, 1), (output, 2)):
         os.dup2(old, new)
-    resource.setrlimit(
-        resource.RLIMIT_DATA, (MEMORY, MEMORY)
-    )  # not of address space, of which Ray maps more than it uses
+    # Not of address space, of which Ray maps more than it uses.
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]

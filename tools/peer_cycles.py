@@ -2,10 +2,9 @@
 (shadows, inter-reflection, filtering).
 
     cost = Cost()
-    for luminance in frames(scene, times_ns, CyclesSettings(samples=64), cost):     # (H, W)
-    float32, one per time, as it is done
-        ...
-    cost.wall_s, cost.cpu_s                                                         # per frame
+    for luminance in frames(scene, times_ns, CyclesSettings(samples=64), cost):
+        ...                      # (H, W) float32, one per time, as it is done
+    cost.wall_s, cost.cpu_s      # per frame
 
 Blender's Python module ``bpy`` (extra [cycles]) is GPL and wants NumPy 1: it is never imported here. The scene is
 written to a folder as plain files (:func:`export`), and ``cycles_worker.py`` renders it in a process of its own, with

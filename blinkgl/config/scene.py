@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
+from blinkgl.config.deform import DeformConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
@@ -407,6 +408,10 @@ class ObjectConfig(KeyedMotionConfig):
         None,
         description="what it is to the engine of a scene with physics; null: it is in the way, where it stands "
         "or moves",
+    )
+
+    deform: DeformConfig | None = Field(
+        None, description="how its shape changes with time, by formula; null: it is rigid"
     )
 
     @rule("physics.kind", "#keyframes")

@@ -130,8 +130,8 @@ def manifest_info(sequence: Simulation) -> dict:
         "emulator": config.events.emulator,
         "frames": sequence.frames,
         "labels": sequence.labels,
-        "duration_us": sequence.t1_ns // 1000
-        - sequence.t0_ns // 1000,  # between whole microseconds, as every time in the files
+        # between whole microseconds, as every time in the files
+        "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,
         **losses(*sequence.losses),
         **sequence.facts(),
     }

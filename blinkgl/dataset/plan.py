@@ -213,9 +213,8 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
                     accepted=f"at least {last + 1} folders, or fewer output.sequences",
                 )
             for folder in folders:
-                with suppress(
-                    AssetError
-                ):  # one bad folder is set aside alone; frames too far apart are the recipe's fault
+                # One bad folder is set aside alone; frames too far apart are the recipe's fault.
+                with suppress(AssetError):
                     used_images(config.frames, folder)
                 for path in sorted(folder.rglob("*")):
                     if path.is_file():

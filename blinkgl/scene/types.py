@@ -20,6 +20,7 @@ from blinkgl.config.scene import LightConfig
 
 if TYPE_CHECKING:
     from blinkgl.scene.rig import Rig, Sensor
+    from blinkgl.scene.shapes.deformer import Deformer
 
 
 @runtime_checkable
@@ -48,13 +49,14 @@ class PosePath(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in object-local coordinates.
+    """Triangles in object-local coordinates, of a mesh that deforms at rest.
 
     vertices : (V, 3) float64.   faces : (F, 3) int32, counter-clockwise seen from outside.
     normals  : (V, 3) float32, unit.
     uvs      : (V, 2) float32; (0, 0) is the top-left corner of the texture image, v grows downwards; repeats.
     closed   : watertight with consistent outward winding, so back faces can be culled.
     name, source_hash : where it came from; ``source_hash`` is a stable hash of the content (train/test splits).
+    deformer : how its shape changes with time, in object-local coordinates; None: it does not.
     """
 
     vertices: np.ndarray
@@ -64,6 +66,7 @@ class Mesh:
     closed: bool = False
     name: str = ""
     source_hash: str = ""
+    deformer: Deformer | None = None
 
     @property
     def radius(self) -> float:
@@ -107,13 +110,24 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """A rigid body. ``instance_id`` >= 1 is what the id pass writes (0 is 'nothing hit')."""
+    """A body on its path, rigid but for parts that deform. ``instance_id`` >= 1 is what the id pass writes (0 is
+    'nothing hit')."""
 
     name: str
     instance_id: int
     parts: tuple[Part, ...]
     path: PosePath
     category: Literal["object", "ground", "wall", "sky"] = "object"
+
+    @property
+    def deforms(self) -> bool:
+        """Whether the shape of any of its parts changes with time."""
+        return any(part.mesh.deformer is not None and not part.mesh.deformer.is_static for part in self.parts)
+
+    @property
+    def is_static(self) -> bool:
+        """True when it looks the same at all times."""
+        return self.path.is_static and not self.deforms
 
     @property
     def radius(self) -> float:

@@ -124,9 +124,8 @@ class Budget(Timeline):
         last = None
         for k, t in enumerate(super().__iter__()):
             if last is not None and k % PROBE_EVERY == 0 and t - last >= 2 * self.config.min_step_us * 1000:
-                yield (
-                    last + (t - last) // 2
-                )  # this step in two halves: its own error is then measured, not extrapolated
+                # This step in two halves: its own error is then measured, not extrapolated.
+                yield (last + (t - last) // 2)
             yield t
             last = t
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
+from blinkgl.config.deform import DeformConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     KeyedMotionConfig,
@@ -19,7 +20,7 @@ from blinkgl.config.scene import (
     object_names,
 )
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.geometry.meshes import bounds, transform_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS
 from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.motion.collision import resolve_collisions
@@ -28,6 +29,7 @@ from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
@@ -78,6 +80,8 @@ def explicit_scene(
             material = part.material if own else materials[item.material]
             material = replace(material, unlit=material.unlit or config.light.unlit)
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
+        if item.deform is not None:
+            parts = deforming(parts, item.deform)
         objects.append(
             SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category)
         )
@@ -111,6 +115,12 @@ def explicit_scene(
         tuple(omissions),
         dynamics,
     )
+
+
+def deforming(parts: Sequence[Part], config: DeformConfig) -> list[Part]:
+    """The parts of one object, whose shape changes together as ``deform:`` says."""
+    deformer = deformer_of(config, *bounds(part.mesh for part in parts))
+    return [replace(part, mesh=replace(part.mesh, deformer=deformer)) for part in parts]
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:

@@ -111,9 +111,8 @@ def random_world(
         SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items)
     )
     space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
-    for _ in range(
-        _CAMERA_PATHS
-    ):  # a camera that was stopped would see a still world from then on: another path is better
+    # A camera that was stopped would see a still world from then on: another path is better.
+    for _ in range(_CAMERA_PATHS):
         path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
         # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
         others = tuple(o for o in scene_objects if o.name not in bodies)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from skinned import arm
 
 from blinkgl.config.deform import BendConfig, BreatheConfig, FlagConfig, TwistConfig, WaveConfig
 from blinkgl.config.sequence import RenderConfig
@@ -15,6 +16,8 @@ from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.shapes.skeleton import Locals, Skeleton
+from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.types import Material
 from render_scenes import LEVEL, cube, drift, quad, rig, scene, smooth_texture, sphere, still, thing
@@ -152,3 +155,117 @@ def test_variants_are_compiled_where_a_shape_asks(gl):
         with Renderer(own, world(by_formula(sphere(1.0, 2), "wave")), RenderConfig()) as renderer:
             renderer.luminance(T0)
         assert sum("DEFORM" in dict(defines) for _, defines in own.shaders.compiled) == 1
+
+
+# ------------------------------------------------------------------------------------------------- skins
+
+
+def bar():
+    tilted = np.eye(4)
+    tilted[:3, :3], tilted[2, 3] = Rotation.from_euler("x", 20, degrees=True).as_matrix(), -1
+    return transform_mesh(arm(), tilted)
+
+
+def morphing(mesh):
+    """The same, pulled to two other shapes besides."""
+    skin, up = mesh.deformer, mesh.vertices[:, 2:]
+    deltas = np.stack([0.3 * np.sin(3 * up) * [1, 0, 0], 0.2 * up * [0, 1, 0]])
+    normals = np.stack(
+        [-0.9 * np.cos(3 * up) * mesh.normals[:, :1] * [0, 0, 1], -0.2 * mesh.normals[:, 1:2] * [0, 0, 1.0]]
+    )
+    weights = lambda t: (np.sin([7e-9 * t, 3e-9 * t]), np.array([7, 3]) * np.cos([7e-9 * t, 3e-9 * t]))
+    morphs = Morphs(deltas, normals, weights, span_ns=2 * 10**9)
+    given = skin.skeleton, skin.bones, skin.inverse_bind, skin.joints, skin.weights
+    return replace(mesh, deformer=Skin(*given, morphs, after=skin.after, before=skin.before))
+
+
+FIGURES = {"skin": bar, "skin and morphs": lambda: morphing(bar())}
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_every_label_of_a_skin(gl, figure):
+    what = world(FIGURES[figure]())
+    ref, labels, off = graded(gl, what)
+    body = off & (ref.instance == 3)
+    assert body.sum() > 500
+    np.testing.assert_array_equal(labels.ids[off], ref.instance[off])
+    np.testing.assert_allclose(labels.depth[off], ref.depth[off], rtol=1e-5)
+    for flow, true in ((labels.forward, ref.forward), (labels.backward, ref.backward)):
+        error = length(flow.flow - true.flow)[off]
+        assert np.median(length(true.flow)[body]) > 1.0
+        assert np.median(error) <= 1e-5 and error.max() <= 1e-2
+    scale = np.median(length(ref.velocity)[body])
+    error = length(labels.velocity - ref.velocity)[off] / scale
+    assert np.median(error) < 2e-6 and error.max() < 1e-4
+    np.testing.assert_allclose(labels.normals[off], (ref.normal @ what.camera_path.pose(T0)[:3, :3])[off], atol=5e-5)
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_a_skin_that_moves_by_a_millionth_of_a_pixel(gl, figure):
+    what = world(FIGURES[figure](), moves=False, camera_moves=False)
+    ref, labels, off = graded(gl, what, forward=T0 + 30, backward=T0 - 30)
+    off &= ref.instance == 3
+    for flow, true in ((labels.forward, ref.forward), (labels.backward, ref.backward)):
+        motion = length(true.flow)[off]
+        assert 1e-8 < np.median(motion) < 1e-4
+        assert np.quantile(length(flow.flow - true.flow)[off] / motion.max(), 0.99) <= 1e-5
+    limit = labels.forward.flow[off] / 30e-9
+    assert length(labels.velocity[off] - limit).max() <= 1e-4 * length(limit).max()
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_rate_of_luminance_of_a_skin(gl, figure):
+    what = world(FIGURES[figure](), moves=False, camera_moves=False)
+    ref = reference.render(what, T0)
+    with Renderer(gl, what, RenderConfig(antialiasing="none"), whole=True) as renderer:
+        before, after = (renderer.luminance(T0 + dt).read().astype(np.float64) for dt in (-MS, MS))
+        rate = renderer.luminance(T0, rate=True).read("rate").astype(np.float64)
+    off = ref.hit & (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
+    true = (after - before) / 2e-3
+    assert np.abs(true[off]).max() > 0.1
+    assert np.quantile(np.abs(rate - true)[off], 0.9) < 0.03 * np.abs(true[off]).max()
+
+
+class Spinning:
+    """One joint that turns as a rigid body on a path would."""
+
+    period_ns, span_ns, is_static = None, 10**9, False
+
+    def __init__(self, path):
+        self.path = path
+
+    def locals(self, t_ns):
+        T, dT = self.path.pose(t_ns), self.path.derivative(t_ns)
+        out = Locals.rest(1)
+        q = out.rotation[0] = Rotation.from_matrix(T[:3, :3]).as_quat()
+        w = T[:3, :3].T @ dT[:3, :3]
+        turn = Rotation.from_quat(q)
+        rate = np.array([w[2, 1], w[0, 2], w[1, 0]])
+        x, y, z, s = turn.as_quat()
+        out.d_rotation[0] = 0.5 * np.array(
+            [s * rate[0] + y * rate[2] - z * rate[1], s * rate[1] + z * rate[0] - x * rate[2],
+             s * rate[2] + x * rate[1] - y * rate[0], -x * rate[0] - y * rate[1] - z * rate[2]]
+        )  # fmt: skip
+        out.translation[0], out.d_translation[0] = T[:3, 3], dT[:3, 3]
+        return out
+
+
+def test_a_turning_skeleton_is_the_turning_body(gl):
+    """All vertices follow one joint that moves as the body's path does: the same picture, to the last id."""
+    path = drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), Rotation.identity(), Rotation.from_rotvec([0.9, 0.4, -0.7]))
+    ball = cube(0.8)
+    skinned = replace(ball, deformer=Skin.rigid(Skeleton([-1], Spinning(path)), 0, len(ball.vertices)))
+    rigid, bones = (
+        scene([thing("body", 3, mesh, way, Material(base_color=(0.9, 0.5, 0.3)))], rig())
+        for mesh, way in ((ball, path), (skinned, still()))
+    )
+    with Renderer(gl, rigid, RenderConfig()) as a, Renderer(gl, bones, RenderConfig(), whole=True) as b:
+        for t in range(50 * MS, 950 * MS, 100 * MS):
+            one, two = (r.labels(t, LABELS, t + 50 * MS, t - 50 * MS) for r in (a, b))
+            np.testing.assert_array_equal(one.ids, two.ids)
+            for flow, other in ((one.forward, two.forward), (one.backward, two.backward)):
+                error = np.abs(flow.flow - other.flow)
+                assert np.quantile(error, 0.999) <= 1e-5 and error.max() <= 1e-4  # of up to 5 px
+                assert np.abs(flow.flow).max() > 1
+            assert np.abs(one.velocity - two.velocity).max() <= 1e-5 * np.abs(one.velocity).max()
+            np.testing.assert_allclose(one.depth, two.depth, rtol=1e-6)

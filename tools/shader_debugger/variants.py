@@ -17,10 +17,11 @@ KINDS = [Kind(*switches) for switches in product((False, True), repeat=3)]
 def kinds() -> list[Kind]:
     """Of materials all, and of shapes that change with time one each."""
     shapes = {
-        deformer.glsl: (("DEFORM", 1), (define_of(deformer.glsl), 1), ("SHAPE_ROWS", 64))
+        (("DEFORM", 1), (define_of(deformer.glsl), 1), ("SHAPE_ROWS", 64), *sorted(sizes.items())): None
         for deformer in DEFORMERS.values()
+        for sizes in deformer.examples
     }
-    return [*KINDS, *(Kind(True, True, True, shape) for shape in shapes.values())]
+    return [*KINDS, *(Kind(True, True, True, shape) for shape in shapes)]
 
 
 def lookups(program: str) -> list[dict[str, Any]]:

@@ -138,9 +138,8 @@ def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((F,) smallest height, (F,) longest edge) of (F, 3, 3) triangles."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    edges = (
-        edges / np.where(longest > 0, longest, 1.0)[:, None, None]
-    )  # products of the smallest coordinates would underflow
+    # Products of the smallest coordinates would underflow.
+    edges = edges / np.where(longest > 0, longest, 1.0)[:, None, None]
     return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * longest, longest
 
 
@@ -283,9 +282,7 @@ def crease_normals(
     corners = vertices[faces]
     to_next = np.roll(corners, -1, axis=1) - corners
     to_previous = np.roll(corners, 1, axis=1) - corners
-    angle = np.arctan2(
-        np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2)
-    )  # (F, 3)
+    angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))
 
     # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
     count = len(faces)

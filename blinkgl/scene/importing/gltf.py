@@ -401,12 +401,13 @@ class Document:
             )
             times = self.accessor(sampler["input"]).astype(np.float64).ravel() if fits else np.zeros(0)
             values = self.accessor(sampler["output"]).astype(np.float64) if fits else np.zeros(0)
+            # Written so that NaN is refused: it compares false.
             if (
                 not fits
                 or not (np.abs(values) <= 1e12).all()
                 or not (np.abs(times) < _MAX_TIME).all()
                 or (np.diff(times) <= 0).any()
-            ):  # NaN compares false
+            ):
                 raise AssetError(
                     f"the animation of {path} of node '{self.nodes[node].name}' is corrupt", where=self.where
                 )

@@ -79,7 +79,7 @@ class Waves(Deformer):
             amplitudes,
             beats,
         )
-        self.period_ns = max(beat.period_ns for beat in beats)
+        self.period_ns = self.span_ns = max(beat.period_ns for beat in beats)
 
     @property
     def is_static(self) -> bool:
@@ -181,7 +181,7 @@ class Turn(Deformer):
 
     def __init__(self, axis: np.ndarray, pivot: np.ndarray, share: tuple[np.ndarray, float], angle: float, beat: Beat):
         self.axis, self.pivot, self.share, self.angle, self.beat = axis, pivot, share, angle, beat
-        self.period_ns = beat.period_ns
+        self.period_ns = self.span_ns = beat.period_ns
 
     @property
     def is_static(self) -> bool:
@@ -277,7 +277,7 @@ class Breathe(Deformer):
 
     def __init__(self, centre: np.ndarray, amount: np.ndarray, beat: Beat):
         self.centre, self.amount, self.beat = centre, amount, beat
-        self.period_ns = beat.period_ns
+        self.period_ns = self.span_ns = beat.period_ns
 
     @classmethod
     def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Breathe:

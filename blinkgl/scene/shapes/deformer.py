@@ -62,8 +62,10 @@ class Deformer(ABC):
         rows : numbers per time, as vec4.   attributes : more of each vertex, (V, 1 to 4) float32 by the names of GLSL.
         textures : (h, w, 4) float32 by the names of their samplers.   sizes : more macros, whole numbers.
 
+    examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
+
     Config : the model of ``deform:`` that asks for it; None: none does.   period_ns : after which the shape repeats;
-    None: it does not."""
+    None: it does not.   span_ns : from time 0 on after so long nothing new comes."""
 
     glsl: ClassVar[str]
     source: ClassVar[str | None] = None
@@ -73,6 +75,8 @@ class Deformer(ABC):
     textures: Mapping[str, np.ndarray] = {}
     sizes: Mapping[str, int] = {}
     period_ns: int | None = None
+    span_ns: int = 0
+    examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
 
     @classmethod
     def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Deformer:
@@ -185,10 +189,8 @@ class Sweep:
                 [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
             )
             return corners, _BOX
-        kept, faces = (
-            kept[hull.vertices],
-            np.searchsorted(hull.vertices, hull.simplices),
-        )  # vertices are sorted in three dimensions
+        # Vertices are sorted in three dimensions.
+        kept, faces = (kept[hull.vertices], np.searchsorted(hull.vertices, hull.simplices))
         a, b, c = (kept[faces[:, k]] for k in range(3))
         inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
         faces[inwards] = faces[inwards, ::-1]

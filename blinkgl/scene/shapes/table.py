@@ -19,6 +19,7 @@ from blinkgl.config.base import tag_of
 from blinkgl.config.deform import DeformConfig
 from blinkgl.scene.shapes.closed_forms import Bend, Breathe, Flag, Twist, Wave
 from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.skin import Skin
 
 DEFORMERS: dict[str, type[Deformer]] = {}
 """By the class's name."""
@@ -112,5 +113,5 @@ def _checked(deformer: Any) -> str:
     return name
 
 
-for _one in (Wave, Flag, Twist, Bend, Breathe):
+for _one in (Wave, Flag, Twist, Bend, Breathe, Skin):
     register(_one)

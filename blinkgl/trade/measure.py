@@ -65,7 +65,7 @@ QUICK = Options(
 )
 
 
-@dataclass
+@dataclass(eq=False)
 class Measured:
     """One setting. wall_s, cpu_s : seconds (processor: of all threads) per simulated second, one per round."""
 
@@ -104,7 +104,7 @@ class Measured:
         }
 
 
-@dataclass
+@dataclass(eq=False)
 class Level:
     """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest
     error of any setting judged by this one. frame_wall_s, frame_cpu_s : of a path tracer, rendering alone, median."""

@@ -516,9 +516,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
-            cap = min(
-                np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel
-            )  # far beyond what chance adds to the mean
+            # Far beyond what chance adds to the mean.
+            cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:

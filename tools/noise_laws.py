@@ -2,11 +2,12 @@
 
     python -m blinkgl.tools.noise_laws [--quick] [--json FILE]
 
-An even scene, still or on a ramp, is watched at 50, 500 and 5,000 frames/s and at uneven steps (log-uniform from 0.1 to 40 ms), and what
-comes out is compared with the law of the stated equation, which is exact and knows no frames: the rate per pixel; the
-interval between two events of a pixel (Kolmogorov–Smirnov distance and its probability); its spread; the wait for the
-first event, which says whether the start is that of a scene watched for long. A row of the table that is flat from column to column is noise that does not depend on
-the frames. ``tests/events/test_noise_laws.py`` holds the same cases to error probabilities.
+An even scene, still or on a ramp, is watched at 50, 500 and 5,000 frames/s and at uneven steps (log-uniform from 0.1
+to 40 ms), and what comes out is compared with the law of the stated equation, which is exact and knows no frames: the
+rate per pixel; the interval between two events of a pixel (Kolmogorov-Smirnov distance and its probability); its
+spread; the wait for the first event, which says whether the start is that of a scene watched for long. A row of the
+table that is flat from column to column is noise that does not depend on the frames.
+``tests/events/test_noise_laws.py`` holds the same cases to error probabilities.
 """
 
 from __future__ import annotations

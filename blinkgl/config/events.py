@@ -28,8 +28,8 @@ _MAX_EVENTS = Field(
 )
 _CAUSES = Field(
     False,
-    description="Mark every event by what caused it (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): 0 signal, "
-    "1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
+    description="Mark every event by what caused it (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): "
+    "0 signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
 )
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
@@ -199,10 +199,11 @@ class V2eConfig(EmulatorConfig):
     refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
     start: Literal["stationary", "balanced", "zero"] = Field(
         "stationary",
-        description="Where a pixel stands between its levels at the first frame. `stationary`: as in a still scene that "
-        "was watched for long, which leak has brought nearer to ON (each pixel to another place): short clips then have "
-        "more ON events than a scene that has been moving. `balanced`: as after a signal that went up as often as down. "
-        "`zero`: every pixel has just fired, as v2e starts. Without leak the first and the last are the same.",
+        description="Where a pixel stands between its levels at the first frame. `stationary`: as in a still scene "
+        "that was watched for long, which leak has brought nearer to ON (each pixel to another place): short clips "
+        "then have more ON events than a scene that has been moving. `balanced`: as after a signal that went up as "
+        "often as down. `zero`: every pixel has just fired, as v2e starts. Without leak the first and the last are "
+        "the same.",
     )
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")

@@ -556,8 +556,8 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
 class DvsVoltmeter(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
-    State: 12 bytes per pixel, 8 more with a dead time, 8 more with causes. ``saturated`` counts the expected number of the events that
-    were not drawn."""
+    State: 12 bytes per pixel, 8 more with a dead time, 8 more with causes. ``saturated`` counts the expected number of
+    the events that were not drawn."""
 
     Config = VoltmeterConfig
     _state = ("_intensity", "_v", "_unspent", "_release", "_by_light", "_by_leak")

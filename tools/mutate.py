@@ -70,6 +70,8 @@ SHARED_CODE = (
     "pyproject.toml",
     "examples",
 )
+FOR_CHECKERS_ALONE = ("TYPE_CHECKING", "False")
+"""The one edit that is none by its kind."""
 DEBUGGERS = "shaders/include/lookup.glsl"
 """the include that only the shader debugger asks for"""
 LOOKERS = tuple(f"tests/test_rooms.py::test_{name}" for name in ("a_record", "records", "doors"))
@@ -976,10 +978,15 @@ def key_of(mutant: Mutant, source: str) -> str:
 
 
 def excuses(mutants: list[Mutant]) -> dict[str, str]:
-    """Name -> reason of those that are listed as equivalent."""
+    """Name -> reason of those that are listed as equivalent, or are by their kind."""
     reasons = equivalent()
     found = {m.name: key_of(m, (ROOT / m.path).read_text()) for m in mutants}
-    return {name: reasons[key] for name, key in found.items() if key in reasons}
+    kind = {
+        m.name: "False is what it is wherever a program runs"
+        for m in mutants
+        if (m.before, m.after) == FOR_CHECKERS_ALONE
+    }
+    return kind | {name: reasons[key] for name, key in found.items() if key in reasons}
 
 
 def judged(mutants: list[Mutant], reach: Reach | ByName, jobs: int) -> Iterator[dict]:

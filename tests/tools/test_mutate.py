@@ -15,6 +15,7 @@ from blinkgl.tools.mutate import (
     Server,
     _on_import,
     equivalent,
+    excuses,
     key_of,
     mutants_of,
 )
@@ -122,6 +123,12 @@ def test_what_is_called_equivalent_exists_and_says_why():
         source = (ROOT / path).read_text()
         assert entry in {key_of(m, source) for m in mutants_of(path, source)}, f"{entry} is no mutant any more"
         assert len(reason) > 10, entry
+
+
+def test_what_only_type_checkers_read_is_excused_and_nothing_else_by_its_kind():
+    mutants = mutants_of("blinkgl/labels/depth.py", (ROOT / "blinkgl/labels/depth.py").read_text())
+    kinds = {(m.before, m.after) for m in mutants if m.name in excuses(mutants)}
+    assert kinds == {("TYPE_CHECKING", "False")}
 
 
 def test_what_is_compiled_into_a_kernel_is_compiled_itself():

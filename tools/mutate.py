@@ -662,7 +662,7 @@ class ByName:
     survives might die in tests that are not among them, so the share of those that die is a lower bound."""
 
     seconds: ClassVar[dict[str, float]] = {}
-    most_s = MOST_S / 2
+    most_s = MOST_S / 3
     PEERS = (
         "tests/tools/",
         "tests/eflow/",

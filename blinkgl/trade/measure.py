@@ -160,9 +160,9 @@ class Bench:
     ):
         self.gl, self.options, self.say = gl, options, say
         if options.reference == "cycles":
-            from blinkgl.tools import peer_cycles
+            from blinkgl.blender import process
 
-            peer_cycles.require()  # now, not after minutes of measuring
+            process.require()  # now, not after minutes of measuring
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")

@@ -261,11 +261,11 @@ def test_a_turning_skeleton_is_the_turning_body(gl):
     )
     with Renderer(gl, rigid, RenderConfig()) as a, Renderer(gl, bones, RenderConfig(), whole=True) as b:
         for t in range(50 * MS, 950 * MS, 100 * MS):
-            one, two = (r.labels(t, LABELS, t + 50 * MS, t - 50 * MS) for r in (a, b))
+            one, two = (r.labels(t, LABELS, t + 10 * MS, t - 10 * MS) for r in (a, b))
             np.testing.assert_array_equal(one.ids, two.ids)
             for flow, other in ((one.forward, two.forward), (one.backward, two.backward)):
                 error = np.abs(flow.flow - other.flow)
-                assert np.quantile(error, 0.999) <= 1e-5 and error.max() <= 1e-4  # of up to 5 px
-                assert np.abs(flow.flow).max() > 1
+                assert np.quantile(error[one.ids > 0], 0.999) <= 1e-5 and error.max() <= 1e-4
+                assert np.abs(flow.flow).max() > 0.5
             assert np.abs(one.velocity - two.velocity).max() <= 1e-5 * np.abs(one.velocity).max()
             np.testing.assert_allclose(one.depth, two.depth, rtol=1e-6)

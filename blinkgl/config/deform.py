@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from blinkgl.config.base import Family, Members, Refused, rule
+from blinkgl.config.base import Config, Family, Members, Refused, rule
 
 Axis = Literal["x", "y", "z"]
 Period = Annotated[float, Field(ge=0.001, le=1e6, description="s of one oscillation")]
@@ -102,6 +102,31 @@ class BreatheConfig(DeformConfig):
     )
     period: Period = 1.5
     phase: Phase = 0.0
+
+
+class ClipConfig(Config):
+    """One clip of a glTF file, and how it runs."""
+
+    clip: str | int = Field(0, description="name or index of the animation")
+    file: str | None = Field(
+        None,
+        description="another gltf or glb file to take the clip from, whose joints have the same names; null: the same",
+    )
+    speed: float = Field(1.0, ge=-100, le=100, description="of the clip's own; negative: backwards")
+    phase: float = Field(0.0, ge=-1e6, le=1e6, description="s of the clip at time 0")
+    loop: bool = Field(True, description="begins again at its end; false: held before its first and after its last key")
+
+
+class AnimationConfig(ClipConfig):
+    """A clip, or two at once."""
+
+    blend: ClipConfig | None = Field(None, description="a second clip, mixed with the first joint by joint")
+    share: float = Field(0.5, ge=0, le=1, description="of the second clip in the mixture")
+
+
+def animation_of(value: str | int | AnimationConfig | None, loop: bool = True) -> AnimationConfig | None:
+    """A clip's name or index as what it stands for."""
+    return AnimationConfig(clip=value, loop=loop) if isinstance(value, (str, int)) else value
 
 
 for _member in (WaveConfig, FlagConfig, TwistConfig, BendConfig, BreatheConfig):

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
-from blinkgl.config.deform import DeformConfig
+from blinkgl.config.deform import AnimationConfig, DeformConfig
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
 PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
@@ -402,6 +402,9 @@ class ObjectConfig(KeyedMotionConfig):
     category: Literal["object", "ground", "wall", "sky"] = Field(
         "object", description="what it is: collisions and drawing order"
     )
+    animation: str | int | AnimationConfig | None = Field(
+        None, description="clip of the mesh's gltf or glb file that it plays, looped; null: the file's rest shape"
+    )
     deform: DeformConfig | None = Field(
         None, description="how its shape changes with time, by formula; null: it is rigid"
     )
@@ -478,7 +481,9 @@ class FileSceneConfig(Config):
     intrinsics: Literal["config", "file"] = Field(
         "config", description="focal length from the YAML's camera or from the file's (yfov)"
     )
-    animation: str | int | None = Field(0, description="name or index of the animation played; null: none")
+    animation: str | int | AnimationConfig | None = Field(
+        0, description="name or index of the animation played, at the file's own times; null: none"
+    )
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")

@@ -41,6 +41,7 @@ def make_mesh(
     uv_size: float | None = None,
     project_degenerate: bool = False,
     log: list[str] | None = None,
+    source: list[np.ndarray] | None = None,
 ) -> Mesh:
     """A valid mesh from raw triangles.
 
@@ -55,6 +56,8 @@ def make_mesh(
     project_degenerate : also project when the given coordinates cannot carry a texture (:func:`uvs_degenerate`). They
         are kept otherwise, because palette textures use exactly such coordinates.
     log : gets a line for each repair.
+    source : gets (W,) int64, which of the given vertices each of the mesh's is; then no two of different origin are
+        joined.
 
     Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is turned round.
     Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, too
@@ -85,6 +88,7 @@ def make_mesh(
             accepted="finite coordinates",
         )
 
+    origin = np.flatnonzero(used)
     vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
     normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
     uvs_given = uvs is not None
@@ -123,7 +127,13 @@ def make_mesh(
         faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
         if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
             corner_normals = -corner_normals
-    return _from_corners(vertices[faces], corner_normals, corner_uvs, closed=closed, name=name, source_hash=source_hash)
+    corners = None if source is None else origin[faces]
+    mesh, first = _from_corners(
+        vertices[faces], corner_normals, corner_uvs, corners, closed=closed, name=name, source_hash=source_hash
+    )
+    if source is not None and corners is not None:
+        source.append(corners.ravel()[first])
+    return mesh
 
 
 def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -346,8 +356,11 @@ def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> 
     return bool(area[uv_area < 1e-10].sum() > 0.5 * area.sum())
 
 
-def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, **fields) -> Mesh:
-    """Corners with equal position, normal and coordinates become one vertex."""
+def _from_corners(
+    positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, origin: np.ndarray | None = None, **fields
+) -> tuple[Mesh, np.ndarray]:
+    """Corners with equal position, normal and coordinates, and of one origin where that is given, become one vertex.
+    Also (W,) which corner, of all one after the other, each vertex was first."""
     positions = positions.reshape(-1, 3)
     normals = normals.reshape(-1, 3)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
@@ -358,24 +371,25 @@ def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, *
             (positions + 0.0).view(np.int64),
             np.round(normals * 1e5).astype(np.int64),
             (uvs + 0.0).view(np.int32).astype(np.int64),
+            *([] if origin is None else [origin.reshape(-1, 1).astype(np.int64)]),
         ],
         axis=1,
     )
-    _, first, index = np.unique(
-        np.ascontiguousarray(rows).view([("", np.int64)] * 8).ravel(), return_index=True, return_inverse=True
-    )
+    whole = [("", np.int64)] * rows.shape[1]
+    _, first, index = np.unique(np.ascontiguousarray(rows).view(whole).ravel(), return_index=True, return_inverse=True)
     # Vertices in order of first use: good for the vertex cache, and independent of how np.unique sorts.
     order = np.argsort(first, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     first = first[order]
-    return Mesh(
+    mesh = Mesh(
         vertices=positions[first],
         faces=rank[index.reshape(-1)].reshape(-1, 3).astype(np.int32),
         normals=normals[first],
         uvs=uvs[first],
         **fields,
     )
+    return mesh, first
 
 
 def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
@@ -418,10 +432,12 @@ def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
 
 def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]:
     """The meshes of one object together, moved so that the bounding box is centred on the origin and scaled to bounding
-    radius 1."""
-    low, high = bounds(meshes)
+    radius 1. Of a mesh that deforms all that it sweeps counts."""
+    filled = [(m.vertices, 0.0) if m.deformer is None else _swept(m) for m in meshes]
+    low = np.min([points.min(axis=0) - margin for points, margin in filled], axis=0)
+    high = np.max([points.max(axis=0) + margin for points, margin in filled], axis=0)
     centre = (low + high) / 2
-    radius = max(float(np.sqrt(((m.vertices - centre) ** 2).sum(axis=1).max())) for m in meshes)
+    radius = max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).max())) + margin for points, margin in filled)
     if not radius > 0:
         raise AssetError("the mesh has no extent", where=where)
     return tuple(
@@ -430,6 +446,13 @@ def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]
         )
         for m in meshes
     )
+
+
+def _swept(mesh: Mesh) -> tuple[np.ndarray, float]:
+    """((K, 3) corners of the hull of all that a mesh which deforms is in its time, by how much it may leave that)."""
+    assert mesh.deformer is not None
+    sweep = mesh.deformer.sweep(mesh, 0, mesh.deformer.span_ns)
+    return sweep.hull[0], sweep.margin
 
 
 def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:

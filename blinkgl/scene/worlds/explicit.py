@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.deform import DeformConfig
+from blinkgl.config.deform import AnimationConfig, DeformConfig, animation_of
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     KeyedMotionConfig,
@@ -62,24 +62,36 @@ def explicit_scene(
         name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name))
         for name, m in config.materials.items()
     }
-    assets: dict[tuple[str, bool], Asset] = {}
+    assets: dict[tuple[str, bool, AnimationConfig | None], Asset] = {}
     objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
     for k, item in enumerate(config.objects):
         where = f"scene.objects.{k}"
-        own = item.material is None
-        if (item.mesh, own) not in assets:
-            assets[item.mesh, own] = _asset(
-                config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes
+        own, animation = item.material is None, animation_of(item.animation)
+        key = item.mesh, own, animation
+        if key not in assets:
+            assets[key] = _asset(
+                config.meshes[item.mesh],
+                item.mesh,
+                own,
+                base,
+                config.max_faces,
+                memory.meshes,
+                animation,
+                f"{where}.animation",
             )
-            log += [line for line in assets[item.mesh, own].log if line not in log]
-            omissions.update(dict.fromkeys(assets[item.mesh, own].omissions))
+            log += [line for line in assets[key].log if line not in log]
+            omissions.update(dict.fromkeys(assets[key].omissions))
         matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
         parts = []
-        for part in assets[item.mesh, own].parts:
+        for part in assets[key].parts:
             material = part.material if own else materials[item.material]
             material = replace(material, unlit=material.unlit or config.light.unlit)
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
         if item.deform is not None:
+            if animation is not None:
+                raise ConfigError(
+                    "an object deforms by one thing", where=f"{where}.deform", accepted="deform or animation"
+                )
             parts = deforming(parts, item.deform)
         objects.append(
             SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category)
@@ -161,8 +173,19 @@ def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
 
 
 def _asset(
-    config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int, memory: Mapping[str, Mesh]
+    config: MeshConfig,
+    name: str,
+    own_materials: bool,
+    base: Path,
+    max_faces: int,
+    memory: Mapping[str, Mesh],
+    animation: AnimationConfig | None,
+    animation_key: str,
 ) -> Asset:
+    if animation is not None and (name in memory or config.file is None):
+        raise ConfigError(
+            "only glTF files have animations", where=animation_key, value=name, accepted="null, or deform"
+        )
     if name in memory or config.primitive is not None:
         mesh = memory[name] if name in memory else primitive_mesh(config, name)
         return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
@@ -177,6 +200,9 @@ def _asset(
         project_uvs=config.project_uvs,
         uv_size=config.uv_size,
         up=config.up,
+        animation=animation,
+        base=base,
+        where=animation_key,
     )
 
 

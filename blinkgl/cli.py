@@ -428,9 +428,8 @@ def _user_line(error: Exception) -> str | None:
     """The line for an error that the user or the machine caused; None for a bug."""
     if isinstance(error, BlinkGLError):
         return str(error)
-    if hasattr(error, "format_message") and hasattr(
-        error, "exit_code"
-    ):  # typer's usage errors; their class moved between versions
+    # typer's usage errors; their class moved between versions.
+    if hasattr(error, "format_message") and hasattr(error, "exit_code"):
         context = getattr(error, "ctx", None)
         command = context.command_path if context is not None else "blinkgl"
         message = " ".join(error.format_message().split()).rstrip(".")

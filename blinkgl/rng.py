@@ -20,6 +20,8 @@ class Role(IntEnum):
     TRAJECTORY = 2
     TEXTURE = 3
     EVENTS = 4
+    PHYSICS = 5
+    SHAPE = 6
 
 
 def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:

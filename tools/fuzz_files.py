@@ -40,9 +40,8 @@ from pathlib import Path
 
 import numpy as np
 
-if (
-    __name__ == "__main__"
-):  # a process with threads cannot be forked safely; where this is imported they are somebody else's
+# A process with threads cannot be forked safely; where this is imported they are somebody else's.
+if __name__ == "__main__":
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(_name, "1")
 

@@ -327,12 +327,8 @@ class _Finder(ast.NodeVisitor):
         self.visit(node.value)
 
     def visit_keyword(self, node) -> None:
-        if node.arg not in (
-            "description",
-            "accepted",
-            "where",
-            "value",
-        ):  # what an error says is golden text, tested as such
+        # What an error says is golden text, tested as such.
+        if node.arg not in ("description", "accepted", "where", "value"):
             self.visit(node.value)
 
 
@@ -688,9 +684,8 @@ def serve() -> int:
             importlib.import_module(name)
     import numba
 
-    numba.njit("f8(f8)")(
-        lambda x: x + 1.0
-    )  # fills numba's tables of types, which it does when it compiles or loads the first kernel
+    # Fills numba's tables of types, which it does when it compiles or loads the first kernel.
+    numba.njit("f8(f8)")(lambda x: x + 1.0)
     taken = sorted(m for m in sys.modules if m.split(".")[0] in ("blinkgl", "eflow", "tests"))
     assert not taken, f"of the tree, before it is edited: {taken}"
     gc.collect()
@@ -731,9 +726,8 @@ def _run_tests(order: dict) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for old, new in ((nothing, 0), (output, 1), (output, 2)):
         os.dup2(old, new)
-    resource.setrlimit(
-        resource.RLIMIT_DATA, (MEMORY, MEMORY)
-    )  # not of address space, of which Ray maps more than it uses
+    # Not of address space, of which Ray maps more than it uses.
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]

@@ -118,9 +118,8 @@ def run_dataset(
             elif folder.in_place:
                 folder.sweep(plan)
                 with contextlib.suppress(OutputError):  # on a full disk the first error is the one to hear of
-                    if (
-                        folder.read("run.json") is None
-                    ):  # deleted under us; without it nobody could tell whose run this is
+                    # Deleted under us; without it nobody could tell whose run this is.
+                    if folder.read("run.json") is None:
                         folder.begin(plan, assets, folder.environment, num)
                 folder.write_failures(outcome.set_aside, plan)
                 with contextlib.suppress(OutputError):

@@ -225,11 +225,12 @@ class SceneResources:
         if key not in self._textures:
             image = material.texture.image
             srgb8 = image.dtype == np.uint8
+            # 0x8C41: GL_SRGB8.
             self._textures[key] = self._upload(
                 image if srgb8 else linear_image(image),
                 material.texture.name,
                 internal_format=0x8C41 if srgb8 else None,
-            )  # GL_SRGB8
+            )
         return self._textures[key]
 
     def albedo_luminance(self, material: Material) -> float:

@@ -201,9 +201,8 @@ def find_blinkgl(root: Path) -> list[Sequence]:
         there, back = LABELS["flow_forward"], LABELS["flow_backward"]
         stamps = folder / there.stamps
         forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
-        if (
-            not forward and not stamps.exists()
-        ):  # made without flow: there is nothing to learn from it, and nothing wrong with it
+        # Made without flow: there is nothing to learn from it, and nothing wrong with it.
+        if not forward and not stamps.exists():
             continue
         times = read_times(stamps)
         _same_count(folder / there.forms[0].folder, forward, times)

@@ -52,9 +52,8 @@ def test_camera_and_poses_mean_the_same_pixel(tmp_path, fx, fy, cx, cy):
     eye = replace(world.camera, fx=fx, fy=fy, cx=cx, cy=cy)
     job, arrays = exported(world.with_camera(eye), tmp_path)
     assert job["size"] == [160, 120] and job["blender_camera"] == blender_camera(eye)
-    assert (
-        min(job["blender_camera"]["pixel_aspect_x"], job["blender_camera"]["pixel_aspect_y"]) == 1.0
-    )  # Blender's least
+    # Blender's least.
+    assert min(job["blender_camera"]["pixel_aspect_x"], job["blender_camera"]["pixel_aspect_y"]) == 1.0
     for k, body in enumerate(world.objects):
         for n, t in enumerate(TIMES):
             corner = body.parts[0].mesh.vertices[-1]
@@ -271,9 +270,8 @@ def test_light_without_shadows_is_ours(gl, sun, sky):
         here = (true.instance == instance) & ~band
         assert here.sum() > 300 and np.median(error[here]) < 6e-4 and np.quantile(error[here], 0.95) < 2.5e-3
         assert sun or np.quantile(error[here], 0.99) < 2.5e-3
-    assert (
-        max((true.luminance[(true.instance == k) & ~band] > 0.1).sum() for k in (3, 4, 5)) > 200
-    )  # something of it is lit
+    # Something of it is lit.
+    assert max((true.luminance[(true.instance == k) & ~band] > 0.1).sum() for k in (3, 4, 5)) > 200
 
 
 @needs_blender

@@ -49,11 +49,8 @@ def _explain(comparison, report, gpu, right, wrong) -> list[str]:
         return []
     quantity, before = report.quantity, report.errors[wrong]
     limit = quantity.fit * (report.tolerance or np.finfo(np.float32).eps)
-    relative = lookup_of(quantity.name)[1] not in (
-        "uv",
-        "level",
-        "albedo",
-    )  # those have a unit of their own, and zeros that mean nothing
+    # Those have a unit of their own, and zeros that mean nothing.
+    relative = lookup_of(quantity.name)[1] not in ("uv", "level", "albedo")
     image = np.array(right, np.float64)
     found = []
     with np.errstate(all="ignore"):

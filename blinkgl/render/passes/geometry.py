@@ -73,9 +73,8 @@ class Geometry(ScenePass):
                         f"label '{label.name}': `uniforms` gives '{name}', which "
                         f"{values[name][0] if name in values else 'the pass'} gives, too"
                     )
-                columns = (
-                    np.swapaxes(array, 1, 2) if array.ndim == 3 else array
-                )  # GLSL's matrices are stored by columns
+                # GLSL's matrices are stored by columns.
+                columns = np.swapaxes(array, 1, 2) if array.ndim == 3 else array
                 kind = {"u": np.uint32, "i": np.int32}.get(array.dtype.kind, np.float32)
                 values[name] = (label.name, [row.tobytes() for row in np.ascontiguousarray(columns, kind)])
         return values

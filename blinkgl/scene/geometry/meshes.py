@@ -3,7 +3,7 @@ coordinates, and known to be closed or not."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.shapes.deformer import filled
 from blinkgl.scene.types import Mesh, Scene
 
 if TYPE_CHECKING:
@@ -148,9 +149,8 @@ def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((F,) smallest height, (F,) longest edge) of (F, 3, 3) triangles."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    edges = (
-        edges / np.where(longest > 0, longest, 1.0)[:, None, None]
-    )  # products of the smallest coordinates would underflow
+    # Products of the smallest coordinates would underflow.
+    edges = edges / np.where(longest > 0, longest, 1.0)[:, None, None]
     return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * longest, longest
 
 
@@ -293,9 +293,7 @@ def crease_normals(
     corners = vertices[faces]
     to_next = np.roll(corners, -1, axis=1) - corners
     to_previous = np.roll(corners, 1, axis=1) - corners
-    angle = np.arctan2(
-        np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2)
-    )  # (F, 3)
+    angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))
 
     # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
     count = len(faces)
@@ -422,7 +420,7 @@ def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
     return replace(mesh, vertices=mesh.vertices * scale, deformer=_transformed(mesh, np.eye(3) * scale, np.zeros(3)))
 
 
-def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
+def bounds(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
     """((3,), (3,)) corners of the common bounding box."""
     return (
         np.min([m.vertices.min(axis=0) for m in meshes], axis=0),
@@ -433,11 +431,11 @@ def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
 def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]:
     """The meshes of one object together, moved so that the bounding box is centred on the origin and scaled to bounding
     radius 1. Of a mesh that deforms all that it sweeps counts."""
-    filled = [(m.vertices, 0.0) if m.deformer is None else _swept(m) for m in meshes]
-    low = np.min([points.min(axis=0) - margin for points, margin in filled], axis=0)
-    high = np.max([points.max(axis=0) + margin for points, margin in filled], axis=0)
+    room = [(m.vertices, 0.0) if m.deformer is None else filled(m) for m in meshes]
+    low = np.min([points.min(axis=0) - margin for points, margin in room], axis=0)
+    high = np.max([points.max(axis=0) + margin for points, margin in room], axis=0)
     centre = (low + high) / 2
-    radius = max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).max())) + margin for points, margin in filled)
+    radius = max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).max())) + margin for points, margin in room)
     if not radius > 0:
         raise AssetError("the mesh has no extent", where=where)
     return tuple(
@@ -448,11 +446,30 @@ def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]
     )
 
 
-def _swept(mesh: Mesh) -> tuple[np.ndarray, float]:
-    """((K, 3) corners of the hull of all that a mesh which deforms is in its time, by how much it may leave that)."""
-    assert mesh.deformer is not None
-    sweep = mesh.deformer.sweep(mesh, 0, mesh.deformer.span_ns)
-    return sweep.hull[0], sweep.margin
+def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
+    """The same surface of smaller triangles: each is split into four until no edge is longer than ``edge``, or
+    there would be more than ``max_faces``."""
+    while True:
+        corners = mesh.vertices[mesh.faces]
+        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+        if longest <= edge or 4 * len(mesh.faces) > max_faces:
+            return mesh
+        pairs = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        edges, middle = np.unique(pairs, axis=0, return_inverse=True)
+        halfway = lambda values, edges=edges: np.concatenate([values, values[edges].mean(axis=1, dtype=np.float64)])
+        normals = halfway(mesh.normals.astype(np.float64))
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        a, b, c = mesh.faces.T
+        ab, bc, ca = (middle.reshape(-1, 3) + len(mesh.vertices)).T
+        faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3).astype(np.int32)
+        normals[: len(mesh.vertices)] = mesh.normals
+        mesh = replace(
+            mesh,
+            vertices=halfway(mesh.vertices),
+            faces=faces,
+            normals=normals.astype(np.float32),
+            uvs=halfway(mesh.uvs).astype(np.float32),
+        )
 
 
 def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:

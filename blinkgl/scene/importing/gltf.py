@@ -499,8 +499,9 @@ class Document:
                     value=float(times[first + 1]),
                     accepted=f"more than {times[first]:g} s",
                 )
+            # Written so that NaN is refused: it compares false.
             if not fits or not (np.abs(values) <= 1e12).all() or not (np.abs(times) < _MAX_TIME).all():
-                raise AssetError(f"{where} is corrupt", where=self.where)  # NaN compares false
+                raise AssetError(f"{where} is corrupt", where=self.where)
             values = values.reshape(-1, per_key, width)
             if path == "rotation" and (np.linalg.norm(values[:, per_key // 2], axis=1) < 1e-9).any():
                 raise AssetError(

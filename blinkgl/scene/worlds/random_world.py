@@ -15,17 +15,24 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
+from blinkgl.config.base import tag_of
+from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
+from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
 from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
 from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
+from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
+from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.dynamics import Exploded, Side, simulate
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.shapes.deformer import filled
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
@@ -48,8 +55,8 @@ def random_world(
     base: Path,
 ) -> Scene:
     """The ``sequence``-th random scene of a run; arguments as :func:`blinkgl.scene.build.build_scene`."""
-    rng, rng_motion, rng_texture = (
-        generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE)
+    rng, rng_motion, rng_texture, rng_shape = (
+        generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE, Role.SHAPE)
     )
     objects, textures = pools(config, base)
     log: list[str] = []
@@ -82,15 +89,20 @@ def random_world(
         for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))
     ]
 
-    placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log, omissions)
+    dice = rng, rng_texture, rng_shape
+    placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
     centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
     radii = np.array([radius for *_, radius, _ in placed])
     half = config.region.width / 2
     low, high = np.array([-half, -half, floor]), np.array([half, half, floor + config.region.height])
     ground_z = floor if config.ground else None
 
+    bodies = _bodies(config.physics, [name for name, *_ in placed], generator(seed, sequence, Role.PHYSICS))
     items = list(backdrop)
     for k, (name, parts, T, radius, resting) in enumerate(placed):
+        if name in bodies:
+            items.append((name, "object", parts, StaticPath(T, t0_ns, t1_ns)))
+            continue
         others = np.arange(len(placed)) != k
         space = FreeSpace(
             low,
@@ -105,22 +117,32 @@ def random_world(
         SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items)
     )
     space = FreeSpace(low + [0, 0, clearance], high, ground_z, centres, radii + _STAND_OFF)
-    for _ in range(
-        _CAMERA_PATHS
-    ):  # a camera that was stopped would see a still world from then on: another path is better
+    # A camera that was stopped would see a still world from then on: another path is better.
+    for _ in range(_CAMERA_PATHS):
         path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
-        result = resolve_collisions(scene_objects, path, clearance, t0_ns, t1_ns)
+        # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
+        others = tuple(o for o in scene_objects if o.name not in bodies)
+        result = resolve_collisions(others, path, clearance, t0_ns, t1_ns)
         if not any("camera" in event.cut for event in result.events):
             break
     # Bounding spheres were apart, so only one that sinks into ground or wall can touch at t0: leave it out.
-    ours = {o.name for o in scene_objects if o.category == "object"}
+    ours = {o.name for o in others if o.category == "object"}
     bad = ours & {name for c in result.at_start for name in (c.first, c.second)}
     if bad:
-        result = resolve_collisions(tuple(o for o in scene_objects if o.name not in bad), path, clearance, t0_ns, t1_ns)
+        result = resolve_collisions(tuple(o for o in others if o.name not in bad), path, clearance, t0_ns, t1_ns)
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
+    resolved = {o.name: o for o in result.objects}
+    kept, dynamics = tuple(resolved.get(o.name, o) for o in scene_objects if o.name not in bad), None
+    while config.physics is not None and dynamics is None and any(o.name in bodies for o in kept):
+        sides, eye = _sides(config, floor), (result.camera_path, clearance)
+        try:
+            kept, dynamics = simulate(kept, bodies, config.physics, t0_ns, t1_ns, camera=eye, sides=sides)
+        except Exploded as error:  # squeezed between two that nothing stops
+            kept = tuple(o for o in kept if o.name != error.body)
+            log.append(f"left out, it came to be faster than scene.physics.max_speed: {error.body}")
     return Scene(
-        objects=result.objects,
+        objects=kept,
         rig=Rig.alone(camera, result.camera_path),
         t0_ns=t0_ns,
         t1_ns=t1_ns,
@@ -128,6 +150,7 @@ def random_world(
         background=config.background,
         log=tuple(log),
         omissions=tuple(omissions),
+        dynamics=dynamics,
     )
 
 
@@ -163,22 +186,22 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
     return T, target
 
 
-def _place(
-    config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log, omissions
-):
+def _place(config, camera, objects: Pool, textures: Pool, dice, split, T_cam, clearance, floor, log, omissions):
     """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
+    rng, rng_texture, rng_shape = dice
     placed: list[tuple] = []
     if settings.count == 0:
         return placed
     centres, radii = [T_cam[:3, 3]], [clearance]
     for k in range(settings.count):
-        asset = objects.draw(rng, split, log)
+        asset, said = _playing(objects.draw(rng, split, log), config, rng_shape)
         radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
         resting = config.ground is not None and rng.random() >= settings.flying
         rotation = _rotation(rng, resting)
-        parts = _dress(config, asset, radius, textures, rng_texture, split, log)
-        lowest = min(float((p.mesh.vertices @ rotation[2]).min()) for p in parts)
+        changed, word = _changing(asset, settings.deform, rng_shape)
+        parts = _dress(config, changed, radius, textures, rng_texture, split, log)
+        lowest = min(_lowest(p.mesh, rotation[2]) for p in parts)
         in_view = rng.random() < settings.in_view
         for _ in range(_PLACEMENTS):
             position = _candidate(config, camera, rng, T_cam, floor, in_view, resting)
@@ -203,9 +226,43 @@ def _place(
         centres.append(position)
         radii.append(radius)
         placed.append((f"{asset.name}#{k}", parts, T, radius, resting))
+        log.extend(f"{asset.name}#{k} {text}" for text in (said, word) if text)
         log.extend(line for line in asset.log if line not in log)
         omissions.update(dict.fromkeys(asset.omissions))
     return placed
+
+
+def _playing(asset: Asset, config: RandomSceneConfig, rng) -> tuple[Asset, str]:
+    """The asset as it plays one of its file's animations, and what to say of it. Nothing is drawn for others."""
+    if asset.replay is None or config.pool.animation == "rest":
+        return asset, ""
+    clip, speed, phase = int(rng.integers(len(asset.clips))), float(rng.uniform(0.8, 1.25)), float(rng.uniform(0, 10))
+    playing = asset.replay(AnimationConfig(clip=clip, speed=speed, phase=phase)).normalised()
+    return playing, f"plays '{asset.clips[clip]}'"
+
+
+def _changing(asset: Asset, config: RandomDeformConfig, rng) -> tuple[Asset, str]:
+    """The asset, of bounding radius 1, as its shape changes, and what to say of it: now and then, by formula. All
+    shapes fit into the sphere of radius 1."""
+    if config.share == 0 or rng.random() >= config.share or any(p.mesh.deformer is not None for p in asset.parts):
+        return asset, ""
+    kinds = config.kinds or tuple(DeformConfig.members.models)
+    model = DeformConfig.members.models[kinds[int(rng.integers(len(kinds)))]]
+    drawn = model.drawn(rng, float(rng.uniform(*config.strength)), _log_uniform(rng, config.period))
+    parts = deforming(asset.parts, drawn)
+    reach = max(
+        float(np.linalg.norm(points, axis=1).max()) + margin for points, margin in (filled(p.mesh) for p in parts)
+    )
+    smaller = [replace(part, mesh=scale_mesh(part.mesh, 1 / reach)) for part in asset.parts]
+    return replace(asset, parts=deforming(smaller, drawn)), f"deforms: {tag_of(model)[1]}"
+
+
+def _lowest(mesh: Mesh, up: np.ndarray) -> float:
+    """Height of its lowest point at any time, along (3,) up in its axes."""
+    if mesh.deformer is None:
+        return float((mesh.vertices @ up).min())
+    points, margin = filled(mesh)
+    return float((points @ up).min()) - margin
 
 
 def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarray:
@@ -250,6 +307,41 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
             )
         parts.append(Part(mesh, material))
     return tuple(parts)
+
+
+def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[str, BodyConfig]:
+    """Those of the objects that fall, by name. As many numbers are drawn for each, whether it falls or not."""
+    found = {}
+    for name in names if config is not None else ():
+        falls, thrown, around, axis = rng.random(), rng.random(), rng.uniform(0, 2 * math.pi), rng.normal(size=3)
+        elevation, speed, spin = rng.uniform(0, math.pi / 3), rng.uniform(*config.speed), rng.uniform(*config.spin)
+        density, friction = _log_uniform(rng, config.density), rng.uniform(*config.friction)
+        restitution = rng.uniform(*config.restitution)
+        if falls >= config.share:
+            continue
+        if thrown >= config.thrown:
+            speed = spin = 0.0
+        flat = speed * math.cos(elevation)
+        found[name] = BodyConfig(
+            density=density,
+            friction=friction,
+            rolling=config.rolling,
+            restitution=restitution,
+            velocity=(flat * math.cos(around), flat * math.sin(around), speed * math.sin(elevation)),
+            spin=tuple(spin * axis / np.linalg.norm(axis)),
+        )
+    return found
+
+
+def _sides(config: RandomSceneConfig, floor: float) -> list[Side]:
+    """Of the region, as far out as walls stand, so that no object is in one; its floor where there is no ground."""
+    reach = 0.5 * config.objects.size[1] + _GAP
+    out = config.region.width / 2 + reach
+    sides = [Side((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
+    sides.append(Side((0.0, 0.0, -1.0), -(floor + config.region.height + reach)))
+    if config.ground is None:
+        sides.append(Side((0.0, 0.0, 1.0), floor - reach))
+    return sides
 
 
 def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[Part, ...]:

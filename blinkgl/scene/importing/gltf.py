@@ -94,11 +94,10 @@ def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Node:
-    """name, parent (None at the root), mesh, camera and skin index (None without), rest translation, quaternion x y z
-    w,
-    scale or matrix; weights of the mesh's morph targets where the node says its own."""
+    """name, parent (None at the root), mesh, camera and skin index (None without), rest translation, quaternion
+    x y z w, scale or matrix; weights of the mesh's morph targets where the node says its own."""
 
     name: str
     parent: int | None
@@ -121,7 +120,7 @@ class Node:
         return T
 
 
-@dataclass
+@dataclass(eq=False)
 class Document:
     """A parsed file. ``nodes`` are those of the default scene, parents before children, by their index in the file.
 

@@ -41,7 +41,7 @@ _PROCEDURAL_SIZE = 1024
 _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InMemory:
     """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand
     instead of what the configuration says there."""

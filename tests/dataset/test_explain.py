@@ -104,7 +104,7 @@ def test_recorded_frames_are_what_is_explained(tmp_path):
     run = load_run(path)
     told = explain(run)
     assert (
-        set(told.scene) == {"frames", "images", "flow", "not used"}
+        set(told.scene) == {"frames", "images", "flow", "qualify", "not used"}
         and "40x24" in told.scene["frames"]
         and "19 of" in told.scene["frames"]
     )

@@ -269,7 +269,12 @@ def export(
 
 @app.command()
 def simulate(
-    source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="INPUT", help="Video, folder of images, .npy or .npz of frames, .aedat4 or .aedat with frames."
+        ),
+    ],
     out: Annotated[
         str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")
     ],
@@ -366,7 +371,8 @@ def convert(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="IN", help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .txt, .csv, .npz, .npy."
+            metavar="IN",
+            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, .npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],

@@ -32,7 +32,7 @@ from blinkgl.config.frames import QualifyConfig
 from blinkgl.config.sequence import RenderConfig, SequenceConfig
 from blinkgl.events import Events
 from blinkgl.events.camera import EventCamera, EventFrame
-from blinkgl.gl import create_context
+from blinkgl.gl import GLContext, create_context
 from blinkgl.labels import LabelRequest
 from blinkgl.machine import bench
 from blinkgl.recordings import artefacts
@@ -194,17 +194,17 @@ def frame_times(rate: float) -> list[int]:
     return [round(k * 1e9 / rate) for k in range(int(SPAN_S * rate) + 1)]
 
 
-def draw(gl, scene: dict[str, Any], seed: int, rates: tuple[float, ...], dense_px: float) -> Dense:
-    """The scene, densely, with the exact flows of every pair of frames at every rate."""
-    config = validate(
-        SequenceConfig,
-        {
-            "seed": seed,
-            "camera": {"width": WIDTH, "height": HEIGHT, "fov": 60},
-            "time": {"duration": SPAN_S, "label_rate": 5},
-            "scene": scene,
-        },
+def config_of(scene: dict[str, Any], seed: int) -> SequenceConfig:
+    """A sequence of the scene that lasts longer than what is looked at."""
+    camera = {"width": WIDTH, "height": HEIGHT, "fov": 60}
+    return validate(
+        SequenceConfig, {"seed": seed, "camera": camera, "time": {"duration": SPAN_S, "label_rate": 5}, "scene": scene}
     )
+
+
+def draw(gl: GLContext, scene: dict[str, Any], seed: int, rates: tuple[float, ...], dense_px: float) -> Dense:
+    """The scene, densely, with the exact flows of every pair of frames at every rate."""
+    config = config_of(scene, seed)
     keep = sorted({t for rate in rates for t in frame_times(rate)})
     request = LabelRequest("flow_forward")
     kept, flows = {}, {}
@@ -323,7 +323,7 @@ def report(rows: list[dict[str, Any]], bad: float, keep: float, plot: str | None
         beyond = np.array([row[name] > limits[name] for row in held])
         told, rank = area(wrong > bad, values), spearmanr(values, wrong).statistic
         ours, theirs = limits[name], shipped.get(name, float("nan"))
-        alone = f"{beyond[bad_held].mean():.2f} {beyond[~bad_held].mean():.2f}"
+        alone = " ".join(f"{beyond[those].mean():.2f}" if those.any() else "–" for those in (bad_held, ~bad_held))
         print(f"{name:14s} {rank:8.2f} {told:6.2f} {ours:8.4g} {theirs:8.4g}  {alone}")
     for title, part, those in (
         ("limits here, scenes they were set on", fitted, limits),

@@ -278,7 +278,7 @@ def test_files_that_are_not_opened(tmp_path, data, message):
         (records([0] * 3, [1, 2, 3])[:-3], rf"truncated: 5 stray bytes after record 1, at byte {START + 16}"),
         (
             records([0, 0, 240 << 12], [1, 2, 3]),
-            rf"outside the sensor: record 2, at byte {START + 16} \(got 'x 240, y 0 .address 0x000f0000.'\); expected x ",
+            rf"outside the sensor: record 2, at byte {START + 16} \(got 'x 240, y 0 .address 0x000f0000.'\)",
         ),
         (records([180 << 22], [1]), rf"outside the sensor: record 0, at byte {START} \(got 'x 0, y 180"),
         (records([0, 1 << 31 | 200 << 22], [1, 2]), rf"outside the sensor: record 1, at byte {START + 8}"),

@@ -10,8 +10,8 @@ the pixel, the polarity and the time in which the image moves by one pixel (the 
 missed and extra together, over the reference's count. Beside that stand the measures that ``blinkgl qualify`` takes of
 the same pair, with the exact flow both ways.
 
-A pair is bad where more than --bad of its events are wrong. On every other scene the limit of each measure is set to
-what --keep of the good pairs are within; the rest of the scenes says what these limits are worth together.
+A pair is bad where more than --bad of its events are wrong. On half of the scenes the limit of each measure is set to
+what --keep of the good pairs are within; the other scenes say what these limits are worth together.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import argparse
 import itertools
 import json
 import time
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -283,9 +284,25 @@ def area(bad: np.ndarray, values: np.ndarray) -> float:
 
 
 def limits_of(rows: list[dict[str, Any]], bad: float, keep: float) -> dict[str, float]:
-    """What ``keep`` of the good pairs are within, for each measure by itself."""
+    """What ``keep`` of the good pairs are within, for each measure by itself; every frame rate counts the same, however
+    many pairs it has."""
     good = [row for row in rows if row["wrong"] <= bad]
-    return {name: float(np.quantile([r[name] for r in good if name in r], keep)) for name in MEASURES}
+    many = Counter(row["rate"] for row in good)
+    weights = np.array([1 / many[row["rate"]] for row in good])
+    limits = {}
+    for name in MEASURES:
+        values = np.array([row[name] for row in good])
+        order = np.argsort(values)
+        share = np.cumsum(weights[order]) / weights.sum()
+        limits[name] = float(values[order][min(np.searchsorted(share, keep), len(good) - 1)])
+    return limits
+
+
+def sides(rows: list[dict[str, Any]]) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Pairs of the scenes that limits are set on, and of the others: of four scenes in a row the first and the last."""
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    first = {name for number, name in enumerate(names) if number % 4 in (0, 3)}
+    return [row for row in rows if row["scene"] in first], [row for row in rows if row["scene"] not in first]
 
 
 def judged(rows: list[dict[str, Any]], limits: dict[str, float], bad: float) -> dict[str, float]:
@@ -311,7 +328,7 @@ def judged(rows: list[dict[str, Any]], limits: dict[str, float], bad: float) -> 
 def report(rows: list[dict[str, Any]], bad: float, keep: float, plot: str | None) -> None:
     rows = usable(rows)
     names = list(dict.fromkeys(row["scene"] for row in rows))
-    fitted, held = ([row for row in rows if names.index(row["scene"]) % 2 == side] for side in (0, 1))
+    fitted, held = sides(rows)
     limits = limits_of(fitted, bad, keep)
     shipped = {name: limit for name in MEASURES if (limit := getattr(QualifyConfig(), name)) is not None}
     wrong = np.array([row["wrong"] for row in rows])

@@ -24,44 +24,45 @@ class QualifyConfig(Config):
     [what was measured](results.md#interpolated-frames) says how the limits were chosen."""
 
     displacement: float | None = _limit(
-        None, 1e4, "99th percentile of the given flow (without one, of the interpolation's own), px"
+        17.0, 1e4, "99th percentile of the given flow (without one, of the interpolation's own), px"
     )
     hidden: float | None = _limit(
-        None,
+        0.12,
         1,
         "share of pixels that the next frame does not show, because forward and backward flow contradict each other "
         "(with `backward`), or because the masks say so",
     )
     uncovered: float | None = _limit(
-        None, 1, "share of the next frame's pixels that no vector of the given flow leads to"
+        0.08, 1, "share of the next frame's pixels that no vector of the given flow leads to"
     )
     residual: float | None = _limit(
-        None,
+        0.2,
         100,
-        "mean of |ln b(x + flow) - ln a(x)| over what both frames show: change that the given flow does not explain",
+        "mean of |ln b(x + flow) - ln a(x)| over what both frames show: change that the given flow does not explain; "
+        "more than this is a flow of other frames",
     )
     thin: float | None = _limit(
-        None,
+        0.01,
         1,
-        "share of pixels on structures narrower than 9 px that move otherwise than what surrounds them, by the given "
-        "flow",
+        "share of pixels on structures that move, against what surrounds them, by more than their own width, by the "
+        "given flow",
     )
     contradicted: float | None = _limit(
-        None,
+        0.17,
         1,
         "share of pixels whose forward and backward flow, as the interpolation finds them, contradict each other",
     )
     astray: float | None = _limit(
-        None,
+        0.3,
         1,
         "share of the light's gradient where the interpolation's own flow is off the given one by more than 1 px and "
         "5 %",
     )
     fine: float | None = _limit(
-        None, 1, "share of the light's change from pixel to pixel that a shift by half a pixel loses"
+        0.33, 1, "share of the light's variation along rows and columns that a shift by half a pixel loses"
     )
     left_out: float | None = _limit(
-        None,
+        0.5,
         100,
         "error of a frame as interpolated from the two beside it, mean of |ln guess - ln frame|, over the mean change "
         "between those two",

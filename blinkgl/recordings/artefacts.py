@@ -16,14 +16,16 @@ EPS = np.float32(1e-3)
 CHANGE = 0.01
 """Least mean change of ln(light) that an error is a share of; event cameras see changes of 0.1 and more."""
 PERCENTILE = 99.0
-THIN_PX = 9
-"""Structures that no square of so many pixels fits into are thin: dense flow matches patches of 8 x 8 px."""
+WIDTHS_PX = (2, 3, 4, 6, 8, 12, 16, 24, 32)
+"""Of structures that may be thin for their motion."""
 
 
 def displacement(flow: np.ndarray, valid: np.ndarray) -> float:
     """99th percentile of the length of the valid vectors, px. ValueError: none is, or the shapes differ."""
     _check(flow, valid)
-    return float(np.percentile(np.hypot(*_vectors(flow, valid)), PERCENTILE))
+    if not valid.any():
+        raise ValueError("no valid vector")
+    return float(np.percentile(np.hypot(flow[..., 0], flow[..., 1])[valid], PERCENTILE))
 
 
 def hidden(forward: np.ndarray, valid: np.ndarray, backward: np.ndarray, valid_backward: np.ndarray) -> np.ndarray:
@@ -35,7 +37,7 @@ def hidden(forward: np.ndarray, valid: np.ndarray, backward: np.ndarray, valid_b
     _check(forward, valid, backward)
     there = _ends(forward)
     back = _look(backward, there)
-    square = lambda field: np.square(field, dtype=np.float32).sum(-1)
+    square = lambda field: field[..., 0] * field[..., 0] + field[..., 1] * field[..., 1]
     miss = square(forward + back) > 0.01 * (square(forward) + square(back)) + 0.5
     miss |= _look(valid_backward.astype(np.float32), there) < 0.999
     return (miss | _outside(there)) & valid
@@ -71,25 +73,38 @@ def residual(a: np.ndarray, b: np.ndarray, flow: np.ndarray, visible: np.ndarray
     return float(np.abs(_look(np.log(b + EPS), there) - np.log(a + EPS))[seen].mean())
 
 
-def thin(flow: np.ndarray, valid: np.ndarray, width_px: int = THIN_PX, apart_px: float = 1.0) -> float:
-    """Share of the valid pixels on structures narrower than ``width_px`` that move otherwise than what surrounds them,
-    by more than ``apart_px``: a bar before a wall. The top-hat and bottom-hat transforms (Serra 1982) of both
-    components with a square of ``width_px``; pixels without a valid vector are not looked at. ValueError: none is
-    valid, or the shapes differ."""
+def thin(flow: np.ndarray, valid: np.ndarray) -> float:
+    """Share of the valid pixels on structures that move, against what surrounds them, by more than their own width: a
+    twig before a wall. Between two frames such a thing overlaps itself nowhere, and dense flow takes the surroundings'.
+
+    The top-hat and bottom-hat transforms (Serra 1982) of both components with squares of ``WIDTHS_PX``: what no square
+    of w px fits into, and differs from its surroundings by more than w px. Pixels without a valid vector are not looked
+    at. ValueError: none is valid, or the shapes differ."""
     _check(flow, valid)
     if not valid.any():
         raise ValueError("no valid vector")
-    square, border = np.ones((width_px, width_px), np.uint8), width_px - 1
-    least = lambda image: cv2.erode(np.where(np.isfinite(image), image, np.float32(np.inf)), square)
-    most = lambda image: cv2.dilate(np.where(np.isfinite(image), image, np.float32(-np.inf)), square)
-    stands_out = []
-    for component in np.moveaxis(np.where(valid[..., None], flow, np.float32(np.nan)), -1, 0):
-        # Continued in a straight line, lest slopes that end at the border stand out there.
-        wide = np.pad(component, border, mode="reflect", reflect_type="odd")
-        opened, closed = most(least(wide)), least(most(wide))
-        hat = np.maximum(wide - opened, closed - wide)[border:-border, border:-border]
-        stands_out.append(hat[valid])
-    return float(np.mean(np.hypot(*stands_out) > apart_px))
+    found = np.zeros(valid.shape, bool)
+    vectors = np.where(valid[..., None], flow, np.float32(np.nan))
+    farthest = float(np.ptp(flow[valid], axis=0).max()) * np.sqrt(2)
+    border = WIDTHS_PX[-1] - 1
+    # Continued in a straight line, lest slopes that end at the border stand out there.
+    wide = [np.pad(component, border, mode="reflect", reflect_type="odd") for component in np.moveaxis(vectors, -1, 0)]
+    inside = (slice(border, -border),) * 2
+    for width in WIDTHS_PX:
+        if width >= farthest:
+            break
+        hats = [np.maximum(image - _opened(image, width), -_opened(-image, width) - image)[inside] for image in wide]
+        found |= np.hypot(*hats) > width
+    return float(found[valid].mean())
+
+
+def _opened(image: np.ndarray, width: int) -> np.ndarray:
+    """Grey-scale opening with a square of ``width`` px; what is not finite is not looked at."""
+    square = np.ones((width, width), np.uint8)
+    low = cv2.erode(np.where(np.isfinite(image), image, np.float32(np.inf)), square)
+    # A square of even width lies the other way round when it is dilated with, so that no pixel moves.
+    anchor = (width - 1 - width // 2,) * 2
+    return cv2.dilate(np.where(np.isfinite(low), low, np.float32(-np.inf)), square, anchor=anchor)
 
 
 def astray(estimated: np.ndarray, flow: np.ndarray, valid: np.ndarray, weight: np.ndarray | None = None) -> float:
@@ -166,12 +181,6 @@ def _check(flow: np.ndarray, valid: np.ndarray, other: np.ndarray | None = None,
     for array, wanted in ((other, flow.shape), *((frame, valid.shape) for frame in frames)):
         if array is not None and array.shape != wanted:
             raise ValueError(f"shapes differ: {array.shape}, {wanted}")
-
-
-def _vectors(flow: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    if not valid.any():
-        raise ValueError("no valid vector")
-    return flow[valid][:, 0], flow[valid][:, 1]
 
 
 def _ends(flow: np.ndarray) -> np.ndarray:

@@ -103,12 +103,18 @@ def test_what_has_no_valid_vector_there_is_hidden_and_here_is_not_judged():
     assert lost.sum() == H * 6
 
 
-@pytest.mark.parametrize("width, share", [(1, 1), (4, 4), (8, 8), (9, 0), (20, 0)])
-def test_bars_of_less_than_nine_pixels_are_thin(width, share):
-    forward, _, _ = bar(width, 5)
-    assert artefacts.thin(forward, YES) == pytest.approx(share / W)
-    assert artefacts.thin(forward.transpose(1, 0, 2).copy(), YES.T) == pytest.approx(share / W), "level ones, too"
-    assert artefacts.thin(-forward, YES) == pytest.approx(share / W), "whichever way they move"
+@pytest.mark.parametrize(
+    "width, px, thin",
+    [(1, 2, False), (1, 3, True), (2, 3, False), (2, 4, True), (3, 4, False), (3, 5, True), (5, 7, True), (5, 6, False),
+     (8, 12, False), (8, 13, True), (11, 13, True), (20, 25, True), (20, 24, False), (20, 12, False)],
+)  # fmt: skip
+def test_bars_that_move_by_more_than_their_width_are_thin(width, px, thin):
+    """By more than the next of the widths that are tried, to be exact: 2, 3, 4, 6, 8, 12, 16, 24."""
+    forward, _, _ = bar(width, px)
+    share = width / W if thin else 0
+    assert artefacts.thin(forward, YES) == pytest.approx(share)
+    assert artefacts.thin(forward.transpose(1, 0, 2).copy(), YES.T) == pytest.approx(share), "level ones, too"
+    assert artefacts.thin(-forward, YES) == pytest.approx(share), "whichever way they move"
 
 
 def test_structures_that_move_with_what_is_around_them_are_not_thin():
@@ -117,9 +123,8 @@ def test_structures_that_move_with_what_is_around_them_are_not_thin():
     zooming = np.stack([0.2 * (x - 30), 0.2 * (y - 20)], -1).astype(np.float32)
     for flow in (constant(9, 4), turning, zooming):
         assert artefacts.thin(flow, YES) == 0
-    slow, _, _ = bar(3, 1)
-    assert artefacts.thin(0.9 * slow, YES) == 0, "less than a pixel apart"
-    assert artefacts.thin(1.1 * slow, YES) == pytest.approx(3 / W)
+    bars, _, _ = bar(3, 14)
+    assert artefacts.thin(bars + constant(-13, 3), YES) == artefacts.thin(bars, YES) == pytest.approx(3 / W)
 
 
 def test_a_thin_structure_of_which_the_surroundings_are_not_known_is_not_judged():

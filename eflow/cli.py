@@ -13,6 +13,7 @@ from blinkgl import __version__
 from blinkgl.cli import _user_line
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.machine.extras import EXTRAS, install
+from blinkgl.machine.interrupts import interruptible
 from blinkgl.show.terminal import never_fail_to_print
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
@@ -342,7 +343,8 @@ def run(arguments: list[str]) -> int:
     debug = "--debug" in arguments
     arguments = [a for a in arguments if a != "--debug"] or ["--help"]
     try:
-        status = app(arguments, prog_name="eflow", standalone_mode=False)
+        with interruptible():
+            status = app(arguments, prog_name="eflow", standalone_mode=False)
         return status if isinstance(status, int) else 0
     except (KeyboardInterrupt, typer.Abort):
         print("interrupted", file=sys.stderr)

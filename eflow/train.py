@@ -198,9 +198,8 @@ def train(
             )
             if world > 1 and not last:
                 reason = _agree(reason, device)
-            ended = (
-                step == steps or reason == "time limit"
-            )  # the clock ends a training as its last step does; a signal is in a hurry
+            # The clock ends a training as its last step does; a signal is in a hurry.
+            ended = step == steps or reason == "time limit"
             if lead and validation and (step % config.run.validate_every == 0 or ended):
                 scores = validate(model, ema, validation, config.run.precision)
                 log.write(step, "validation", **scores)
@@ -227,9 +226,8 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
     ):
         prediction = net({k: batch[k] for k in ("old", "new")})
     count = None
-    if (
-        world > 1
-    ):  # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels
+    # DDP averages gradients over ranks: dividing by the mean count makes it the mean over all valid pixels.
+    if world > 1:
         count = batch["valid"].sum().float()
         dist.all_reduce(count)
         count = count / world

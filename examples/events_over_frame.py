@@ -24,9 +24,8 @@ def main(out: Path) -> None:
     events = recording.events.window(100_000, 104_000)  # the 4 ms after the image
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained")
     axes[0].imshow(recording.images[0])
-    axes[1].imshow(
-        recording.images[0].mean(axis=-1) / 2 + 127, cmap="gray", vmin=0, vmax=255
-    )  # pale, for the events to stand out
+    # Pale, for the events to stand out.
+    axes[1].imshow(recording.images[0].mean(axis=-1) / 2 + 127, cmap="gray", vmin=0, vmax=255)
     for polarity, colour in ((1, "blue"), (0, "red")):
         axes[1].scatter(
             events.x[events.p == polarity],

@@ -22,6 +22,10 @@
 #endif
 #ifdef CHANGES
 #define NEEDS_LOCAL
+#define NEEDS_RATE
+#ifdef LIT
+#define NEEDS_NORMAL_RATE
+#endif
 #endif
 #include "vertex.glsl"
 
@@ -101,7 +105,16 @@ void main()
 #ifdef LIT
     // L = albedo E(n): the product rule. ``luminance`` is still the albedo here, and the normal seen changes as the
     // surface slides by.
-    change = change * light + luminance * irradiance_rate(facing, seen_rate(facing, motion));
+    vec3 facing_rate = seen_rate(facing, motion);
+#ifdef DEFORM
+    // and as the surface itself turns
+#ifdef TWO_SIDED
+    facing_rate += gl_FrontFacing ? normal_rate : -normal_rate;
+#else
+    facing_rate += normal_rate;
+#endif
+#endif
+    change = change * light + luminance * irradiance_rate(facing, facing_rate);
 #endif
 #endif
 #ifdef SHOW_LOOKUP

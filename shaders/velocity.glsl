@@ -3,6 +3,7 @@
 // the image, whose pixels are image_scale px of the image apart; velocity is still the image's.
 
 #define NEEDS_LOCAL
+#define NEEDS_RATE
 #include "vertex.glsl"
 
 #ifdef FRAGMENT_SHADER

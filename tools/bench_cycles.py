@@ -2,14 +2,14 @@
 ``peer_cycles.py``) on the default random scene.
 
     python -m blinkgl.tools.bench_cycles [CONFIG] [--frames 32] [--samples 128] [--set a.b=c …]
-    [--json FILE] [--pictures FOLDER]
+                                         [--json FILE] [--pictures FOLDER]
 
 1. A short clip at low resolution (--width; the camera of the configuration, shrunk), frame times with at most --max-px
    of motion between two, the same for every renderer; ESIM with the same thresholds on each, linear in time. Errors of
    the events, one cause at a time:
 
-   filtering   our frames against path-traced ones under our own light model (no shadows, no
-               bounces): mip maps, anti-aliasing
+   filtering   our frames against path-traced ones under our own light model (no shadows,
+               no bounces): mip maps, anti-aliasing
    shadows     without them against with them, both path-traced
    bounces     direct light against four diffuse bounces, both path-traced
    all         our frames against everything
@@ -35,6 +35,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from blinkgl.blender.process import available
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import BlinkGLError
@@ -48,7 +49,7 @@ from blinkgl.scene.types import Scene
 from blinkgl.srgb import to_srgb8
 from blinkgl.timeline.sampling import displacement_times
 from blinkgl.timeline.speed import largest_speed
-from blinkgl.tools.peer_cycles import Cost, CyclesSettings, available, frames
+from blinkgl.tools.peer_cycles import Cost, CyclesSettings, frames
 from blinkgl.trade.metrics import SpeedMaps, event_errors
 
 ANTIALIASINGS = ("none", "ssaa2", "ssaa4")

@@ -1,7 +1,7 @@
 """How fast the event networks' own code is: voxel grids, samples, and inference against the RAFT-style twin.
 
-    python -m blinkgl.tools.bench_eflow [--model eflowformer] [--size 640x480] [--rounds
-    5] [--data FOLDER] [--json FILE]
+    python -m blinkgl.tools.bench_eflow [--model eflowformer] [--size 640x480] [--rounds 5]
+                                        [--data FOLDER] [--json FILE]
 
 - Voxel grids of 15 bins at 640x480, one core: million events per second, uniform and clustered
   events, raw and rectified coordinates.

@@ -43,10 +43,8 @@ THREADS = (1, 2)
 @contextlib.contextmanager
 def spinning(count: int) -> Iterator[None]:
     """``count`` processes that keep a core busy each, for as long as the block lasts."""
-    program = (
-        "import os\nparent = os.getppid()\nwhile os.getppid() == "
-        "parent:\n    sum(range(100_000))"
-    )  # none outlives this process
+    # None outlives this process.
+    program = "import os\nparent = os.getppid()\nwhile os.getppid() == parent:\n    sum(range(100_000))"
     children = [subprocess.Popen([sys.executable, "-c", program]) for _ in range(count)]
     try:
         yield

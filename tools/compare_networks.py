@@ -1,8 +1,7 @@
 """Two networks on equal terms, from nothing to a table: generate, train both for the same steps, evaluate, time.
 
-    python -m blinkgl.tools.compare_networks --out out/h100                       # half an hour on one large GPU
-    python -m blinkgl.tools.compare_networks --out out/h100 --minutes 9           # the
-    same in pieces: repeat until it exits 0
+    python -m blinkgl.tools.compare_networks --out out/h100              # half an hour on one large GPU
+    python -m blinkgl.tools.compare_networks --out out/h100 --minutes 9  # in pieces: repeat until it exits 0
 
 What is done is kept and not done again: the data set goes on with ``--resume``, training from its newest checkpoint,
 and whatever has a result is left alone. With --minutes it stops in time with exit status 75 and the same command goes

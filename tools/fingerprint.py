@@ -1,8 +1,9 @@
 """What a dozen small configurations write, as SHA-256 sums: did a change change anything?
 
     python -m blinkgl.tools.fingerprint --out before.json        # at one commit
-    python -m blinkgl.tools.fingerprint --against before.json    # at another, on the same
-    machine: exit status 1 where bytes differ
+    python -m blinkgl.tools.fingerprint --against before.json    # at another, on the same machine
+
+The second exits with status 1 where bytes differ.
 
 All timelines, emulators, anti-aliasing settings, reconstructions, labels, sensors, level of detail, a still camera,
 converted frames and ``simulate`` take part. Sums of two machines differ (processor, driver, versions are in the

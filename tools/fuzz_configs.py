@@ -2,8 +2,7 @@
 generated and verified; all else is one line.
 
     python -m blinkgl.tools.fuzz_configs [--seed 0] [--count 10000] [--runs 300] [--out out/fuzz_configs] [--json FILE]
-    python -m blinkgl.tools.fuzz_configs --seed 0 --only read:317        # one configuration
-    again: its YAML, and its traceback
+    python -m blinkgl.tools.fuzz_configs --seed 0 --only read:317  # one again: its YAML, and its traceback
 
 ``read``: a configuration with any keys at any legal value, ends of ranges first, distributions anywhere, presets,
 groups and --set overrides; half of them with one or two defects (a value out of range or of another type, a misspelt or

@@ -2,8 +2,8 @@
 die, under a clock and a memory limit.
 
     python -m blinkgl.tools.fuzz_files [--mutants 1000] [--formats "events*" "mesh*"] [--seed 0] [--out out/fuzz]
-    [--json FILE] python -m blinkgl.tools.fuzz_files --formats "mesh ply" --only 317
-    # one mutant again, with its traceback
+                                       [--json FILE]
+    python -m blinkgl.tools.fuzz_files --formats "mesh ply" --only 317  # one mutant again, with its traceback
 
 What may come of a mutant: it is read (and what was read is looked at, see :mod:`blinkgl.tools.fuzz_formats`), or
 refused with the one line of the command line. Everything else is a defect: a traceback, a crash, more than --cpu
@@ -40,9 +40,8 @@ from pathlib import Path
 
 import numpy as np
 
-if (
-    __name__ == "__main__"
-):  # a process with threads cannot be forked safely; where this is imported they are somebody else's
+# A process with threads cannot be forked safely; where this is imported they are somebody else's.
+if __name__ == "__main__":
     for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(_name, "1")
 

@@ -142,9 +142,8 @@ def sentences() -> dict[str, list[str]]:
                 and path.split("/")[1] in ("config", "config.py")
                 and isinstance(node.exc, ast.Call)
             ):
-                if (
-                    _called(node.exc) in ("ValueError", "PydanticCustomError") and node.exc.args
-                ):  # pydantic turns these into a ConfigError
+                # pydantic turns these into a ConfigError.
+                if _called(node.exc) in ("ValueError", "PydanticCustomError") and node.exc.args:
                     lines.append((node.lineno, template(node.exc.args[-1])))
         if lines:
             found[path] = list(dict.fromkeys(line for _, line in sorted(lines)))

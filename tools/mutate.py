@@ -1,11 +1,11 @@
 """A small mutation run: are there tests that notice when a line is wrong?
 
-    python -m blinkgl.tools.mutate --map                      # once per commit: which test
-                                                              runs which line (the suite under coverage)
-    python -m blinkgl.tools.mutate --count 200 --seed 1       # draw mutants, run the tests that reach each, print the
-    survivors python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py    # the mutants of a module, without
-    running any python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41 # those of a line
+    python -m blinkgl.tools.mutate --map                 # once per commit: which test runs which line
+    python -m blinkgl.tools.mutate --count 200 --seed 1  # draw mutants, run the tests that reach each, print survivors
+    python -m blinkgl.tools.mutate --show blinkgl/render/matrices.py     # the mutants of a module, without running any
+    python -m blinkgl.tools.mutate --only blinkgl/render/matrices.py:41  # those of a line
 
+``--map`` runs the suite under coverage.
 A mutant is one small edit of one line: an operator, a comparison, a constant, a condition, a statement left out. It is
 made in a copy of the tree, so nothing here is touched. The tests that reached its line run, its module's own first,
 until one fails (killed), the time is up (killed: "time"), or all passed (survived). Lines that no test reaches are
@@ -71,6 +71,8 @@ SHARED_CODE = (
 )
 DEBUGGERS = "shaders/include/lookup.glsl"
 """the include that only the shader debugger asks for"""
+LOOKERS = tuple(f"tests/test_rooms.py::test_{name}" for name in ("a_record", "records", "doors"))
+"""tests that look at dataclasses and signatures of the whole package, whichever test it was that imported them first"""
 MOST_TESTS, MOST_S = 300, 120.0
 """of the tests that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
@@ -327,12 +329,8 @@ class _Finder(ast.NodeVisitor):
         self.visit(node.value)
 
     def visit_keyword(self, node) -> None:
-        if node.arg not in (
-            "description",
-            "accepted",
-            "where",
-            "value",
-        ):  # what an error says is golden text, tested as such
+        # What an error says is golden text, tested as such.
+        if node.arg not in ("description", "accepted", "where", "value"):
             self.visit(node.value)
 
 
@@ -539,6 +537,15 @@ def _remembered(mutant: Mutant) -> bool:
     )
 
 
+def _on_import(mutant: Mutant) -> bool:
+    """Whether the line runs when its module is imported: a decorator, a default, a constant."""
+    return not any(
+        isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+        and node.body[0].lineno <= mutant.line <= node.end_lineno
+        for node in ast.walk(ast.parse((ROOT / mutant.path).read_text()))
+    )
+
+
 class Reach:
     """Test ids by line, from :func:`make_map`."""
 
@@ -600,6 +607,8 @@ class Reach:
                 contexts = set().union(*(self.anywhere(path) for path in callers))
             else:
                 contexts = reached if _remembered(mutant) else self._around(mutant)
+                if _on_import(mutant):
+                    contexts = [*contexts, *(t for t in self.seconds if t.startswith(LOOKERS))]
         ids = (set(contexts) & self.seconds.keys()) - self.idle
         chosen, together = [], 0.0
         for test in sorted(ids, key=lambda t: (self._distance(mutant, t), self.seconds.get(t, 1.0), t)):
@@ -626,7 +635,7 @@ class Reach:
     def _distance(mutant: Mutant, test: str) -> int:
         """0: a test of the module, 1: of its room, 2: of another."""
         path, file = Path(mutant.path), Path(test.split("::")[0])
-        if file.stem == f"test_{path.stem}":
+        if file.stem == f"test_{path.stem}" or test.startswith(LOOKERS):
             return 0
         return 1 if file.parts[1] == ("render" if path.suffix == ".glsl" else path.parts[1]) else 2
 
@@ -688,9 +697,8 @@ def serve() -> int:
             importlib.import_module(name)
     import numba
 
-    numba.njit("f8(f8)")(
-        lambda x: x + 1.0
-    )  # fills numba's tables of types, which it does when it compiles or loads the first kernel
+    # Fills numba's tables of types, which it does when it compiles or loads the first kernel.
+    numba.njit("f8(f8)")(lambda x: x + 1.0)
     taken = sorted(m for m in sys.modules if m.split(".")[0] in ("blinkgl", "eflow", "tests"))
     assert not taken, f"of the tree, before it is edited: {taken}"
     gc.collect()
@@ -712,9 +720,8 @@ def serve() -> int:
 
 def _awaited(child: int, limit_s: float) -> str:
     handle = os.pidfd_open(child)
-    ready = select.select([handle, sys.stdin], [], [], limit_s)[
-        0
-    ]  # no order comes while one is carried out: readable is who gives them gone
+    # No order comes while one is carried out: when stdin can be read, who gives them is gone.
+    ready, _, _ = select.select([handle, sys.stdin], [], [], limit_s)
     in_time = handle in ready
     os.close(handle)
     with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -732,9 +739,8 @@ def _run_tests(order: dict) -> int:
     nothing = os.open(os.devnull, os.O_RDONLY)
     for old, new in ((nothing, 0), (output, 1), (output, 2)):
         os.dup2(old, new)
-    resource.setrlimit(
-        resource.RLIMIT_DATA, (MEMORY, MEMORY)
-    )  # not of address space, of which Ray maps more than it uses
+    # Not of address space, of which Ray maps more than it uses.
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     from numba.core import caching, config
 
     os.environ["NUMBA_CACHE_DIR"] = config.CACHE_DIR = order["kernels"]

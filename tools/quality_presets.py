@@ -3,7 +3,7 @@ keeps the measurement beside them.
 
     blinkgl trade configs/flying_objects.yaml --out out/trade
     python -m blinkgl.tools.quality_presets out/trade/trade.json 'fast=NAME' 'balanced=NAME' 'accurate=NAME'
-    'reference=NAME' [--command TEXT]
+                                            'reference=NAME' [--command TEXT]
 
 NAME is a setting of that measurement that is on its front; anything else is refused.
 tests/trade/test_presets.py checks the result.

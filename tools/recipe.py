@@ -115,7 +115,7 @@ def build(recipe: str, target: str, context: Path, root: Path, certificates: Pat
     state = State()
     if certificates is not None:
         shutil.copy(certificates, root / "tmp/certificates.crt")
-        state.environment["PIP_CERT"] = "/tmp/certificates.crt"
+        state.environment["PIP_CERT"] = "/tmp/certificates.crt"  # seen from inside `root`
     for step in stage(recipe, target)[1]:
         if step.instruction == "RUN":
             print(f"RUN {step.text}", flush=True)

@@ -1,7 +1,7 @@
 """Injects faults into real runs for as long as one likes, and checks that nothing shows in the end.
 
-    python -m blinkgl.tools.soak [--recipe configs/blinkflow_mini.yaml] [--tiny] [--rounds 3] [--faults
-    kill-worker,disk-full,…] [--json FILE]
+    python -m blinkgl.tools.soak [--recipe configs/blinkflow_mini.yaml] [--tiny] [--rounds 3]
+                                 [--faults kill-worker,disk-full,…] [--json FILE]
 
 One uninterrupted run in one process is the reference. Then, per round and fault: a run with two workers, the fault at a
 random moment, ``--resume`` as often as it takes, ``verify --deep``, and a comparison of every byte outside ``.run``.

@@ -79,9 +79,8 @@ class Radtan(DistortedModel):
         part keeps growing; beyond, nan."""
         distance = np.linalg.norm(d, axis=1)
         r = radial_inverse(distance, (self.k1, self.k2, self.k3), self._limit)
-        r = np.where(
-            np.isnan(r), 0.99 * self._limit if math.isfinite(self._limit) else np.nan, r
-        )  # the tangential part may bring it back
+        # The tangential part may bring it back.
+        r = np.where(np.isnan(r), 0.99 * self._limit if math.isfinite(self._limit) else np.nan, r)
         with np.errstate(divide="ignore", invalid="ignore"):
             u = d * np.where(distance > 0, r / distance, 1.0)[:, None]
         if self.p1 == 0.0 and self.p2 == 0.0:

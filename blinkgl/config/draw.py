@@ -152,9 +152,8 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     if kind == "integer":
         return int(rng.integers(int(low), int(high), endpoint=True))
     if kind == "log_uniform":
-        return min(
-            max(float(math.exp(rng.uniform(math.log(low), math.log(high)))), low), high
-        )  # exp(log(b)) may be above b
+        # exp(log(b)) may be above b.
+        return min(max(float(math.exp(rng.uniform(math.log(low), math.log(high)))), low), high)
     return float(rng.uniform(low, high))
 
 

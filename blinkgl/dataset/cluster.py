@@ -165,9 +165,8 @@ class RayCluster:
     def _start_own(self) -> None:
         """A cluster on 127.0.0.1 alone, with its files where no other user of the machine can read or write them."""
         before = set(listening(os.getpid()))  # a notebook's kernel listens, too
-        self._folder = tempfile.mkdtemp(
-            prefix="ray-", dir=_short_folder()
-        )  # 0700; Ray opens its own folder in it to everybody
+        # 0700; Ray opens its own folder in it to everybody.
+        self._folder = tempfile.mkdtemp(prefix="ray-", dir=_short_folder())
         with _loopback_only():
             self._ray.init(
                 address="local",

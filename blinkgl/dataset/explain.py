@@ -147,7 +147,7 @@ def _verdict_in_words(found: Verdict | None) -> str:
 
 
 def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
-    moving = sum(not o.path.is_static for o in scene.objects)
+    moving = sum(not o.is_static for o in scene.objects)
     parts = [p for o in scene.objects for p in o.parts]
     textures = {id(p.material.texture): p.material.texture for p in parts if p.material.texture is not None}
     pixels = sum(t.image.shape[0] * t.image.shape[1] for t in textures.values())

@@ -119,15 +119,19 @@ def manifest_info(sequence: Simulation) -> dict:
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
     return {
         "blinkgl": blinkgl.__version__,
-        "versions": versions | ({} if config.frames is None else {"opencv": cv2.__version__}),
+        "versions": {
+            **versions,
+            **({} if config.frames is None else {"opencv": cv2.__version__}),
+            **sequence.libraries,
+        },
         "seed": config.seed,
         "sequence": sequence.index,
         "split": config.output.split,
         "emulator": config.events.emulator,
         "frames": sequence.frames,
         "labels": sequence.labels,
-        "duration_us": sequence.t1_ns // 1000
-        - sequence.t0_ns // 1000,  # between whole microseconds, as every time in the files
+        # between whole microseconds, as every time in the files
+        "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,
         **losses(*sequence.losses),
         **sequence.facts(),
     }

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -26,6 +24,7 @@ from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import Job, Message, environment_differences, report_of
 from blinkgl.errors import BlinkGLError, ConfigError, OutputError
 from blinkgl.io.index import write_index
+from blinkgl.machine.interrupts import interruptible
 
 ATTEMPTS = 3
 """A sequence is set aside after so many failures that could have passed, or one that could not
@@ -85,7 +84,7 @@ def run_dataset(
     plan = Plan.of(template, num)
     assets = plan.check_assets()
     folder = RunFolder(out)
-    with _terminable(), folder.locked():
+    with interruptible(signal.SIGTERM), folder.locked():  # batch systems and `docker stop` end a run as Ctrl-C does
         folder.check(plan, assets, mixed)
         outcome = _found(plan, folder, resume)
         missing = outcome.planned - outcome.found
@@ -119,9 +118,8 @@ def run_dataset(
             elif folder.in_place:
                 folder.sweep(plan)
                 with contextlib.suppress(OutputError):  # on a full disk the first error is the one to hear of
-                    if (
-                        folder.read("run.json") is None
-                    ):  # deleted under us; without it nobody could tell whose run this is
+                    # Deleted under us; without it nobody could tell whose run this is.
+                    if folder.read("run.json") is None:
                         folder.begin(plan, assets, folder.environment, num)
                 folder.write_failures(outcome.set_aside, plan)
                 with contextlib.suppress(OutputError):
@@ -237,20 +235,3 @@ def _agree(hello: Message, environment: dict[str, str], assets: str | None) -> N
             where="--executor",
             accepted="the same files on all machines",
         )
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM (batch systems, ``docker stop``) ends a run as Ctrl-C does. Only a main thread can see to that."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def interrupt(*_):
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -173,9 +173,8 @@ class RunFolder:
             except BaseException:
                 os.close(handle)
                 raise
-            os.close(
-                handle
-            )  # another run was refused, and took the folder away, between our opening and our locking it
+            # Another run was refused, and took the folder away, between our opening and our locking it.
+            os.close(handle)
             self._make()
 
     def check_in_place(self) -> None:

@@ -75,9 +75,8 @@ def _write(out: Path, split: str, entries: Iterator[tuple[Path, int]], shard_byt
             with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as shard:
                 while pending is not None and (counts[-1] == 0 or shard.offset < shard_bytes):
                     for name, data in sample(*pending):
-                        member = tarfile.TarInfo(
-                            name
-                        )  # owner, mode and time stay at their defaults: the same bytes on every day
+                        # Owner, mode and time stay at their defaults: the same bytes on every day.
+                        member = tarfile.TarInfo(name)
                         member.size = len(data)
                         shard.addfile(member, io.BytesIO(data))
                     counts[-1] += 1

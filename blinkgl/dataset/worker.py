@@ -17,6 +17,8 @@ import threading
 import time
 from collections.abc import Callable
 
+from blinkgl.machine.interrupts import interruptible
+
 _GRACE_S = 20.0
 _ALIVE_EVERY_S = 1.0
 
@@ -24,7 +26,14 @@ _ALIVE_EVERY_S = 1.0
 def main() -> int:
     """Makes tasks until the driver's end of standard input closes; the exit status."""
     faulthandler.enable()
-    signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        with interruptible(signal.SIGTERM):
+            return _work()
+    except KeyboardInterrupt:
+        return 130
+
+
+def _work() -> int:
     channel = int(sys.argv[1])
     tasks: queue.Queue = queue.Queue()
     threading.Thread(target=_listen, args=(tasks,), daemon=True).start()
@@ -42,24 +51,21 @@ def main() -> int:
 
     threading.Thread(target=_pulse, args=(tell,), daemon=True).start()
 
-    try:
-        from blinkgl.dataset.work import Job, Maker
-        from blinkgl.errors import BlinkGLError
+    from blinkgl.dataset.work import Job, Maker
+    from blinkgl.errors import BlinkGLError
 
-        start = tasks.get()
-        if start is None:
-            return 0
-        with Maker(Job(**start["job"]), start["device"]) as maker:
-            try:
-                tell(maker.open())
-            except BlinkGLError as error:
-                tell({"kind": "refused", "error": str(error)})
-                return 2
-            while (order := tasks.get()) is not None:
-                tell(maker.make(order["task"], order["attempt"], tell))
+    start = tasks.get()
+    if start is None:
         return 0
-    except KeyboardInterrupt:
-        return 130
+    with Maker(Job(**start["job"]), start["device"]) as maker:
+        try:
+            tell(maker.open())
+        except BlinkGLError as error:
+            tell({"kind": "refused", "error": str(error)})
+            return 2
+        while (order := tasks.get()) is not None:
+            tell(maker.make(order["task"], order["attempt"], tell))
+    return 0
 
 
 def _listen(tasks: queue.Queue) -> None:
@@ -79,10 +85,6 @@ def _pulse(tell: Callable[[dict], None]) -> None:
         while True:
             time.sleep(_ALIVE_EVERY_S)
             tell({"kind": "alive"})
-
-
-def _interrupt(*_) -> None:
-    raise KeyboardInterrupt
 
 
 if __name__ == "__main__":

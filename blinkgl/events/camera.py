@@ -38,10 +38,9 @@ class EventFrame(NamedTuple):
 class EventCamera:
     """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
 
-    readout : None: no limit.   seed : of the emulator's draws.   reconstruction : the path
-                                between frames, see :class:`Emulator`.
-    emulator : the :class:`Emulator` itself.   Raises EventDataError: size, or a path that
-                                               the emulator cannot follow."""
+    readout : None: no limit.   seed : of the emulator's draws.
+    reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
+    Raises EventDataError: size, or a path that the emulator cannot follow."""
 
     def __init__(
         self,

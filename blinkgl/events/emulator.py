@@ -155,9 +155,8 @@ class Emulator(ABC):
         whole = (0, self.height)
         here = whole if rows is None or self.t_ns is None else (max(0, rows[0]), min(self.height, rows[1]))
         first, stop = here
-        if (
-            self.needs_rate
-        ):  # where there was a rate in the frame before there is none now: slopes are part of the state
+        # Where there was a rate in the frame before there is none now: slopes are part of the state.
+        if self.needs_rate:
             before = self._rows_before or whole
             if before[0] < before[1]:
                 first, stop = (min(first, before[0]), max(stop, before[1])) if first < stop else before

@@ -129,10 +129,8 @@ def _emit_block(active, count, first, now, p, v, cap, packed, begin, curve, slop
         polarity = np.int64(level >= above)
         gap = max(level - above, below - level)  # how far the signal ends beyond the level being passed
         pixel = (y << 17) | ((i - row_end + v.width) << 1) | polarity  # the word of packing.py but for its time
-        step_on, step_off = (
-            v.on_all,
-            v.off_all,
-        )  # the pixel's own thresholds; ``up`` and ``down`` are those now in force, with jitter
+        # The pixel's own thresholds; ``up`` and ``down`` are those now in force, with jitter.
+        step_on, step_off = (v.on_all, v.off_all)
         if p.on.size:
             step_on, step_off = np.int64(p.on[i]), np.int64(p.off[i])
         up, down = step_on, step_off
@@ -210,10 +208,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
-            if (
-                filled + count * cap > packed.size
-            ):  # no room for the worst case; nothing of this block has been touched: the caller
-                return block, filled, cut  # makes room and comes back to it
+            # No room for the worst case; nothing of this block has been touched: the caller makes room and comes back to it.
+            if filled + count * cap > packed.size:
+                return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, None, None)
             cut += cut_here
         copy_block(now[:n], p.log[s:e])  # last: until here p.log is the frame before
@@ -432,10 +429,8 @@ class Esim(Emulator):
         if self._passed[0] < k - 1:
             self._ring_ns[k % 4] = t_ns
             return self._pass_interval(k - 1, source)
-        log, first, stop = (
-            self._ring[k % 4],
-            *self._stale(k),
-        )  # the interval before is done: only the first frame, and after flush
+        # The interval before is done: only the first frame, and after flush.
+        log, first, stop = (self._ring[k % 4], *self._stale(k))
         frame, codes, table = (a[first:stop] if j < 2 else a for j, a in enumerate(source))
         if first < stop:
             lookup_block(codes, table, log[first:stop]) if codes.size else log_block(

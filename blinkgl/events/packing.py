@@ -147,12 +147,8 @@ class PackedBuffer:
             run(_count_parts, parts, (source, starts, counts, first_row, shift, mask, histogram), threads)
             _histograms_to_offsets(histogram)
             run(_scatter_parts, parts, (source, starts, counts, first_row, shift, mask, histogram, target), threads)
-            source, starts, counts, first_row = (
-                target,
-                edges[:-1],
-                np.diff(edges),
-                np.arange(parts + 1),
-            )  # contiguous from now on
+            # Contiguous from now on.
+            source, starts, counts, first_row = (target, edges[:-1], np.diff(edges), np.arange(parts + 1))
         x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
         t, p = np.empty(total, np.int64), np.empty(total, np.uint8)
         run(_unpack_parts, parts, (source, edges, base_us, x, y, t, p), threads)

@@ -183,9 +183,8 @@ def _shot_block(block, pixels_in_block, p, v, intensity_now, keys):
             i = first + offset
             after = max(t_ns - v.t0_ns, 0)
             intensity = p.intensity[i] + (intensity_now[offset] - p.intensity[i]) * (after / v.dt_ns)
-            u, _ = uniform2(
-                v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1
-            )  # odd: shot_draw has the even numbers
+            # Odd: shot_draw has the even numbers.
+            u, _ = uniform2(v.seed, np.uint64(block), _SHOT, np.uint64(index) * _U2 + _U1)
             if u * DARKEST < shot_factor(intensity):
                 if count == keys.size:
                     return -1, t_ns, index  # the caller doubles ``keys`` and begins the block anew: draws know no state
@@ -246,9 +245,8 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
         up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
         on, off = np.float64(constants[j, 0]), np.float64(constants[j, 1])
         s, now_ns, dead = 0.0, np.int64(0), False
-        if (
-            p.release.size and up == -np.inf
-        ):  # in its dead time, which ends where the comparator takes its new reference
+        # In its dead time, which ends where the comparator takes its new reference.
+        if p.release.size and up == -np.inf:
             if p.release[i] > end_ns:
                 dead = True
             else:
@@ -268,11 +266,8 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                 fires, polarity, target = True, np.int64(1), up
             elif end <= down:
                 fires, target = True, down
-            event_s, event_ns, reference = (
-                2.0,
-                np.int64(0),
-                target,
-            )  # a crossing leaves the reference at the level that it met
+            # A crossing leaves the reference at the level that it met.
+            event_s, event_ns, reference = (2.0, np.int64(0), target)
             if fires:
                 event_s = crossing_fraction(s, target, polarity, c, rise, fall, k, end)
                 event_ns = np.int64(event_s * dt_ns)
@@ -308,9 +303,8 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                     dead = True
                     break
                 s = now_ns / dt_ns
-            if (
-                from_noise or p.release.size
-            ):  # noise, and the end of a dead time, leave the reference wherever the signal is
+            # Noise, and the end of a dead time, leave the reference wherever the signal is.
+            if from_noise or p.release.size:
                 reference = signal_at(s, c, rise, fall, k)
             up, down = reference + on, reference - off
         if dead:  # both levels are passed, whatever comes: the pixel is looked at until it is released

@@ -211,9 +211,8 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
             if not in_reach(voltage, mu * left_us, sigma * np.sqrt(left_us)):
                 voltage += mu * left_us
                 break
-            index = (np.uint64(v.step) << _U20) | np.uint64(
-                2 * draw
-            )  # two blocks a draw: (normal, uniform), then the side
+            # Two blocks a draw: (normal, uniform), then the side.
+            index = (np.uint64(v.step) << _U20) | np.uint64(2 * draw)
             normal, which = normal_and_uniform(v.seed, np.uint64(i), _DIFFUSION, index)
             chance = on_first(1.0 - voltage, 1.0 + voltage, mu, sigma)
             polarity = np.int64(chance)  # where it is certain, no number is drawn
@@ -222,9 +221,8 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
                 polarity = np.int64(side < chance)
             distance = 1.0 - voltage if polarity else 1.0 + voltage
             hit_us = t_us + hitting_time(distance, mu, sigma, normal, which)
-            if (
-                not hit_us <= dt_us
-            ):  # too late, or never (inf): no event, and V takes its drift along, as in the paper's algorithm
+            # Too late, or never (inf): no event, and V takes its drift along, as in the paper's algorithm.
+            if not hit_us <= dt_us:
                 voltage = max(min(voltage + mu * left_us, NEAREST), -NEAREST)
                 break
             draw += 1
@@ -267,9 +265,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
-            cap = min(
-                np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel
-            )  # far beyond what chance adds to the mean
+            # Far beyond what chance adds to the mean.
+            cap = min(np.int64(2 * most + 8 * np.sqrt(most)) + 8, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:

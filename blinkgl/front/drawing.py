@@ -64,8 +64,8 @@ class Renderer:
     ) -> LabelFrame:
         """:class:`LabelFrame` at t s with the named buffers; "images" is its ``colour``, (H, W, 3) float32 linear.
 
-        labels : as of :func:`record`.   to, back_to : s, where flow and flow_backward lead;
-                                         default: one label interval on and back."""
+        labels : as of :func:`record`.
+        to, back_to : s, where flow and flow_backward lead; default: one label interval on and back."""
         request = asked_for(LabelsConfig.model_validate(labels_tree(labels)))
         t_ns, interval = _ns(t, "t"), self.config.time.interval_ns
         return self._renderer.labels(

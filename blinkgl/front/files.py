@@ -153,8 +153,8 @@ def compare(
 ) -> Comparison:
     """How alike two event files are, over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
 
-    b : event file; None: ``a`` is described.   frames : video or folder of images both are
-                                                compared with.   fps : of the frames, Hz.
+    b : event file; None: ``a`` is described.
+    frames : video or folder of images both are compared with.   fps : of the frames, Hz.
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
@@ -185,13 +185,14 @@ def simulate(
     """:class:`Events` of any stream of frames, a chunk per step, t in µs; nothing but the current frames is kept.
 
     frames : iterable, a generator included, of (H, W) or (H, W, 3) RGB arrays with ``fps``, Hz, or of pairs (array,
-    t_ns). uint8, uint16, or float (1.0 is white).   emulator : as of :func:`record`.   sensor : the read-out limit of
-                                                     that camera, and with an emulator's name its values.
+    t_ns). uint8, uint16, or float (1.0 is white).
+    emulator : as of :func:`record`.
+    sensor : the read-out limit of that camera, and with an emulator's name its values.
     gamma : "srgb", "linear" or an exponent; default: srgb for integers, linear for floats.
     interpolate : "linear"; "cubic": ``factor - 1`` frames in between; "motion": dense
     flow, at most ``max_px`` px a step.
-    report : a SimulationReport to be filled.   Raises ConfigError at once; EventDataError
-                                                as frames come, naming the frame."""
+    report : a SimulationReport to be filled.
+    Raises ConfigError at once; EventDataError as frames come, naming the frame."""
     from blinkgl.recordings import simulation
 
     if not isinstance(frames, Iterable):
@@ -226,7 +227,7 @@ def simulate_file(
     ``blinkgl simulate``; files appear whole or not at all.
 
     timestamps : file of times, one a frame.   preview : a video of frames and events to write.
-                                               The rest: as of :func:`simulate`.
+    The rest: as of :func:`simulate`.
     Returns a report: frames, steps, events, lost … Raises AssetError, OutputError, EventDataError, ConfigError."""
     from blinkgl.recordings import simulation
 

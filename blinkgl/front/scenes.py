@@ -1,8 +1,9 @@
 """Scenes in Python: the pieces of ``scene: {kind: explicit}``, checked by the same models,
 drawn from the same data classes.
 
-    scene = Scene(Camera(320, 240, pose=Keyframes({0: look_at((-3, 0, 1), (0, 0, 0)), 1: look_at((-3, 1, 1), (0, 0,
-    0))}))) scene += Primitive("cuboid", material=Material(procedural="bricks"))
+    path = Keyframes({0: look_at((-3, 0, 1), (0, 0, 0)), 1: look_at((-3, 1, 1), (0, 0, 0))})
+    scene = Scene(Camera(320, 240, pose=path))
+    scene += Primitive("cuboid", material=Material(procedural="bricks"))
 
 World: right-handed, z up. Lengths in metres, angles in degrees, times in seconds on the scene's clock. All pieces are
 values: nothing changes them, ``scene + body`` is another scene. Whatever cannot be used raises ConfigError when the
@@ -254,8 +255,8 @@ class Primitive(_Body):
 
     parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``
     (docs/configuration.md, "primitives").
-    material : :class:`Material`, default white.   pose : :class:`Pose`, :class:`Keyframes` or a
-                                                   position (3,).   scale : one factor, or (3,).
+    material : :class:`Material`, default white.   scale : one factor, or (3,).
+    pose : :class:`Pose`, :class:`Keyframes` or a position (3,).
     name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
     Raises ConfigError."""
 

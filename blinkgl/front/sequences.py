@@ -43,8 +43,8 @@ def simulate_sequence(
     source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
     included.   index : number of the sequence.
     emulator, sensor, timeline, quality, labels : as of :func:`record`; what ``labels`` does not name is not drawn.
-    events : False leaves them out.   pictures_hz : gives a :class:`Picture` so many times per
-                                      second of simulated time, at event frames.
+    events : False leaves them out.
+    pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
     ``labels``. Iterate over it once, or use it in ``with`` where it may never be. Raises ConfigError, AssetError,
     GLError and, as it goes, EventDataError."""
@@ -74,8 +74,8 @@ class Recording:
     events : all of them, t in µs on the scene's clock.   t_us : (K,) int64, times of the labels.
     labels : K times :class:`LabelFrame`; what was not asked for is None in it.
     images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones as they are), or None.
-    config : every value as drawn.   frames : how many the emulator saw.   lost : events that
-                                     its limit and the read-out swallowed."""
+    config : every value as drawn.   frames : how many the emulator saw.
+    lost : events that its limit and the read-out swallowed."""
 
     events: Events
     t_us: np.ndarray

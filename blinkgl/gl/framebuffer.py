@@ -7,7 +7,8 @@ flipped here or anywhere else.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import moderngl
@@ -108,6 +109,7 @@ class Target:
         self._clear_float = gl.function("glClearBufferfv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._clear_uint = gl.function("glClearBufferuiv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
         self._clear_int = gl.function("glClearBufferiv", None, ctypes.c_uint, ctypes.c_int, ctypes.c_void_p)
+        self._cleared: tuple[tuple, list[Callable[[], object]]] = (), []  # to what values, and the calls that do it
 
     def _texture(self, pixel: PixelFormat) -> moderngl.Texture | moderngl.Renderbuffer:
         if self.samples:
@@ -159,14 +161,23 @@ class Target:
         attachments. Honours the scissor.
         """
         self.fbo.use()
+        values = (*(c if isinstance(c, (int, float)) else tuple(c) for c in colour), depth)
+        if values != self._cleared[0]:  # mostly they are those of the frame before
+            self._cleared = values, [*self._clear_calls(colour, depth)]
+        for call in self._cleared[1]:
+            call()
+
+    def _clear_calls(
+        self, colour: Sequence[float | int | Sequence[float]], depth: float
+    ) -> Iterator[Callable[[], object]]:
         for i, pixel in enumerate(self.formats):
             value = np.zeros(4, {"u": np.uint32, "i": np.int32}.get(pixel.gl[0], np.float32))
             if i < len(colour):
                 value[: np.size(colour[i])] = colour[i]
             clear = {"u": self._clear_uint, "i": self._clear_int}.get(pixel.gl[0], self._clear_float)
-            clear(_COLOR, i, value.ctypes.data)
+            yield partial(clear, _COLOR, i, value.ctypes)
         if self.depth is not None:
-            self._clear_float(_DEPTH, 0, ctypes.byref(ctypes.c_float(depth)))
+            yield partial(self._clear_float, _DEPTH, 0, ctypes.byref(ctypes.c_float(depth)))
 
     def resolve_into(self, other: Target) -> None:
         """Writes the mean of each pixel's samples into ``other``, a target of the same size and formats that is not

@@ -72,9 +72,8 @@ class DsecEventWriter:
         self._error: BaseException | None = None
         self._closed = False
         with output_errors(path):
-            self._file = h5py.File(
-                self.path, "w", rdcc_nbytes=0
-            )  # whole chunks only: no cache, a full disk shows at once
+            # Whole chunks only: no cache, a full disk shows at once.
+            self._file = h5py.File(self.path, "w", rdcc_nbytes=0)
             self._columns = {
                 k: blosc_dataset(self._file, f"events/{k}", (0,), dtype, (BLOCK,)) for k, dtype in _COLUMNS.items()
             }

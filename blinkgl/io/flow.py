@@ -27,6 +27,16 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
         return read_flow_png(path)
     if path.suffix != ".npy":
         raise AssetError("unknown flow file ending", where=str(path), value=path.suffix, accepted=", ".join(ENDINGS))
+    flow, stated = read_flow_npy(path)
+    valid = stated & np.isfinite(flow).all(-1)
+    return np.where(valid[..., None], flow, np.float32(0)), valid
+
+
+def read_flow_npy(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
+    """flow (H, W, 2) float32 px as it stands in a .npy of (H, W, 2) or, with the validity, (H, W, 3), NaN included; and
+    (H, W) bool what the file says is valid, all of it where it says nothing.
+
+    Raises AssetError: missing, damaged, or no flow."""
     data = read_npy(path)
     if data.ndim != 3 or data.shape[2] not in (2, 3) or data.dtype.kind != "f":
         raise AssetError(
@@ -35,9 +45,8 @@ def read_flow(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
             value=f"{data.dtype} {data.shape}",
             accepted="float (H, W, 2) or (H, W, 3)",
         )
-    flow = data[..., :2].astype(np.float32)
-    valid = np.isfinite(flow).all(-1) & (data[..., 2] > 0 if data.shape[2] == 3 else True)
-    return np.where(valid[..., None], flow, np.float32(0)), valid
+    stated = data[..., 2] > 0 if data.shape[2] == 3 else np.ones(data.shape[:2], bool)
+    return data[..., :2].astype(np.float32), stated
 
 
 def encode_flow_npy(flow: np.ndarray, valid: np.ndarray) -> bytes:

@@ -2,8 +2,7 @@
 
     <sequence>/
       events.h5                      DSEC layout (blinkgl.io.dsec)
-      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line   (these
-                                     and all below that are labels: as their rows say, blinkgl.labels)
+      images/%06d.png                sRGB frames at label times;        images/timestamps.txt   one µs per line
       flow/forward/%06d.png          DSEC 16-bit flow;                  flow/forward_timestamps.txt   from_us,to_us
       flow/forward_npy/%06d.npy      float32 (H, W, 3) = u, v, valid    (as BlinkFlow's; on request)
       flow/forward_flo/%06d.flo, flow/forward.h5                        (on request)
@@ -12,6 +11,7 @@
       depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
       poses.npz  config.yaml  manifest.json  preview.mp4
 
+Images, flow and all that are labels stand where their rows say (``blinkgl.labels``).
 Float flow stands in folders of its own because DSEC loaders take every file of ``flow/forward`` for a PNG.
 """
 

@@ -137,9 +137,8 @@ class VideoReader:
             probe.close()
         except Exception as error:  # IOError, RuntimeError, IndexError, StopIteration …
             raise AssetError(f"cannot read video: {_gist(str(error))}", where=str(path)) from error
-        self.width, self.height = (
-            meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]
-        )  # ffmpeg turns frames upright
+        # ffmpeg turns frames upright.
+        self.width, self.height = meta["size"] if meta.get("rotate", 0) % 180 == 0 else meta["size"][::-1]
         self.fps = float(meta.get("fps") or 0)
         self.expected = round(float(meta.get("duration") or 0) * self.fps)
 

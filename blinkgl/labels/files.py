@@ -14,9 +14,9 @@ import numpy as np
 class Form:
     """``FOLDER/000000.ENDING``, one file a label, or ``FOLDER.ENDING``, one file for all of them.
 
-    encode : a value as the bytes of a file, or as (bytes, number of its pixels that the form cannot hold).   read : the
-    value in a file; raises AssetError.   rows : of one file for all, name -> (H, W[, C]) array that
-                                          is appended to the dataset of that name."""
+    encode : a value as the bytes of a file, or as (bytes, number of its pixels that the form cannot hold).
+    read : the value in a file; raises AssetError.
+    rows : of one file for all, name -> (H, W[, C]) array that is appended to the dataset of that name."""
 
     folder: str
     ending: str

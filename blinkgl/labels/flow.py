@@ -37,9 +37,10 @@ class FlowTo(Label):
     the PNG, not in the float forms."""
 
     unit, kind = "px", "motion"
-    buffer, varyings = "RGBA32F", ("local",)
+    buffer = "RGBA32F"
 
     def __init__(self, towards: Towards):
+        self.varyings = ("local", towards)
         self.towards, self.name, self.title = towards, f"flow_{towards}", f"{towards} flow"
         self.about, self.off = f"optical flow {towards}", "not in labels.flow"
         self.stamps, self.shard = f"flow/{towards}_timestamps.txt", "flow.png" if towards == "forward" else "back.png"

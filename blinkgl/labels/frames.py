@@ -69,12 +69,11 @@ class Flow:
 class LabelFrame:
     """Ground truth at t_ns. Every label that was asked for is an attribute of its name; those that were not are None.
 
-    colour : (H, W, 3) float32 linear radiance (label "images").     depth : (H, W) float32 Z
-    along the optical axis; inf: nothing hit.
-    ids : (H, W) uint32; 0: nothing hit.            normals : (H, W, 3) float32 unit,
-                                                    camera axes (OpenCV), facing the camera.
-    velocity : (H, W, 2) float32 px/s at t.         forward, backward : :class:`Flow`, with the
-                                                    occlusion mask where that was asked for.
+    colour : (H, W, 3) float32 linear radiance (label "images").
+    depth : (H, W) float32 Z along the optical axis; inf: nothing hit.   ids : (H, W) uint32; 0: nothing hit.
+    normals : (H, W, 3) float32 unit, camera axes (OpenCV), facing the camera.
+    velocity : (H, W, 2) float32 px/s at t.
+    forward, backward : :class:`Flow`, with the occlusion mask where that was asked for.
     values : all of them by the name of the label."""
 
     def __init__(self, t_ns: int, values: dict[str, Any]):

@@ -44,7 +44,7 @@ BUFFERS = {
     "RGBA32F": Buffer("vec4", 4, np.dtype(np.float32)),
     "R32UI": Buffer("uint", 1, np.dtype(np.uint32)),
 }
-VARYINGS = ("local", "normal")
+VARYINGS = ("local", "normal", "rate", "forward", "backward")
 _NUMBERS = {"f": "real", "u": "whole", "i": "whole", "b": "truth"}
 KINDS = ("scalar", "depth", "signed", "ids", "mask", "light", "unit", "motion")
 
@@ -89,8 +89,8 @@ class View:
 class Drawn(Protocol):
     """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
 
-    scene : as it is drawn.   raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.
-                              value(name) : what that label made of its.
+    scene : as it is drawn.
+    raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
     there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
 
     scene: Scene
@@ -110,15 +110,16 @@ class Label:
         name : key of ``labels:`` (unless it says other ``keys``), folder, attribute of a
         :class:`~blinkgl.labels.LabelFrame`.
         about : what it is and how it is written, for the page of keys.   default : written when nothing is said.
-        title, unit : for tables.   kind : how a picture shows it, one of KINDS.   off : what
-                                    ``explain`` says of it when it is not asked for.
+        title, unit : for tables.   kind : how a picture shows it, one of KINDS.
+        off : what ``explain`` says of it when it is not asked for.
 
     What is drawn
         buffer : a key of BUFFERS; None: no output of the label shader.
         glsl : source of ``TYPE label_NAME()``, TYPE being the buffer's, with uniforms of its own and, by name,
         ``local`` (object-local position) and ``facing()`` (the surface's normal, object axes, on the camera's side),
         where ``varyings`` names "local" or "normal", and ``#include``; None: it stands in
-        ``shaders/include/labels/NAME.glsl``.
+        ``shaders/include/labels/NAME.glsl``. "rate", "forward", "backward": how a shape that changes with time moves
+        (``DEFORM`` is defined then), as ``shaders/include/vertex.glsl`` says; "rate" is all that ``velocity()`` needs.
         needs : labels whose buffers are drawn with it.   there : labels whose buffers it reads at the other time.
         towards : "forward" or "backward": it leads from one label's time to the next or the
         one before; None: it is of one time.

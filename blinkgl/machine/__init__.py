@@ -2,6 +2,6 @@
 
 In:    nothing.
 Out:   what it can do, what is missing and the command that mends it, how long kernels have compiled.
-Start: doctor.py (``examine``); cpu.py, extras.py, compiling.py and bench.py answer one
-question each, for every other room.
+Start: doctor.py (``examine``); cpu.py, extras.py, compiling.py, bench.py and interrupts.py answer one question each,
+for every other room.
 """

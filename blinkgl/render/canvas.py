@@ -120,10 +120,11 @@ class Canvas:
 
     def __init__(self, pass_: Pass, painter: Painter, width: int, height: int):
         self.pass_, self.painter, self.number = pass_, painter, 0
+        self.outputs = pass_.outputs
         self.target = self.make_target(width, height)
         self.planes: dict[str, tuple[int, int | None]] = {}
         """Name of each picture -> attachment, and component where it is one of several."""
-        for i, output in enumerate(pass_.outputs):
+        for i, output in enumerate(self.outputs):
             self.planes |= (
                 {name: (i, k) for k, name in enumerate(output.planes)} if output.planes else {output.name: (i, None)}
             )
@@ -136,7 +137,7 @@ class Canvas:
         pass_ = self.pass_
         return self.painter.gl.framebuffer(
             *pass_.size(width, height),
-            colour=tuple(o.format for o in pass_.outputs),
+            colour=tuple(o.format for o in self.outputs),
             depth=pass_.depth,
             samples=pass_.samples.multi,
         )
@@ -165,13 +166,13 @@ class Canvas:
 
     def attachment(self, output: str) -> int:
         """Number of an output (default: the first). Raises GLError."""
-        return self._known([o.name for o in self.pass_.outputs], output)[0]
+        return self._known([o.name for o in self.outputs], output)[0]
 
     def read(self, name: str, out: np.ndarray | None) -> np.ndarray:
         i, component = self._place(name)
         self.painter.finish()
         started = working_clock()
-        if component is None and not self.pass_.outputs[i].components:
+        if component is None and not self.outputs[i].components:
             out = self.target.read(i, out=out)
         else:
             picture = self._given_out(i, self.target.read(i), component)
@@ -196,7 +197,7 @@ class Canvas:
         started = working_clock()
         planes = {name: component for name, (attachment, component) in self.planes.items() if attachment == i}
         for r in [None] if stale is None else stale:
-            if r is None and not self.pass_.outputs[i].components and len(planes) == 1:
+            if r is None and not self.outputs[i].components and len(planes) == 1:
                 (name,) = planes
                 pictures = {name: self.target.read(i, out=pictures.get(name))}
                 continue
@@ -215,7 +216,7 @@ class Canvas:
     def _given_out(self, i: int, array: np.ndarray, component: int | None) -> np.ndarray:
         if component is not None:
             return array[..., component]
-        return array[..., : self.pass_.outputs[i].components or None]
+        return array[..., : self.outputs[i].components or None]
 
     def _place(self, name: str) -> tuple[int, int | None]:
         return self.planes[self._known(list(self.planes), name)[1]]

@@ -15,8 +15,9 @@ def cam_from_obj(T_world_cam: np.ndarray, T_world_obj: np.ndarray) -> np.ndarray
     """(..., 4, 4) float64 T_cam_obj. The translations are subtracted before they are rotated, so that a scene
     far from the origin loses no more than the rounding of its own coordinates."""
     R_t = np.swapaxes(T_world_cam[..., :3, :3], -1, -2)
-    out = np.zeros(np.broadcast_shapes(T_world_cam.shape, T_world_obj.shape))
-    out[..., :3, :3] = R_t @ T_world_obj[..., :3, :3]
+    rotation = R_t @ T_world_obj[..., :3, :3]
+    out = np.zeros((*rotation.shape[:-2], 4, 4))
+    out[..., :3, :3] = rotation
     out[..., :3, 3] = (R_t @ (T_world_obj[..., :3, 3:] - T_world_cam[..., :3, 3:]))[..., 0]
     out[..., 3, 3] = 1.0
     return out
@@ -46,6 +47,11 @@ def rows_xyw_bytes(matrix: np.ndarray) -> bytes:
     return np.ascontiguousarray(matrix[[0, 1, 3]].T, dtype=np.float32).tobytes()
 
 
+def linear_xyw_bytes(matrix: np.ndarray) -> bytes:
+    """GLSL mat3 with the x, y, w rows of the linear part of a (4, 4) clip-space matrix: of differences of positions."""
+    return np.ascontiguousarray(matrix[[0, 1, 3], :3].T, dtype=np.float32).tobytes()
+
+
 DEPTH_ROOM = 2.0
 """A fragment may lie a fraction of a pixel outside of its triangle, and outside of the
 part's depths by the slope there."""
@@ -55,6 +61,8 @@ def inverse_depth_bits(centre_z: np.ndarray, radius: np.ndarray, near: float) ->
     """(n, 2) uint32 of bounding spheres, ``inverse_depths`` of guard.glsl: the smallest 1/Z that a fragment can have,
     as the bits of a float32, and the largest's less those. centre_z, radius : (n,) float64."""
     farthest, nearest = np.maximum(centre_z + radius, near), np.maximum(centre_z - radius, near)
-    bits = np.stack([1 / (DEPTH_ROOM * farthest), DEPTH_ROOM / nearest], axis=1).astype(np.float32).view(np.uint32)
+    inverse = np.empty((len(centre_z), 2), np.float32)
+    inverse[:, 0], inverse[:, 1] = 1 / (DEPTH_ROOM * farthest), DEPTH_ROOM / nearest
+    bits = inverse.view(np.uint32)
     bits[:, 1] -= bits[:, 0]
     return bits

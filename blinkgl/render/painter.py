@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import moderngl
 
 from blinkgl.machine.compiling import working_clock
+from blinkgl.render.matrices import linear_xyw_bytes
 
 if TYPE_CHECKING:
     from blinkgl.gl import GLContext, Target
     from blinkgl.render.frames import RenderStats
     from blinkgl.render.moment import Moment
-    from blinkgl.render.passes.base import Pass
+    from blinkgl.render.passes.base import Pass, Shot
     from blinkgl.render.resources import DrawItem, Kind, SceneResources
     from blinkgl.scene.types import Scene
 
+FREE_UNIT = 8
+"""Texture unit from which on a shape may put its own: a pass has a material's and those of its inputs."""
 Uniforms = dict[str, Any]
 """name -> moderngl.Uniform of one program; "" is the program itself."""
 
@@ -48,9 +52,7 @@ class Painter:
         """Draw into ``target`` from now on, which is cleared: the first attachment to
         ``background``, 0 where it ends, the others to 0."""
         self.prepare(target)
-        target.clear(
-            *([*background, 0.0, 0.0, 0.0, 0.0][: pixel.components] for pixel in target.formats[:1]), depth=0.0
-        )
+        target.clear(*((*background, 0.0, 0.0, 0.0, 0.0)[: pixel.components] for pixel in target.formats[:1]))
         self.stats.frames += 1
 
     def prepare(self, target: Target) -> None:
@@ -65,9 +67,10 @@ class Painter:
         self._culling = False
 
     def programs(self, pass_: Pass) -> Programs:
-        if pass_ not in self._programs:
-            self._programs[pass_] = Programs(self, pass_)
-        return self._programs[pass_]
+        programs = self._programs.get(pass_)
+        if programs is None:
+            programs = self._programs[pass_] = Programs(self, pass_)
+        return programs
 
     def uniforms(self, program: moderngl.Program) -> Uniforms:
         """The table that a pass sets values in."""
@@ -85,6 +88,22 @@ class Painter:
             R = moment.T_world_obj[index, :3, :3]
             uniforms["sun_direction"].value = tuple(light.sun_direction @ R)
             uniforms["up_direction"].value = tuple(R[2])
+
+    def deform(self, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        """Sets what the vertex stage of a shape that changes with time takes besides; to be called after
+        :meth:`place`."""
+        moment, index, deformer = shot.moment, item.object_index, item.deformer
+        assert deformer is not None
+        shape, t_ns = self.resources.shape(deformer), moment.t_ns
+        shape.put("now", t_ns, partial(deformer.numbers, t_ns))
+        if "clip_rate" in uniforms:
+            shape.put("rate", t_ns, partial(deformer.rates, t_ns))
+            uniforms["clip_rate"].write(linear_xyw_bytes(moment.mvp[index]))
+        for towards, there in shot.ends.items():
+            if f"clip_{towards}" in uniforms:
+                shape.put(towards, (t_ns, there.t_ns), partial(deformer.changes, t_ns, there.t_ns))
+                uniforms[f"clip_{towards}"].write(linear_xyw_bytes(there.mvp[index]))
+        shape.use(uniforms[""], FREE_UNIT)
 
     def draw(self, uniforms: Uniforms, item: DrawItem) -> None:
         cull = not item.two_sided

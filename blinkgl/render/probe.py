@@ -6,7 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from blinkgl.render.reference import Flow, Hits, cast, flow_to, relative_pose_at, scene_parts, surface, velocity
+from blinkgl.render.reference import (
+    Flow,
+    Hits,
+    cast,
+    flow_to,
+    local_at,
+    relative_pose_at,
+    scene_parts,
+    surface,
+    velocity,
+    vertices_at,
+)
 from blinkgl.scene.types import Scene
 
 
@@ -62,7 +73,7 @@ def probe(scene: Scene, t_ns: int, x: float, y: float, to_ns: int | None = None)
 
     def world(at):
         pose = thing.path.pose(at)
-        return pose[:3, :3] @ hits.local[0] + pose[:3, 3]
+        return pose[:3, :3] @ local_at(scene, hits, at)[0] + pose[:3, 3]
 
     later = {}
     if to_ns is not None:
@@ -74,7 +85,7 @@ def probe(scene: Scene, t_ns: int, x: float, y: float, to_ns: int | None = None)
             "valid": valid,
             "occluded": bool(flow.occluded[0]),
             "world_to": world(to_ns),
-            "camera_to": pose[:3, :3] @ hits.local[0] + pose[:3, 3],
+            "camera_to": pose[:3, :3] @ local_at(scene, hits, to_ns)[0] + pose[:3, 3],
             "xy_to": hits.xy[0] + flow.flow[0] if valid else None,
             "why": _why(scene, hits, flow),
         }
@@ -91,7 +102,7 @@ def probe(scene: Scene, t_ns: int, x: float, y: float, to_ns: int | None = None)
         triangle=triangle,
         front=bool(hits.front[0]),
         bary=hits.bary[0],
-        corners=np.asarray(part.mesh.vertices, np.float64)[part.mesh.faces[triangle]],
+        corners=vertices_at(part.mesh, t_ns)[part.mesh.faces[triangle]],
         local=hits.local[0],
         world=world(t_ns),
         camera=now[:3, :3] @ hits.local[0] + now[:3, 3],

@@ -3,7 +3,8 @@
 It shares nothing with the rasteriser but :mod:`blinkgl.scene.types` and the camera models: no GLSL, no clip space, no
 projection matrix. It sees through any camera model whose rays point forward (Z > 0).
 Tests and the shader debugger compare the GPU with it. One ray goes through each pixel centre (or any other image
-point); it hits the nearest triangle, and everything else follows from the object-local point of the hit.
+point); it hits the nearest triangle, and everything else follows from the object-local point of the hit. A mesh that
+deforms is a mesh of its own at each time: its vertices are moved in float64, and rays are cast at them there.
 
 Flow and its rounding
 ---------------------
@@ -13,7 +14,8 @@ With ``M(t) = inv(T_world_cam(t)) @ T_world_obj(t)``, the point p is at ``M p`` 
     flow_x = fx (dX - rx dZ) / Z1,    (dX, dY, dZ) = (M1 - M0) p,    Z1 = Z0 + dZ,
 
 without subtracting two projections (:meth:`blinkgl.camera.CameraModel.displacement`). ``M1 - M0`` is formed from the
-differences of the poses, so a pose that does not change contributes exactly nothing. What is left is about 1e-15 of the
+differences of the poses, so a pose that does not change contributes exactly nothing. The point q of a
+shape that changes moves by ``M1 (q1 - q0) + (M1 - M0) q0``. What is left is about 1e-15 of the
 flow, plus the resolution of the poses themselves: a translation of size 1e6 units is stored
 to 1e-10 units, i.e. fx * 1e-10 / Z px.
 
@@ -24,7 +26,7 @@ way to anti-alias, not a property of the scene.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,14 +34,18 @@ from scipy import ndimage
 
 from blinkgl.camera import CameraModel
 from blinkgl.render.raycast import Forest, build_tree, join_trees, nearest_exhaustive, nearest_tree
-from blinkgl.scene.types import Material, Part, Scene, SceneObject, Texture
+from blinkgl.scene.shapes.deformer import normals_at
+from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject, Texture
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
 # A visibility ray ends this much (relative) before the point it aims at, so that the point does not hide itself:
 # far above the rounding of a hit (1e-15), far below any separation of two surfaces that a picture could show.
 VISIBILITY_SLACK = 1e-9
 
+KEPT = 4
+"""Times whose shapes are kept, of a scene that deforms."""
 _trees: WeakKeyDictionary = WeakKeyDictionary()
+_shapes: WeakKeyDictionary = WeakKeyDictionary()
 _forests: WeakKeyDictionary = WeakKeyDictionary()
 
 
@@ -55,7 +61,7 @@ class Hits:
     instance : (N,) int32 ``instance_id``, 0 where nothing is hit.
     part : (N,) int32 index into :func:`scene_parts`, -1 where nothing is hit.   triangle : (N,) int32 index into
     ``mesh.faces``.   front : (N,) bool seen from the front.   bary : (N, 3) weights of the triangle's corners.
-    local : (N, 3) object-local position (float64, nan where nothing is hit).
+    local : (N, 3) object-local position at ``t_ns`` (float64, nan where nothing is hit).
     """
 
     xy: np.ndarray
@@ -155,7 +161,7 @@ def cast(scene: Scene, t_ns: int, xy: np.ndarray | None = None, *, exhaustive: b
     local = np.full((len(xy), 3), np.nan)
     for p, rows in _by_part(hit[:, 0]):
         mesh = parts[p][1].mesh
-        corners = np.asarray(mesh.vertices, np.float64)[mesh.faces[hit[rows, 1]]]
+        corners = vertices_at(mesh, t_ns)[mesh.faces[hit[rows, 1]]]
         local[rows] = np.einsum("nc,nck->nk", bary[rows], corners)
     return Hits(xy, int(t_ns), found, depth, ids[hit[:, 0]], hit[:, 0], hit[:, 1], hit[:, 2] == 1, bary, local)
 
@@ -166,20 +172,41 @@ def _rays(camera: CameraModel, xy: np.ndarray) -> np.ndarray:
     return rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
 
 
-def _forest(scene: Scene) -> Forest:
-    if scene not in _forests:
+def vertices_at(mesh: Mesh, t_ns: int) -> np.ndarray:
+    """(V, 3) float64 object-local positions at a time; those of the last few are kept. Not to be written to."""
+    if mesh.deformer is None:
+        return np.asarray(mesh.vertices, np.float64)
+    kept = _shapes.setdefault(mesh, {})
+    if t_ns not in kept:
+        kept[t_ns] = mesh.deformer.positions(mesh, t_ns)
+        while len(kept) > KEPT:
+            kept.pop(next(iter(kept)))
+    return kept[t_ns]
+
+
+def _forest(scene: Scene, t_ns: int) -> Forest:
+    kept = _forests.setdefault(scene, {})
+    key = t_ns if any(thing.deforms for thing in scene.objects) else None
+    if key not in kept:
         parts = scene_parts(scene)
+        trees = []
         for _, part in parts:
+            if part.mesh.deformer is not None:
+                trees.append(build_tree(vertices_at(part.mesh, t_ns), part.mesh.faces))
+                continue
             if part.mesh not in _trees:
                 _trees[part.mesh] = build_tree(part.mesh.vertices, part.mesh.faces)
+            trees.append(_trees[part.mesh])
         cull = [part.mesh.closed and not part.material.double_sided for _, part in parts]
-        _forests[scene] = join_trees([_trees[part.mesh] for _, part in parts], cull)
-    return _forests[scene]
+        kept[key] = join_trees(trees, cull)
+        while len(kept) > KEPT:
+            kept.pop(next(iter(kept)))
+    return kept[key]
 
 
 def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
     """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`."""
-    forest = _forest(scene)
+    forest = _forest(scene, int(t_ns))
     camera_pose = scene.camera_path.pose(t_ns)
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
     relative = [_relative_pose(camera_pose, thing.path.pose(t_ns)) for thing, _ in scene_parts(scene)]
@@ -262,10 +289,35 @@ def _apply(scene: Scene, hits: Hits, matrix_of) -> np.ndarray:
     return out
 
 
+def _add_of_shapes(scene: Scene, hits: Hits, out: np.ndarray, t_ns: int, vectors_of) -> None:
+    """Adds to ``out`` (N, 3) what the shape itself does, on parts that deform: vectors_of(mesh) (V, 3) at the hit
+    point, from the object's axes to the camera's at t_ns."""
+    for p, rows in _by_part(hits.part):
+        thing, part = scene_parts(scene)[p]
+        if part.mesh.deformer is not None:
+            corners = vectors_of(part.mesh)[part.mesh.faces[hits.triangle[rows]]]
+            moved = np.einsum("nc,nck->nk", hits.bary[rows], corners)
+            out[rows] += moved @ relative_pose_at(scene, thing, t_ns)[:3, :3].T
+
+
+def local_at(scene: Scene, hits: Hits, t_ns: int) -> np.ndarray:
+    """(N, 3) object-local positions of the hit points at another time."""
+    out = hits.local
+    for p, rows in _by_part(hits.part):
+        mesh = scene_parts(scene)[p][1].mesh
+        if mesh.deformer is not None:
+            out = out.copy() if out is hits.local else out
+            out[rows] = np.einsum(
+                "nc,nck->nk", hits.bary[rows], vertices_at(mesh, t_ns)[mesh.faces[hits.triangle[rows]]]
+            )
+    return out
+
+
 def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     """Displacement of every hit point from ``hits.t_ns`` to t_ns, and whether it is seen there."""
     camera = scene.camera
     change = _apply(scene, hits, lambda thing: _relative_change(scene, thing, hits.t_ns, t_ns))
+    _add_of_shapes(scene, hits, change, t_ns, lambda mesh: vertices_at(mesh, t_ns) - vertices_at(mesh, hits.t_ns))
     depth = hits.depth + change[:, 2]
     valid = hits.hit & (depth > 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -279,7 +331,8 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     hidden_by = np.full((len(hits.hit), 2), -1, np.int32)
     rows = np.flatnonzero(candidate)
     # the ray aims at the moved point itself: through there = xy + flow it would carry that sum's rounding
-    moved = _apply(scene, hits, lambda thing: relative_pose_at(scene, thing, t_ns))[rows]
+    there_hits = replace(hits, local=local_at(scene, hits, t_ns))
+    moved = _apply(scene, there_hits, lambda thing: relative_pose_at(scene, thing, t_ns))[rows]
     skip = np.ascontiguousarray(np.stack([hits.part[rows], hits.triangle[rows]], axis=1))
     far = moved[:, 2] * (1.0 - VISIBILITY_SLACK)
     blocker, _, _ = _nearest(scene, t_ns, moved[:, :2] / moved[:, 2:], far=far, skip=skip)
@@ -291,6 +344,7 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
     rate = _apply(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))
+    _add_of_shapes(scene, hits, rate, hits.t_ns, lambda mesh: mesh.deformer.velocity(mesh, hits.t_ns))
     with np.errstate(invalid="ignore"):
         points = _rays(scene.camera, hits.xy) * hits.depth[:, None]
         return np.einsum("nij,nj->ni", scene.camera.jacobian(points), rate)
@@ -309,7 +363,7 @@ def _faces_camera(scene: Scene, hits: Hits, t_ns: int, rows: np.ndarray) -> np.n
         if len(on) and part.mesh.closed and not part.material.double_sided:
             m = relative_pose_at(scene, thing, t_ns)
             eye = -m[:3, :3].T @ m[:3, 3]
-            a, b, c = np.moveaxis(np.asarray(part.mesh.vertices, np.float64)[part.mesh.faces[hits.triangle[on]]], 1, 0)
+            a, b, c = np.moveaxis(vertices_at(part.mesh, t_ns)[part.mesh.faces[hits.triangle[on]]], 1, 0)
             shown[on] = (np.cross(b - a, c - a) * (eye - a)).sum(axis=1) > 0.0
     return shown
 
@@ -327,7 +381,7 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         thing, part = parts[p]
         corners = part.mesh.faces[hits.triangle[rows]]
         bary = hits.bary[rows]
-        blend = np.einsum("nc,nck->nk", bary, part.mesh.normals[corners].astype(np.float64))
+        blend = np.einsum("nc,nck->nk", bary, normals_at(part.mesh, hits.t_ns)[corners].astype(np.float64))
         length = np.maximum(np.linalg.norm(blend, axis=1, keepdims=True), 1e-15)  # a zero normal stays zero
         sign = np.where(hits.front[rows], 1.0, -1.0)[:, None]
         normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T

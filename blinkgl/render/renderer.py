@@ -66,7 +66,7 @@ class Renderer:
         self._canvases: dict[Pass, Canvas] = {}
         self._labels = Labels(self)
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
-        some_stand = any(o.path.is_static for o in scene.objects)
+        some_stand = any(o.is_static for o in scene.objects)
         self.whole = whole or not (scene.camera_path.is_static and some_stand)
 
     def __enter__(self) -> Renderer:
@@ -127,14 +127,15 @@ class Renderer:
         return frame
 
     def _drawn(self, pass_: Pass, moment: Moment, ends: Mapping[str, Moment], done: dict[Pass, Frame]) -> Frame:
-        if pass_ not in done:
+        frame = done.get(pass_)
+        if frame is None:
             inputs = {one.sampler: self._drawn(one.of, moment, ends, done) for one in pass_.inputs}
             canvas = self._canvases.get(pass_)
             if canvas is None:
                 kind = StillCanvas if pass_.still and not self.whole else Canvas
                 canvas = self._canvases[pass_] = kind(pass_, self._painter, self.width, self.height)
-            done[pass_] = canvas.draw(Shot(pass_.seen(moment), canvas.target, self.scene, ends, inputs))
-        return done[pass_]
+            frame = done[pass_] = canvas.draw(Shot(pass_.seen(moment), canvas.target, self.scene, ends, inputs))
+        return frame
 
     # ---- frames --------------------------------------------------------------------------------------------------
 

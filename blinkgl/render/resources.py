@@ -4,6 +4,8 @@ content, and released together."""
 from __future__ import annotations
 
 import ctypes
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,23 +14,53 @@ import numpy as np
 
 from blinkgl.errors import AssetError
 from blinkgl.gl import GLContext
+from blinkgl.gl.shader import MADE
 from blinkgl.render.colour import LUMA, linear_image, luminance_image
+from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.table import define_of, includes
 from blinkgl.scene.types import Material, Mesh, Scene
+
+MADE.append(includes)
 
 _TEXTURE_2D, _TEXTURE_LOD_BIAS = 0x0DE1, 0x8501
 _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f", 8))
 
 
 class Kind(NamedTuple):
-    """What of a material makes another program."""
+    """What of a material, and of a shape that changes with time, makes another program. shape : macros of the
+    latter."""
 
     textured: bool
     lit: bool
     two_sided: bool
+    shape: tuple[tuple[str, int], ...] = ()
 
     @property
     def defines(self) -> dict[str, int]:
-        return {name: 1 for name, on in zip(("TEXTURED", "LIT", "TWO_SIDED"), self) if on}
+        return {name: 1 for name, on in zip(("TEXTURED", "LIT", "TWO_SIDED"), self) if on} | dict(self.shape)
+
+
+def shape_of(deformer: Deformer | None) -> tuple[tuple[str, int], ...]:
+    """The macros of a deformer's variants."""
+    if deformer is None:
+        return ()
+    return (
+        ("DEFORM", 1),
+        (define_of(deformer.glsl), 1),
+        ("SHAPE_ROWS", padded_rows(deformer)),
+        *sorted(deformer.sizes.items()),
+    )
+
+
+def padded_rows(deformer: Deformer) -> int:
+    """Rows of numbers that its programs have room for: the next power of two, so that one program serves many
+    skeletons."""
+    return 1 << max(deformer.rows - 1, 3).bit_length()
+
+
+def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(8, 3) of the box between two of its corners, (3,) each."""
+    return np.array(list(itertools.product(*zip(low, high))))
 
 
 @dataclass(eq=False)
@@ -37,7 +69,8 @@ class DrawItem:
 
     object_index : row of a moment's matrices.   part : number of the part among those of the scene, object by object.
     number : of this item among all, in the order of the layers.   moves : whether the object does.
-    centre, radius; low, high : bounding sphere and box, object frame.
+    centre, radius; low, high : bounding sphere and box, object frame; of a shape that changes those of all that it
+    sweeps.   corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.
     """
@@ -56,13 +89,11 @@ class DrawItem:
     part: int = -1
     number: int = -1
 
-    @property
-    def textured(self) -> bool:
-        return self.material.texture is not None
-
-    @property
-    def kind(self) -> Kind:
-        return Kind(self.textured, self.lit, self.two_sided)
+    def __post_init__(self) -> None:
+        self.textured = self.material.texture is not None
+        self.deformer = self.mesh.deformer
+        self.kind = Kind(self.textured, self.lit, self.two_sided, shape_of(self.deformer))
+        self.corners = box_corners(self.low, self.high)
 
 
 MAX_RADIUS = 1e18
@@ -71,6 +102,65 @@ MAX_RADIANCE = 1e18
 """Of a texel: times the largest colour and the largest light of a configuration, 1e9 each,
 it is still finite in float32."""
 _LAYER = {"object": 0, "ground": 1, "wall": 1, "sky": 2}
+
+
+class Shape:
+    """GL side of one deformer: its numbers at one time and those that lead to others, as the block ``Shape`` of
+    deform.glsl."""
+
+    SETS = ("now", "rate", "forward", "backward")
+    BINDING = 0
+
+    def __init__(self, ctx: moderngl.Context, deformer: Deformer):
+        self.ctx, self.deformer, self._rows = ctx, deformer, padded_rows(deformer)
+        size = 16 * self._rows * len(self.SETS)
+        limit = ctx.info["GL_MAX_UNIFORM_BLOCK_SIZE"]
+        if size > limit:
+            raise AssetError(
+                "a shape needs more numbers than this OpenGL takes",
+                where=type(deformer).__name__,
+                value=deformer.rows,
+                accepted=f"at most {limit // 16 // len(self.SETS)} rows of four",
+            )
+        self._buffer = ctx.buffer(reserve=size)
+        self._held: dict[str, object] = {}
+        self._streams = {
+            name: (ctx.buffer(np.ascontiguousarray(values, np.float32).tobytes()), np.atleast_2d(values.T).shape[0])
+            for name, values in deformer.attributes.items()
+        }
+        self._textures = {name: self._texture(image) for name, image in deformer.textures.items()}
+
+    def _texture(self, image: np.ndarray) -> moderngl.Texture:
+        height, width, _ = image.shape
+        texture = self.ctx.texture((width, height), 4, np.ascontiguousarray(image, np.float32).tobytes(), dtype="f4")
+        texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        return texture
+
+    def streams(self, program: moderngl.Program) -> list[tuple]:
+        """Vertex streams of those attributes that the program has."""
+        return [(buffer, f"{n}f", name) for name, (buffer, n) in self._streams.items() if name in program]
+
+    def put(self, name: str, key: object, rows: Callable[[], np.ndarray]) -> None:
+        """Numbers of one of SETS, unless those of the same ``key`` are there."""
+        if self._held.get(name) != key:
+            data = np.zeros((self._rows, 4), np.float32)
+            given = rows()
+            data[: len(given)] = given
+            self._buffer.write(data.tobytes(), offset=self.SETS.index(name) * data.nbytes)
+            self._held[name] = key
+
+    def use(self, program: moderngl.Program, unit: int) -> None:
+        """Of the program that is drawn with next. unit : first texture unit that is free."""
+        program["Shape"].binding = self.BINDING
+        self._buffer.bind_to_uniform_block(self.BINDING)
+        for offset, (name, texture) in enumerate(self._textures.items()):
+            if name in program:
+                program[name].value = unit + offset
+                texture.use(unit + offset)
+
+    def release(self) -> None:
+        for owned in (self._buffer, *(buffer for buffer, _ in self._streams.values()), *self._textures.values()):
+            owned.release()
 
 
 class SceneResources:
@@ -82,8 +172,9 @@ class SceneResources:
         self._buffers: dict[tuple, tuple[moderngl.Buffer, moderngl.Buffer]] = {}
         self._textures: dict[tuple, moderngl.Texture] = {}
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
+        self._shapes: dict[int, Shape] = {}
         self.items = [
-            _draw_item(index, part.mesh, part.material, obj.category, not obj.path.is_static)
+            _draw_item(index, part.mesh, part.material, obj.category, not obj.is_static, scene.t0_ns, scene.t1_ns)
             for index, obj in enumerate(scene.objects)
             for part in obj.parts
         ]
@@ -108,8 +199,17 @@ class SceneResources:
                 formats.append(fmt if used else f"{size}x")
                 if used:
                     names.append(name)
-            self._vaos[key] = self.ctx.vertex_array(program, [(vertices, " ".join(formats), *names)], indices, 4)
+            streams = [(vertices, " ".join(formats), *names)]
+            if item.deformer is not None:
+                streams += self.shape(item.deformer).streams(program)
+            self._vaos[key] = self.ctx.vertex_array(program, streams, indices, 4)
         return self._vaos[key]
+
+    def shape(self, deformer: Deformer) -> Shape:
+        """What a deformer occupies in OpenGL."""
+        if id(deformer) not in self._shapes:
+            self._shapes[id(deformer)] = Shape(self.ctx, deformer)
+        return self._shapes[id(deformer)]
 
     def luminance_texture(self, material: Material) -> moderngl.Texture:
         """R32F: luminance of texture * base_color (mip-mapped in linear light)."""
@@ -125,11 +225,12 @@ class SceneResources:
         if key not in self._textures:
             image = material.texture.image
             srgb8 = image.dtype == np.uint8
+            # 0x8C41: GL_SRGB8.
             self._textures[key] = self._upload(
                 image if srgb8 else linear_image(image),
                 material.texture.name,
                 internal_format=0x8C41 if srgb8 else None,
-            )  # GL_SRGB8
+            )
         return self._textures[key]
 
     def albedo_luminance(self, material: Material) -> float:
@@ -147,9 +248,9 @@ class SceneResources:
         for pair in self._buffers.values():
             for buffer in pair:
                 buffer.release()
-        for texture in self._textures.values():
-            texture.release()
-        self._buffers, self._textures = {}, {}
+        for owned in (*self._textures.values(), *self._shapes.values()):
+            owned.release()
+        self._buffers, self._textures, self._shapes = {}, {}, {}
 
     def _mesh_buffers(self, mesh: Mesh, uv_scale: tuple[float, float]) -> tuple[moderngl.Buffer, moderngl.Buffer]:
         key = (id(mesh), uv_scale)
@@ -214,10 +315,16 @@ def _near_zero(uvs: np.ndarray) -> np.ndarray:
     return uvs - np.rint((low + high) / 2) if max(-low.min(), high.max()) > 64 else uvs
 
 
-def _draw_item(index: int, mesh: Mesh, material: Material, category: str, moves: bool) -> DrawItem:
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    centre = (low + high) / 2
-    radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
+def _draw_item(
+    index: int, mesh: Mesh, material: Material, category: str, moves: bool, t0_ns: int, t1_ns: int
+) -> DrawItem:
+    if mesh.deformer is None:
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        centre = (low + high) / 2
+        radius = float(np.sqrt(((mesh.vertices - centre) ** 2).sum(axis=1).max()))
+    else:
+        low, high = mesh.deformer.bounds(mesh, t0_ns, t1_ns)
+        centre, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     if not radius <= MAX_RADIUS:  # NaN too
         raise AssetError(
             "mesh is too large to be drawn in float32",
@@ -227,5 +334,15 @@ def _draw_item(index: int, mesh: Mesh, material: Material, category: str, moves:
         )
     two_sided = material.double_sided or not mesh.closed
     return DrawItem(
-        index, mesh, material, centre, radius, low, high, _LAYER[category], two_sided, not material.unlit, moves
+        index,
+        mesh,
+        material,
+        centre,
+        radius,
+        low,
+        high,
+        _LAYER[category],
+        two_sided,
+        not material.unlit,
+        moves,
     )

@@ -28,10 +28,7 @@ _COLOUR_AND_DEPTH, _NEAREST = 0x4000 | 0x0100, 0x2600
 
 def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
     """Pixels that the item can touch, by its bounding box; None when it is out of the image."""
-    low, high = item.low, item.high
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    points = corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3]
-    bounds = camera.bounds(points)
+    bounds = camera.bounds(item.corners @ T_cam_obj[:3, :3].T + T_cam_obj[:3, 3])
     return None if bounds is None else Rectangle(*bounds)
 
 

@@ -20,6 +20,7 @@ from blinkgl.config.scene import LightConfig
 
 if TYPE_CHECKING:
     from blinkgl.scene.rig import Rig, Sensor
+    from blinkgl.scene.shapes.deformer import Deformer
 
 
 @runtime_checkable
@@ -48,13 +49,14 @@ class PosePath(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles in object-local coordinates.
+    """Triangles in object-local coordinates, of a mesh that deforms at rest.
 
     vertices : (V, 3) float64.   faces : (F, 3) int32, counter-clockwise seen from outside.
     normals  : (V, 3) float32, unit.
     uvs      : (V, 2) float32; (0, 0) is the top-left corner of the texture image, v grows downwards; repeats.
     closed   : watertight with consistent outward winding, so back faces can be culled.
     name, source_hash : where it came from; ``source_hash`` is a stable hash of the content (train/test splits).
+    deformer : how its shape changes with time, in object-local coordinates; None: it does not.
     """
 
     vertices: np.ndarray
@@ -64,6 +66,7 @@ class Mesh:
     closed: bool = False
     name: str = ""
     source_hash: str = ""
+    deformer: Deformer | None = None
 
     @property
     def radius(self) -> float:
@@ -107,13 +110,24 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """A rigid body. ``instance_id`` >= 1 is what the id pass writes (0 is 'nothing hit')."""
+    """A body on its path, rigid but for parts that deform. ``instance_id`` >= 1 is what the id pass writes (0 is
+    'nothing hit')."""
 
     name: str
     instance_id: int
     parts: tuple[Part, ...]
     path: PosePath
     category: Literal["object", "ground", "wall", "sky"] = "object"
+
+    @property
+    def deforms(self) -> bool:
+        """Whether the shape of any of its parts changes with time."""
+        return any(part.mesh.deformer is not None and not part.mesh.deformer.is_static for part in self.parts)
+
+    @property
+    def is_static(self) -> bool:
+        """True when it looks the same at all times."""
+        return self.path.is_static and not self.deforms
 
     @property
     def radius(self) -> float:
@@ -134,6 +148,23 @@ class Light:
     sky: float = LightConfig().sky
 
 
+@dataclass(frozen=True)
+class Dynamics:
+    """How the paths of a scene's falling bodies came about.
+
+    engine, version : what computed them.   bodies : how many.   steps : of the engine.
+    impacts_ns : times at which a velocity changes abruptly, increasing: frames at these times keep what turns there.
+    digest : SHA-256 of all their paths, in hex.
+    """
+
+    engine: str
+    version: str
+    bodies: int
+    steps: int
+    impacts_ns: tuple[int, ...]
+    digest: str
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Everything that is rendered over [t0_ns, t1_ns].
@@ -143,6 +174,7 @@ class Scene:
     log        : one line per decision worth keeping (collisions cut, objects dropped), for the manifest.
     omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and
     the manifest.
+    dynamics   : of the objects that an engine moves; None: there are none.
     """
 
     objects: tuple[SceneObject, ...]
@@ -153,6 +185,7 @@ class Scene:
     background: float = 0.0
     log: tuple[str, ...] = field(default=())
     omissions: tuple[str, ...] = field(default=())
+    dynamics: Dynamics | None = None
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:

@@ -30,8 +30,8 @@ class GroundTruth:
     frame : what ``labels:`` asks for, as :class:`LabelFrame` says; images as they were drawn, float32 linear light, or
     as they were recorded, sRGB codes. At the last time of a sequence, from where nothing leads on, images alone.
     forward_ns, backward_ns : where it leads, ns; None: nowhere.
-    T_world_cam : (4, 4) float64, OpenCV axes.   T_world_obj : (n, 4, 4) float64, n objects; both
-                                                 None where nobody knows (recorded frames)."""
+    T_world_cam : (4, 4) float64, OpenCV axes.   T_world_obj : (n, 4, 4) float64, n objects.
+    Both are None where nobody knows (recorded frames)."""
 
     k: int
     t_ns: int

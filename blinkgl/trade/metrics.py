@@ -20,11 +20,13 @@ BINS = 15
 class EventErrors:
     """Errors of a stream against the reference. Times are absolute differences of matched events.
 
-    time_*_us : µs.   shift_*_px : the same times the image speed at the event's pixel and
-                      time: how far the edge is from where it
-    should have been. missed, extra : events without a partner, relative to the reference's count. count : events
-    relative to the reference's count, minus 1. voxel : ||V - V_ref|| / ||V_ref|| of signed 15-bin voxel grids. NaN
-    where there is nothing to judge by."""
+    time_*_us : µs.
+    shift_*_px : the same times the image speed at the event's pixel and time: how far the edge is from where it should
+    have been.
+    missed, extra : events without a partner, relative to the reference's count.
+    count : events relative to the reference's count, minus 1.
+    voxel : ||V - V_ref|| / ||V_ref|| of signed 15-bin voxel grids.
+    NaN where there is nothing to judge by."""
 
     events: int
     reference_events: int

@@ -40,9 +40,8 @@ def pareto(result: dict) -> bytes:
     axes[0].set_ylabel("error of the events: difference of the voxel grids a network sees, relative")
     _legend(axes[0], rows)
     canvas.draw()
-    for _ in range(
-        8
-    ):  # until the names, whose length on the axis is not known beforehand, have room left of their points
+    # Until the names, whose length on the axis is not known beforehand, have room left of their points.
+    for _ in range(8):
         names = _label(axes[0], [r for r in rows if r["on_front"]], cost, canvas.get_renderer())
         if all(name.get_window_extent(canvas.get_renderer()).x0 > axes[0].bbox.x0 + 5 for name in names):
             break

@@ -77,9 +77,8 @@ class MvsecSource:
         self.dt, self._index, self._sequences = dt, [], []
         for path in files:
             self._sequences.append(s := _MvsecSequence(path))
-            i0, i1 = np.searchsorted(
-                s.image_us, (s.flow_us[0], s.flow_us[-1])
-            )  # flow must cover [image i, image i + dt]
+            # Flow must cover [image i, image i + dt].
+            i0, i1 = np.searchsorted(s.image_us, (s.flow_us[0], s.flow_us[-1]))
             self._index += [(s, i) for i in range(max(int(i0), dt), min(int(i1), len(s.image_us)) - dt)]
 
     def __len__(self) -> int:

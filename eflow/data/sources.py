@@ -25,9 +25,9 @@ import numpy as np
 from blinkgl.config.reader import read_table
 from blinkgl.errors import AssetError, ConfigError, EventDataError
 from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.flow import read_flow_npy
 from blinkgl.io.flow_png import read_flow_png
 from blinkgl.io.hdf5 import dataset, hdf5_errors, open_hdf5
-from blinkgl.io.images import read_npy
 from blinkgl.io.index import INDEX, read_index
 from blinkgl.labels import LABELS
 from eflow.data.window import RawSample, Window
@@ -174,16 +174,7 @@ def read_flow(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises AssetError: missing, corrupt, wrong shape, or NaN / infinity in a valid pixel."""
     if path.suffix != ".npy":
         return read_flow_png(path)
-    data = read_npy(path)
-    if data.ndim != 3 or data.shape[2] not in (2, 3) or data.dtype.kind != "f":
-        raise AssetError(
-            "not a flow field",
-            where=str(path),
-            value=f"{data.dtype} {data.shape}",
-            accepted="float (H, W, 2) or (H, W, 3)",
-        )
-    flow = data[..., :2].astype(np.float32)
-    valid = data[..., 2] > 0 if data.shape[2] == 3 else np.ones(data.shape[:2], bool)
+    flow, valid = read_flow_npy(path)
     bad = valid & ~np.isfinite(flow).all(-1)
     if bad.any():
         y, x = np.argwhere(bad)[0]
@@ -210,9 +201,8 @@ def find_blinkgl(root: Path) -> list[Sequence]:
         there, back = LABELS["flow_forward"], LABELS["flow_backward"]
         stamps = folder / there.stamps
         forward, backward = (sorted((folder / label.forms[0].folder).glob("*.png")) for label in (there, back))
-        if (
-            not forward and not stamps.exists()
-        ):  # made without flow: there is nothing to learn from it, and nothing wrong with it
+        # Made without flow: there is nothing to learn from it, and nothing wrong with it.
+        if not forward and not stamps.exists():
             continue
         times = read_times(stamps)
         _same_count(folder / there.forms[0].folder, forward, times)

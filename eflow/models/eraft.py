@@ -147,9 +147,8 @@ class Eraft(FlowModel):
         self.update = Update()
         self.plain = False
         initialise(self)
-        nn.init.normal_(
-            self.update.flow_head[-1].weight, std=1e-3
-        )  # the first Δflows are near zero, whatever the depth
+        # The first Δflows are near zero, whatever the depth.
+        nn.init.normal_(self.update.flow_head[-1].weight, std=1e-3)
 
     def forward(self, batch: dict) -> FlowPrediction:
         """Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution px."""

@@ -68,9 +68,8 @@ class SpikeFlowNet(FlowModel):
                 currents[layer] = currents[layer] + current
                 membrane = membranes[layer] + current
                 x = _Fire.apply(membrane, self.config.threshold)
-                membranes[layer] = (
-                    membrane - self.config.threshold * x.detach()
-                )  # soft reset: what exceeds the threshold stays
+                # Soft reset: what exceeds the threshold stays.
+                membranes[layer] = membrane - self.config.threshold * x.detach()
         x, flows = self.residuals(F.leaky_relu(currents[3], 0.1)), []
         for scale, head in enumerate(self.heads):
             flows.append(head(x).float())

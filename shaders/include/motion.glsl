@@ -12,23 +12,34 @@ vec2 ndc_of_fragment(vec2 image_size)
     return gl_FragCoord.xy / image_size * 2.0 - 1.0;
 }
 
-// difference: rows x, y, w of D.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera, or so near to
-// its plane that the flow is beyond float32; u = v = 0 then.
-vec3 displacement(mat4x3 difference, vec3 local, vec2 image_size)
+// Of a shape that changes, q is in the place of p, and its own change comes on top: d = D * q + MVP' * (q' - q), the
+// second term from the vertex stage.
+//
+// d: rows x, y, w.  Returns (u, v in px, w' in world units).  w' <= 0: behind the camera, or so near to its plane that the
+// flow is beyond float32; u = v = 0 then.
+vec3 displacement(vec3 d, vec2 image_size)
 {
-    vec3 d = difference * vec4(local, 1.0); // d.z is the w row
     float w_next = 1.0 / gl_FragCoord.w + d.z;
     vec2 flow = (d.xy - ndc_of_fragment(image_size) * d.z) / w_next * 0.5 * image_size;
     bool usable = w_next > 0.0 && max(abs(flow.x), abs(flow.y)) < BEYOND;
     return usable ? vec3(flow, w_next) : vec3(0.0, 0.0, min(w_next, 0.0));
 }
 
-// The same in the limit: d(ndc)/dt = (d.xy - ndc.xy * d.w) / w with d = d(MVP)/dt * p; half the image is one unit of
-// ndc.
+// The same of a rigid body. difference: rows x, y, w of D.
+vec3 displacement(mat4x3 difference, vec3 local, vec2 image_size)
+{
+    return displacement(difference * vec4(local, 1.0), image_size);
+}
+
+// In the limit: d(ndc)/dt = (d.xy - ndc.xy * d.w) / w with d = d(MVP)/dt * p (of a shape that changes: d(MVP)/dt * q + MVP *
+// dq/dt); half the image is one unit of ndc.
 // rate: rows x, y, w of d(MVP)/dt.  Returns px/s, at most BEYOND, whose square is infinite.
 vec2 velocity(mat4x3 rate, vec3 local, vec2 image_size)
 {
     vec3 d = rate * vec4(local, 1.0);
+#if defined(DEFORM) && defined(NEEDS_RATE)
+    d += shape_rate;
+#endif
     vec2 v = (d.xy - ndc_of_fragment(image_size) * d.z) * gl_FragCoord.w * 0.5 * image_size;
     return clamp(v, -BEYOND, BEYOND);
 }

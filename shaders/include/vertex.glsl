@@ -6,6 +6,13 @@
 //   NEEDS_UV      in vec2 uv      texture coordinates, times the material's scale
 //   NEEDS_NORMAL  in vec3 normal  object frame, not normalised
 //   NEEDS_LOCAL   in vec3 local   position, object frame
+//
+// Of a shape that changes with time (DEFORM, deform.glsl) all of these are as they are now, and there is besides, in clip
+// space, rows x, y, w:
+//   NEEDS_RATE         in vec3 shape_rate      MVP dq/dt, per second
+//   NEEDS_FORWARD      in vec3 shape_forward   MVP' (q' - q) of the time that forward flow leads to
+//   NEEDS_BACKWARD     in vec3 shape_backward  the same of backward flow
+//   NEEDS_NORMAL_RATE  in vec3 normal_rate     of ``normal``, object frame, per second
 
 #ifdef VERTEX_SHADER
 in vec3 in_position;
@@ -23,18 +30,59 @@ out vec3 normal;
 #ifdef NEEDS_LOCAL
 out vec3 local;
 #endif
+#ifdef DEFORM
+#include "deform.glsl"
+#ifdef NEEDS_RATE
+uniform mat3 clip_rate; // rows x, y, w of the linear part of MVP now
+out vec3 shape_rate;
+#endif
+#ifdef NEEDS_FORWARD
+uniform mat3 clip_forward; // of MVP'
+out vec3 shape_forward;
+#endif
+#ifdef NEEDS_BACKWARD
+uniform mat3 clip_backward;
+out vec3 shape_backward;
+#endif
+#ifdef NEEDS_NORMAL_RATE
+out vec3 normal_rate;
+#endif
+#endif
 
 void main()
 {
-    gl_Position = mvp * vec4(in_position, 1.0);
+#ifdef DEFORM
+    vec3 position = deformed(in_position);
+#else
+    vec3 position = in_position;
+#endif
+    gl_Position = mvp * vec4(position, 1.0);
 #ifdef NEEDS_UV
     uv = in_uv;
 #endif
 #ifdef NEEDS_NORMAL
+#ifdef DEFORM
+    normal = deformed_normal(in_position, in_normal);
+#else
     normal = in_normal;
 #endif
+#endif
 #ifdef NEEDS_LOCAL
-    local = in_position;
+    local = position;
+#endif
+#ifdef DEFORM
+#ifdef NEEDS_RATE
+    shape_rate = clip_rate * deformed_rate(in_position);
+#endif
+#ifdef NEEDS_FORWARD
+    shape_forward = clip_forward * deformed_change(in_position, SHAPE_FORWARD);
+#endif
+#ifdef NEEDS_BACKWARD
+    shape_backward = clip_backward * deformed_change(in_position, SHAPE_BACKWARD);
+#endif
+#ifdef NEEDS_NORMAL_RATE
+    normal_rate = deformed_normal_rate(in_position, in_normal);
+#endif
 #endif
 }
 #endif
@@ -48,5 +96,19 @@ in vec3 normal;
 #endif
 #ifdef NEEDS_LOCAL
 in vec3 local;
+#endif
+#ifdef DEFORM
+#ifdef NEEDS_RATE
+in vec3 shape_rate;
+#endif
+#ifdef NEEDS_FORWARD
+in vec3 shape_forward;
+#endif
+#ifdef NEEDS_BACKWARD
+in vec3 shape_backward;
+#endif
+#ifdef NEEDS_NORMAL_RATE
+in vec3 normal_rate;
+#endif
 #endif
 #endif

@@ -76,9 +76,8 @@ def test_equidistant_projects_as_opencv(name):
     expected, slopes = cv2.fisheye.projectPoints(points[:, None], np.zeros(3), np.zeros(3), camera.K, k)
     np.testing.assert_allclose(camera.project(points), expected[:, 0], atol=1e-9)
     ours = camera.jacobian(points).reshape(-1, 3)
-    np.testing.assert_allclose(
-        ours, slopes[:, 11:14], rtol=1e-7, atol=1e-7
-    )  # f, c, k, rotation (3), translation (3), skew
+    # f, c, k, rotation (3), translation (3), skew.
+    np.testing.assert_allclose(ours, slopes[:, 11:14], rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", FISHEYES)
@@ -155,9 +154,8 @@ def test_the_limit_is_where_the_radial_part_turns():
     assert radius_limit((-0.3,)) == pytest.approx(1 / math.sqrt(0.9))
     k = (-0.368, 0.149, 0.0)  # 1 - 1.104 s + 0.745 s² has no real root
     assert radius_limit(k) == math.inf
-    assert radius_limit((0.5, -0.2)) == pytest.approx(
-        math.sqrt((1.5 + math.sqrt(1.5**2 + 4)) / 2)
-    )  # 1 + 1.5 s - s² = 0
+    # 1 + 1.5 s - s² = 0.
+    assert radius_limit((0.5, -0.2)) == pytest.approx(math.sqrt((1.5 + math.sqrt(1.5**2 + 4)) / 2))
 
 
 def test_radtan_sees_nothing_beyond_its_fold():
@@ -204,9 +202,8 @@ def test_fisheye_at_its_largest_angle():
     assert camera._limit == math.pi
     behind = np.array([1e-3, 0, -1.0])
     np.testing.assert_allclose(camera.project(behind), [49.5 + 23.0 * (math.pi - 1e-3), 49.5], atol=1e-6)
-    assert (
-        np.isnan(camera.project(np.array([0.0, 0.0, -1.0]))).all() and np.isnan(camera.project(np.zeros(3))).all()
-    )  # no direction
+    # No direction.
+    assert np.isnan(camera.project(np.array([0.0, 0.0, -1.0]))).all() and np.isnan(camera.project(np.zeros(3))).all()
 
 
 # ---- distortion that folds in the picture, and other bad input -----------------------------------------------------

@@ -112,9 +112,8 @@ def test_a_cluster_of_ones_own_listens_on_the_loopback_alone(tmp_path, monkeypat
 
 @pytest.mark.slow
 def test_a_ray_that_listens_to_everybody_is_refused(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(
-        "blinkgl.dataset.cluster._loopback_only", contextlib.nullcontext
-    )  # as Ray would, left to itself
+    # As Ray would, left to itself.
+    monkeypatch.setattr("blinkgl.dataset.cluster._loopback_only", contextlib.nullcontext)
     assert run(["generate", str(recipe_file(tmp_path)), "--out", str(tmp_path / "out"), "--executor", "ray"]) == 2
     error = capsys.readouterr().err
     assert "listens to other machines: " in error and "raylet on " in error and error.count("\n") == 1

@@ -187,12 +187,10 @@ def small_disk(tmp_path):
 
 def test_full_disk_stops_the_run_and_a_larger_one_goes_on(reference, small_disk, tmp_path, capsys):
     recipe, out = recipe_file(tmp_path), small_disk / "out"
-    pages = sum(
-        -(-p.stat().st_size // 4096) for p in reference.rglob("*") if p.is_file()
-    )  # small files take a page each
-    subprocess.run(
-        ["mount", "-o", f"remount,size={pages * 2 // 3 * 4096}", small_disk], check=True
-    )  # four of six, two at work
+    # Small files take a page each.
+    pages = sum(-(-p.stat().st_size // 4096) for p in reference.rglob("*") if p.is_file())
+    # Four of six, two at work.
+    subprocess.run(["mount", "-o", f"remount,size={pages * 2 // 3 * 4096}", small_disk], check=True)
     assert run(["generate", str(recipe), "--out", str(out), "--workers", "2", "--quiet"]) == 2
     error = capsys.readouterr().err
     assert "no space left" in error and "--resume" in error and error.count("\n") == 1

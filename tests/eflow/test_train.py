@@ -143,9 +143,8 @@ def test_resuming_with_another_configuration_names_the_key(tmp_path, data):
     ):
         with pytest.raises(ConfigError, match=f"^{key}: differs from the run"):
             train(load_train_config(path, [option]), tmp_path / "run", resume=True, quiet=True)
-    train(
-        load_train_config(path, ["run.log_every=2"]), tmp_path / "run", resume=True, stop_after=1, quiet=True
-    )  # how it runs may change
+    # How it runs may change.
+    train(load_train_config(path, ["run.log_every=2"]), tmp_path / "run", resume=True, stop_after=1, quiet=True)
     with pytest.raises(BlinkGLError, match="no checkpoint to resume from"):
         train(load_train_config(path), tmp_path / "other", resume=True, quiet=True)
 

@@ -359,9 +359,8 @@ def test_cubics_converge_faster_than_the_straight_line(reconstruction, order, in
         rates = [f * np.float32(slope(u) / period) for f, u in zip(frames, s)]
         events = run_cubic(emulator, frames, [round(u * period * 1e9) for u in s], rates)
         assert len(events) == len(truth)
-        inner = (truth > end / 6) & (truth < end * 5 / 6) | (
-            reconstruction == "hermite"
-        )  # pchip's outer intervals have one neighbour only
+        # pchip's outer intervals have one neighbour only.
+        inner = (truth > end / 6) & (truth < end * 5 / 6) | (reconstruction == "hermite")
         spacings.append(end / n)
         errors.append(np.sqrt(np.mean((events.t * 1e-6 / period - truth)[inner] ** 2)))
     found = np.polyfit(np.log(spacings), np.log(errors), 1)[0]

@@ -63,10 +63,8 @@ def test_same_events_on_cubics(config, reconstruction):
     for k, (frame, changed) in enumerate(zip(frames, rows)):
         rate = rng.normal(0, 500, (H, W)).astype(np.float32)
         first, stop = changed or (0, H)
-        rate[:first], rate[stop:] = (
-            0,
-            0,
-        )  # that is all the contract asks for: what moved in the frame before may stand still in this one
+        # That is all the contract asks for: what moved in the frame before may stand still in this one.
+        rate[:first], rate[stop:] = (0, 0)
         chunks.append((told.step(frame, k * 1_000_000, changed, rate), untold.step(frame, k * 1_000_000, None, rate)))
     chunks.append((told.flush(), untold.flush()))
     for a, b in chunks:

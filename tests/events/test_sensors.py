@@ -65,9 +65,8 @@ def test_an_idle_bus_pays_for_the_row_again():
     times = np.array([10, 10, 50, 50, 50, 90], np.int64)
     rows = np.array([3, 3, 3, 3, 7, 7], np.uint16)
     events = Events(np.arange(6, dtype=np.uint16), rows, times, np.zeros(6, np.uint8))
-    readout = Readout(
-        ReadoutConfig(events_per_second=1e6 / 0.6, row_ns=600, queue_events=100)
-    )  # 0.6 us an event, 0.6 us a row
+    # 0.6 us an event, 0.6 us a row.
+    readout = Readout(ReadoutConfig(events_per_second=1e6 / 0.6, row_ns=600, queue_events=100))
     assert readout.step(events).t.tolist() == [11, 11, 51, 51, 53, 91]
     lone = Events(*(c[[2]] for c in (events.x, rows, times, events.p)))
     fresh = Readout(ReadoutConfig(events_per_second=1e7, row_ns=5000, queue_events=100))

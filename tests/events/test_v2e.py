@@ -45,9 +45,8 @@ def test_equals_slow_twin(variant, dtype, threads):  # noqa: F811
 
 def test_resumes_bit_identically():
     clip, times = random_clip(2, frames=8)
-    config = V2eConfig(
-        shot_noise_rate_hz=50.0, leak_rate_hz=30.0, refractory_us=9_000.0
-    )  # 30 Hz: the leak clock restarts
+    # 30 Hz: the leak clock restarts.
+    config = V2eConfig(shot_noise_rate_hz=50.0, leak_rate_hz=30.0, refractory_us=9_000.0)
     whole = run(V2e(37, 45, config, 3), clip, times)
     first, second = V2e(37, 45, config, 3), V2e(37, 45, config, 3)
     head = run(first, clip[:3], times[:3])
@@ -205,9 +204,8 @@ def test_leak_rate_and_jitter(frame_ms):
     # Long gaps are a little under-represented in a finite window.
     assert abs(gaps.mean() * rate - 1) < 0.01 and abs(gaps.std() * rate / jitter - 1) < 0.1
     counts = np.bincount(pixel, minlength=400)
-    assert (
-        stats.chi2.sf(((counts - seconds * rate) ** 2).sum() / (seconds * rate), 400) > 0.99
-    )  # far more regular than Poisson
+    # Far more regular than Poisson.
+    assert stats.chi2.sf(((counts - seconds * rate) ** 2).sum() / (seconds * rate), 400) > 0.99
 
 
 @pytest.mark.parametrize("frame_ms", [0.1, 1, 10, 100])

@@ -18,9 +18,10 @@ MOTION = LabelRequest("depth", "ids", "velocity", "flow_forward")
 
 @dataclass(frozen=True)
 class Errors:
-    """Over the N pixels off silhouettes. flow : (N,) px.   size : (N,) px, the true flow's length.   velocity : (N,)
-    relative to the median speed.   depth : (N,) relative.   approach : (N,) depth now over
-                                    depth then.   luminance : (N,) absolute.
+    """Over the N pixels off silhouettes.
+
+    flow : (N,) px.   size : (N,) px, the true flow's length.   velocity : (N,) relative to the median speed.
+    depth : (N,) relative.   approach : (N,) depth now over depth then.   luminance : (N,) absolute.
     wrong_ids : pixels off silhouettes that show another object."""
 
     flow: np.ndarray

@@ -72,9 +72,8 @@ def nasty() -> np.ndarray:
     through = np.array([[-1.0, -2, -0.5], [1.0, 3, -0.5], [0.5, 4, 0.5]])
     in_plane = np.array([[-1.0, 0, -0.5], [1.0, 0, -0.5], [0.0, 0, 0.5]])
     at_near = np.array([[-1.0, 0.05, -0.5], [1.0, 0.05, -0.5], [0.0, 0.05, 0.5]])
-    upright = np.array(
-        [[0.0, 2, -0.5], [0.0, 4, -0.5], [0.0, 3, 0.5]]
-    )  # exactly edge-on where the principal point lies on x = 0
+    # Exactly edge-on where the principal point lies on x = 0.
+    upright = np.array([[0.0, 2, -0.5], [0.0, 4, -0.5], [0.0, 3, 0.5]])
     point = np.full((3, 3), 2.0)
     shapes = [
         line,

@@ -95,9 +95,8 @@ def test_ten_thousand_events_per_pixel(promise):
     promise("10^4 events per pixel: too many or few", np.abs(per_pixel - 10_000).max(), 1)
     mine = events.t[(events.x == 1) & (events.y == 2)]
     expected = np.arange(1, len(mine) + 1) * 1e-3 / 10.0005 * 1e6
-    promise(
-        "10^4 events per pixel: event times over 1 s", np.abs(mine - expected).max(), 18.0, "us"
-    )  # 10^4 x 1.5e-8 / 10 of 1 s, + 1 us + ends
+    # 10^4 x 1.5e-8 / 10 of 1 s, + 1 us + ends.
+    promise("10^4 events per pixel: event times over 1 s", np.abs(mine - expected).max(), 18.0, "us")
     assert esim.saturated == 0 and (np.diff(events.t) >= 0).all()
     back = esim.step(low, 2 * SECOND)
     assert len(back) == len(events)
@@ -207,9 +206,8 @@ def test_a_still_day_of_v2e_noise_keeps_its_rate(promise):
         halves[(k - 1) // 144] += (events.p == 0).sum(), (events.p == 1).sum()
     off, on = halves.sum(0)
     pixels, seconds = 64, 86_400
-    expected_off = (
-        0.5 * 0.01 * (1 - 0.75 * 20 / 275) * pixels * seconds
-    )  # half of the shot noise, v2e's rate at intensity 0
+    # Half of the shot noise, v2e's rate at intensity 0.
+    expected_off = 0.5 * 0.01 * (1 - 0.75 * 20 / 275) * pixels * seconds
     promise(
         "V2E, a still day: OFF noise against its rate, sigmas", abs(off - expected_off) / np.sqrt(expected_off), 4.0
     )

@@ -71,6 +71,7 @@ def test_a_hot_texel_among_black_ones(gl, promise):
     image[20, 30] = 1e9
     paint = Material(texture=Texture(image), unlit=True)
     world = scene([thing("sky", 1, quad(4, 4), still((0, 8, 0), FACING), paint)], rig(32, 32, 40.0))
+    # Every pixel holds 2.7 x 2.7 whole textures.
     wide = scene(
         [
             thing(
@@ -82,7 +83,7 @@ def test_a_hot_texel_among_black_ones(gl, promise):
             )
         ],
         rig(32, 32, 30.0),
-    )  # every pixel holds 2.7 x 2.7 whole textures
+    )
     with Renderer(gl, world, RenderConfig()) as renderer:
         near = renderer.luminance(0).read()
         assert np.isfinite(near).all() and near.min() == 0 and near.max() > 1e8

@@ -59,9 +59,8 @@ def test_backend_draws_and_is_released(backend):
     assert 0.3 < covered.mean() < 0.6
     assert np.all(colour[~covered] == [9, 8, 7, 6])
     y, x = np.nonzero(covered)
-    np.testing.assert_allclose(
-        colour[y, x, :2], np.stack([x + 0.5, y + 0.5], 1) * 0.1, rtol=1e-6
-    )  # row 0 is GL's row 0
+    # Row 0 is GL's row 0.
+    np.testing.assert_allclose(colour[y, x, :2], np.stack([x + 0.5, y + 0.5], 1) * 0.1, rtol=1e-6)
     np.testing.assert_allclose(colour[y, x, 3], depth[y, x], rtol=1e-6)  # zero-to-one: no 0.5 * z + 0.5 anywhere
     gl.release()  # twice is harmless
 

@@ -236,9 +236,8 @@ def test_headers_without_an_end_and_with_lines_too_long(tmp_path):
     path, word = tmp_path / "e.raw", np.array([0x8000, 0x2001], "<u2").tobytes()
     path.write_bytes(b"% evt 3.0\n% camera x\n" + word)
     assert [len(e) for e in EvtReader(path).chunks()] == [1]
-    path.write_bytes(
-        b"% evt 3.0\n" + np.array([0x8000 | 0x25, 0x2001], "<u2").tobytes()
-    )  # a word that begins with the byte of '%'
+    # A word that begins with the byte of '%'.
+    path.write_bytes(b"% evt 3.0\n" + np.array([0x8000 | 0x25, 0x2001], "<u2").tobytes())
     assert [e.t.tolist() for e in EvtReader(path).chunks()] == [[0x25 << 12]]
     path.write_bytes(b"% evt 3.0\n% " + b"x" * 4000 + b"\n% end\n" + word)
     assert [len(e) for e in EvtReader(path).chunks()] == [1]

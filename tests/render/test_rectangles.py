@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import PinHole
 from blinkgl.render.rectangles import Rectangle, merged
+from blinkgl.render.resources import box_corners
 from blinkgl.render.still import screen_rectangle
 
 CAMERA = PinHole(64, 40, 50.0, 70.0, 20.0, 28.0, near=0.1)
@@ -23,7 +24,7 @@ def pose(position, turn=(0.0, 0.0, 0.0)) -> np.ndarray:
 
 
 def item(low, high):
-    return SimpleNamespace(low=np.array(low, float), high=np.array(high, float))
+    return SimpleNamespace(corners=box_corners(np.array(low, float), np.array(high, float)))
 
 
 def test_a_box_is_inside_its_rectangle_with_a_pixel_to_spare_and_no_more():
@@ -49,12 +50,13 @@ def test_a_box_is_inside_its_rectangle_with_a_pixel_to_spare_and_no_more():
             CAMERA.fx * corners[:, 0] / corners[:, 2] + CAMERA.cx,
             CAMERA.fy * corners[:, 1] / corners[:, 2] + CAMERA.cy,
         )
+        # Pixels, both ends included.
         x0, x1, y0, y1 = (
             math.floor(x.min()) - 1,
             math.ceil(x.max()) + 1,
             math.floor(y.min()) - 1,
             math.ceil(y.max()) + 1,
-        )  # pixels, both ends included
+        )
         x0, x1, y0, y1 = max(x0, 0), min(x1, 63), max(y0, 0), min(y1, 39)
         found = screen_rectangle(item(low, high), T, CAMERA)
         if x0 > x1 or y0 > y1:

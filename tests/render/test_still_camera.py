@@ -17,6 +17,7 @@ from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.passes import Luminance
 from blinkgl.render.rectangles import Rectangle, merged
 from blinkgl.render.renderer import Renderer
+from blinkgl.render.resources import box_corners
 from blinkgl.render.still import screen_rectangle
 from blinkgl.scene.motion.paths import KeyframePath
 from blinkgl.timeline.speed import largest_speed
@@ -245,7 +246,7 @@ def test_rectangles():
 
 def test_screen_rectangle_contains_the_projection():
     camera = PinHole(200, 100, 150.0, 150.0, 99.5, 49.5)
-    item = SimpleNamespace(low=np.array([-0.5] * 3), high=np.array([0.5] * 3))
+    item = SimpleNamespace(corners=box_corners(np.full(3, -0.5), np.full(3, 0.5)))
     T = np.eye(4)
     T[:3, 3] = (1.0, -0.5, 4.0)
     r = screen_rectangle(item, T, camera)

@@ -40,12 +40,12 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
     assert result["programs"] == {
-        "colour.glsl": 16,
-        "debug.glsl": 8,
+        "colour.glsl": 26,
+        "debug.glsl": 13,
         "downsample.glsl": 2,
-        "label.glsl": 504,
-        "luminance.glsl": 40,
-        "velocity.glsl": 16,
+        "label.glsl": 819,
+        "luminance.glsl": 70,
+        "velocity.glsl": 26,
     }
 
 
@@ -60,9 +60,8 @@ def test_the_table_of_variants_is_what_the_renderer_asks_for(gl, config, monkeyp
 
     monkeypatch.setattr(ShaderLoader, "_compile", record)
     monkeypatch.setattr(gl, "shaders", ShaderLoader(gl.ctx))
-    monkeypatch.setattr(
-        Painter, "draw", lambda self, uniforms, item: None
-    )  # linking is enough: llvmpipe compiles at the first draw
+    # Linking is enough: llvmpipe compiles at the first draw.
+    monkeypatch.setattr(Painter, "draw", lambda self, uniforms, item: None)
     world = scene_of(config, width=8, height=6)
     fields = [name for name, label in LABELS.items() if label.buffer]
     t = 100_000_000
@@ -524,9 +523,8 @@ def test_unreadable_shader_folder(shader, shaders, monkeypatch):
     import os
 
     real = os.access
-    monkeypatch.setattr(
-        os, "access", lambda path, mode: Path(path) != shaders and real(path, mode)
-    )  # root may read anything
+    # Root may read anything.
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != shaders and real(path, mode))
     status, _, err = shader("check", "--shaders", shaders)
     assert status == 2 and err.startswith("error: --shaders: shader folder cannot be read") and err.count("\n") == 1
 

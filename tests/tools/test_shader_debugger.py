@@ -191,18 +191,15 @@ def test_derivative_of_luminance_of_a_sliding_cosine(gl):
     scene = Scene((wall,), Rig.alone(PinHole(64, 8, 200.0, 200.0, 31.5, 3.5), eye), 0, 10**9)
     when = When(500_000_000, 600_000_000, 400_000_000, 499_000_000, 501_000_000)
     x = speed * 0.5 + depth * (np.arange(64) - 31.5) / 200.0
-    phase = wall.parts[0].mesh.uvs[:, 0][np.argmin(wall.parts[0].mesh.vertices[:, 0])] - (
-        -0.5
-    )  # where u = 0 lies, in texture widths
+    # Where u = 0 lies, in texture widths.
+    phase = wall.parts[0].mesh.uvs[:, 0][np.argmin(wall.parts[0].mesh.vertices[:, 0])] - (-0.5)
     expected = -0.3 * k * np.sin(k * x + 2 * np.pi * periods * phase) * speed
     with DebugRenderer(gl, scene, RenderConfig()) as renderer:
         measured = moments.GpuMoment(renderer, when, 1e-3)["dL_dt"]
     true = moments.ReferenceMoment(scene, when, 1e-3)["dL_dt"]
     largest = 0.3 * k * speed
-    for derivative in (
-        measured,
-        true,
-    ):  # the bilinear texture's slope is a staircase: off by up to half a texel's curvature, 5 %
+    # The bilinear texture's slope is a staircase: off by up to half a texel's curvature, 5 %.
+    for derivative in (measured, true):
         assert (
             np.abs(derivative - expected).max() < 0.06 * largest
             and np.abs(derivative - expected).mean() < 0.03 * largest

@@ -38,9 +38,8 @@ def served(config, tmp_path_factory):
 def ask(server, path: str, method: str = "GET", host: str | None = None):
     """(status, headers, body). Paths go over the wire as they are."""
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=30)
-    connection._encode_request = lambda request: request.encode(
-        "utf-8", "surrogateescape"
-    )  # as it stands, not as http.client likes it
+    # As it stands, not as http.client likes it.
+    connection._encode_request = lambda request: request.encode("utf-8", "surrogateescape")
     connection._validate_path = lambda path: None
     connection.putrequest(method, path, skip_host=True)
     if host != "":
@@ -479,9 +478,8 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
             "float luminance = texture(albedo, uv).r;",
             "float luminance = texture(albedo, uv, 1.0).r;",
         )
-        page.wait(
-            "return document.querySelector('#verdict').textContent.includes('has changed')"
-        )  # the verdict was of other shaders
+        # The verdict was of other shaders.
+        page.wait("return document.querySelector('#verdict').textContent.includes('has changed')")
         page.run("document.querySelector('#compare').click()")
         page.wait("return document.querySelector('#verdict').className === 'bad'", timeout=60)
         assert "level of luminance" in page.text("#verdict") and "a mip bias of +1" in page.text("#verdict")

@@ -7,8 +7,9 @@ Start: cli.py (the commands), then session.py:
     session.py    one moment of the scene that a generation run would render; the shader folder; the OpenGL side
     moments.py    every buffer of that moment, from the GPU and from the float64 reference, by the same names
     compare.py    one against the other, with tolerances and the silhouette band
-    suspicions.py what the error looks like; poses.py: which other pose would explain it; verdict.py: what is wrong
-    first, on which object probe.py      everything about one pixel
+    suspicions.py what the error looks like; poses.py: which other pose would explain it
+    verdict.py    what is wrong first, on which object
+    probe.py      everything about one pixel
     picture.py    arrays as pictures: colour maps, labelled PNGs, the contact sheet
     check.py      every program in every variant (variants.py), errors at their own line (diagnostics.py, preprocess.py)
     timing.py     timer queries per pass and variant

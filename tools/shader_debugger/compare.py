@@ -161,9 +161,9 @@ def parse_tolerances(texts: list[str], names: list[str]) -> dict[str, float]:
 @dataclass(eq=False)
 class Report:
     """Of one buffer. errors : (H, W) float64, nan where not comparable.   graded, band : (H, W) bool.
-    value : the graded statistic.   objects : of each object (the worst ten, worst first) its
-                                    graded pixels, those over the tolerance,
-    their median and largest error, and where the largest is: x, y, error, gpu, reference, triangle."""
+    value : the graded statistic.
+    objects : of each object (the worst ten, worst first) its graded pixels, those over the tolerance, their median and
+    largest error, and where the largest is: x, y, error, gpu, reference, triangle."""
 
     quantity: Quantity
     tolerance: float

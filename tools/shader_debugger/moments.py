@@ -274,7 +274,7 @@ class ReferenceMoment(_Lazy):
                 size[on] = part.material.texture.image.shape[1::-1]
                 corners = part.mesh.faces[frame.triangle[on]]
                 pose = reference.relative_pose_at(scene, thing, t_ns)
-                points = part.mesh.vertices[corners] @ pose[:3, :3].T + pose[:3, 3]
+                points = reference.vertices_at(part.mesh, t_ns)[corners] @ pose[:3, :3].T + pose[:3, 3]
                 texels = (
                     part.mesh.uvs[corners].astype(np.float64)
                     * part.material.uv_scale

@@ -99,9 +99,8 @@ def _save(figure: Figure, path: Path, palette: bool = False) -> None:
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
     if palette:
-        image = image.quantize(
-            palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG
-        )  # Pillow dithers to given palettes only
+        # Pillow dithers to given palettes only.
+        image = image.quantize(palette=image.quantize(256), dither=Image.Dither.FLOYDSTEINBERG)
     with atomic_file(path) as temporary, output_errors(path):
         image.save(temporary, "PNG", optimize=palette)
 

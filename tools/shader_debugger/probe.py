@@ -50,7 +50,9 @@ def probe(gpu: GpuMoment, ref: ReferenceMoment, x: int, y: int, comparison: Comp
             _row(name, gpu, ref, comparison, x, y) for name in PASSES if name not in ("triangle", "local")
         ],  # told below
         "surface": {
-            "gpu": _surface(parts, drawn, int(gpu["triangle"][y, x]) - 1, _barycentric(parts, drawn, gpu, x, y)),
+            "gpu": _surface(
+                parts, drawn, int(gpu["triangle"][y, x]) - 1, _barycentric(parts, drawn, gpu, x, y, when.t_ns)
+            ),
             "reference": _surface(parts, true, hit.triangle, hit.bary)
             | ({"front": hit.front, "corners": _plain(hit.corners)} if hit.hit else {}),
         },
@@ -122,13 +124,13 @@ def _surface(parts, p, triangle, bary) -> dict:
     }
 
 
-def _barycentric(parts, p, gpu, x, y):
+def _barycentric(parts, p, gpu, x, y, t_ns):
     """Of the GPU's interpolated local position in the triangle it drew; float64 solve of float32 data."""
     triangle = int(gpu["triangle"][y, x]) - 1
     if p < 0 or not 0 <= triangle < len(parts[p][1].mesh.faces):
         return None
     mesh = parts[p][1].mesh
-    a, b, c = mesh.vertices[mesh.faces[triangle]]
+    a, b, c = reference.vertices_at(mesh, t_ns)[mesh.faces[triangle]]
     e1, e2, d = b - a, c - a, gpu["local"][y, x].astype(np.float64) - a
     m = np.array([[e1 @ e1, e1 @ e2], [e1 @ e2, e2 @ e2]])
     if np.linalg.det(m) <= 0:

@@ -13,6 +13,7 @@ import numpy as np
 
 from blinkgl.render import reference
 from blinkgl.render.colour import LUMA
+from blinkgl.scene.shapes.deformer import normals_at
 from blinkgl.srgb import srgb_from_linear
 from blinkgl.tools.shader_debugger.moments import PASSES, lookup_of
 
@@ -48,11 +49,8 @@ def _explain(comparison, report, gpu, right, wrong) -> list[str]:
         return []
     quantity, before = report.quantity, report.errors[wrong]
     limit = quantity.fit * (report.tolerance or np.finfo(np.float32).eps)
-    relative = lookup_of(quantity.name)[1] not in (
-        "uv",
-        "level",
-        "albedo",
-    )  # those have a unit of their own, and zeros that mean nothing
+    # Those have a unit of their own, and zeros that mean nothing.
+    relative = lookup_of(quantity.name)[1] not in ("uv", "level", "albedo")
     image = np.array(right, np.float64)
     found = []
     with np.errstate(all="ignore"):
@@ -159,7 +157,7 @@ def _screen_weights(comparison, on) -> np.ndarray:
     for p, (thing, own) in enumerate(reference.scene_parts(ref.scene)):
         rows = part == p
         pose = reference.relative_pose_at(ref.scene, thing, ref.when.t_ns)
-        corners = own.mesh.vertices[own.mesh.faces[triangle[rows]]].astype(np.float64)
+        corners = reference.vertices_at(own.mesh, ref.when.t_ns)[own.mesh.faces[triangle[rows]]]
         depths[rows] = (corners @ pose[:3, :3].T + pose[:3, 3])[..., 2]
     weights = frame.bary[on] * depths
     return weights / weights.sum(axis=1, keepdims=True)
@@ -177,7 +175,11 @@ def _interpolated(comparison, on, attribute: str, weights: np.ndarray) -> np.nda
     out = np.full((len(part), 2 if attribute == "uvs" else 3), np.nan)
     for p, (_, own) in enumerate(reference.scene_parts(ref.scene)):
         rows = part == p
-        corners = getattr(own.mesh, attribute)[own.mesh.faces[triangle[rows]]].astype(np.float64)
+        values = {
+            "vertices": lambda mesh: reference.vertices_at(mesh, ref.when.t_ns),
+            "normals": lambda mesh: normals_at(mesh, ref.when.t_ns),
+        }.get(attribute, lambda mesh: mesh.uvs)(own.mesh)
+        corners = values[own.mesh.faces[triangle[rows]]].astype(np.float64)
         out[rows] = np.einsum("nc,nck->nk", weights[rows], corners) * (
             own.material.uv_scale if attribute == "uvs" else 1.0
         )

@@ -216,11 +216,8 @@ def measure(subject: Subject, when: When, shaders: str | None = None, repeat: in
 def _measure_pass(name, call, scale, full: TimedRenderer, half: TimedRenderer, ratio: float, repeat: int) -> dict:
     runs: dict[str, list[Draws]] = {"full": [], "half": [], "each": []}
     for k in range(repeat + 1):
-        for kind, renderer in (
-            ("full", full),
-            ("half", half),
-            ("each", full),
-        ):  # interleaved: drift of the machine hits all alike
+        # Interleaved: drift of the machine hits all alike.
+        for kind, renderer in (("full", full), ("half", half), ("each", full)):
             result = renderer.run(call, each=kind == "each")
             if k:
                 runs[kind].append(result)

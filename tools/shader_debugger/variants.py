@@ -8,9 +8,20 @@ from typing import Any
 
 from blinkgl.render.passes import PASSES, Pass, ScenePass
 from blinkgl.render.resources import Kind
+from blinkgl.scene.shapes.table import DEFORMERS, define_of
 from blinkgl.tools.shader_debugger.session import LOOKUPS, Inspection
 
-KINDS = [Kind(*switches) for switches in product((False, True), repeat=len(Kind._fields))]
+KINDS = [Kind(*switches) for switches in product((False, True), repeat=3)]
+
+
+def kinds() -> list[Kind]:
+    """Of materials all, and of shapes that change with time one each."""
+    shapes = {
+        (("DEFORM", 1), (define_of(deformer.glsl), 1), ("SHAPE_ROWS", 64), *sorted(sizes.items())): None
+        for deformer in DEFORMERS.values()
+        for sizes in deformer.examples
+    }
+    return [*KINDS, *(Kind(True, True, True, shape) for shape in shapes)]
 
 
 def lookups(program: str) -> list[dict[str, Any]]:
@@ -27,7 +38,7 @@ def _defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]
     found: dict[tuple, dict[str, Any]] = {}
     for one in passes:
         for pass_ in one.every_kind() if one.program == program else ():
-            for kind in KINDS if isinstance(pass_, ScenePass) else [None]:
+            for kind in kinds() if isinstance(pass_, ScenePass) else [None]:
                 defines = pass_.defines(kind) | (kind.defines if kind is not None else {})
                 found.setdefault(tuple(sorted(defines.items())), defines)
     return list(found.values())

@@ -8,8 +8,8 @@ from blinkgl.tools.shader_debugger.compare import QUANTITIES, Comparison, Report
 def verdict(comparison: Comparison, reports: list[Report]) -> dict:
     """Plain data (JSON).
 
-    passed : every buffer is within its tolerance.   first : {buffer, title, source, objects,
-                                                     suspicions} of the first that is not.
+    passed : every buffer is within its tolerance.
+    first : {buffer, title, source, objects, suspicions} of the first that is not.
     objects : per object that is over a tolerance, in the order of ``first``: object, first (buffer), x, y (the worst
     pixel there), over_tolerance and pixels (of that buffer), then (the other buffers that are
     wrong), suspicion ("" when none fits)."""

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class Output(NamedTuple):
     """An attachment: ``layout(location = i)`` of the fragment stage for the i-th output of a pass.
 
-    format : key of :data:`blinkgl.gl.FORMATS`.   components : how many of its format's are
-                                                  given out, the first ones; 0: all.
+    format : key of :data:`blinkgl.gl.FORMATS`.
+    components : how many of its format's are given out, the first ones; 0: all.
     planes : names of its components where each is a picture of its own; they are then read by these names."""
 
     name: str
@@ -134,6 +134,8 @@ class ScenePass(Pass):
         for item in self.items(shot.moment) if items is None else items:
             uniforms = programs[item.kind]
             painter.place(uniforms, item, shot.moment)
+            if item.deformer is not None:
+                painter.deform(uniforms, item, shot)
             self.bind(uniforms, shot)
             self.set(painter, uniforms, item, shot)
             painter.draw(uniforms, item)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import DrawItem, Kind
 
 MADE.append(includes)
-_OF_THE_PASS = {"", "mvp", "inverse_depths", "image_size"}
+_OF_THE_PASS = {"", "mvp", "inverse_depths", "image_size", "clip_rate", "clip_forward", "clip_backward"}
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,10 @@ class Geometry(ScenePass):
             uniforms = programs[item.kind]
             if item.kind not in checked:
                 checked.add(item.kind)
-                self._check(uniforms, values)
+                self._check(uniforms, values, item)
             painter.place(uniforms, item, shot.moment)
+            if item.deformer is not None:
+                painter.deform(uniforms, item, shot)
             if "image_size" in uniforms:
                 uniforms["image_size"].value = shot.size
             for name, (_, rows) in values.items():
@@ -71,17 +73,17 @@ class Geometry(ScenePass):
                         f"label '{label.name}': `uniforms` gives '{name}', which "
                         f"{values[name][0] if name in values else 'the pass'} gives, too"
                     )
-                columns = (
-                    np.swapaxes(array, 1, 2) if array.ndim == 3 else array
-                )  # GLSL's matrices are stored by columns
+                # GLSL's matrices are stored by columns.
+                columns = np.swapaxes(array, 1, 2) if array.ndim == 3 else array
                 kind = {"u": np.uint32, "i": np.int32}.get(array.dtype.kind, np.float32)
                 values[name] = (label.name, [row.tobytes() for row in np.ascontiguousarray(columns, kind)])
         return values
 
-    def _check(self, uniforms: Uniforms, values: dict[str, tuple[str, list[bytes]]]) -> None:
+    def _check(self, uniforms: Uniforms, values: dict[str, tuple[str, list[bytes]]], item: DrawItem) -> None:
         """Every uniform that the program has is given, and none that it has not (of shaders that
         somebody is editing it may have fewer)."""
-        if missing := uniforms.keys() - values.keys() - _OF_THE_PASS:
+        of_the_shape = item.deformer.textures if item.deformer is not None else ()
+        if missing := uniforms.keys() - values.keys() - _OF_THE_PASS - {*of_the_shape}:
             name = min(missing)
             whose = [f"'{one}'" for one in self.names if name in (LABELS[one].glsl or "")]
             raise TypeError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -13,6 +14,9 @@ from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
 from blinkgl.scene.types import Mesh, Scene
+
+if TYPE_CHECKING:
+    from blinkgl.scene.shapes.deformer import Deformer
 
 CREASE_DEGREES = 40.0
 WELD_RELATIVE = 1e-6  # vertices nearer than this times the extent are one point
@@ -134,9 +138,8 @@ def _height_and_edge(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """((F,) smallest height, (F,) longest edge) of (F, 3, 3) triangles."""
     edges = corners - np.roll(corners, 1, axis=1)
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    edges = (
-        edges / np.where(longest > 0, longest, 1.0)[:, None, None]
-    )  # products of the smallest coordinates would underflow
+    # Products of the smallest coordinates would underflow.
+    edges = edges / np.where(longest > 0, longest, 1.0)[:, None, None]
     return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) * longest, longest
 
 
@@ -279,9 +282,7 @@ def crease_normals(
     corners = vertices[faces]
     to_next = np.roll(corners, -1, axis=1) - corners
     to_previous = np.roll(corners, 1, axis=1) - corners
-    angle = np.arctan2(
-        np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2)
-    )  # (F, 3)
+    angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_previous), axis=2), (to_next * to_previous).sum(axis=2))
 
     # Pair up faces across each undirected edge; edge k of a face joins its corners k and k+1.
     count = len(faces)
@@ -386,12 +387,22 @@ def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
     normals = mesh.normals @ np.linalg.inv(linear)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
     faces = mesh.faces if determinant > 0 else np.ascontiguousarray(mesh.faces[:, ::-1])
-    return replace(mesh, vertices=vertices, faces=faces, normals=normals)
+    shift = matrix[:3, 3] if matrix.shape[0] == 4 else np.zeros(3)
+    return replace(mesh, vertices=vertices, faces=faces, normals=normals, deformer=_transformed(mesh, linear, shift))
+
+
+def _transformed(mesh: Mesh, linear: np.ndarray, shift: np.ndarray) -> Deformer | None:
+    """The mesh's deformer under an affine map."""
+    if mesh.deformer is None:
+        return None
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    return mesh.deformer.transformed(matrix)
 
 
 def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
     """The mesh, ``scale`` times as large."""
-    return replace(mesh, vertices=mesh.vertices * scale)
+    return replace(mesh, vertices=mesh.vertices * scale, deformer=_transformed(mesh, np.eye(3) * scale, np.zeros(3)))
 
 
 def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
@@ -410,7 +421,12 @@ def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]
     radius = max(float(np.sqrt(((m.vertices - centre) ** 2).sum(axis=1).max())) for m in meshes)
     if not radius > 0:
         raise AssetError("the mesh has no extent", where=where)
-    return tuple(replace(m, vertices=(m.vertices - centre) / radius) for m in meshes)
+    return tuple(
+        replace(
+            m, vertices=(m.vertices - centre) / radius, deformer=_transformed(m, np.eye(3) / radius, -centre / radius)
+        )
+        for m in meshes
+    )
 
 
 def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:

@@ -85,7 +85,7 @@ def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Node:
     """name, parent (None at the root), mesh and camera index (None without), rest translation, quaternion x y z w,
     scale or matrix."""
@@ -146,7 +146,7 @@ class Channel:
         return (1 - s) * values[i] + s * values[i + 1]
 
 
-@dataclass
+@dataclass(eq=False)
 class Document:
     """A parsed file. ``nodes`` are those of the default scene, parents before children, by their index in the file.
 
@@ -401,12 +401,13 @@ class Document:
             )
             times = self.accessor(sampler["input"]).astype(np.float64).ravel() if fits else np.zeros(0)
             values = self.accessor(sampler["output"]).astype(np.float64) if fits else np.zeros(0)
+            # Written so that NaN is refused: it compares false.
             if (
                 not fits
                 or not (np.abs(values) <= 1e12).all()
                 or not (np.abs(times) < _MAX_TIME).all()
                 or (np.diff(times) <= 0).any()
-            ):  # NaN compares false
+            ):
                 raise AssetError(
                     f"the animation of {path} of node '{self.nodes[node].name}' is corrupt", where=self.where
                 )

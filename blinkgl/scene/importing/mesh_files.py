@@ -237,9 +237,8 @@ def _material(
         colour = (1.0, 1.0, 1.0) if image is not None else gltf.to_linear(np.asarray(diffuse, float)[:3] / 255)
     else:
         factor = np.ones(3) if factor is None else np.asarray(factor)[:3]
-        colour = tuple(
-            float(c) for c in (factor / 255 if factor.dtype.kind in "iu" else factor)
-        )  # glTF factors are linear
+        # glTF factors are linear.
+        colour = tuple(float(c) for c in (factor / 255 if factor.dtype.kind in "iu" else factor))
         if getattr(material, "alphaMode", None) not in (None, "OPAQUE"):
             omissions.add(f"alpha {material.alphaMode} (drawn opaque)")
         if np.any(getattr(material, "emissiveFactor", None)):

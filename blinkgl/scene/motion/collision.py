@@ -18,6 +18,10 @@ Rest: a body that touches the ground (or a wall) at t0 was put there. Where that
 may slide on it, lift off and land; only sinking more than ``rest_margin`` of its radius into it counts as a
 collision. Touching other bodies, or ground that is not convex, at t0 is a collision at t0.
 
+A body that changes its shape is the convex hull of all shapes that it takes in [t0, t1], thickened by what may lie
+between the times that were looked at (:class:`~blinkgl.scene.shapes.deformer.Sweep`): what keeps clear of that keeps
+clear of each of them. Its path is cut like any other's; its shape goes on changing.
+
 A body wholly inside another closed mesh has a positive distance to it: that is tested once, at t0, by winding number
 (later it cannot get in without a collision), and only against objects and their closed meshes: sky, walls and ground
 may enclose.
@@ -100,7 +104,7 @@ def resolve_collisions(
     """
     if not (0 < tolerance <= 0.1 and 0 < rest_margin <= 0.1 and camera_radius > 0 and t0_ns <= t1_ns):
         raise ValueError("resolve_collisions: tolerance and rest_margin in (0, 0.1], camera_radius > 0, t0_ns <= t1_ns")
-    bodies = [_Body.of_object(o) for o in objects if any(len(p.mesh.faces) for p in o.parts)]
+    bodies = [_Body.of_object(o, int(t0_ns), int(t1_ns)) for o in objects if any(len(p.mesh.faces) for p in o.parts)]
     bodies.append(_Body.of_camera(camera_path, camera_radius))
     search = _Search(bodies, int(t0_ns), int(t1_ns), tolerance, rest_margin)
     events = tuple(search.run())
@@ -134,18 +138,22 @@ class _Body:
     cut: bool = False
 
     @staticmethod
-    def of_object(obj: SceneObject) -> _Body:
+    def of_object(obj: SceneObject, t0: int, t1: int) -> _Body:
         meshes = [part.mesh for part in obj.parts if len(part.mesh.faces)]
-        first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+        swept = [None if mesh.deformer is None else mesh.deformer.sweep(mesh, t0, t1) for mesh in meshes]
+        solids = [(mesh.vertices, mesh.faces) if sweep is None else sweep.hull for mesh, sweep in zip(meshes, swept)]
+        first = np.cumsum([0] + [len(vertices) for vertices, _ in solids])
+        closed = [solid for solid, mesh, sweep in zip(solids, meshes, swept) if mesh.closed or sweep is not None]
         return _Body(
             obj.name,
             obj.category,
             id(obj),
             obj.path,
-            np.concatenate([mesh.vertices for mesh in meshes]),
-            np.concatenate([mesh.faces + k for mesh, k in zip(meshes, first)]),
-            np.array([mesh.vertices[mesh.faces[0, 0]] for mesh in meshes]),
-            closed=tuple((m.vertices, m.faces) for m in meshes if m.closed) if obj.category == "object" else (),
+            np.concatenate([vertices for vertices, _ in solids]),
+            np.concatenate([faces + k for (_, faces), k in zip(solids, first)]),
+            np.array([vertices[faces[0, 0]] for vertices, faces in solids]),
+            pad=max((sweep.margin for sweep in swept if sweep is not None), default=0.0),
+            closed=tuple(closed) if obj.category == "object" else (),
         )
 
     @staticmethod
@@ -171,6 +179,8 @@ class _Body:
             self.planes = _face_planes(
                 used @ T[:3, :3].T + T[:3, 3], self.vertices @ T[:3, :3].T + T[:3, 3], self.faces
             )
+            if self.planes is not None:
+                self.planes[:, 3] += self.pad
         self._shape = None
 
     def shape(self) -> fcl.CollisionObject:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
+from blinkgl.config.deform import DeformConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     KeyedMotionConfig,
@@ -19,14 +20,16 @@ from blinkgl.config.scene import (
     object_names,
 )
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.geometry.meshes import bounds, transform_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS
 from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
@@ -38,7 +41,7 @@ _PROCEDURAL_SIZE = 1024
 _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InMemory:
     """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand
     instead of what the configuration says there."""
@@ -53,7 +56,7 @@ def explicit_scene(
     """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
 
     Raises ConfigError (missing file, bad parameter; with ``collisions``,
-    bodies that touch at the start) and AssetError."""
+    bodies that touch at the start; with ``physics``, what :func:`simulate` raises) and AssetError."""
     log: list[str] = []
     omissions: dict[str, None] = {}
     materials = {
@@ -77,19 +80,30 @@ def explicit_scene(
             material = part.material if own else materials[item.material]
             material = replace(material, unlit=material.unlit or config.light.unlit)
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
+        if item.deform is not None:
+            parts = deforming(parts, item.deform)
         objects.append(
             SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category)
         )
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
+    bodies = {name: item.physics for name, item in zip(names, config.objects) if item.physics is not None}
     if config.collisions:
-        result = resolve_collisions(tuple(objects), path, 1.01 * camera.near_corner, t0_ns, t1_ns)
+        # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
+        falling = {name for name, body in bodies.items() if body.kind == "dynamic"}
+        others = [obj for obj in objects if obj.name not in falling]
+        result = resolve_collisions(others, path, 1.01 * camera.near_corner, t0_ns, t1_ns)
         if result.at_start:
             raise ConfigError(
                 f"{result.at_start[0]}, at the start",
                 where="scene.collisions",
                 accepted="bodies apart at the start, or collisions: false",
             )
-        objects, path, log = result.objects, result.camera_path, log + list(result.log)
+        resolved = {obj.name: obj for obj in result.objects}
+        objects = [resolved.get(obj.name, obj) for obj in objects]
+        path, log = result.camera_path, log + list(result.log)
+    dynamics = None
+    if config.physics is not None:
+        objects, dynamics = simulate(objects, bodies, config.physics, t0_ns, t1_ns)
     return Scene(
         tuple(objects),
         Rig.alone(camera, path),
@@ -99,7 +113,14 @@ def explicit_scene(
         config.background,
         tuple(log),
         tuple(omissions),
+        dynamics,
     )
+
+
+def deforming(parts: Sequence[Part], config: DeformConfig) -> list[Part]:
+    """The parts of one object, whose shape changes together as ``deform:`` says."""
+    deformer = deformer_of(config, *bounds(part.mesh for part in parts))
+    return [replace(part, mesh=replace(part.mesh, deformer=deformer)) for part in parts]
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:

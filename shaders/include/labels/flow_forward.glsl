@@ -5,5 +5,9 @@ uniform mat4x3 difference_forward;
 
 vec4 label_flow_forward()
 {
-    return vec4(displacement(difference_forward, local, image_size), 1.0);
+    vec3 d = difference_forward * vec4(local, 1.0); // d.z is the w row
+#ifdef DEFORM
+    d += shape_forward;
+#endif
+    return vec4(displacement(d, image_size), 1.0);
 }

@@ -203,9 +203,8 @@ def test_shrinking_in_blocks_is_shrinking_at_once(monkeypatch):
         whole = I.shrink(image, max_size)
         monkeypatch.setattr(I, "_BLOCK_PIXELS", 2000)
         assert len(I._blocks(301, 217)) > 10
-        assert (
-            np.abs(I.shrink(image, max_size).astype(int) - whole).max() <= 1
-        )  # the float32 sums differ in their last bit
+        # The float32 sums differ in their last bit.
+        assert np.abs(I.shrink(image, max_size).astype(int) - whole).max() <= 1
         monkeypatch.undo()
         linear = linear_from_srgb(image / 255.0).astype(np.float32)
         reference = cv2.resize(linear, whole.shape[1::-1], interpolation=cv2.INTER_AREA)

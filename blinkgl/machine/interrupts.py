@@ -1,0 +1,55 @@
+"""Ctrl-C and SIGTERM that are not lost.
+
+Python runs a signal's handler between any two byte codes of the main thread, also those of a weak reference's callback,
+of ``__del__`` and of what a C library calls back. What is raised there goes to ``sys.unraisablehook``, is printed as
+"Exception ignored in" and is gone: a run that was told to end goes on. Here it is sent again.
+"""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+_AGAIN_AFTER_S = 0.05
+
+
+@contextlib.contextmanager
+def interruptible(*numbers: int) -> Iterator[None]:
+    """Inside, signals ``numbers`` raise KeyboardInterrupt as SIGINT does, and one that was raised where Python drops
+    exceptions is sent again 50 ms later, until it gets through. Only a main thread can see to that: in another nothing
+    changes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    main, inside, last = threading.get_ident(), True, signal.SIGINT
+
+    def interrupt(number: int, _) -> None:
+        nonlocal last
+        last = number
+        raise KeyboardInterrupt
+
+    def again() -> None:
+        time.sleep(_AGAIN_AFTER_S)
+        if inside:  # else the signal has had its effect, or its default action is back, which would kill the process
+            signal.pthread_kill(main, last)  # a real signal: it also ends a system call that waits
+
+    def unraisable(unraisable: sys.UnraisableHookArgs) -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            _thread.start_new_thread(again, ())  # not threading's, whose locks the interrupted code may hold
+        else:
+            hook_before(unraisable)
+
+    hook_before, sys.unraisablehook = sys.unraisablehook, unraisable
+    before = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        inside = False
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        sys.unraisablehook = hook_before

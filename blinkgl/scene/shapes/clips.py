@@ -1,0 +1,232 @@
+"""Clips: key frames of many joints' translations, rotations, scales, and how they run on a sequence's clock.
+
+Reference: Khronos glTF 2.0 specification, 3.11 and appendix C (interpolation), of which a clip is the general form.
+Values between key frames are exact, and so are their rates: nothing is resampled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from blinkgl.scene.shapes.skeleton import Locals, Motion
+
+PATHS = ("translation", "rotation", "scale")
+KINDS = ("LINEAR", "STEP", "CUBICSPLINE")
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Key frames of one property. joint : number in its skeleton.   path : of PATHS, or "weights".
+    times : (K,) s, increasing.   values : (K, n), of a CUBICSPLINE (K, 3, n): in-tangent, value, out-tangent."""
+
+    joint: int
+    path: str
+    times: np.ndarray
+    values: np.ndarray
+    interpolation: str = "LINEAR"
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """((n,), (n,)): value at a time of the clip and its rate per second; held outside the key frames. Of a
+        rotation:
+        use :class:`Clip`."""
+        times = self.times
+        cubic = self.interpolation == "CUBICSPLINE"
+        values = self.values[:, 1] if cubic else self.values
+        i = int(np.searchsorted(times, time, side="right")) - 1
+        if i < 0 or i >= len(times) - 1 or self.interpolation == "STEP":
+            held = values[min(max(i, 0), len(times) - 1)]
+            return held, np.zeros_like(held)
+        h = times[i + 1] - times[i]
+        s = (time - times[i]) / h
+        if not cubic:
+            return (1 - s) * values[i] + s * values[i + 1], (values[i + 1] - values[i]) / h
+        a, b, u, v = values[i], values[i + 1], h * self.values[i, 2], h * self.values[i + 1, 0]
+        value = (
+            (2 * s**3 - 3 * s**2 + 1) * a + (s**3 - 2 * s**2 + s) * u + (3 * s**2 - 2 * s**3) * b + (s**3 - s**2) * v
+        )
+        rate = (6 * s**2 - 6 * s) * (a - b) + (3 * s**2 - 4 * s + 1) * u + (3 * s**2 - 2 * s) * v
+        return value, rate / h
+
+
+@dataclass(frozen=True)
+class Playing:
+    """How a clip runs on the sequence's clock. first, last : s, its own times.   speed : clip seconds per second,
+    negative:
+    backwards.   phase : clip seconds after ``first`` at time 0.   loop : begins again; otherwise it is held at its
+    ends."""
+
+    first: float
+    last: float
+    speed: float = 1.0
+    phase: float = 0.0
+    loop: bool = True
+
+    @property
+    def period_ns(self) -> int | None:
+        """Of a loop."""
+        if not self.loop or self.speed == 0 or self.last <= self.first:
+            return None
+        return max(round((self.last - self.first) / abs(self.speed) * 1e9), 1)
+
+    @property
+    def span_ns(self) -> int:
+        """From time 0 on after so long nothing new comes."""
+        return 0 if self.is_static else round((self.last - self.first) / abs(self.speed) * 1e9)
+
+    @property
+    def is_static(self) -> bool:
+        return self.speed == 0 or self.last <= self.first
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        """(time of the clip, its rate)."""
+        length, period = self.last - self.first, self.period_ns
+        if length <= 0:
+            return self.first, 0.0
+        if self.loop:
+            passed = self.speed * (int(t_ns) if period is None else int(t_ns) % period) * 1e-9 + self.phase
+            within = math.fmod(passed, length)
+            return self.first + (within if within >= 0 else within + length), self.speed
+        time = self.first + self.phase + self.speed * int(t_ns) * 1e-9
+        return min(max(time, self.first), self.last), self.speed if self.first <= time < self.last else 0.0
+
+
+class Clip:
+    """Tracks on a skeleton. rest : where joints are that no track moves.   tracks : of those that do.   playing : when.
+
+    The motion of :class:`~blinkgl.scene.shapes.skeleton.Skeleton`."""
+
+    def __init__(self, rest: Locals, tracks: Sequence[Track], playing: Playing):
+        self.rest, self.playing = rest, playing
+        moving = [track for track in tracks if track.path in PATHS]
+        self.is_static = playing.is_static or not moving
+        self.period_ns, self.span_ns = playing.period_ns, playing.span_ns
+        self._joint = np.array([track.joint for track in moving], np.int64)
+        self._path = np.array([PATHS.index(track.path) for track in moving], np.int64)
+        self._kind = np.array([KINDS.index(track.interpolation) for track in moving], np.int64)
+        counts = [len(track.times) for track in moving]
+        self._first = np.cumsum([0, *counts]).astype(np.int64)
+        self._times = np.concatenate([np.zeros(0), *(np.asarray(track.times, np.float64) for track in moving)])
+        self._values = np.zeros((len(self._times), 3, 4))
+        for track, first in zip(moving, self._first):
+            values = np.asarray(track.values, np.float64)
+            values = values if values.ndim == 3 else np.stack([0 * values, values, 0 * values], axis=1)
+            if track.path == "rotation":
+                values = values / np.where(
+                    track.interpolation == "CUBICSPLINE", 1.0, np.linalg.norm(values[:, 1:2], axis=2, keepdims=True)
+                )
+            self._values[first : first + len(values), :, : values.shape[2]] = values
+
+    def locals(self, t_ns: int) -> Locals:
+        time, speed = self.playing.at(t_ns)
+        out = self.rest.copy()
+        _evaluate(time, speed, self._joint, self._path, self._kind, self._first, self._times, self._values, *out)
+        return out
+
+
+class Blend:
+    """Two motions of the same joints at once: ``share`` of the second, the rest of the first. Rotations are blended
+    along the shorter
+    way, by their quaternions."""
+
+    def __init__(self, first: Motion, second: Motion, share: float):
+        self.first, self.second, self.share = first, second, share
+        self.is_static = first.is_static and second.is_static
+        periods = {motion.period_ns for motion in (first, second) if not motion.is_static}
+        self.period_ns = periods.pop() if len(periods) == 1 else None
+        self.span_ns = max(first.span_ns, second.span_ns)
+
+    def locals(self, t_ns: int) -> Locals:
+        a, b, w = self.first.locals(t_ns), self.second.locals(t_ns), self.share
+        mixed = [(1 - w) * p + w * q for p, q in zip(a, b)]
+        side = np.where((a.rotation * b.rotation).sum(axis=1, keepdims=True) < 0, -w, w)
+        q, dq = (1 - w) * a.rotation + side * b.rotation, (1 - w) * a.d_rotation + side * b.d_rotation
+        length = np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-12)
+        q, dq = q / length, dq / length
+        mixed[1], mixed[4] = q, dq - q * (q * dq).sum(axis=1, keepdims=True)
+        return Locals(*mixed)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _evaluate(time, speed, joint, path, kind, first, times, values, T, R, S, dT, dR, dS):
+    """Writes what the tracks give at a time of the clip, and rates per second of the sequence's clock."""
+    value, rate = np.zeros(4), np.zeros(4)
+    for track in range(len(joint)):
+        begin, end = first[track], first[track + 1]
+        n = 4 if path[track] == 1 else 3
+        i, high = begin - 1, end  # the last key that is not later
+        while high - i > 1:
+            middle = (i + high) // 2
+            if times[middle] <= time:
+                i = middle
+            else:
+                high = middle
+        rate[:] = 0.0
+        if i < begin or i >= end - 1 or kind[track] == 1:
+            value[:] = values[min(max(i, begin), end - 1), 1]
+        else:
+            h = times[i + 1] - times[i]
+            s = (time - times[i]) / h
+            if kind[track] == 2:
+                for k in range(n):
+                    a, b = values[i, 1, k], values[i + 1, 1, k]
+                    u, v = h * values[i, 2, k], h * values[i + 1, 0, k]
+                    value[k] = (
+                        (2 * s**3 - 3 * s**2 + 1) * a
+                        + (s**3 - 2 * s**2 + s) * u
+                        + (3 * s**2 - 2 * s**3) * b
+                        + (s**3 - s**2) * v
+                    )
+                    rate[k] = ((6 * s**2 - 6 * s) * (a - b) + (3 * s**2 - 4 * s + 1) * u + (3 * s**2 - 2 * s) * v) / h
+            elif n == 3:
+                for k in range(3):
+                    value[k] = (1 - s) * values[i, 1, k] + s * values[i + 1, 1, k]
+                    rate[k] = (values[i + 1, 1, k] - values[i, 1, k]) / h
+            else:
+                _slerp(values[i, 1], values[i + 1, 1], s, 1.0 / h, value, rate)
+        if n == 4:
+            length, along = 0.0, 0.0
+            for k in range(4):
+                length += value[k] * value[k]
+            length = np.sqrt(length)
+            for k in range(4):
+                value[k] /= length
+                rate[k] /= length
+                along += value[k] * rate[k]
+            for k in range(4):
+                R[joint[track], k] = value[k]
+                dR[joint[track], k] = speed * (rate[k] - value[k] * along)
+        else:
+            for k in range(3):
+                if path[track] == 0:
+                    T[joint[track], k], dT[joint[track], k] = value[k], speed * rate[k]
+                else:
+                    S[joint[track], k], dS[joint[track], k] = value[k], speed * rate[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slerp(a, b, s, ds, value, rate):
+    """Along the shorter arc between unit quaternions, and its rate where s grows by ds per second."""
+    cosine = 0.0
+    for k in range(4):
+        cosine += a[k] * b[k]
+    side = 1.0 if cosine >= 0 else -1.0
+    distance = 0.0
+    for k in range(4):
+        distance += (side * b[k] - a[k]) ** 2
+    angle = 2 * np.arcsin(min(0.5 * np.sqrt(distance), 1.0))  # exact for small ones, as acos is not
+    if angle < 1e-9:
+        for k in range(4):
+            value[k] = a[k] + s * (side * b[k] - a[k])
+            rate[k] = ds * (side * b[k] - a[k])
+        return
+    whole = np.sin(angle)
+    u, v = np.sin((1 - s) * angle) / whole, side * np.sin(s * angle) / whole
+    du, dv = -angle * np.cos((1 - s) * angle) / whole, side * angle * np.cos(s * angle) / whole
+    for k in range(4):
+        value[k] = u * a[k] + v * b[k]
+        rate[k] = ds * (du * a[k] + dv * b[k])

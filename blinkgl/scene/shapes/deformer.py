@@ -1,0 +1,205 @@
+"""What a deformer is: a shape ``q(p, t)`` in the place of ``p``, in the frame of its object.
+
+A rigid body's point is at ``T(t) p``, a deforming one's at ``T(t) q(p, t)``. With the clip matrix ``MVP`` the motion
+from t to t' is
+
+    MVP' (q' - q) + (MVP' - MVP) q,
+
+in which neither difference is one of rounded numbers: the second is composed in float64, the first has a form of its
+own in every deformer (:meth:`Deformer.changes`), so that a motion of 1e-6 px is as exact as one of 10 px. Rates
+likewise: ``MVP dq/dt + dMVP/dt q``.
+
+Everything here is pure data in float64; what the vertex stage computes from the same numbers stands in
+``shaders/include/deform/``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+if TYPE_CHECKING:
+    from blinkgl.config.deform import DeformConfig
+    from blinkgl.scene.types import Mesh
+
+_SAMPLES = 32
+"""Times at which a shape is looked at to find what it sweeps, at least."""
+_MAX_SAMPLES = 256
+_STEP_NS = 50_000_000
+_MARGIN = 1.25
+_BOX = np.array(  # corners by the bits x, y, z
+    [
+        (0, 1, 3),
+        (0, 3, 2),
+        (4, 6, 7),
+        (4, 7, 5),
+        (0, 4, 5),
+        (0, 5, 1),
+        (2, 3, 7),
+        (2, 7, 6),
+        (0, 2, 6),
+        (0, 6, 4),
+        (1, 5, 7),
+        (1, 7, 3),
+    ],
+    np.int32,
+)
+
+
+class Deformer(ABC):
+    """How one mesh changes its shape. Belongs to a mesh (``Mesh.deformer``), whose vertices are the shape at rest.
+
+    What the vertex stage needs
+        glsl : name of the source, ``shaders/include/deform/NAME.glsl``, or of ``source`` where that is given.
+        source : the text itself: the five functions that ``shaders/include/deform.glsl`` names.
+        rows : numbers per time, as vec4.   attributes : more of each vertex, (V, 1 to 4) float32 by the names of GLSL.
+        textures : (h, w, 4) float32 by the names of their samplers.   sizes : more macros, whole numbers.
+
+    examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
+
+    Config : the model of ``deform:`` that asks for it; None: none does.   period_ns : after which the shape repeats;
+    None: it does not.   span_ns : from time 0 on after so long nothing new comes."""
+
+    glsl: ClassVar[str]
+    source: ClassVar[str | None] = None
+    Config: ClassVar[type[DeformConfig] | None] = None
+
+    attributes: Mapping[str, np.ndarray] = {}
+    textures: Mapping[str, np.ndarray] = {}
+    sizes: Mapping[str, int] = {}
+    period_ns: int | None = None
+    span_ns: int = 0
+    examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
+
+    @classmethod
+    def of(cls, config: Any, low: np.ndarray, high: np.ndarray) -> Deformer:
+        """What ``deform:`` asks for, of an object whose box at rest is (3,) low to high. Of classes with a
+        ``Config``."""
+        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def rows(self) -> int:
+        """Of the arrays that :meth:`numbers`, :meth:`rates` and :meth:`changes` give."""
+
+    @property
+    def is_static(self) -> bool:
+        """True when the shape is the same at all times."""
+        return False
+
+    # ---- the shape, on the CPU -----------------------------------------------------------------------------------
+
+    @abstractmethod
+    def positions(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        """(V, 3) float64 q(p, t) of the mesh's vertices."""
+
+    @abstractmethod
+    def velocity(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        """(V, 3) float64 dq/dt, units/s, analytic."""
+
+    @abstractmethod
+    def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        """(V, 3) float64 directions of the normals, not normalised."""
+
+    def sweep(self, mesh: Mesh, t0_ns: int, t1_ns: int) -> Sweep:
+        """What the shape fills over [t0, t1]. Kept with the mesh."""
+        kept = _sweeps.setdefault(mesh, {})
+        if (t0_ns, t1_ns) not in kept:
+            kept[t0_ns, t1_ns] = Sweep.of(self, mesh, t0_ns, t1_ns)
+        return kept[t0_ns, t1_ns]
+
+    def bounds(self, mesh: Mesh, t0_ns: int, t1_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """((3,), (3,)) box that holds the shape over [t0, t1]."""
+        swept = self.sweep(mesh, t0_ns, t1_ns)
+        return swept.low, swept.high
+
+    def transformed(self, matrix: np.ndarray) -> Deformer:
+        """The same of the mesh under an affine (4, 4) map A: q_A(A p) = A q(p). TypeError where that is another
+        kind of deformer."""
+        raise TypeError(f"{type(self).__name__} cannot be transformed")
+
+    # ---- the shape, for the vertex stage -------------------------------------------------------------------------
+
+    @abstractmethod
+    def numbers(self, t_ns: int) -> np.ndarray:
+        """(rows, 4) float64 of which GLSL makes the shape at t."""
+
+    @abstractmethod
+    def rates(self, t_ns: int) -> np.ndarray:
+        """(rows, 4) float64 that it needs besides for dq/dt at t."""
+
+    @abstractmethod
+    def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
+        """(rows, 4) float64 that it needs besides for q(p, there) - q(p, t)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """What a shape fills over some time. low, high : (3,) box, the margin included.
+    margin : by how much the shape may leave the positions that were looked at, units."""
+
+    deformer: Deformer
+    mesh: Mesh
+    times: tuple[int, ...]
+    low: np.ndarray
+    high: np.ndarray
+    margin: float
+
+    @classmethod
+    def of(cls, deformer: Deformer, mesh: Mesh, t0_ns: int, t1_ns: int) -> Sweep:
+        """Positions are looked at at some times. In between a vertex leaves the straight line by at most h/4 times
+        the change of its velocity from one time to the next (h/8 if that is steady, h/4 if it jumps), of which a
+        quarter more is the margin."""
+        if deformer.period_ns is not None:
+            t1_ns = min(t1_ns, t0_ns + deformer.period_ns)
+        count = (
+            1 if deformer.is_static or t1_ns <= t0_ns else min(max(_SAMPLES, (t1_ns - t0_ns) // _STEP_NS), _MAX_SAMPLES)
+        )
+        times = tuple(int(t) for t in np.linspace(t0_ns, t1_ns, count + (count > 1)).round())
+        low, high, margin, before = np.full(3, np.inf), np.full(3, -np.inf), 0.0, None
+        for i, t in enumerate(times):
+            at, velocity = deformer.positions(mesh, t), deformer.velocity(mesh, t)
+            low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
+            if before is not None:
+                jump = float(np.sqrt(((velocity - before) ** 2).sum(axis=1).max()))
+                margin = max(margin, _MARGIN * jump * (t - times[i - 1]) * 1e-9 / 4)
+            before = velocity
+        return cls(deformer, mesh, times, low - margin, high + margin, margin)
+
+    @cached_property
+    def hull(self) -> tuple[np.ndarray, np.ndarray]:
+        """((K, 3) float64, (F, 3) int32, facing out): convex hull of all positions that were looked at, without the
+        margin; the box of a flat one."""
+        kept = np.zeros((0, 3))
+        try:
+            for t in self.times:
+                points = np.vstack([kept, self.deformer.positions(self.mesh, t)])
+                kept = points[ConvexHull(points).vertices]
+            hull = ConvexHull(kept)
+        except (QhullError, ValueError):
+            low, high = self.low + self.margin, self.high - self.margin
+            corners = np.array(
+                [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+            )
+            return corners, _BOX
+        # Vertices are sorted in three dimensions.
+        kept, faces = (kept[hull.vertices], np.searchsorted(hull.vertices, hull.simplices))
+        a, b, c = (kept[faces[:, k]] for k in range(3))
+        inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
+        faces[inwards] = faces[inwards, ::-1]
+        return kept, faces.astype(np.int32)
+
+
+_sweeps: WeakKeyDictionary[Mesh, dict[tuple[int, int], Sweep]] = WeakKeyDictionary()
+
+
+def normals_at(mesh: Mesh, t_ns: int) -> np.ndarray:
+    """(V, 3) normals at t, object frame; of a mesh that deforms not normalised."""
+    return mesh.normals if mesh.deformer is None else mesh.deformer.normals(mesh, t_ns)

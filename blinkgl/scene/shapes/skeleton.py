@@ -1,0 +1,206 @@
+"""Bones: a tree of joints, and what moves them.
+
+    skeleton = Skeleton(parents, motion)
+    world, rate = skeleton.at(t_ns)                     # (n, 4, 4) each, per second the second
+
+A :class:`Motion` gives translation, rotation and scale of every joint to its parent, and their rates: a clip of a file
+(:mod:`~blinkgl.scene.shapes.clips`), or a formula.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike
+
+from blinkgl.errors import AssetError
+
+MAX_JOINTS = 200_000
+_KEPT = 4
+
+
+class Locals(NamedTuple):
+    """Of n joints to their parents. translation, scale : (n, 3).   rotation : (n, 4) unit quaternions x, y, z, w.
+    The others: their rates, per second."""
+
+    translation: np.ndarray
+    rotation: np.ndarray
+    scale: np.ndarray
+    d_translation: np.ndarray
+    d_rotation: np.ndarray
+    d_scale: np.ndarray
+
+    @classmethod
+    def rest(cls, count: int) -> Locals:
+        """Of joints that lie in their parents' places."""
+        rotation = np.zeros((count, 4))
+        rotation[:, 3] = 1.0
+        zeros = np.zeros((count, 3))
+        return cls(zeros, rotation, np.ones((count, 3)), zeros.copy(), np.zeros((count, 4)), zeros.copy())
+
+    def copy(self) -> Locals:
+        return Locals(*(array.copy() for array in self))
+
+
+class Motion(Protocol):
+    """What moves the joints of a skeleton. period_ns : after which it repeats; None: it does not.
+    span_ns : from time 0 on after so long nothing new comes."""
+
+    period_ns: int | None
+    span_ns: int
+
+    @property
+    def is_static(self) -> bool: ...
+
+    def locals(self, t_ns: int) -> Locals:
+        """Arrays of the motion's own, or new ones; whoever gets them does not write to them."""
+
+
+class Still:
+    """Joints that do not move."""
+
+    period_ns = None
+    span_ns = 0
+    is_static = True
+
+    def __init__(self, locals_: Locals):
+        self._locals = locals_
+
+    def locals(self, t_ns: int) -> Locals:
+        return self._locals
+
+
+class Skeleton:
+    """parents : (n,) number of each joint's parent, -1: none; in any order.   motion : of the n joints.
+    fixed : (n, 4, 4) what stands before each joint's own transform, such as the place of a root; None: nothing.
+    names : of the joints, for messages.   where : of whom errors speak.
+
+    Raises AssetError for parents that are none of the joints or go in a circle, and for a ``fixed`` that is not
+    finite."""
+
+    def __init__(
+        self,
+        parents: ArrayLike,
+        motion: Motion,
+        fixed: ArrayLike | None = None,
+        names: Sequence[str] = (),
+        where: str = "skeleton",
+    ):
+        self.parents = np.asarray(parents, np.int64).reshape(-1)
+        self.motion, self.names, self.where = motion, tuple(names), where
+        count = len(self.parents)
+        if count > MAX_JOINTS:
+            raise AssetError(
+                "the skeleton has too many joints", where=where, value=count, accepted=f"at most {MAX_JOINTS}"
+            )
+        self.fixed = np.tile(np.eye(4), (count, 1, 1)) if fixed is None else np.array(fixed, np.float64)
+        if self.fixed.shape != (count, 4, 4) or not np.isfinite(self.fixed).all():
+            raise AssetError(
+                "the skeleton's fixed transforms are not finite, or not one per joint",
+                where=where,
+                value=self.fixed.shape,
+                accepted=f"shape ({count}, 4, 4)",
+            )
+        self.order = self._parents_first()
+        self._kept: OrderedDict[int, tuple[np.ndarray, np.ndarray]] = OrderedDict()
+
+    @property
+    def is_static(self) -> bool:
+        return self.motion.is_static
+
+    def _parents_first(self) -> np.ndarray:
+        count, parents = len(self.parents), self.parents
+        if count and (parents.min() < -1 or parents.max() >= count):
+            first = int(np.flatnonzero((parents < -1) | (parents >= count))[0])
+            raise AssetError(
+                f"joint {self._name(first)} has a parent that does not exist",
+                where=self.where,
+                value=int(parents[first]),
+                accepted=f"-1 to {count - 1}",
+            )
+        children: list[list[int]] = [[] for _ in range(count)]
+        order = []
+        for i, parent in enumerate(parents.tolist()):
+            if parent < 0:
+                order.append(i)
+            else:
+                children[parent].append(i)
+        for i in order:  # grows while it is gone through
+            order += children[i]
+        if len(order) < count:
+            circle = min(set(range(count)) - set(order))
+            raise AssetError(f"the parents of joint {self._name(circle)} go in a circle", where=self.where)
+        return np.array(order, np.int64)
+
+    def _name(self, joint: int) -> str:
+        return f"'{self.names[joint]}'" if joint < len(self.names) else str(joint)
+
+    def at(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """((n, 4, 4), (n, 4, 4)) float64: each joint's transform to the object's frame, and its rate, 1/s. Those of the
+        last few times are kept; not to be written to."""
+        if t_ns not in self._kept:
+            world, rate = np.empty((2, len(self.parents), 4, 4))
+            _world(self.order, self.parents, self.fixed, *self.motion.locals(t_ns), world, rate)
+            self._kept[t_ns] = world, rate
+            if len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        return self._kept[t_ns]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _world(order, parents, fixed, T, R, S, dT, dR, dS, world, rate):
+    """Transforms of all joints, parents first, and their rates by the product rule."""
+    L, D, F, G = np.zeros((4, 4)), np.zeros((4, 4)), np.empty((4, 4)), np.empty((4, 4))
+    L[3, 3] = 1.0
+    for i in order:
+        x, y, z, w = R[i]
+        dx, dy, dz, dw = dR[i]
+        _turn(x, y, z, w, L)
+        # The matrix is quadratic in the quaternion: its rate is linear in the quaternion's.
+        D[0, 0] = -4 * (y * dy + z * dz)
+        D[1, 1] = -4 * (x * dx + z * dz)
+        D[2, 2] = -4 * (x * dx + y * dy)
+        a, b = dx * y + x * dy, dz * w + z * dw
+        D[0, 1], D[1, 0] = 2 * (a - b), 2 * (a + b)
+        a, b = dx * z + x * dz, dy * w + y * dw
+        D[0, 2], D[2, 0] = 2 * (a + b), 2 * (a - b)
+        a, b = dy * z + y * dz, dx * w + x * dw
+        D[1, 2], D[2, 1] = 2 * (a - b), 2 * (a + b)
+        for r in range(3):
+            for c in range(3):
+                D[r, c] = D[r, c] * S[i, c] + L[r, c] * dS[i, c]
+                L[r, c] *= S[i, c]
+            L[r, 3], D[r, 3] = T[i, r], dT[i, r]
+        _times(fixed[i], L, F)
+        _times(fixed[i], D, G)
+        parent = parents[i]
+        if parent < 0:
+            world[i], rate[i] = F, G
+        else:
+            _times(world[parent], F, world[i])
+            _times(rate[parent], F, rate[i])
+            for r in range(4):
+                for c in range(4):
+                    for k in range(4):
+                        rate[i, r, c] += world[parent, r, k] * G[k, c]
+
+
+@njit(cache=True, nogil=True)
+def _turn(x, y, z, w, out):
+    out[0, 0], out[0, 1], out[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    out[1, 0], out[1, 1], out[1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    out[2, 0], out[2, 1], out[2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+
+
+@njit(cache=True, nogil=True)
+def _times(a, b, out):
+    for r in range(4):
+        for c in range(4):
+            total = 0.0
+            for k in range(4):
+                total += a[r, k] * b[k, c]
+            out[r, c] = total

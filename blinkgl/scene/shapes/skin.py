@@ -1,0 +1,335 @@
+"""Skins and morph targets: vertices that follow joints, and vertices that are pulled to other shapes.
+
+    q(p, t) = sum_i w_i J_i(t) (p + sum_k m_k(t) d_k),     J_i = after . joint_i(t) . inverse bind_i . before
+
+and the difference to another time, with p_m the morphed vertex and D = sum_k (m_k' - m_k) d_k,
+
+    q' - q = sum_i w_i (J_i' - J_i) (p_m + D) + sum_i w_i J_i D        (the last J without its translation),
+
+whose matrices are subtracted in float64 (``changes``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
+from blinkgl.scene.types import Mesh
+
+MAX_ROWS = 1024
+"""Of numbers per time: OpenGL's blocks of 64 kB hold four times as many."""
+MAX_WEIGHTS = 8
+"""Joints that one vertex may follow."""
+_TEXTURE_WIDTH = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Morphs:
+    """Shapes that a mesh is pulled to. positions : (k, V, 3) what is added at weight 1.   normals : likewise, or None.
+    weights : ((k,), (k,)) at a time in ns: how much of each, and the rate of that per second.
+    is_static, period_ns, span_ns : as of :class:`~blinkgl.scene.shapes.skeleton.Motion`."""
+
+    positions: np.ndarray
+    normals: np.ndarray | None
+    weights: Callable[[int], tuple[np.ndarray, np.ndarray]]
+    is_static: bool = False
+    period_ns: int | None = None
+    span_ns: int = 0
+
+    def taken(self, vertices: np.ndarray) -> Morphs:
+        """Of some of the vertices, in their order."""
+        normals = None if self.normals is None else self.normals[:, vertices]
+        return replace(self, positions=self.positions[:, vertices], normals=normals)
+
+
+class Skin(Deformer):
+    """Vertices that follow joints.
+
+    skeleton : :class:`~blinkgl.scene.shapes.skeleton.Skeleton`, in the object's frame.
+    bones : (m,) joints of it that vertices follow.   inverse_bind : (m, 4, 4) from the mesh to each as it was bound.
+    joints : (V, k) numbers in ``bones``.   weights : (V, k), made to sum to 1.   morphs : :class:`Morphs` or None.
+    after, before : (4, 4) of the object and of the mesh, where these are turned or scaled (:meth:`transformed`).
+
+    Raises AssetError naming ``where``: joints that do not exist, weights that are negative, not finite or sum to
+    zero, a matrix that is not finite, more joints than fit."""
+
+    glsl = "skin"
+    examples = (
+        {"SKIN_WEIGHTS": 4},
+        {"SKIN_WEIGHTS": 8, "SKIN_MORPHS": 2, "SKIN_MORPH_ROW": 60, "SKIN_VERTICES": 100},
+    )
+
+    def __init__(
+        self,
+        skeleton: Skeleton,
+        bones: ArrayLike,
+        inverse_bind: ArrayLike,
+        joints: ArrayLike,
+        weights: ArrayLike,
+        morphs: Morphs | None = None,
+        *,
+        after: ArrayLike | None = None,
+        before: ArrayLike | None = None,
+        where: str = "skin",
+    ):
+        self.skeleton, self.morphs, self.where = skeleton, morphs, where
+        self.bones = np.asarray(bones, np.int64).reshape(-1)
+        self.inverse_bind = np.asarray(inverse_bind, np.float64)
+        self.after = np.eye(4) if after is None else np.asarray(after, np.float64)
+        self.before = np.eye(4) if before is None else np.asarray(before, np.float64)
+        self.joints, self.weights = _checked_weights(
+            np.asarray(joints), np.asarray(weights, np.float64), len(self.bones), where
+        )
+        _check_bones(self.bones, self.inverse_bind, len(skeleton.parents), where)
+        self._bind = self.inverse_bind @ self.before
+        targets = 0 if morphs is None else len(morphs.positions)
+        self._rows = 3 * len(self.bones) + -(-targets // 4)
+        if self._rows > MAX_ROWS:
+            raise AssetError(
+                "a skin has too many joints and morph targets",
+                where=where,
+                value=(len(self.bones), targets),
+                accepted=f"three per joint and a quarter per target, at most {MAX_ROWS} together",
+            )
+        moving = [part for part in (skeleton.motion, morphs) if part is not None and not part.is_static]
+        periods = {part.period_ns for part in moving}
+        self.period_ns = periods.pop() if len(periods) == 1 else None
+        self.span_ns = max((part.span_ns for part in moving), default=0)
+        self.sizes = {"SKIN_WEIGHTS": self.weights.shape[1]}
+        if targets:
+            self.sizes |= {
+                "SKIN_MORPHS": targets,
+                "SKIN_MORPH_ROW": 3 * len(self.bones),
+                "SKIN_VERTICES": len(self.joints),
+            }
+        self.attributes = _streams(self.joints, self.weights)
+        self.textures = {} if morphs is None else {"skin_morphs": _deltas_texture(morphs)}
+
+    @classmethod
+    def rigid(
+        cls,
+        skeleton: Skeleton,
+        joint: int,
+        vertices: int,
+        morphs: Morphs | None = None,
+        *,
+        inverse_bind: ArrayLike | None = None,
+        after: ArrayLike | None = None,
+        where: str = "skin",
+    ) -> Skin:
+        """All vertices follow one joint, in whose frame they are, or are taken by ``inverse_bind`` (4, 4)."""
+        bind = np.eye(4) if inverse_bind is None else np.asarray(inverse_bind)
+        bound = np.zeros((vertices, 1)), np.ones((vertices, 1))
+        return cls(skeleton, [joint], bind[None], *bound, morphs, after=after, where=where)
+
+    @classmethod
+    def morphing(cls, morphs: Morphs, where: str = "morph targets") -> Skin:
+        """No joint at all, but for one that lies still."""
+        still = Skeleton([-1], Still(Locals.rest(1)), where=where)
+        return cls.rigid(still, 0, morphs.positions.shape[1], morphs, where=where)
+
+    @property
+    def rows(self) -> int:
+        return self._rows
+
+    @property
+    def is_static(self) -> bool:
+        return self.skeleton.is_static and (self.morphs is None or self.morphs.is_static)
+
+    def transformed(self, matrix: np.ndarray) -> Skin:
+        matrix = np.asarray(matrix, np.float64)
+        morphs = self.morphs
+        if morphs is not None:
+            linear = matrix[:3, :3]
+            # Exact for turns and even scales, which keep the length that a mesh's normals have.
+            scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
+            normals = None if morphs.normals is None else morphs.normals @ np.linalg.inv(linear) * scale
+            morphs = replace(morphs, positions=morphs.positions @ linear.T, normals=normals)
+        given = self.skeleton, self.bones, self.inverse_bind, self.joints, self.weights, morphs
+        return Skin(*given, after=matrix @ self.after, before=self.before @ np.linalg.inv(matrix), where=self.where)
+
+    # ---- the shape, on the CPU -----------------------------------------------------------------------------------
+
+    def matrices(self, t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """((m, 4, 4), (m, 4, 4)) float64 J_i and dJ_i/dt."""
+        world, rate = self.skeleton.at(t_ns)
+        return self.after @ world[self.bones] @ self._bind, self.after @ rate[self.bones] @ self._bind
+
+    def _blend(self, matrices: np.ndarray) -> np.ndarray:
+        """(V, 3, 4) of (m, 4, 4)."""
+        return np.einsum("vk,vkij->vij", self.weights, matrices[:, :3][self.joints])
+
+    def _morphed(self, vectors: np.ndarray, deltas: np.ndarray | None, weights: np.ndarray) -> np.ndarray:
+        vectors = np.asarray(vectors, np.float64)
+        return vectors if deltas is None else vectors + np.tensordot(weights, deltas, 1)
+
+    def positions(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        points, blend = mesh.vertices, self._blend(self.matrices(t_ns)[0])
+        if self.morphs is not None:
+            points = self._morphed(points, self.morphs.positions, self.morphs.weights(t_ns)[0])
+        return np.einsum("vij,vj->vi", blend[:, :, :3], points) + blend[:, :, 3]
+
+    def velocity(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        J, dJ = self.matrices(t_ns)
+        points, rates, blend = mesh.vertices, None, self._blend(dJ)
+        if self.morphs is not None:
+            weights, d_weights = self.morphs.weights(t_ns)
+            points = self._morphed(points, self.morphs.positions, weights)
+            rates = np.tensordot(d_weights, self.morphs.positions, 1)
+        out = np.einsum("vij,vj->vi", blend[:, :, :3], points) + blend[:, :, 3]
+        return out if rates is None else out + np.einsum("vij,vj->vi", self._blend(J)[:, :, :3], rates)
+
+    def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
+        a, b, c = np.moveaxis(self._blend(self.matrices(t_ns)[0])[:, :, :3], 1, 0)
+        n = np.asarray(mesh.normals, np.float64)
+        if self.morphs is not None:
+            n = self._morphed(n, self.morphs.normals, self.morphs.weights(t_ns)[0])
+        return np.stack([(np.cross(p, q) * n).sum(axis=1) for p, q in ((b, c), (c, a), (a, b))], axis=1)
+
+    # ---- the shape, for the vertex stage -------------------------------------------------------------------------
+
+    def _packed(self, matrices: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+        out = np.zeros((self._rows, 4))
+        out[: 3 * len(self.bones)] = matrices[:, :3].reshape(-1, 4)
+        if weights is not None:
+            out[3 * len(self.bones) :].reshape(-1)[: len(weights)] = weights
+        return out
+
+    def numbers(self, t_ns: int) -> np.ndarray:
+        return self._packed(self.matrices(t_ns)[0], None if self.morphs is None else self.morphs.weights(t_ns)[0])
+
+    def rates(self, t_ns: int) -> np.ndarray:
+        return self._packed(self.matrices(t_ns)[1], None if self.morphs is None else self.morphs.weights(t_ns)[1])
+
+    def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
+        weights = None
+        if self.morphs is not None:
+            weights = self.morphs.weights(there_ns)[0] - self.morphs.weights(t_ns)[0]
+        return self._packed(self.matrices(there_ns)[0] - self.matrices(t_ns)[0], weights)
+
+
+def joined(skins: Sequence[Skin]) -> Skin | None:
+    """One skin of several meshes' vertices, one after the other; None where they cannot be one: other skeletons,
+    morph targets, too many
+    joints."""
+    first = skins[0]
+    if any(
+        s.skeleton is not first.skeleton or s.morphs is not None or not np.array_equal(s.after, first.after)
+        for s in skins
+    ):
+        return None
+    sets: dict[tuple[bytes, bytes, bytes], tuple[int, Skin]] = {}
+    joints, weights, count = [], [], 0
+    width = max(s.weights.shape[1] for s in skins)
+    for s in skins:
+        key = (s.bones.tobytes(), s.inverse_bind.tobytes(), s.before.tobytes())
+        if key not in sets:
+            sets[key] = count, s
+            count += len(s.bones)
+        room = ((0, 0), (0, width - s.weights.shape[1]))
+        joints.append(np.pad(s.joints, room) + sets[key][0])
+        weights.append(np.pad(s.weights, room))
+    if 3 * count > MAX_ROWS:
+        return None
+    kinds = [s for _, s in sets.values()]
+    bind = np.concatenate([s.inverse_bind @ s.before for s in kinds])
+    bones = np.concatenate([s.bones for s in kinds])
+    return Skin(
+        first.skeleton, bones, bind, np.vstack(joints), np.vstack(weights), after=first.after, where=first.where
+    )
+
+
+def _checked_weights(joints: np.ndarray, weights: np.ndarray, bones: int, where: str) -> tuple[np.ndarray, np.ndarray]:
+    """((V, k) int64, (V, k) float64), the weights of each vertex in falling order and summing to 1, as exact in
+    float32."""
+    if joints.ndim != 2 or joints.shape != weights.shape or not joints.shape[1] >= 1:
+        raise AssetError(
+            "joints and weights of a skin differ in shape",
+            where=where,
+            value=f"{joints.shape} and {weights.shape}",
+            accepted="(V, k) both",
+        )
+    bad = ~(np.isfinite(weights) & (weights >= 0)).all(axis=1)
+    if bad.any():
+        vertex = int(np.flatnonzero(bad)[0])
+        raise AssetError(
+            f"vertex {vertex} of a skin has a weight that is negative or no number",
+            where=where,
+            value=weights[vertex].tolist(),
+        )
+    total = weights.sum(axis=1)
+    if not (total > 1e-12).all():
+        vertex = int(np.flatnonzero(~(total > 1e-12))[0])
+        raise AssetError(
+            f"the weights of vertex {vertex} of a skin sum to zero",
+            where=where,
+            value=weights[vertex].tolist(),
+            accepted="one joint or more",
+        )
+    used = weights > 0
+    outside = used & ~((joints >= 0) & (joints < bones))
+    if outside.any():
+        vertex = int(np.flatnonzero(outside.any(axis=1))[0])
+        raise AssetError(
+            f"vertex {vertex} of a skin follows a joint that does not exist",
+            where=where,
+            value=int(joints[vertex][outside[vertex]][0]),
+            accepted=f"0 to {bones - 1}",
+        )
+    order = np.argsort(-weights, axis=1, kind="stable")
+    weights, joints = np.take_along_axis(weights, order, 1), np.take_along_axis(np.where(used, joints, 0), order, 1)
+    width = min(max(int(used.sum(axis=1).max()), 1), MAX_WEIGHTS)
+    weights, joints = weights[:, :width], joints[:, :width].astype(np.int64)
+    weights = (weights / weights.sum(axis=1, keepdims=True)).astype(np.float32).astype(np.float64)
+    return joints, weights
+
+
+def _check_bones(bones: np.ndarray, inverse_bind: np.ndarray, joints: int, where: str) -> None:
+    if not len(bones) or bones.min() < 0 or bones.max() >= joints:
+        raise AssetError(
+            "a skin names a joint that is not in its skeleton",
+            where=where,
+            value=bones[(bones < 0) | (bones >= joints)][:1].tolist(),
+        )
+    if inverse_bind.shape != (len(bones), 4, 4):
+        raise AssetError(
+            "a skin has not one inverse bind matrix per joint",
+            where=where,
+            value=str(inverse_bind.shape),
+            accepted=f"shape ({len(bones)}, 4, 4)",
+        )
+    if not np.isfinite(inverse_bind).all():
+        first = int(np.flatnonzero(~np.isfinite(inverse_bind).all(axis=(1, 2)))[0])
+        raise AssetError(
+            f"the inverse bind matrix of joint {first} of a skin is not finite",
+            where=where,
+            value=inverse_bind[first].tolist(),
+        )
+
+
+def _streams(joints: np.ndarray, weights: np.ndarray) -> dict[str, np.ndarray]:
+    """Vertex attributes, four joints each."""
+    streams = {}
+    for number, start in enumerate(range(0, weights.shape[1], 4)):
+        room = ((0, 0), (0, 4 - weights[:, start : start + 4].shape[1]))
+        streams[f"in_joints_{number}"] = np.pad(joints[:, start : start + 4], room).astype(np.float32)
+        streams[f"in_weights_{number}"] = np.pad(weights[:, start : start + 4], room).astype(np.float32)
+    return streams
+
+
+def _deltas_texture(morphs: Morphs) -> np.ndarray:
+    """(h, 4096, 4) float32: of target k and vertex v the texels 2 (k V + v), position, and the next, normal."""
+    count, vertices = morphs.positions.shape[:2]
+    texels = np.zeros((count, vertices, 2, 4), np.float32)
+    texels[:, :, 0, :3] = morphs.positions
+    if morphs.normals is not None:
+        texels[:, :, 1, :3] = morphs.normals
+    flat = texels.reshape(-1, 4)
+    height = -(-len(flat) // _TEXTURE_WIDTH)
+    return np.pad(flat, ((0, height * _TEXTURE_WIDTH - len(flat)), (0, 0))).reshape(height, _TEXTURE_WIDTH, 4)

@@ -1,0 +1,117 @@
+"""Which deformers there are: one table of classes.
+
+    @register
+    class Mine(Deformer):
+        Config = MineConfig               # class MineConfig(DeformConfig): kind: Literal["mine"] = "mine"; …
+        glsl, source = "mine", "vec3 deformed(vec3 p) …"
+
+docs/extending.md has the whole of one.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from blinkgl.config.base import tag_of
+from blinkgl.config.deform import DeformConfig
+from blinkgl.scene.shapes.closed_forms import Bend, Breathe, Flag, Twist, Wave
+from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.skin import Skin
+
+DEFORMERS: dict[str, type[Deformer]] = {}
+"""By the class's name."""
+FUNCTIONS = (
+    "vec3 deformed(vec3 p)",
+    "vec3 deformed_rate(vec3 p)",
+    "vec3 deformed_change(vec3 p, int other)",
+    "vec3 deformed_normal(vec3 p, vec3 n)",
+    "vec3 deformed_normal_rate(vec3 p, vec3 n)",
+)
+"""What the source of a deformer has to define."""
+
+
+def register(deformer: type[Deformer]) -> type[Deformer]:
+    """Puts a class into the table, and its ``Config`` into ``deform:``; returns it.
+
+    Raises TypeError naming the class and the part that is missing or of the wrong kind; nothing is then registered."""
+    name = _checked(deformer)
+    if deformer.Config is not None:
+        DeformConfig.members.add(deformer.Config)
+    DEFORMERS[name] = deformer
+    return deformer
+
+
+def unregister(deformer: type[Deformer]) -> None:
+    """Takes a class out again. Raises KeyError where it is not in the table."""
+    del DEFORMERS[deformer.__name__]
+    if deformer.Config is not None:
+        DeformConfig.members.remove(deformer.Config.model_fields["kind"].default)
+
+
+def deformer_of(config: DeformConfig, low: np.ndarray, high: np.ndarray) -> Deformer:
+    """What ``deform:`` asks for, of an object whose box at rest is (3,) low to high. Raises TypeError for a
+    configuration of none in the table."""
+    for deformer in DEFORMERS.values():
+        if deformer.Config is type(config):
+            return deformer.of(config, np.asarray(low, np.float64), np.asarray(high, np.float64))
+    raise TypeError(f"no deformer for {type(config).__name__}")
+
+
+def define_of(glsl: str) -> str:
+    """The macro that compiles a deformer's source in."""
+    return f"DEFORM_{glsl.upper()}"
+
+
+def includes() -> dict[str, str]:
+    """Texts by the name that shaders include them by: deforms.glsl, and deform/NAME.glsl of those whose source is
+    their own."""
+    sources = {deformer.glsl: deformer.source for deformer in DEFORMERS.values()}
+    lines = [
+        line for name in sources for line in (f"#ifdef {define_of(name)}", f'#include "deform/{name}.glsl"', "#endif")
+    ]
+    own = {f"deform/{name}.glsl": text.lstrip("\n") for name, text in sources.items() if text is not None}
+    return {"deforms.glsl": "\n".join(lines) + "\n", **own}
+
+
+def _checked(deformer: Any) -> str:
+    if not (isinstance(deformer, type) and issubclass(deformer, Deformer)):
+        raise TypeError(f"{deformer!r} is not a subclass of Deformer")
+    name = deformer.__name__
+
+    def unless(right: Any, part: str, problem: str) -> None:
+        if not right:
+            raise TypeError(f"deformer {name}: `{part}` {problem}")
+
+    unless(DEFORMERS.get(name, deformer) is deformer, "__name__", "is taken: there is such a deformer already")
+    for part in sorted(deformer.__abstractmethods__):
+        unless(False, part, "is missing")
+    glsl = getattr(deformer, "glsl", "")
+    unless(
+        isinstance(glsl, str) and glsl.isidentifier() and glsl.islower(), "glsl", "is missing, or no word of a-z and _"
+    )
+    text = deformer.source
+    if text is None:
+        file = resources.files("blinkgl.shaders").joinpath(f"include/deform/{glsl}.glsl")
+        unless(file.is_file(), "source", f"is missing, and so is the file shaders/include/deform/{glsl}.glsl")
+        text = file.read_text(encoding="utf-8")
+    for function in FUNCTIONS:
+        unless(function in text, "source", f"does not define {function}")
+    model = deformer.Config
+    if model is not None:
+        unless(
+            isinstance(model, type) and issubclass(model, DeformConfig), "Config", f"is {model!r} and no DeformConfig"
+        )
+        unless(
+            (tag_of(model) or ("",))[0] == "kind",
+            "Config.kind",
+            'is not of the form `kind: Literal["name"] = "name"`',
+        )
+        unless(deformer.of.__func__ is not Deformer.of.__func__, "of", "is missing")
+    return name
+
+
+for _one in (Wave, Flag, Twist, Bend, Breathe, Skin):
+    register(_one)

@@ -1,0 +1,271 @@
+"""Shapes that change with time, drawn, against the float64 reference, which moves the vertices and casts rays at
+them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from skinned import arm
+
+from blinkgl.config.deform import BendConfig, BreatheConfig, FlagConfig, TwistConfig, WaveConfig
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.labels import LabelRequest
+from blinkgl.render import reference
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.shapes.skeleton import Locals, Skeleton
+from blinkgl.scene.shapes.skin import Morphs, Skin
+from blinkgl.scene.shapes.table import deformer_of
+from blinkgl.scene.types import Material
+from render_scenes import LEVEL, cube, drift, quad, rig, scene, smooth_texture, sphere, still, thing
+
+MS = 1_000_000
+T0, T1, T_BACK = 300 * MS, 400 * MS, 200 * MS
+LABELS = LabelRequest(
+    "depth", "ids", "normals", "velocity", "flow_forward", "flow_backward", "occlusion_forward", "occlusion_backward"
+)
+SPIN = Rotation.from_rotvec([0.1, -0.2, 0.3])
+FORMS = {
+    "wave": WaveConfig(),
+    "flag": FlagConfig(along="x", towards="z"),
+    "twist": TwistConfig(angle=120),
+    "bend": BendConfig(),
+    "breathe": BreatheConfig(amount=(0.3, 0.2, -0.2)),
+}
+
+
+def by_formula(mesh, kind):
+    return replace(mesh, deformer=deformer_of(FORMS[kind], mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)))
+
+
+def world(mesh, texture=None, moves=True, camera_moves=True):
+    path = drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), Rotation.identity(), SPIN) if moves else still((0.2, 4, 0.1))
+    eye = drift((0, 0, 0), (0.2, 0.1, -0.1), LEVEL, LEVEL * SPIN) if camera_moves else None
+    wall = thing("wall", 1, quad(9, 9), still((0, 9, 0), LEVEL * Rotation.from_euler("x", 180, degrees=True)))
+    return scene([thing("body", 3, mesh, path, Material(texture, (0.9, 0.5, 0.3))), wall], rig(path=eye))
+
+
+def graded(gl, what, t=T0, forward=T1, backward=T_BACK):
+    ref = reference.render(what, t, forward_ns=forward, backward_ns=backward)
+    with Renderer(gl, what, RenderConfig(image_antialiasing="none")) as renderer:
+        labels = renderer.labels(t, LABELS, forward, backward)
+    off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth)
+    return ref, labels, off
+
+
+def length(v):
+    return np.linalg.norm(np.asarray(v, np.float64), axis=-1)
+
+
+@pytest.mark.parametrize("kind", FORMS)
+def test_every_label_of_a_shape_by_formula(gl, kind):
+    what = world(by_formula(sphere(1.0, 4), kind))
+    ref, labels, off = graded(gl, what)
+    body = off & (ref.instance == 3)
+    assert body.sum() > 1000
+    np.testing.assert_array_equal(labels.ids[off], ref.instance[off])
+    np.testing.assert_allclose(labels.depth[off], ref.depth[off], rtol=1e-5)
+    for flow, true in ((labels.forward, ref.forward), (labels.backward, ref.backward)):
+        error = length(flow.flow - true.flow)[off]
+        assert np.median(length(true.flow)[body]) > 1.0
+        assert np.median(error) <= 1e-5 and error.max() <= 1e-2
+    scale = np.median(length(ref.velocity)[body])
+    error = length(labels.velocity - ref.velocity)[off] / scale
+    assert np.median(error) < 2e-6 and error.max() < 1e-4
+    np.testing.assert_allclose(labels.normals[off], (ref.normal @ what.camera_path.pose(T0)[:3, :3])[off], atol=5e-5)
+    hidden = (labels.forward.occluded != ref.forward.occluded)[off]
+    assert hidden.mean() < 0.03
+
+
+@pytest.mark.parametrize("kind", FORMS)
+def test_motions_of_a_millionth_of_a_pixel(gl, kind):
+    """The body and the camera stand still: nothing but the shape moves."""
+    what = world(by_formula(sphere(1.0, 4), kind), moves=False, camera_moves=False)
+    ref, labels, off = graded(gl, what, forward=T0 + 30, backward=T0 - 30)
+    off &= ref.instance == 3
+    for flow, true in ((labels.forward, ref.forward), (labels.backward, ref.backward)):
+        motion = length(true.flow)[off]
+        assert 1e-8 < np.median(motion) < 1e-5
+        # Of the largest motion: near a knot of the wave itself nothing moves. Where a triangle is seen from its edge,
+        # its corners' # snapping to 1/256 px is a larger part of it.
+        error = length(flow.flow - true.flow)[off] / motion.max()
+        assert np.quantile(error, 0.99) <= 1e-5 and error.max() <= 1e-3
+    limit = labels.forward.flow[off] / 30e-9
+    assert length(labels.velocity[off] - limit).max() <= 1e-5 * length(limit).max()
+
+
+@pytest.mark.parametrize("kind", FORMS)
+def test_there_and_back_again(gl, kind):
+    """backward flow at where forward flow ends, of the same surface: back to the pixel."""
+    what = world(by_formula(sphere(1.0, 4), kind))
+    _, there, off = graded(gl, what, T0, T1, T_BACK)
+    _, back, _ = graded(gl, what, T1, T1 + MS, T0)
+    y, x = np.nonzero(off & ~there.forward.occluded & (there.ids == 3))
+    at = np.stack([x, y], axis=1) + there.forward.flow[y, x]
+    x0, y0 = np.floor(at).astype(int).T
+    inside = (x0 >= 0) & (y0 >= 0) & (x0 < what.camera.width - 1) & (y0 < what.camera.height - 1)
+    at, x0, y0 = at[inside], x0[inside], y0[inside]
+    same = np.all([back.ids[y0 + j, x0 + i] == 3 for i in (0, 1) for j in (0, 1)], axis=0)
+    at, x0, y0 = at[same], x0[same], y0[same]
+    a, b = (at - np.stack([x0, y0], axis=1)).T[:, :, None]
+    f = back.backward.flow
+    mean = (1 - b) * ((1 - a) * f[y0, x0] + a * f[y0, x0 + 1]) + b * ((1 - a) * f[y0 + 1, x0] + a * f[y0 + 1, x0 + 1])
+    start = np.stack([x, y], axis=1)[inside][same]
+    assert same.sum() > 500 and np.median(length(at + mean - start)) < 5e-3
+
+
+@pytest.mark.parametrize("kind", FORMS)
+@pytest.mark.parametrize("textured", [False, True])
+def test_rate_of_luminance_is_that_of_the_frames(gl, kind, textured):
+    egg = transform_mesh(sphere(1.0, 4), np.diag([1.0, 0.5, 0.8]))
+    what = world(by_formula(egg, kind), smooth_texture() if textured else None, moves=False, camera_moves=False)
+    h = MS
+    ref = reference.render(what, T0)
+    with Renderer(gl, what, RenderConfig(antialiasing="none"), whole=True) as renderer:
+        before, after = (renderer.luminance(T0 + dt).read().astype(np.float64) for dt in (-h, h))
+        frame = renderer.luminance(T0, rate=True)
+        rate = frame.read("rate").astype(np.float64)
+    off = ref.hit & (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
+    true = (after - before) / (2e-9 * h)
+    error = np.abs(rate - true)[off]
+    assert np.abs(true[off]).max() > 0.1
+    assert np.quantile(error, 0.9) < 0.03 * np.abs(true[off]).max()
+
+
+def test_a_still_camera_draws_a_body_that_only_changes_its_shape(gl):
+    what = world(by_formula(cube(1.0), "twist"), moves=False, camera_moves=False)
+    with Renderer(gl, what, RenderConfig()) as renderer, Renderer(gl, what, RenderConfig(), whole=True) as whole:
+        assert not renderer.whole
+        for t in (T0, T0 + 7 * MS, T1, T_BACK):
+            np.testing.assert_array_equal(renderer.luminance(t).view(), whole.luminance(t).read())
+            np.testing.assert_array_equal(renderer.velocity(t).read(), whole.velocity(t).read())
+        assert np.abs(renderer.velocity_of_movers(T0).read()).max() > 1
+
+
+def test_variants_are_compiled_where_a_shape_asks(gl):
+    from blinkgl.gl import create_context
+
+    with create_context() as own:
+        with Renderer(own, world(sphere(1.0, 2)), RenderConfig()) as renderer:
+            renderer.luminance(T0)
+        assert not any("DEFORM" in dict(defines) for _, defines in own.shaders.compiled)
+        with Renderer(own, world(by_formula(sphere(1.0, 2), "wave")), RenderConfig()) as renderer:
+            renderer.luminance(T0)
+        assert sum("DEFORM" in dict(defines) for _, defines in own.shaders.compiled) == 1
+
+
+# ------------------------------------------------------------------------------------------------- skins
+
+
+def bar():
+    tilted = np.eye(4)
+    tilted[:3, :3], tilted[2, 3] = Rotation.from_euler("x", 20, degrees=True).as_matrix(), -1
+    return transform_mesh(arm(), tilted)
+
+
+def morphing(mesh):
+    """The same, pulled to two other shapes besides."""
+    skin, up = mesh.deformer, mesh.vertices[:, 2:]
+    deltas = np.stack([0.3 * np.sin(3 * up) * [1, 0, 0], 0.2 * up * [0, 1, 0]])
+    normals = np.stack(
+        [-0.9 * np.cos(3 * up) * mesh.normals[:, :1] * [0, 0, 1], -0.2 * mesh.normals[:, 1:2] * [0, 0, 1.0]]
+    )
+    weights = lambda t: (np.sin([7e-9 * t, 3e-9 * t]), np.array([7, 3]) * np.cos([7e-9 * t, 3e-9 * t]))
+    morphs = Morphs(deltas, normals, weights, span_ns=2 * 10**9)
+    given = skin.skeleton, skin.bones, skin.inverse_bind, skin.joints, skin.weights
+    return replace(mesh, deformer=Skin(*given, morphs, after=skin.after, before=skin.before))
+
+
+FIGURES = {"skin": bar, "skin and morphs": lambda: morphing(bar())}
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_every_label_of_a_skin(gl, figure):
+    what = world(FIGURES[figure]())
+    ref, labels, off = graded(gl, what)
+    body = off & (ref.instance == 3)
+    assert body.sum() > 500
+    np.testing.assert_array_equal(labels.ids[off], ref.instance[off])
+    np.testing.assert_allclose(labels.depth[off], ref.depth[off], rtol=1e-5)
+    for flow, true in ((labels.forward, ref.forward), (labels.backward, ref.backward)):
+        error = length(flow.flow - true.flow)[off]
+        assert np.median(length(true.flow)[body]) > 1.0
+        assert np.median(error) <= 1e-5 and error.max() <= 1e-2
+    scale = np.median(length(ref.velocity)[body])
+    error = length(labels.velocity - ref.velocity)[off] / scale
+    assert np.median(error) < 2e-6 and error.max() < 1e-4
+    np.testing.assert_allclose(labels.normals[off], (ref.normal @ what.camera_path.pose(T0)[:3, :3])[off], atol=5e-5)
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_a_skin_that_moves_by_a_millionth_of_a_pixel(gl, figure):
+    what = world(FIGURES[figure](), moves=False, camera_moves=False)
+    ref, labels, off = graded(gl, what, forward=T0 + 30, backward=T0 - 30)
+    off &= ref.instance == 3
+    for flow, true in ((labels.forward, ref.forward), (labels.backward, ref.backward)):
+        motion = length(true.flow)[off]
+        assert 1e-8 < np.median(motion) < 1e-4
+        assert np.quantile(length(flow.flow - true.flow)[off] / motion.max(), 0.99) <= 1e-5
+    limit = labels.forward.flow[off] / 30e-9
+    assert length(labels.velocity[off] - limit).max() <= 1e-4 * length(limit).max()
+
+
+@pytest.mark.parametrize("figure", FIGURES)
+def test_rate_of_luminance_of_a_skin(gl, figure):
+    what = world(FIGURES[figure](), moves=False, camera_moves=False)
+    ref = reference.render(what, T0)
+    with Renderer(gl, what, RenderConfig(antialiasing="none"), whole=True) as renderer:
+        before, after = (renderer.luminance(T0 + dt).read().astype(np.float64) for dt in (-MS, MS))
+        rate = renderer.luminance(T0, rate=True).read("rate").astype(np.float64)
+    off = ref.hit & (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
+    true = (after - before) / 2e-3
+    assert np.abs(true[off]).max() > 0.1
+    assert np.quantile(np.abs(rate - true)[off], 0.9) < 0.03 * np.abs(true[off]).max()
+
+
+class Spinning:
+    """One joint that turns as a rigid body on a path would."""
+
+    period_ns, span_ns, is_static = None, 10**9, False
+
+    def __init__(self, path):
+        self.path = path
+
+    def locals(self, t_ns):
+        T, dT = self.path.pose(t_ns), self.path.derivative(t_ns)
+        out = Locals.rest(1)
+        q = out.rotation[0] = Rotation.from_matrix(T[:3, :3]).as_quat()
+        w = T[:3, :3].T @ dT[:3, :3]
+        turn = Rotation.from_quat(q)
+        rate = np.array([w[2, 1], w[0, 2], w[1, 0]])
+        x, y, z, s = turn.as_quat()
+        out.d_rotation[0] = 0.5 * np.array(
+            [s * rate[0] + y * rate[2] - z * rate[1], s * rate[1] + z * rate[0] - x * rate[2],
+             s * rate[2] + x * rate[1] - y * rate[0], -x * rate[0] - y * rate[1] - z * rate[2]]
+        )  # fmt: skip
+        out.translation[0], out.d_translation[0] = T[:3, 3], dT[:3, 3]
+        return out
+
+
+def test_a_turning_skeleton_is_the_turning_body(gl):
+    """All vertices follow one joint that moves as the body's path does: the same picture, to the last id."""
+    path = drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), Rotation.identity(), Rotation.from_rotvec([0.9, 0.4, -0.7]))
+    ball = cube(0.8)
+    skinned = replace(ball, deformer=Skin.rigid(Skeleton([-1], Spinning(path)), 0, len(ball.vertices)))
+    rigid, bones = (
+        scene([thing("body", 3, mesh, way, Material(base_color=(0.9, 0.5, 0.3)))], rig())
+        for mesh, way in ((ball, path), (skinned, still()))
+    )
+    with Renderer(gl, rigid, RenderConfig()) as a, Renderer(gl, bones, RenderConfig(), whole=True) as b:
+        for t in range(50 * MS, 950 * MS, 100 * MS):
+            one, two = (r.labels(t, LABELS, t + 50 * MS, t - 50 * MS) for r in (a, b))
+            np.testing.assert_array_equal(one.ids, two.ids)
+            for flow, other in ((one.forward, two.forward), (one.backward, two.backward)):
+                error = np.abs(flow.flow - other.flow)
+                assert np.quantile(error, 0.999) <= 1e-5 and error.max() <= 1e-4  # of up to 5 px
+                assert np.abs(flow.flow).max() > 1
+            assert np.abs(one.velocity - two.velocity).max() <= 1e-5 * np.abs(one.velocity).max()
+            np.testing.assert_allclose(one.depth, two.depth, rtol=1e-6)

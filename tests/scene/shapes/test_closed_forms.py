@@ -1,0 +1,113 @@
+"""Deformers by formula: their rates, normals and differences are those of their positions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from blinkgl.config.deform import BendConfig, BreatheConfig, FlagConfig, TwistConfig, WaveConfig
+from blinkgl.errors import ConfigError
+from blinkgl.scene.geometry.primitives import BUILDERS
+from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.paths import KeyframePath, StaticPath
+from blinkgl.scene.shapes.table import deformer_of
+from blinkgl.scene.types import Material, Part, SceneObject
+
+MS = 1_000_000
+KINDS = {
+    "wave": WaveConfig(along="y", amplitude=0.2),
+    "flag": FlagConfig(phase=40),
+    "twist": TwistConfig(angle=200),
+    "bend": BendConfig(angle=80, held=0.3),
+    "breathe": BreatheConfig(amount=(0.4, 0.2, -0.3)),
+}
+TIMES = (0, 137 * MS, 1_812_345_678, 10**15 + 137 * MS)
+
+
+def body(kind, build="icosphere", **parameters):
+    mesh = BUILDERS[build](**parameters)
+    return replace(mesh, deformer=deformer_of(KINDS[kind], mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("t", TIMES)
+def test_velocity_is_the_rate_of_the_positions(kind, t):
+    mesh, h = body(kind), 1000
+    before, after = (mesh.deformer.positions(mesh, t + dt) for dt in (-h, h))
+    velocity = mesh.deformer.velocity(mesh, t)
+    np.testing.assert_allclose(velocity, (after - before) / (2e-9 * h), atol=1e-8)
+    assert np.abs(velocity).max() > 0.01
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_normals_are_those_of_the_surface(kind):
+    """Across two directions along the surface, moved as the shape moves them."""
+    mesh, t, h = body(kind), 137 * MS, 1e-6
+    n = mesh.normals.astype(np.float64)
+    u = np.cross(n, np.where(np.abs(n[:, :1]) < 0.6, [[1.0, 0, 0]], [[0, 1.0, 0]]))
+    moved = lambda way: mesh.deformer.positions(replace(mesh, vertices=mesh.vertices + way), t)
+    across = np.cross(moved(h * u) - moved(-h * u), moved(h * np.cross(n, u)) - moved(-h * np.cross(n, u)))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    normals = mesh.deformer.normals(mesh, t)
+    np.testing.assert_allclose(normals / np.linalg.norm(normals, axis=1, keepdims=True), across, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_shape_that_is_not_to_move_stays_as_it_is(kind):
+    still = {"amplitude": 0.0, "angle": 0.0, "amount": (0.0, 0.0, 0.0)}
+    config = KINDS[kind]
+    config = config.model_copy(update={key: value for key, value in still.items() if key in type(config).model_fields})
+    mesh = BUILDERS["cuboid"]()
+    mesh = replace(mesh, deformer=deformer_of(config, mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)))
+    assert mesh.deformer.is_static
+    np.testing.assert_allclose(mesh.deformer.positions(mesh, 137 * MS), mesh.vertices, atol=1e-15)
+    assert SceneObject("box", 1, (Part(mesh, Material()),), StaticPath()).is_static
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bounds_hold_every_shape(kind):
+    mesh = body(kind)
+    low, high = mesh.deformer.bounds(mesh, 0, 900 * MS)
+    for t in np.linspace(0, 900 * MS, 401).astype(np.int64):
+        at = mesh.deformer.positions(mesh, int(t))
+        assert (at >= low).all() and (at <= high).all()
+    rest = np.ptp(mesh.vertices, axis=0).max()
+    assert (high - low).max() < 2.2 * rest  # and hold little else
+    vertices, faces = mesh.deformer.sweep(mesh, 0, 900 * MS).hull
+    corners = vertices[faces] - vertices.mean(axis=0)
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) * corners.mean(axis=1)).sum(
+        axis=1
+    ).min() > 0
+
+
+def test_two_bodies_keep_clear_of_all_that_a_third_sweeps():
+    """A ball flies past a rod that bends into its way: the rod at rest would not be touched."""
+    rod = body("bend", "cuboid", extents=(0.1, 0.1, 2.0), subdivisions=8)
+    ball = BUILDERS["icosphere"](radius=0.1)
+    way = KeyframePath([0, 1000 * MS], [[0.5, -3, 0.9], [0.5, 3, 0.9]], [[0, 0, 0, 1]] * 2, "linear")
+
+    def hits(mesh):
+        objects = [
+            SceneObject("rod", 1, (Part(mesh, Material()),), StaticPath()),
+            SceneObject("ball", 2, (Part(ball, Material()),), way),
+        ]
+        return resolve_collisions(objects, StaticPath(np.eye(4) + np.eye(4, k=3) * 50), 0.1, 0, 1000 * MS).events
+
+    assert [(e.first, e.second) for e in hits(rod)] == [("rod", "ball")]
+    assert not hits(replace(rod, deformer=None))
+
+
+def test_a_configuration_is_refused_in_words():
+    from blinkgl.config.base import validate
+    from blinkgl.config.scene import ObjectConfig
+
+    for data, said in (
+        ({"kind": "wobble"}, "wobble"),
+        ({"kind": "wave", "towards": "x"}, "must be another axis than along"),
+        ({"kind": "breathe", "amount": [1, 0, 0]}, "amount"),
+        ({"kind": "bend", "wavelength": 1}, "wavelength"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            validate(ObjectConfig, {"mesh": "a", "deform": data})

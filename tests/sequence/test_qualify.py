@@ -19,10 +19,12 @@ from blinkgl.dataset.explain import explain
 from blinkgl.dataset.run import run_dataset
 from blinkgl.dataset.verify import verify_dataset
 from blinkgl.errors import AssetError, EventDataError
-from blinkgl.sequence.qualify import verdict
+from blinkgl.sequence.qualify import MEASURES, verdict
 
 H, W, N = 48, 64, 5
-STRICT = {"displacement": 3.0, "uncovered": 0.1, "residual": 0.1, "thin": 0.01, "astray": 0.2, "left_out": 0.9}
+NONE = dict.fromkeys(MEASURES)
+"""No limit of any measure."""
+STRICT = NONE | {"displacement": 3.0, "uncovered": 0.1, "residual": 0.1, "thin": 0.01, "astray": 0.2, "left_out": 0.9}
 
 
 def folder(path: Path, *, px: float = 1.0, bar_px: int = 0, bar: int = 3, size: tuple[int, int] = (H, W)) -> Path:
@@ -89,7 +91,7 @@ def test_a_folder_that_moves_evenly_qualifies(tmp_path):
 
 def test_a_refusal_names_the_pair_the_measure_the_value_and_the_limit(tmp_path):
     where = folder(tmp_path / "P001", bar_px=6)
-    found = verdict(config(qualify={**dict.fromkeys(STRICT), "thin": 0.01}), where)
+    found = verdict(config(qualify={**NONE, "thin": 0.01}), where)
     assert not found.qualifies and found.refused == N - 1
     assert {(e.measure, e.limit) for e in found.excesses} == {("thin", 0.01)}
     assert str(found.refusal()) == (
@@ -103,16 +105,16 @@ def test_the_pair_that_is_named_is_the_one_farthest_beyond(tmp_path):
     where = folder(tmp_path / "P000")
     flow = np.load(where / "flow/000002.npy")
     np.save(where / "flow/000002.npy", 5 * flow)
-    found = verdict(config(qualify={"displacement": 3, "thin": 0.1}), where)
+    found = verdict(config(qualify={**NONE, "displacement": 3}), where)
     assert found.refused == 1 and "000002.png to 000003.png" in str(found.refusal())
     assert "displacement 5 px; expected at most 3 px" in str(found.refusal())
     for share, qualifies in ((0.25, True), (0.2, False)):
-        limits = {"displacement": 3, "tolerated": share}
+        limits = {**NONE, "displacement": 3, "tolerated": share}
         assert verdict(config(qualify=limits), where).qualifies == qualifies
 
 
 def test_a_limit_of_nothing_and_a_value_of_nothing(tmp_path):
-    found = verdict(config(qualify={"thin": 0, "displacement": 0}), folder(tmp_path / "P000"))
+    found = verdict(config(qualify={**NONE, "thin": 0, "displacement": 0}), folder(tmp_path / "P000"))
     assert {e.measure for e in found.excesses} == {"displacement"} and found.nearest == "displacement"
 
 
@@ -276,7 +278,7 @@ def command(capsys, *words) -> tuple[int, str, str]:
     return status, printed.out, printed.err
 
 
-LIMITS = [word for name, value in STRICT.items() for word in ("--set", f"frames.qualify.{name}={value}")]
+LIMITS = [word for name, value in STRICT.items() for word in ("--set", f"frames.qualify.{name}={value or 'null'}")]
 
 
 def test_the_command_prints_one_folder(tmp_path, capsys):

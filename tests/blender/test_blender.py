@@ -50,10 +50,11 @@ class Came:
 
     def frames(self, name: str):
         """(seconds since the first frame, what Blender saw, whether it is a frame of the file)."""
+        first = min(float(key.rpartition("@")[2]) for key in self.truth)  # FBX counts from one further
         for key, value in self.truth.items():
             owner, _, frame = key.rpartition("@")
             if owner == name:
-                t = (float(frame) - self.report.frames[0]) / self.report.fps
+                t = (float(frame) - first) / self.report.fps
                 yield t, value, float(frame) % 1 == 0
 
 

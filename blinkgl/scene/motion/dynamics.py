@@ -43,6 +43,7 @@ from blinkgl.config.physics import IN_THE_WAY, BodyConfig, PhysicsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.machine.extras import install
 from blinkgl.scene.motion.paths import HermitePath, StaticPath, thin
+from blinkgl.scene.shapes.deformer import filled
 from blinkgl.scene.types import Dynamics, PosePath, SceneObject
 
 IMPACT_S = 1.6e-3
@@ -501,8 +502,8 @@ class Shape:
 
 
 def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
-    """What touches, of an object: its parts' solids in its axes."""
-    parts = [part.mesh.vertices[np.unique(part.mesh.faces)] for part in obj.parts if len(part.mesh.faces)]
+    """What touches, of an object: its parts' solids in its axes; of one that deforms the hull of all its shapes."""
+    parts = [filled(part.mesh)[0] for part in obj.parts if len(part.mesh.faces)]
     if len(parts) > _MOST_PARTS:
         parts = [np.concatenate(parts)]
     if obj.category == "ground" and config.shape == "auto" and config.kind == "fixed" and len(parts) == 1:

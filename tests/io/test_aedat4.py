@@ -72,6 +72,7 @@ def recording(tmp_path, monkeypatch):
 
     before = len(os.listdir("/proc/self/fd"))
     yield written
+    sys.modules.pop("dv_processing", None)  # ours, else it stays for the tests that come; what was there comes back
     assert len(os.listdir("/proc/self/fd")) == before, "the decoder's pipe stayed open"
 
 
@@ -98,7 +99,7 @@ def test_a_decoder_that_ends_too_early(recording, counts, read):
     assert sum(found) == read
     with pytest.raises(AssetError, match="damaged AEDAT4 file: packet is odd"):
         list(Aedat4Reader(recording(2, 98)).chunks())
-    with pytest.raises(AssetError, match="damaged AEDAT4 file: recording without an event stream"):
+    with pytest.raises(AssetError, match="e.aedat4: no events in the recording"):
         Aedat4Reader(recording(0))
 
 
@@ -141,7 +142,6 @@ def test_what_is_written(recording, tmp_path, monkeypatch):
         with pytest.raises(error, match=said):
             write_events(tmp_path / "n.aedat4", events, height, width)
     assert not (tmp_path / "n.aedat4").exists()
-    monkeypatch.delitem(sys.modules, "dv_processing")
 
 
 def test_positions_are_counted_from_the_file_s_first_event(recording, monkeypatch):

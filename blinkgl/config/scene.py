@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
-from blinkgl.config.deform import DeformConfig
+from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
@@ -107,6 +107,7 @@ class ObjectsConfig(Config):
     texture_scale: PositiveRange = Field(
         (0.7, 2.0), description="texture repeats over an object's texture coordinates; log-uniform"
     )
+    deform: RandomDeformConfig = RandomDeformConfig()
 
 
 class PoolConfig(Config):
@@ -131,6 +132,9 @@ class PoolConfig(Config):
     max_file_mb: float = Field(512.0, gt=0, description="a larger mesh file is refused unread")
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
     keep_materials: bool = Field(False, description="use the meshes' own colours and textures where they have any")
+    animation: Literal["random", "rest"] = Field(
+        "random", description="what a file with animations does: it plays one of them, looped, or keeps its rest shape"
+    )
     bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unusable mesh and draws another")
 
 
@@ -338,7 +342,7 @@ class KeyedMotionConfig(PoseConfig):
 class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
-    primitive: Literal[PrimitiveKind, "grid"] | None = Field(None, description="kind of primitive")
+    primitive: Literal[PrimitiveKind, "grid", "die"] | None = Field(None, description="kind of primitive")
     parameters: dict[str, Annotated[int | float | Vector3, BeforeValidator(_number_or_three)]] = Field(
         {}, description="the primitive's sizes and numbers of faces: see [primitives](#primitives)"
     )
@@ -374,7 +378,9 @@ class MaterialConfig(Config):
     """A colour, times at most one texture."""
 
     texture: str | None = Field(None, description="image file, sRGB, or .hdr, linear")
-    procedural: TextureKind | None = Field(None, description="kind of procedural texture")
+    procedural: Literal[TextureKind, "pips"] | None = Field(
+        None, description="kind of procedural texture; pips: the faces of a die"
+    )
     seed: int = Field(0, ge=0, description="which procedural texture of that kind")
     photograph: str | None = Field(
         None, description="name of a photograph bundled with scikit-image, such as astronaut"
@@ -404,12 +410,14 @@ class ObjectConfig(KeyedMotionConfig):
     category: Literal["object", "ground", "wall", "sky"] = Field(
         "object", description="what it is: collisions and drawing order"
     )
+    animation: str | int | AnimationConfig | None = Field(
+        None, description="clip of the mesh's gltf or glb file that it plays, looped; null: the file's rest shape"
+    )
     physics: BodyConfig | None = Field(
         None,
         description="what it is to the engine of a scene with physics; null: it is in the way, where it stands "
         "or moves",
     )
-
     deform: DeformConfig | None = Field(
         None, description="how its shape changes with time, by formula; null: it is rigid"
     )
@@ -515,7 +523,9 @@ class FileSceneConfig(Config):
     intrinsics: Literal["config", "file"] = Field(
         "config", description="focal length from the YAML's camera or from the file's (yfov)"
     )
-    animation: str | int | None = Field(0, description="name or index of the animation played; null: none")
+    animation: str | int | AnimationConfig | None = Field(
+        0, description="name or index of the animation played, at the file's own times; null: none"
+    )
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")

@@ -58,7 +58,7 @@ def _dot(points: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 class Waves(Deformer):
-    """Two plane waves along one direction. direction : (3,) unit.   envelope : ((3,), float): e(p) = e . p + e0.
+    """Two plane waves along one direction. direction : (3,).   envelope : ((3,), float): e(p) = e . p + e0.
     numbers : ((3,) rad per unit, phase rad) of both waves.   amplitudes : units."""
 
     glsl = "waves"
@@ -84,6 +84,17 @@ class Waves(Deformer):
     @property
     def is_static(self) -> bool:
         return not any(self.amplitudes)
+
+    def transformed(self, matrix: np.ndarray) -> Waves:
+        linear, shift = matrix[:3, :3], matrix[:3, 3]
+        inverse = np.linalg.inv(linear)
+
+        def form(vector: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
+            """v . p + c of the points' new coordinates."""
+            return vector @ inverse, constant - float(vector @ inverse @ shift)
+
+        first, second = (form(*wave) for wave in self.waves)
+        return type(self)(linear @ self.direction, form(*self.envelope), (first, second), self.amplitudes, self.beats)
 
     def _terms(self, mesh: Mesh, t_ns: int):
         """(amplitude, wave vector, angles (V,), rate) of both waves."""
@@ -187,6 +198,12 @@ class Turn(Deformer):
     def is_static(self) -> bool:
         return self.angle == 0
 
+    def transformed(self, matrix: np.ndarray) -> Turn:
+        scale, turn = _similarity(self, matrix)
+        vector = turn @ self.share[0] / scale
+        share = vector, self.share[1] - float(vector @ matrix[:3, 3])
+        return type(self)(turn @ self.axis, matrix[:3, :3] @ self.pivot + matrix[:3, 3], share, self.angle, self.beat)
+
     def _share(self, mesh: Mesh) -> np.ndarray:
         return _dot(mesh.vertices, self.share[0]) + self.share[1]
 
@@ -287,6 +304,12 @@ class Breathe(Deformer):
     def is_static(self) -> bool:
         return not self.amount.any()
 
+    def transformed(self, matrix: np.ndarray) -> Breathe:
+        _, turn = _similarity(self, matrix)
+        if not np.allclose(turn, np.eye(3), atol=1e-12):
+            raise TypeError("Breathe cannot be turned")
+        return type(self)(matrix[:3, :3] @ self.centre + matrix[:3, 3], self.amount, self.beat)
+
     def _factor(self, t_ns: int) -> np.ndarray:
         return 1 + self.amount * math.sin(self.beat.at(t_ns))
 
@@ -315,6 +338,15 @@ class Breathe(Deformer):
 
     def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
         return self._rows(np.zeros(3), self.amount * self.beat.sine_change(t_ns, there_ns))
+
+
+def _similarity(deformer: Deformer, matrix: np.ndarray) -> tuple[float, np.ndarray]:
+    """(scale, (3, 3) rotation) of an affine map that is nothing else, but for a shift. Raises TypeError."""
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if scale <= 0 or not np.allclose(linear @ linear.T, scale**2 * np.eye(3), rtol=0, atol=1e-9 * scale**2):
+        raise TypeError(f"{type(deformer).__name__} can be turned and scaled evenly, and nothing else")
+    return scale, linear / scale
 
 
 def _length(low: np.ndarray, high: np.ndarray, along: np.ndarray) -> float:

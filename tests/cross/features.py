@@ -80,7 +80,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
             "events": {"emulator": "esim", "threshold_jitter": 0.05, "refractory_us": 50, "contrast_threshold_off": 0.3}
         },
         "v2e": {"events": {"emulator": "v2e"}},
-        "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean"}},
+        "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean", "start": "zero"}},
         "v2e, noisy": {
             "events": {
                 "emulator": "v2e",

@@ -93,7 +93,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "v2e, causes": {"events": {"emulator": "v2e", "causes": True, "start": "balanced", "leak_rate_hz": 50}},
         "voltmeter": {"events": {"emulator": "voltmeter"}},
         "voltmeter, 240, causes": {"events": {"emulator": "voltmeter", "preset": "DVS240", "causes": True}},
-        "voltmeter, authors": {"events": {"emulator": "voltmeter", "compat": "authors"}},
+        "voltmeter, authors": {"events": {"emulator": "voltmeter", "compat": "authors", "k4": 1e-4}},
     },
     "timeline": {
         "uniform": {"timeline": {"kind": "uniform", "fps": 400}},

@@ -58,8 +58,8 @@ def _dot(points: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 class Waves(Deformer):
-    """Two plane waves along one direction. direction : (3,) unit.   envelope : ((3,), float): e(p) = e . p + e0.
-    numbers : ((3,) rad per unit, phase rad) of both waves.   amplitudes : units."""
+    """Two plane waves along one direction. direction : (3,) where amplitudes of 1 lead.
+    envelope : ((3,), float): e(p) = e . p + e0.   numbers : ((3,) rad per unit, phase rad) of both waves.   amplitudes : units."""
 
     glsl = "waves"
     rows = 5  # type: ignore[assignment]
@@ -84,6 +84,23 @@ class Waves(Deformer):
     @property
     def is_static(self) -> bool:
         return not any(self.amplitudes)
+
+    def transformed(self, matrix: np.ndarray) -> Waves:
+        back = np.linalg.inv(matrix)
+
+        def seen(vector: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
+            """v . p + c of a point that the matrix took to where it is."""
+            return vector @ back[:3, :3], float(vector @ back[:3, 3]) + constant
+
+        out = Waves(
+            matrix[:3, :3] @ self.direction,
+            seen(*self.envelope),
+            (seen(*self.waves[0]), seen(*self.waves[1])),
+            self.amplitudes,
+            self.beats,
+        )
+        out.goes, out.speed = self.goes, self.speed * float(np.linalg.norm(matrix[:3, 0]))
+        return out
 
     def _terms(self, mesh: Mesh, t_ns: int):
         """(amplitude, wave vector, angles (V,), rate) of both waves."""

@@ -64,6 +64,9 @@ class Deformer(ABC):
 
     examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
 
+    goes : which way up a body is, and which way it goes: "anyhow"; "upright" on the ground, "level" above it, both along
+    its x axis.   speed : units/s that the shape goes with, as steps do; 0: it may stay where it is.
+
     Config : the model of ``deform:`` that asks for it; None: none does.   period_ns : after which the shape repeats;
     None: it does not.   span_ns : from time 0 on after so long nothing new comes."""
 
@@ -76,6 +79,8 @@ class Deformer(ABC):
     sizes: Mapping[str, int] = {}
     period_ns: int | None = None
     span_ns: int = 0
+    goes: str = "anyhow"
+    speed: float = 0.0
     examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
 
     @classmethod

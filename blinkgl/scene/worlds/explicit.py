@@ -26,9 +26,11 @@ from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
+from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.table import deformer_of
+from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
@@ -81,9 +83,15 @@ def explicit_scene(
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
         if item.deform is not None:
             parts = deforming(parts, item.deform)
-        objects.append(
-            SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category)
-        )
+        if item.way is None:
+            path = motion_path(item, t0_ns, t1_ns, where)
+        else:
+            speed = item.way.speed or speed_of(parts) or 1.0
+            way = item.way
+            path = way_path(
+                way.points, speed, t0_ns, t1_ns, closed=way.closed, level=way.level, start=way.start
+            )
+        objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
     if config.collisions:
         result = resolve_collisions(tuple(objects), path, 1.01 * camera.near_corner, t0_ns, t1_ns)
@@ -110,6 +118,11 @@ def deforming(parts: Sequence[Part], config: DeformConfig) -> list[Part]:
     """The parts of one object, whose shape changes together as ``deform:`` says."""
     deformer = deformer_of(config, *bounds(part.mesh for part in parts))
     return [replace(part, mesh=replace(part.mesh, deformer=deformer)) for part in parts]
+
+
+def speed_of(parts: Sequence[Part]) -> float:
+    """Units/s that an object's shape goes with, 0: none."""
+    return max((part.mesh.deformer.speed for part in parts if part.mesh.deformer is not None), default=0.0)
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
@@ -165,7 +178,9 @@ def _asset(
 ) -> Asset:
     if name in memory or config.primitive is not None:
         mesh = memory[name] if name in memory else primitive_mesh(config, name)
-        return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
+        wears = own_materials and name not in memory and config.primitive in COATS
+        material = Material(coat(config.primitive, config.parameters.get("coat", 0))) if wears else Material()
+        return Asset(name, mesh.source_hash, (Part(mesh, material),))
     where = f"scene.meshes.{name}"
     path = resolve(config.file, base)
     if not path.is_file():

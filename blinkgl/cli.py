@@ -372,6 +372,61 @@ def convert(
     )
 
 
+@app.command("import")
+def import_(
+    source: Annotated[str, typer.Argument(metavar="SCENE", help=".blend, .fbx, .usd/.usda/.usdc/.usdz, .dae or .abc.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="The GLB to write.")],
+    scene: Annotated[
+        str | None, typer.Option("--scene", help="Name of the file's scene (default: the one it was saved in).")
+    ] = None,
+    frames: Annotated[
+        tuple[int, int] | None, typer.Option("--frames", metavar="FIRST LAST", help="Default: the scene's range.")
+    ] = None,
+    fps: Annotated[
+        float | None,
+        typer.Option("--fps", help="Frames per second (default: the file's; 24 for USD, Collada and Alembic)."),
+    ] = None,
+    keys_per_frame: Annotated[
+        int,
+        typer.Option("--keys-per-frame", min=1, max=64, help="Key frames per frame; between them motion is straight."),
+    ] = 1,
+    clips: Annotated[
+        bool, typer.Option("--clips", help="An animation per action, not one of the scene as it plays.")
+    ] = False,
+    texture_size: Annotated[
+        int, typer.Option("--texture-size", min=16, max=8192, help="Sides of baked pictures, px.")
+    ] = 1024,
+    bake_seconds: Annotated[
+        float, typer.Option("--bake-seconds", min=0, help="After so long no further picture is begun.")
+    ] = 120.0,
+    time_limit: Annotated[
+        float, typer.Option("--time-limit", min=1, help="Seconds that Blender may take altogether.")
+    ] = 900.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no table.")] = False,
+) -> int:
+    """Make a GLB of a scene of Blender's or of a format that Blender reads (extra [cycles]), and say what came and what
+    could not."""
+    from blinkgl.show import import_ as command
+
+    return command.run(
+        source,
+        out,
+        as_json=as_json,
+        quiet=quiet,
+        scene=scene,
+        frames=frames,
+        fps=fps,
+        keys_per_frame=keys_per_frame,
+        clips=clips,
+        texture_size=texture_size,
+        bake_s=bake_seconds,
+        time_limit_s=time_limit,
+        overwrite=overwrite,
+    )
+
+
 # --- frame ------------------------------------------------------------------------------------------------------------
 
 

@@ -20,6 +20,7 @@ class Role(IntEnum):
     TRAJECTORY = 2
     TEXTURE = 3
     EVENTS = 4
+    PHYSICS = 5
 
 
 def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:

@@ -1,11 +1,17 @@
 """The house, as docs/architecture.md draws it: every room says what it is for."""
 
 import ast
+import dataclasses
 import graphlib
+import importlib
+import inspect
+import pkgutil
 import re
 from pathlib import Path
 
 import pytest
+
+import blinkgl
 
 ROOT = Path(__file__).parents[1]
 ROOMS = sorted(
@@ -75,3 +81,75 @@ def test_data_flows_one_way():
     assert not arrows["blinkgl.events"] & {"blinkgl.scene", "blinkgl.gl", "blinkgl.render"} and not arrows[
         "blinkgl.io"
     ] & {"blinkgl.render", "blinkgl.gl"}
+
+
+# --- records ----------------------------------------------------------------------------------------------------------
+
+FILLED_IN_LATER = set(
+    """
+    Collected Comparison Displacement Document DrawItem Example Explanation Level Measured Omissions Outcome Parameter
+    Pool RenderStats SequenceReport Side SimulationReport Totals Verification _Body _Known
+""".split()
+)
+"""Records that are written to while they are made. All others are values: who holds one may count on it."""
+
+
+def records():
+    """Every dataclass of the package, by where it is."""
+    for module in pkgutil.walk_packages(blinkgl.__path__, "blinkgl."):
+        if not re.search(r"\.(tools|shaders|configs|cli|__main__)\b", module.name):
+            for thing in vars(importlib.import_module(module.name)).values():
+                if inspect.isclass(thing) and dataclasses.is_dataclass(thing) and thing.__module__ == module.name:
+                    yield thing
+
+
+def test_a_record_is_a_value_unless_it_is_filled_in_later():
+    assert {thing.__name__ for thing in records() if not thing.__dataclass_params__.frozen} == FILLED_IN_LATER
+
+
+def test_records_that_hold_arrays_are_compared_by_identity():
+    """Else ``==`` of two of them raises (an array has no truth value), and a hash by value does, too."""
+    everything, holders = list(records()), {"ndarray", "ArrayLike"}
+    words = lambda thing: [
+        set(re.findall(r"\w+", re.sub(r"Callable\[.*", "", str(f.type)))) for f in dataclasses.fields(thing)
+    ]
+    while new := {t.__name__ for t in everything if any(w & holders for w in words(t))} - holders:
+        holders |= new  # what holds such a record
+    wrong = [t.__qualname__ for t in everything if t.__dataclass_params__.eq == (t.__name__ in holders)]
+    assert not wrong, "@dataclass(…, eq=False) is for those that hold arrays, and for no other"
+
+
+# --- defaults ---------------------------------------------------------------------------------------------------------
+
+DOORS = {
+    "simulate": """blinkgl.cli.simulate blinkgl.simulate blinkgl.simulate_file
+        blinkgl.recordings.simulation.frames_to_events blinkgl.recordings.simulation.simulated_steps
+        blinkgl.recordings.simulation.file_to_events""",
+    "compare": "blinkgl.cli.compare blinkgl.compare blinkgl.recordings.comparison.compare",
+    "convert": "blinkgl.cli.convert blinkgl.convert blinkgl.io.formats.convert",
+    "write": "blinkgl.write_events blinkgl.io.formats.event_writer",
+    "verify": "blinkgl.cli.verify blinkgl.verify blinkgl.dataset.verify.verify_dataset",
+    "generate": "blinkgl.cli.generate blinkgl.generate blinkgl.dataset.run.run_dataset",
+    "explain": "blinkgl.cli.explain blinkgl.dataset.explain.explain",
+    "sequence": "blinkgl.simulate_sequence blinkgl.sequence.simulate.simulate_sequence",
+    "report": "blinkgl.cli.report blinkgl.report.page.write_report",
+}
+OTHERWISE = {
+    "overwrite": "a command asks first",
+    "workers": "a command's own word for one process",
+    "executor": "a name, or the thing itself",
+    "labels": "which ones, or whether any",
+}
+
+
+@pytest.mark.parametrize("what", DOORS)
+def test_doors_to_one_thing_have_the_same_defaults(what):
+    """A command, the function of the front door and the one of the room behind it."""
+    said: dict[str, dict[str, object]] = {}
+    for name in DOORS[what].split():
+        place, _, function = name.rpartition(".")
+        for parameter in inspect.signature(getattr(importlib.import_module(place), function)).parameters.values():
+            if parameter.default is not parameter.empty and parameter.name not in OTHERWISE:
+                said.setdefault(parameter.name, {})[name] = parameter.default
+    assert any(len(doors) > 1 for doors in said.values())
+    assert {name: doors for name, doors in said.items() if len(set(doors.values())) > 1} == {}

@@ -35,6 +35,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from blinkgl.blender.process import available
 from blinkgl.config.events import EsimConfig
 from blinkgl.config.sequence import RenderConfig, load_run
 from blinkgl.errors import BlinkGLError
@@ -48,7 +49,7 @@ from blinkgl.scene.types import Scene
 from blinkgl.srgb import to_srgb8
 from blinkgl.timeline.sampling import displacement_times
 from blinkgl.timeline.speed import largest_speed
-from blinkgl.tools.peer_cycles import Cost, CyclesSettings, available, frames
+from blinkgl.tools.peer_cycles import Cost, CyclesSettings, frames
 from blinkgl.trade.metrics import SpeedMaps, event_errors
 
 ANTIALIASINGS = ("none", "ssaa2", "ssaa4")

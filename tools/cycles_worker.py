@@ -311,4 +311,6 @@ def adjust(scene, settings: dict) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    status = main(Path(sys.argv[1]))
+    sys.stderr.flush()
+    os._exit(status)  # not through Blender's own end, which now and then waits for itself for ever

@@ -71,6 +71,8 @@ SHARED_CODE = (
 )
 DEBUGGERS = "shaders/include/lookup.glsl"
 """the include that only the shader debugger asks for"""
+LOOKERS = tuple(f"tests/test_rooms.py::test_{name}" for name in ("a_record", "records", "doors"))
+"""tests that look at dataclasses and signatures of the whole package, whichever test it was that imported them first"""
 MOST_TESTS, MOST_S = 300, 120.0
 """of the tests that reach a line, for one mutant: how many, and how long they take together"""
 MEMORY = 6 << 30
@@ -535,6 +537,15 @@ def _remembered(mutant: Mutant) -> bool:
     )
 
 
+def _on_import(mutant: Mutant) -> bool:
+    """Whether the line runs when its module is imported: a decorator, a default, a constant."""
+    return not any(
+        isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef))
+        and node.body[0].lineno <= mutant.line <= node.end_lineno
+        for node in ast.walk(ast.parse((ROOT / mutant.path).read_text()))
+    )
+
+
 class Reach:
     """Test ids by line, from :func:`make_map`."""
 
@@ -596,6 +607,8 @@ class Reach:
                 contexts = set().union(*(self.anywhere(path) for path in callers))
             else:
                 contexts = reached if _remembered(mutant) else self._around(mutant)
+                if _on_import(mutant):
+                    contexts = [*contexts, *(t for t in self.seconds if t.startswith(LOOKERS))]
         ids = (set(contexts) & self.seconds.keys()) - self.idle
         chosen, together = [], 0.0
         for test in sorted(ids, key=lambda t: (self._distance(mutant, t), self.seconds.get(t, 1.0), t)):
@@ -622,7 +635,7 @@ class Reach:
     def _distance(mutant: Mutant, test: str) -> int:
         """0: a test of the module, 1: of its room, 2: of another."""
         path, file = Path(mutant.path), Path(test.split("::")[0])
-        if file.stem == f"test_{path.stem}":
+        if file.stem == f"test_{path.stem}" or test.startswith(LOOKERS):
             return 0
         return 1 if file.parts[1] == ("render" if path.suffix == ".glsl" else path.parts[1]) else 2
 

@@ -7,8 +7,8 @@
     cost.wall_s, cost.cpu_s      # per frame
 
 Blender's Python module ``bpy`` (extra [cycles]) is GPL and wants NumPy 1: it is never imported here. The scene is
-written to a folder as plain files (:func:`export`), and ``cycles_worker.py`` renders it in a process of its own, with
-this interpreter or with the one that the environment variable BLINKGL_BPY_PYTHON names.
+written to a folder as plain files (:func:`export`), and ``cycles_worker.py`` renders it in a process of its own
+(:mod:`blinkgl.blender.process`).
 
 The same picture, as far as two renderers can make it:
 
@@ -31,11 +31,7 @@ The same picture, as far as two renderers can make it:
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -43,17 +39,13 @@ from pathlib import Path
 
 import numpy as np
 
+from blinkgl.blender.process import Blender, how_it_ended, interpreter
 from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render.colour import LUMA, linear_image
 from blinkgl.scene.types import Material, Scene
 
-ENVIRONMENT = "BLINKGL_BPY_PYTHON"
 WORKER = Path(__file__).with_name("cycles_worker.py")
-REMEDY = (
-    "run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter "
-    f"in {ENVIRONMENT} (or install it here)"
-)
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
 CV_FROM_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -106,32 +98,6 @@ class Cost:
     cpu_s: list[float] = field(default_factory=list)
 
 
-def interpreter() -> str:
-    """The Python that runs Blender: the environment's, or this one."""
-    return os.environ.get(ENVIRONMENT) or sys.executable
-
-
-def available() -> str:
-    """'' when a bpy is there (not whether it loads: that takes seconds and is found out by using
-    it), else a line that says what to do."""
-    chosen = interpreter()
-    if chosen == sys.executable:
-        found = importlib.util.find_spec("bpy") is not None
-    else:
-        probe = "import importlib.util, sys; sys.exit(importlib.util.find_spec('bpy') is None)"
-        try:
-            found = subprocess.run([chosen, "-c", probe], capture_output=True).returncode == 0
-        except OSError:
-            return f"{ENVIRONMENT} names no interpreter that runs: {chosen}"
-    return "" if found else f"no bpy (Blender as a Python module) for {chosen}: {REMEDY}"
-
-
-def require() -> None:
-    """Raises BlinkGLError when there is no bpy."""
-    if missing := available():
-        raise BlinkGLError(missing)
-
-
 def frames(
     scene: Scene, times_ns: Iterable[int], settings: CyclesSettings = CyclesSettings(), cost: Cost | None = None
 ) -> Iterator[np.ndarray]:
@@ -155,57 +121,33 @@ def colours(
     One Blender process serves the iterator and ends with it, also when it is abandoned. Raises BlinkGLError (one line)
     when there is no bpy, when it does not fit its interpreter, or when Blender stops.
     """
-    require()
     cost = Cost() if cost is None else cost
     times_ns = np.array(list(times_ns), np.int64)
-    with tempfile.TemporaryDirectory(prefix="blinkgl-cycles-") as name, open(Path(name) / "blender.log", "w+b") as log:
+    with tempfile.TemporaryDirectory(prefix="blinkgl-cycles-") as name:
         folder = Path(name)
         export(scene, times_ns, settings, folder)
-        # What this process set for its own OpenGL and its own libraries is not for Blender.
-        environment = {
-            key: value
-            for key, value in os.environ.items()
-            if key not in ("PYTHONPATH", "LP_NUM_THREADS", "OMP_NUM_THREADS")
-        }
-        blender = subprocess.Popen(
-            [interpreter(), str(WORKER), name],
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=log,
-            text=True,
-        )
-        try:
-            yield from _answers(blender, folder, log, len(times_ns), cost)
-        finally:
-            if blender.poll() is None:
-                blender.kill()
-            blender.wait()
-            blender.stdout.close()
+        with Blender(WORKER, folder) as blender:
+            yield from _answers(blender, len(times_ns), cost)
 
 
-def _answers(blender, folder: Path, log, count: int, cost: Cost) -> Iterator[np.ndarray]:
+def _answers(blender: Blender, count: int, cost: Cost) -> Iterator[np.ndarray]:
     done = 0
-    for line in blender.stdout:
-        words = json.loads(line)
-        if "error" in words:
-            raise BlinkGLError(words["error"], where=interpreter(), accepted=REMEDY)
+    for words in blender.answers():
         if "blender" in words:
             cost.blender, cost.setup_s, cost.setup_cpu_s = words["blender"], words["setup_s"], words["setup_cpu_s"]
             continue
         cost.wall_s.append(words["wall_s"])
         cost.cpu_s.append(words["cpu_s"])
-        file = folder / f"{words['frame']:06d}.npy"
+        file = blender.folder / f"{words['frame']:06d}.npy"
         frame = np.load(file, allow_pickle=False)
         file.unlink()
         done += 1
         yield frame
-    status = blender.wait()
+    status = blender.status()
     if status or done < count:
-        log.seek(0)
-        words = log.read().decode("utf-8", "replace").strip().splitlines() or ["no message"]
         raise BlinkGLError(
-            f"Blender stopped after {done} of {count} frames (status {status}): {words[-1]}", where=interpreter()
+            f"Blender {how_it_ended(status)} after {done} of {count} frames: {blender.last_words()}",
+            where=interpreter(),
         )
 
 

@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
 from blinkgl.config.deform import DeformConfig
+from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
 PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid")
@@ -246,6 +247,7 @@ class RandomSceneConfig(Config):
     light: LightConfig = LightConfig()
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
+    physics: RandomPhysicsConfig | None = Field(None, description="null: nothing falls. Needs the extra [physics]")
     camera_clearance: float = Field(
         0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m"
     )
@@ -444,6 +446,12 @@ class ObjectConfig(KeyedMotionConfig):
     category: Literal["object", "ground", "wall", "sky"] = Field(
         "object", description="what it is: collisions and drawing order"
     )
+    physics: BodyConfig | None = Field(
+        None,
+        description="what it is to the engine of a scene with physics; null: it is in the way, where it stands "
+        "or moves",
+    )
+
     deform: DeformConfig | None = Field(
         None,
         description="how its shape changes with time, by formula, whatever it does by itself; null: it is rigid, but "
@@ -455,6 +463,16 @@ class ObjectConfig(KeyedMotionConfig):
     def _one_motion(way, keyframes, position, *orientation):
         if way and (keyframes or any(position) or any(o is not None for o in orientation)):
             raise Refused("give a way, a fixed pose or keyframes, not several of them")
+
+    @rule("physics.kind", "#keyframes")
+    def _the_engine_or_key_frames(kind, keyframes):
+        if kind == "dynamic" and keyframes:
+            raise Refused(
+                "a dynamic body has no key frames: the engine moves it",
+                where="physics.kind",
+                value=kind,
+                accepted="fixed, which pushes what it meets on its way, or a pose without key frames",
+            )
 
 
 def _known(used, known, key: str, table: str, at=None) -> None:
@@ -491,6 +509,11 @@ class ExplicitSceneConfig(Config):
         False, description="true: find collisions along the trajectories and stop what collides there"
     )
     camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
+    physics: PhysicsConfig | None = Field(
+        None,
+        description="null: nothing falls. {} is enough: gravity for objects that say physics. Needs the extra "
+        "[physics]",
+    )
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
@@ -498,6 +521,20 @@ class ExplicitSceneConfig(Config):
     @rule("objects.*.mesh", "#meshes")
     def _meshes_are_known(used, known):
         _known(used, known, "mesh", "scene.meshes")
+
+    @rule("?physics", "objects.*.physics.kind")
+    def _something_falls(physics: bool, kinds: tuple[str | None, ...]):
+        for k, kind in enumerate(kinds):
+            if kind is not None and not physics:
+                raise Refused(
+                    "the scene has no physics",
+                    where=f"objects.{k}.physics",
+                    accepted="scene.physics, too: {} is enough",
+                )
+        if physics and "dynamic" not in kinds:
+            raise Refused(
+                "no object falls", where="physics", accepted="objects with physics, of kind dynamic, or physics: null"
+            )
 
     @rule("objects.*.name", "objects.*.mesh")
     def _names_differ(names: tuple[str | None, ...], meshes: tuple[str, ...]):

@@ -17,12 +17,14 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from blinkgl.config.base import Config
 
 
-def _as_pair(value: Any) -> Any:
+def as_pair(value: Any) -> Any:
+    """A number stands for both ends of a range."""
     # Text too: YAML 1.1 reads 1e-1 as text, and pydantic turns it into a number afterwards.
     return (value, value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else value
 
 
-def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
+def ordered(pair: tuple[float, float]) -> tuple[float, float]:
+    """The range, if its lower end is not above its upper one; else ValueError."""
     if pair[0] > pair[1]:
         raise ValueError("the lower end of the range is above the upper end")
     return pair
@@ -31,8 +33,8 @@ def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
 # Far beyond anything filmed; past them float64 geometry is fine but a unit was almost certainly mistaken.
 _Speed = Annotated[float, Field(ge=0, le=1e4)]
 _Rate = Annotated[float, Field(ge=0, le=36_000.0)]
-SpeedRange = Annotated[tuple[_Speed, _Speed], BeforeValidator(_as_pair), AfterValidator(_ordered)]
-RateRange = Annotated[tuple[_Rate, _Rate], BeforeValidator(_as_pair), AfterValidator(_ordered)]
+SpeedRange = Annotated[tuple[_Speed, _Speed], BeforeValidator(as_pair), AfterValidator(ordered)]
+RateRange = Annotated[tuple[_Rate, _Rate], BeforeValidator(as_pair), AfterValidator(ordered)]
 
 
 class MotionConfig(Config):

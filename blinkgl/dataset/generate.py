@@ -119,7 +119,11 @@ def manifest_info(sequence: Simulation) -> dict:
     versions = {"python": platform.python_version(), "numpy": np.__version__, "numba": numba.__version__}
     return {
         "blinkgl": blinkgl.__version__,
-        "versions": versions | ({} if config.frames is None else {"opencv": cv2.__version__}),
+        "versions": {
+            **versions,
+            **({} if config.frames is None else {"opencv": cv2.__version__}),
+            **sequence.libraries,
+        },
         "seed": config.seed,
         "sequence": sequence.index,
         "split": config.output.split,

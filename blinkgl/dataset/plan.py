@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import overload
+from typing import Any, overload
 
 from blinkgl.config.base import validate
 from blinkgl.config.reader import to_yaml
@@ -23,6 +23,7 @@ from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
 from blinkgl.scene.importing.mesh_files import dependencies
+from blinkgl.scene.motion.dynamics import engine_version
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
 from blinkgl.scene.worlds.pool import files_below, resolve
 from blinkgl.scene.worlds.random_world import pools
@@ -175,6 +176,11 @@ class Plan:
                 raise
         return hashes
 
+    def libraries(self) -> dict[str, str]:
+        """Versions of those that only some runs use and that have a say in the bytes. Raises ConfigError where one is
+        not installed."""
+        return {"mujoco": engine_version()} if any(_falls(group.template.tree) for group in self.used) else {}
+
     def recipe_text(self) -> str:
         """The recipe with all overrides, as YAML that ``load_run`` takes."""
         return to_yaml(self.template.tree)
@@ -182,6 +188,8 @@ class Plan:
 
 def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
     base = group.template.base
+    if _falls(group.template.tree):
+        engine_version()
     # What check_assets looks at, and which folders there are.
     for config in group.template.corners_of(
         "frames",
@@ -216,6 +224,13 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
             continue
         check_assets(config.scene, base, config.output.split)
         _hash_scene_files(config.scene, base, hashes)
+
+
+def _falls(tree: Any) -> bool:
+    """Whether some draw of a recipe may have physics."""
+    if isinstance(tree, dict):
+        return tree.get("physics") is not None or any(_falls(value) for value in tree.values())
+    return isinstance(tree, (list, tuple)) and any(_falls(value) for value in tree)
 
 
 def _hash_scene_files(scene, base: Path, hashes: dict[str, str]) -> None:

@@ -26,6 +26,7 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from blinkgl import __version__
@@ -90,7 +91,12 @@ class Maker:
                     "the groups ask for different OpenGL", where="gl", accepted="one gl section at the top level"
                 )
             self.gl = create_context(rendered[0].backend, rendered[0].device if self.device is None else self.device)
-        return {"kind": "hello", "pid": os.getpid(), "environment": environment(self.gl), "assets": digest(assets)}
+        return {
+            "kind": "hello",
+            "pid": os.getpid(),
+            "environment": environment(self.gl, self.plan.libraries()),
+            "assets": digest(assets),
+        }
 
     def make(self, number: int, attempt: int, tell: Callable[[Message], None]) -> Message:
         """The ``number``-th task of the plan. Returns "done" or "failed"; only
@@ -168,8 +174,9 @@ def report_of(message: Message) -> SequenceReport:
     return SequenceReport(**{**message["report"], "path": Path(message["report"]["path"])})
 
 
-def environment(gl: GLContext | None) -> dict[str, str]:
-    """Everything that has a say in the bytes: two machines that agree in it make the same sequences."""
+def environment(gl: GLContext | None, libraries: Mapping[str, str] = MappingProxyType({})) -> dict[str, str]:
+    """Everything that has a say in the bytes: two machines that agree in it make the same sequences.
+    libraries : versions of those that not every run uses."""
     import numba
     import numpy
     import scipy
@@ -182,6 +189,7 @@ def environment(gl: GLContext | None) -> dict[str, str]:
         "scipy": scipy.__version__,
         "numba": numba.__version__,
         "opengl": f"{gl.renderer}, {gl.version}" if gl is not None else "not used",
+        **libraries,
     }
 
 

@@ -262,4 +262,4 @@ def read_timestamps(path: Path) -> list[tuple[int, str | None]]:
 
 def _natural(path: Path) -> list:
     """frame2 before frame10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", path.name)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]

@@ -18,13 +18,13 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any
 
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.io.atomic import atomic_file, output_errors
-from blinkgl.io.records import InsidePath, parse, read_text, shown
+from blinkgl.io.records import HereOrInside, parse, read_text, shown
 from blinkgl.io.sequence_dir import MANIFEST, read_manifest
 
 INDEX = "index.jsonl"
@@ -130,7 +130,7 @@ class _Line(BaseModel):
     """What a reader relies on; "." is the path of a folder that is a sequence itself."""
 
     model_config = ConfigDict(strict=True, extra="allow")
-    path: Literal["."] | InsidePath
+    path: HereOrInside
 
 
 _MODEL = TypeAdapter(_Line)

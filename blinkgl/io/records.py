@@ -97,6 +97,8 @@ def _inside(name: str) -> str:
 
 InsidePath = Annotated[str, AfterValidator(_inside)]
 """A relative path that neither leaves its folder nor names the folder itself."""
+HereOrInside = Annotated[str, AfterValidator(lambda name: name if name == "." else _inside(name))]
+"""The same, or "." for the folder itself."""
 
 
 def entries_below(folder: str | os.PathLike) -> Iterator[tuple[str, str, int]]:

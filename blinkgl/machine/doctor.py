@@ -344,6 +344,16 @@ def _codecs() -> Iterator[Check]:
     yield _try(section, "16-bit RGB PNG", png16, f"{pip} opencv-python-headless")
 
 
+def _blender(value: str, purpose: str) -> tuple[list[str], str, str]:
+    """Blender may be another interpreter's: what is lacking, what to say, the remedy."""
+    from blinkgl.blender import process
+
+    missing = process.available()
+    if missing:
+        return ["bpy"], value, missing.partition(": ")[2] or missing
+    return [], value if process.interpreter() == sys.executable else f"by {process.interpreter()} ({purpose})", ""
+
+
 def _extras() -> Iterator[Check]:
     for extra, (distributions, purpose) in EXTRAS.items():
         found, lacking = [], []
@@ -354,4 +364,6 @@ def _extras() -> Iterator[Check]:
                 lacking.append(name)
         value = ", ".join(found + [f"no {name}" for name in lacking]) + f" ({purpose})"
         remedy = install(*lacking) if lacking else ""
+        if extra == "cycles":
+            lacking, value, remedy = _blender(value, purpose)
         yield Check("Optional extras", f"[{extra}]", "absent" if lacking else "ok", value, remedy)

@@ -11,10 +11,11 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "check": (("pyrender",), "an independent renderer to compare with"),
     "cycles": (
         ("bpy",),
-        "Blender's path tracer to compare with; better in an environment of its own, see docs/install.md",
+        "Blender: blinkgl import, a path tracer; better in an environment of its own, see docs/install.md",
     ),
     "learn": (("torch", "safetensors", "tensorboard"), "training"),
     "cluster": (("ray",), "many machines"),
+    "physics": (("mujoco",), "scenes in which things fall"),
     "formats": (
         ("faery", "dv-processing"),
         "dv-processing: AEDAT4 files; faery: checks of EVT2 and EVT3, which need nothing",
@@ -24,7 +25,7 @@ EXTRAS = {  # extra of setup.cfg -> (distributions, what they are for)
     "docs": (("zensical", "mkdocstrings", "towncrier"), "the documentation as a site"),
     "dev": (("pytest", "pytest-xdist", "hypothesis", "build"), "tests and packaging"),
 }
-_PINNED = {"torch": "torch==2.13.0", "bpy": "bpy>=4.5,<4.6"}
+_PINNED = {"torch": "torch==2.13.0", "bpy": "bpy>=4.5,<4.6", "mujoco": "mujoco>=3.17,<4"}
 
 
 def python() -> str:

@@ -30,7 +30,7 @@ BLUR_PX = 1.0
 sub-pixel shifts are not what it asks about."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Side:
     """One recording inside the compared time span. Maps are (H, W), times µs."""
 
@@ -66,7 +66,7 @@ class Side:
         return float(np.sqrt(IEI_EDGES_US[i] * IEI_EDGES_US[i + 1]))
 
 
-@dataclass
+@dataclass(eq=False)
 class Comparison:
     """Result of :func:`compare`. ``b`` is None when there was one recording. What is told pixel by
     pixel is None where the two differ in size."""

@@ -28,7 +28,7 @@ MAX_CONFIGS = 5000
 _FLOW = LABELS["flow_forward"]
 
 
-@dataclass
+@dataclass(eq=False)
 class Example:
     """Pictures of one label, RGB uint8 (H, W, 3), and what stands below them."""
 
@@ -52,7 +52,7 @@ class Parameter:
     values: list[Any]
 
 
-@dataclass
+@dataclass(eq=False)
 class Collected:
     """What the page of a data set is made of."""
 

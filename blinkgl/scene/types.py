@@ -148,6 +148,23 @@ class Light:
     sky: float = LightConfig().sky
 
 
+@dataclass(frozen=True)
+class Dynamics:
+    """How the paths of a scene's falling bodies came about.
+
+    engine, version : what computed them.   bodies : how many.   steps : of the engine.
+    impacts_ns : times at which a velocity changes abruptly, increasing: frames at these times keep what turns there.
+    digest : SHA-256 of all their paths, in hex.
+    """
+
+    engine: str
+    version: str
+    bodies: int
+    steps: int
+    impacts_ns: tuple[int, ...]
+    digest: str
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Everything that is rendered over [t0_ns, t1_ns].
@@ -157,6 +174,7 @@ class Scene:
     log        : one line per decision worth keeping (collisions cut, objects dropped), for the manifest.
     omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and
     the manifest.
+    dynamics   : of the objects that an engine moves; None: there are none.
     """
 
     objects: tuple[SceneObject, ...]
@@ -167,6 +185,7 @@ class Scene:
     background: float = 0.0
     log: tuple[str, ...] = field(default=())
     omissions: tuple[str, ...] = field(default=())
+    dynamics: Dynamics | None = None
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:

@@ -20,7 +20,7 @@ from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
 from blinkgl.scene.build import recording, sequence_scene
-from blinkgl.scene.types import Scene
+from blinkgl.scene.types import Dynamics, Scene
 from blinkgl.sequence.clock import StageClock
 from blinkgl.sequence.items import GroundTruth, Picture
 from blinkgl.sequence.simulate import Simulation
@@ -71,6 +71,8 @@ class RenderedSequence(Simulation):
                 renderer = stack.enter_context(Renderer(gl, scene, config.render))
             size, span_ns = (renderer.height, renderer.width), window_ns or (scene.t0_ns, scene.t1_ns)
             self.scene, self.renderer, self.omissions = scene, renderer, scene.omissions
+            if scene.dynamics is not None:
+                self.libraries = {scene.dynamics.engine: scene.dynamics.version}
             self.sensor = recording(scene, config).sensors[0]
             self.triangles, self._before = renderer.triangles, (renderer.stats.render_s, renderer.stats.readback_s)
             camera = None
@@ -83,8 +85,9 @@ class RenderedSequence(Simulation):
                     kernel_seed(config.seed, index, Role.EVENTS),
                     config.timeline.reconstruction,
                 )
+                response, dynamics = emulator_of(emulator).response(emulator), scene.dynamics
                 self.timeline = make_timeline(
-                    config.timeline, *span_ns, renderer, emulator_of(emulator).response(emulator)
+                    config.timeline, *span_ns, renderer, response, dynamics.impacts_ns if dynamics is not None else ()
                 )
             super().__init__(
                 config,
@@ -180,7 +183,18 @@ class RenderedSequence(Simulation):
             ],
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
+            **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),
         }
+
+
+def _facts_of(dynamics: Dynamics) -> dict[str, Any]:
+    return {
+        "engine": dynamics.engine,
+        "bodies": dynamics.bodies,
+        "steps": dynamics.steps,
+        "impacts": len(dynamics.impacts_ns),
+        "paths_sha256": dynamics.digest,
+    }
 
 
 def poses_at(scene: Scene, times_ns: list[int]) -> tuple[np.ndarray, np.ndarray]:

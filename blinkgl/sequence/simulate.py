@@ -15,9 +15,10 @@ would then have to keep every event.)
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -96,11 +97,13 @@ class Simulation(ABC):
     events, labels : given so far.   triangles : of all that is drawn; 0 for recorded frames.
     timeline : the :class:`Timeline` that says when event frames are drawn; None for
     recorded frames, and without events.
-    omissions : what files of the scene ask for and is not drawn, a line per file."""
+    omissions : what files of the scene ask for and is not drawn, a line per file.
+    libraries : versions of those that have a say in this sequence and not in every one."""
 
     triangles = 0
     timeline: Timeline | None = None
     omissions: tuple[str, ...] = ()
+    libraries: Mapping[str, str] = MappingProxyType({})
 
     def __init__(
         self,

@@ -6,7 +6,8 @@ grows with the length of a sequence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 
 NS_PER_S = 1_000_000_000
@@ -36,21 +37,31 @@ def displacement_times(
 
 
 def bounded_times(
-    pace: Callable[[int], float], min_step_ns: int, max_step_ns: int, t0_ns: int, t1_ns: int
+    pace: Callable[[int], float],
+    min_step_ns: int,
+    max_step_ns: int,
+    t0_ns: int,
+    t1_ns: int,
+    stops_ns: Sequence[int] = (),
 ) -> Iterator[int]:
     """Steps so short that ``pace * step <= 1`` at both ends of each step, within [min_step, max_step].
 
     pace : t_ns -> how many steps per second the scene asks for at that time.
+    stops_ns : increasing times that no step goes over, such as those of impacts: what turns round inside a step is at
+        neither of its ends. One that comes less than min_step after another, or before t1, is left out.
     The step is proposed from the pace at its start (as in Rebecq et al. 2018, section 3.2) and then checked against
     the pace at its end, which the original does not do: something that accelerates inside the step would exceed the
     bound. A rejected step is shortened and tried again; the pace at an accepted end is the next step's start, so a
     pace is asked for once per frame as long as nothing is rejected. The last step ends at t1 exactly, and steps
-    before it may be shorter than min_step only there.
+    before it may be shorter than min_step only there, and before a stop.
     """
     yield t0_ns
     t, v = t0_ns, pace(t0_ns)
+    ends = deque(_apart(stops_ns, min_step_ns, t0_ns, t1_ns))
     while t < t1_ns:
-        step = min(_step(1.0, v, min_step_ns, max_step_ns), t1_ns - t)
+        while ends and ends[0] <= t:
+            ends.popleft()
+        step = min(_step(1.0, v, min_step_ns, max_step_ns), (ends[0] if ends else t1_ns) - t)
         while True:
             end = t + step
             v_end = pace(end)
@@ -60,6 +71,14 @@ def bounded_times(
             step = max(min_step_ns, min(int(0.9 * step), _step(0.95, max(v, v_end), min_step_ns, max_step_ns)))
         yield end
         t, v = end, v_end
+
+
+def _apart(stops_ns: Sequence[int], least_ns: int, t0_ns: int, t1_ns: int) -> Iterator[int]:
+    last = t0_ns
+    for stop in stops_ns:
+        if last + least_ns <= stop <= t1_ns - least_ns:
+            yield stop
+            last = stop
 
 
 def _step(steps: float, pace: float, low: int, high: int) -> int:

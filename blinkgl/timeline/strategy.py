@@ -9,7 +9,7 @@ timeline.info()                                  # what was achieved, for the ma
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -38,18 +38,26 @@ class SmallPictures(Protocol):
 
 class Timeline:
     """Iterates over frame times, int64 ns, from t0 to t1, both included, strictly increasing;
-    each is decided when asked for."""
+    each is decided when asked for. ``stops_ns``: times of impacts, that adaptive kinds do not step over."""
 
-    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response):
+    def __init__(
+        self,
+        config: TimelineConfig,
+        t0_ns: int,
+        t1_ns: int,
+        pictures: SmallPictures,
+        response: Response,
+        stops_ns: Sequence[int] = (),
+    ):
         self.config, self.t0_ns, self.t1_ns, self.pictures, self.response = config, t0_ns, t1_ns, pictures, response
+        self.stops_ns = stops_ns
         self.looks = 0
         """Small pictures asked for so far."""
 
     def __iter__(self) -> Iterator[int]:
         c = self.config
-        return bounded_times(
-            self._counted, round(c.min_step_us * 1000), round(c.max_step_us * 1000), self.t0_ns, self.t1_ns
-        )
+        least, most = round(c.min_step_us * 1000), round(c.max_step_us * 1000)
+        return bounded_times(self._counted, least, most, self.t0_ns, self.t1_ns, self.stops_ns)
 
     def pace(self, t_ns: int) -> float:
         """Steps per second that the scene asks for at one time."""
@@ -101,8 +109,8 @@ class Brightness(Timeline):
 class Budget(Timeline):
     """The step whose estimated error is what was asked for: :mod:`blinkgl.timeline.budget`."""
 
-    def __init__(self, config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response):
-        super().__init__(config, t0_ns, t1_ns, pictures, response)
+    def __init__(self, config: TimelineConfig, *others: Any):
+        super().__init__(config, *others)
         in_px = config.max_time_error_px is not None
         self.error = TimeError(
             config.reconstruction,
@@ -150,10 +158,16 @@ _KINDS = {"uniform": Uniform, "displacement": Displacement, "brightness": Bright
 
 
 def make_timeline(
-    config: TimelineConfig, t0_ns: int, t1_ns: int, pictures: SmallPictures, response: Response
+    config: TimelineConfig,
+    t0_ns: int,
+    t1_ns: int,
+    pictures: SmallPictures,
+    response: Response,
+    stops_ns: Sequence[int] = (),
 ) -> Timeline:
-    """Of any ``timeline:`` configuration."""
-    return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response)
+    """Of any ``timeline:`` configuration.   stops_ns : increasing; times of impacts, that
+    adaptive kinds do not step over."""
+    return _KINDS[config.kind](config, t0_ns, t1_ns, pictures, response, stops_ns)
 
 
 def moving(values: np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ QUICK = Options(
 )
 
 
-@dataclass
+@dataclass(eq=False)
 class Measured:
     """One setting. wall_s, cpu_s : seconds (processor: of all threads) per simulated second, one per round."""
 
@@ -104,7 +104,7 @@ class Measured:
         }
 
 
-@dataclass
+@dataclass(eq=False)
 class Level:
     """One reference of the ladder. movement : errors of the level before, judged by this one; smallest : the smallest
     error of any setting judged by this one. frame_wall_s, frame_cpu_s : of a path tracer, rendering alone, median."""
@@ -160,9 +160,9 @@ class Bench:
     ):
         self.gl, self.options, self.say = gl, options, say
         if options.reference == "cycles":
-            from blinkgl.tools import peer_cycles
+            from blinkgl.blender import process
 
-            peer_cycles.require()  # now, not after minutes of measuring
+            process.require()  # now, not after minutes of measuring
         base = template.sequence(options.sequence)
         if base.frames is not None:
             raise ConfigError("nothing is rendered from recorded frames, so there is nothing to trade", where="frames")

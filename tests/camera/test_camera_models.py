@@ -262,3 +262,118 @@ def test_extremes_between_samples_are_not_missed(points):
     angles = np.linspace(0.1, 2.9, points) + math.pi / 2 * np.arange(4)[:, None]
     low, high = _extremes(np.stack([np.cos(angles), np.sin(angles)], axis=-1))
     assert (low <= -1).all() and (high >= 1).all() and np.abs([low, high]).max() < 1 + 20 / points**2
+
+
+# ---- no wider than the picture -------------------------------------------------------------------------------------
+
+LOPSIDED = [
+    PinHole(40, 30, 35.0, 20.0, cx, cy, 0.5) for cx in (-3.0, 10.0, 33.0) for cy in (2.0, 14.5, 31.0)
+]  # the corner that is farthest out is another in each
+
+
+def border(camera):
+    """Pixels along the four sides, left, right, top, bottom: each (100, 2)."""
+    right, bottom = camera.width - 0.5, camera.height - 0.5
+    x, y, one = np.linspace(-0.5, right, 100), np.linspace(-0.5, bottom, 100), np.ones(100)
+    return [np.stack(s, axis=-1) for s in ((-0.5 * one, y), (right * one, y), (x, -0.5 * one), (x, bottom * one))]
+
+
+@pytest.mark.parametrize(
+    "camera", [*CAMERAS, *LOPSIDED], ids=lambda c: f"{c.kind}-{c.cx:g}-{c.cy:g}-{c.k1 if hasattr(c, 'k1') else ''}"
+)
+def test_planes_touch_the_picture(camera):
+    """A culled object is one that is out of the picture; a plane a quarter of a pixel off draws too much, for ever."""
+    planes = camera.frustum_planes()
+    if camera.half_angle > math.pi / 2:
+        assert planes.shape == (0, 3)
+        return
+    np.testing.assert_allclose(np.linalg.norm(planes, axis=1), 1)
+    assert planes[4].tolist() == [0, 0, 1] and planes.dtype == np.float64
+    exact = camera.kind == "pinhole"
+    for plane, side in zip(planes, border(camera)):
+        rays = camera.rays(side)
+        nearest = (rays @ plane).min() / np.linalg.norm(rays, axis=1).max()
+        assert abs(nearest) < 1e-12 if exact else -1e-12 < nearest < 0.1 / camera.fx
+
+
+@pytest.mark.parametrize("camera", LOPSIDED, ids=lambda c: f"{c.cx:g}-{c.cy:g}")
+def test_a_pin_hole_s_bounds_are_those_of_its_farthest_corner(camera):
+    rays = camera.rays(corners(camera))
+    length = np.linalg.norm(rays, axis=1).max()
+    assert camera.half_angle == pytest.approx(math.acos(1 / length), rel=1e-12)
+    assert camera.near_corner == pytest.approx(0.5 * length, rel=1e-12)
+    assert camera.magnification == pytest.approx(35.0 * length, rel=1e-12)
+    clip = camera.clip_from_cam()
+    xy = pixels(camera, 50)
+    at = np.concatenate([7.0 * camera.rays(xy), np.ones((50, 1))], axis=1) @ clip.T
+    np.testing.assert_allclose(at[:, :2] / at[:, 3:], (xy + 0.5) / [20, 15] - 1, atol=1e-12)
+    np.testing.assert_allclose(at[:, 2:], np.tile([0.5, 7.0], (50, 1)))
+
+
+def points_at(camera, xy, z=2.0):
+    return z * camera.rays(np.asarray(xy, np.float64))
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [PinHole(40, 30, 35.0, 20.0, 10.0, 14.0), Radtan(40, 30, 35.0, 33.0, 10.0, 14.0, k1=-0.02)],
+    ids=lambda c: c.kind,
+)
+@pytest.mark.parametrize(
+    "low, high, expected",
+    [
+        ((10.5, 12.5), (20.5, 22.5), (9, 11, 23, 25)),
+        ((-9.0, -9.0), (90.0, 90.0), (0, 0, 40, 30)),
+        ((-9.0, 12.5), (-2.5, 22.5), None),
+        ((41.5, 12.5), (60.0, 22.5), None),
+        ((10.5, -9.0), (20.5, -2.5), None),
+        ((10.5, 31.5), (20.5, 60.0), None),
+        ((-9.0, -9.0), (0.5, 0.5), (0, 0, 3, 3)),
+        ((38.5, 28.5), (60.0, 60.0), (37, 27, 40, 30)),
+    ],
+)  # fmt: skip
+def test_bounds_are_tight_to_a_pixel(camera, low, high, expected):
+    """One pixel to spare on every side; None as soon as the hull is out of the picture by more."""
+    hull = points_at(camera, [low, (high[0], low[1]), high, (low[0], high[1])])
+    got = camera.bounds(hull)
+    if camera.kind == "pinhole":
+        assert got == expected
+    elif expected is not None:  # of a lens that bends, the rectangle round a bent side
+        assert np.abs(np.subtract(got, expected)).max() <= 1
+    whole = (0, 0, 40, 30)
+    assert camera.bounds(np.array([[0, 0, camera.near], [0, 0, 1.0]])) == whole, "the hull meets the near plane"
+    assert camera.bounds(np.array([[0, 0, -1.0], [0, 0, camera.near]])) is None
+    ahead = np.array([[0, 0, 1.01 * camera.near]] * 2)
+    assert camera.bounds(ahead) != whole and camera.bounds(ahead) is not None
+
+
+@every
+def test_pixels_per_unit_at_the_edges(camera):
+    """A sphere that touches the near plane shows its surface at any size; one beside the picture shows nothing."""
+    camera = replace(camera, near=1.0)
+    per = lambda z: float(camera.pixels_per_unit(np.array([[0.0, 0, z]]), 0.25)[0])
+    assert per(2.25) == pytest.approx(camera.magnification / 2) and per(1.25) == np.inf > per(1.2501) > 0
+    assert per(0.7501) == np.inf and per(0.75) == 0, "all of it nearer than the near plane"
+    if camera.half_angle < math.pi / 2:
+        for off, seen in ((0.99, True), (1.01, False)):
+            angle = camera.half_angle + off * math.asin(0.1)
+            centre = 5.0 * np.array([[math.sin(angle), 0, math.cos(angle)]])
+            assert (camera.pixels_per_unit(centre, 0.5)[0] > 0) == seen
+
+
+@every
+def test_the_smallest_cameras(camera):
+    """One pixel is a picture; sizes may be NumPy's; what is no whole number, or no number, is refused."""
+    tiny = replace(camera, width=np.int64(1), height=1, cx=0.0, cy=0.0)
+    assert tiny.rays(np.zeros(2)).tolist() == [0, 0, 1] and tiny.summary == f"1x1, fx {camera.fx:.0f} px"
+    assert tiny.half_angle < 0.02 and tiny.near_corner == pytest.approx(camera.near, rel=1e-3)
+    for name, value in (
+        ("width", -1),
+        ("width", "9"),
+        ("cx", math.inf),
+        ("near", math.nan),
+        ("near", -1.0),
+        ("fx", 0.0),
+    ):
+        with pytest.raises(ConfigError, match=rf"\.{name}: not a") if value != "9" else pytest.raises(ConfigError):
+            replace(camera, **{name: value})

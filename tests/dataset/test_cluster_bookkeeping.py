@@ -189,3 +189,131 @@ def test_the_environment_is_as_it_was(ray, monkeypatch):
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0" and os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] == "1"
     cluster.close()
     assert "RAY_USAGE_STATS_ENABLED" not in os.environ and os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] == "1"
+
+
+# --- connecting, and the worker's side --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "given, environment, asked", [("host:1", "other:2", "host:1"), (None, "other:2", "other:2"), (None, None, None)]
+)
+def test_which_cluster_is_asked(ray, monkeypatch, given, environment, asked):
+    """The address that is given, else the environment's, else one of our own."""
+    calls, looked = [], []
+    monkeypatch.setattr(module, "_reachable", looked.append)
+    ray.init = lambda **said: calls.append(said["address"])
+    monkeypatch.setattr(RayCluster, "_start_own", lambda self: calls.append(None))
+    monkeypatch.setenv("RAY_ADDRESS", environment or "")
+    cluster = RayCluster(address=given)
+    cluster._connect()
+    assert calls == [asked] and cluster._ours and looked == ([asked] if asked else [])
+    cluster._address = "auto"
+    cluster._connect()
+    assert calls[-1] == "auto" and len(looked) == (1 if asked else 0), "Ray finds it by itself"
+    cluster._restore_environment()
+
+
+@pytest.mark.parametrize(
+    "error, said",
+    [
+        (
+            RuntimeError("Version mismatch:\n  2.1"),
+            "Ray's or Python's version differs from the cluster's: Version mismatch: 2.1",
+        ),
+        (ConnectionError("x" * 300), "cannot connect to Ray: " + "x" * 200 + " .got 'a:1'"),
+        (BlinkGLError("ours"), "^ours$"),
+    ],
+)
+def test_why_ray_cannot_be_connected_to(ray, monkeypatch, error, said):
+    def init(**_):
+        raise error
+
+    monkeypatch.setattr(module, "_reachable", lambda address: None)
+    ray.init = init
+    cluster = RayCluster(address="a:1")
+    with pytest.raises(BlinkGLError, match=said):
+        cluster._connect()
+    assert not cluster._ours
+    cluster._restore_environment()
+
+
+def test_the_latest_of_each_task_is_pinned_up():
+    board = module._Board()
+    for message in ({"task": 1, "n": 1}, {"task": 2, "n": 2}, {"task": 1, "n": 3}):
+        board.put(message)
+    assert board.take() == [{"task": 1, "n": 3}, {"task": 2, "n": 2}] and board.take() == []
+
+
+class Worker:
+    """What ``_open`` makes: a maker of a job that says hello."""
+
+    def __init__(self, job, environment="e", assets="a"):
+        self.job = SimpleNamespace(to_dict=lambda: job)
+        self.hello = {"kind": "hello", "environment": {"v": environment}, "assets": assets}
+        self.made = []
+
+    def make(self, task, attempt, tell):
+        self.made.append((task, attempt, tell))
+        return {"kind": "done", "task": task}
+
+
+@pytest.mark.parametrize(
+    "environment, assets, said",
+    [
+        ("e", "a", None),
+        ("f", "a", "differs from the run's first in version or hardware: v f and e"),
+        ("e", "b", "sees other meshes"),
+    ],
+)
+def test_a_worker_looks_before_its_first_task(monkeypatch, environment, assets, said):
+    opened, job, board = [], {"out": "o"}, SimpleNamespace(put=SimpleNamespace(remote="tell"))
+    worker = Worker(job, environment, assets)
+
+    def open_(asked):
+        opened.append(asked)
+        monkeypatch.setattr(module, "_maker", worker)
+        return worker, worker.hello
+
+    monkeypatch.setattr(module, "_open", open_)
+    monkeypatch.setattr(module, "_maker", None)
+    expected = ({"v": "e"}, "a")
+    message = module._work(job, 3, 1, expected, board)
+    if said:
+        assert message["kind"] == "refused" and said in message["error"] and worker.made == []
+        return
+    module._work(job, 4, 2, expected, board)
+    assert message == {"kind": "done", "task": 3} and worker.made == [(3, 1, "tell"), (4, 2, "tell")]
+    assert opened == [job], "once for a job"
+    module._work({"out": "another"}, 5, 1, expected, board)
+    assert len(opened) == 2
+
+    def refuses(asked):
+        raise BlinkGLError("no OpenGL")
+
+    monkeypatch.setattr(module, "_open", refuses)
+    for message in (module._work({"out": "third"}, 5, 1, expected, board), module._hello(job)):
+        assert message == {"kind": "refused", "error": "no OpenGL"}
+
+
+def test_words_and_folders_that_are_short_enough(monkeypatch):
+    assert (
+        module._first_line(ValueError("\n  one \n two")) == "one" and module._first_line(ValueError("")) == "ValueError"
+    )
+    outer = RayError("outer")
+    outer.cause = ValueError("y" * 300)
+    assert module._first_line(outer) == "y" * 200
+    for folder, chosen in (("/" + "t" * 19, "/" + "t" * 19), ("/" + "t" * 20, "/tmp")):
+        monkeypatch.setattr(module.tempfile, "gettempdir", lambda folder=folder: folder)
+        assert module._short_folder() == chosen
+
+
+@pytest.mark.parametrize("address", ["host", ":5", "host:port", "ray://host", "host:"])
+def test_what_is_no_address(address):
+    with pytest.raises(BlinkGLError, match="--address: not an address .*; expected host:port, ray://host:port or auto"):
+        module._reachable(address)
+
+
+@pytest.mark.parametrize("ids, device", [([], None), (["0"], 1), ([1], 3), ([2], None), (["MIG-7"], None)])
+def test_cards_of_egl_without_software(monkeypatch, ids, device):
+    monkeypatch.setattr("blinkgl.gl.context.egl_devices", lambda: ["Software", "a", "software b", "c"])
+    assert module._egl_device(ids) == device

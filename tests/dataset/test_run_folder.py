@@ -7,7 +7,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from pydantic import ValidationError
 
+from blinkgl.dataset import run_folder
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.errors import OutputError
 
@@ -223,3 +225,64 @@ def test_costs_are_the_last_of_each_sequence_and_a_line_cut_short_is_left_out(tm
         and "path" not in line
         and "index" not in line
     )
+
+
+COST = {
+    "name": "a", "seconds": {"render": 0.0}, "total_s": 0, "simulated_s": 1e18, "frames": 1, "bytes": 1, "cpu_s": 1,
+    "peak_rss_kib": 1, "attempts": 1,
+}  # fmt: skip
+RUN = {"format": "blinkgl-run", "format_version": 1, "groups": {}, "environment": {}, "base": "b"}
+
+
+@pytest.mark.parametrize(
+    "model, whole, changes, fine",
+    [
+        ("cost", COST, {}, True),
+        *[
+            ("cost", COST, {key: bad}, False)
+            for key in COST
+            if key not in ("name", "seconds")
+            for bad in (-1e-9, 1.1e18)
+        ],
+        ("cost", COST, {"seconds": {"render": -1}}, False),
+        ("cost", COST, {"total_s": float("nan")}, False),
+        ("cost", COST, {"more": 1}, True),
+        ("run", RUN, {}, True),
+        ("run", RUN, {"num": 1}, True),
+        ("run", RUN, {"num": 0}, False),
+        ("run", RUN, {"num": 10_000_000}, True),
+        ("run", RUN, {"num": 10_000_001}, False),
+        ("run", RUN, {"base": "b" * 4096}, True),
+        ("run", RUN, {"base": "b" * 4097}, False),
+        ("run", RUN, {"base": "a\0b"}, False),
+        ("run", RUN, {"format_version": 2}, False),
+        ("run", RUN, {"groups": {"a": 1}}, False),
+        ("run", RUN, {"mixed": [{"groups": {"a": "b"}}]}, True),
+    ],
+)
+def test_limits_of_a_run_s_records(model, whole, changes, fine):
+    adapter = run_folder._COST if model == "cost" else run_folder._RECORDS["run.json"]
+    if fine:
+        adapter.validate_python({**whole, **changes})
+    else:
+        with pytest.raises(ValidationError):
+            adapter.validate_python({**whole, **changes})
+
+
+def test_what_is_put_away_lies_beside_what_was_put_away_before(tmp_path):
+    """Under the next number that is free, whatever has it: a link to nowhere, too."""
+    folder = begun(tmp_path / "out")
+    away = tmp_path / "out/.run/damaged/train"
+    for number in (0, 1, 3):
+        if number == 3:
+            (away / "a-2").symlink_to("nowhere")
+        (tmp_path / "out/train").mkdir(exist_ok=True)
+        (tmp_path / "out/train/a").write_text(str(number))
+        assert folder.state("train/a") == "not a folder"
+        folder.put_away("train/a")
+        assert (away / f"a-{number}").read_text() == str(number) and folder.state("train/a") is None
+    assert not folder.occupied("train/a")
+    (tmp_path / "out/train/a").mkdir()
+    assert not folder.occupied("train/a") and folder.state("train/a") is None
+    (tmp_path / "out/train/a/x").touch()
+    assert folder.occupied("train/a") and "no manifest" in folder.state("train/a")

@@ -398,3 +398,54 @@ def test_output_names(tmp_path):
     with pytest.raises(EventDataError, match="outside the sensor"):
         write_events(tmp_path / "e.raw", random_events(100), 10, 10)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "largest, size",
+    [
+        ((0, 0), (180, 240)),
+        ((179, 239), (180, 240)),
+        ((180, 239), (240, 304)),
+        ((179, 240), (240, 304)),
+        ((239, 304), (260, 346)),
+        ((259, 345), (260, 346)),
+        ((260, 300), (320, 320)),
+        ((319, 319), (320, 320)),
+        ((319, 320), (480, 640)),
+        ((479, 639), (480, 640)),
+        ((480, 0), (720, 1280)),
+        ((719, 1279), (720, 1280)),
+        ((1079, 1919), (1080, 1920)),
+        ((1080, 5), (1081, 6)),
+    ],
+)
+def test_a_size_that_is_not_said_is_that_of_the_smallest_sensor_that_holds_all(tmp_path, largest, size):
+    """DAVIS240, ATIS, DAVIS346, GENX320, VGA, HD and full HD; else as large as the events are."""
+    y, x = largest
+    (tmp_path / "e.txt").write_text(f"1 0 {y} 1\n2 {x} 0 1\n")
+    file = open_events(tmp_path / "e.txt")
+    assert (file.height, file.width) == (None, None)
+    assert (file.sized().height, file.sized().width) == size
+
+
+@pytest.mark.parametrize(
+    "first, zero, offset",
+    [
+        (5, False, 0),
+        (999_999, False, 0),
+        (1_000_000, False, 10**6),
+        (2_500_000, False, 2 * 10**6),
+        (2_500_000, True, 0),
+    ],
+)
+def test_dsec_counts_from_the_first_event_s_second(tmp_path, first, zero, offset):
+    """Or from the source's own beginning, or from the first event."""
+    (tmp_path / "e.txt").write_text(f"{first} 1 2 1\n{first + 7} 3 4 0\n")
+    source, count = convert(tmp_path / "e.txt", tmp_path / "e.h5", zero_time=zero)
+    assert count == 2 and source.format == "text"
+    with open_events(tmp_path / "e.h5") as file:
+        assert file.t_offset_us == offset and file.read().t.tolist() == [0 if zero else first, 7 if zero else first + 7]
+    write_events(tmp_path / "own.h5", random_events(9, t0=3_300_000), H, W, t_offset_us=3_250_000)
+    convert(tmp_path / "own.h5", tmp_path / "again.h5")
+    with open_events(tmp_path / "again.h5") as file:
+        assert file.t_offset_us == 3_250_000

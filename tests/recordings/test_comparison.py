@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from blinkgl.cli import run
 from blinkgl.errors import EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.formats import write_events
+from blinkgl.recordings import comparison
 from blinkgl.recordings.comparison import IEI_EDGES_US, compare, plot
 from tests.shared_data import shared
 
@@ -143,3 +146,125 @@ def test_bad_input(tmp_path):
     np.savez(tmp_path / "f.npz", frames=np.ones((3, H, W + 2)), timestamps_us=[0, 1, 2])
     with pytest.raises(EventDataError, match=r"f\.npz: 52x40; .*a\.h5: 50x40"):
         compare(tmp_path / "a.h5", tmp_path / "f.npz")
+
+
+# --- by hand, one figure at a time ------------------------------------------------------------------------------------
+
+
+def listed(*rows) -> Events:
+    """Events of (x, y, t, p)."""
+    x, y, t, p = (np.array(column) for column in zip(*rows, strict=True))
+    return Events(x.astype(np.uint16), y.astype(np.uint16), t.astype(np.int64), p.astype(np.uint8))
+
+
+def test_every_figure_of_two_small_recordings(tmp_path):
+    """Two pixels of A with intervals of 1, 10 and 0 µs and 20 s; B has one of 1000 µs."""
+    a = listed(
+        (0, 0, 1000, 1), (0, 0, 1001, 1), (0, 0, 1011, 0), (3, 2, 5000, 1), (3, 2, 5000, 1), (0, 0, 20_001_011, 1)
+    )
+    b = listed((1, 1, 1000, 1), (1, 1, 2000, 1), (1, 1, 20_001_011, 0))
+    write_events(tmp_path / "a.npz", a, 3, 4)
+    write_events(tmp_path / "b.npz", b, 3, 4)
+    result = compare(tmp_path / "a.npz", tmp_path / "b.npz", interval_ms=10_000)
+    assert result.edges_us.tolist() == [1000, 10_001_000, 20_001_000, 30_001_000] and result.duration_s == 30
+    assert (result.a.count, result.a.on, result.b.count, result.b.on) == (6, 5, 3, 2)
+    assert result.a.rate_hz.tolist() == [0.5, 0, 0.1] and result.b.rate_hz.tolist() == [0.2, 0, 0.1]
+    np.testing.assert_allclose(result.rate_ratio, [0.4, np.nan, 1.0])
+    assert np.flatnonzero(result.a.iei).tolist() == [0, 10, 69] and result.a.iei.sum() == 4 and result.a.iei[0] == 2
+    assert np.flatnonzero(result.b.iei).tolist() == [30, 69], "a millisecond, and all above ten seconds in the last"
+    assert result.a.median_iei_us == pytest.approx(10**0.05) and result.b.median_iei_us == pytest.approx(10**3.05)
+    assert result.a.on_off_ratio == 5 and result.b.on_off_ratio == 2 and result.iei_distance == 0.75
+    counts = np.zeros((2, 3, 4))
+    counts[0, 0, 0], counts[0, 2, 3], counts[1, 1, 1] = 4, 2, 3
+    assert np.array_equal(result.a.counts, counts[0]) and np.array_equal(result.b.counts, counts[1])
+    assert result.pixel_correlation == pytest.approx(np.corrcoef(counts[0].ravel(), counts[1].ravel())[0, 1])
+    assert np.isnan(result.polarity_correlation[1]) and np.isfinite(result.polarity_correlation[[0, 2]]).all()
+    said = {name: values for name, *values in result.rows()}
+    assert said["sensor"] == ["4x3", "4x3"] and said["events"] == ["6", "3"]
+    assert said["rate"] == ["2e-07 M/s", "1e-07 M/s"] and said["rate of a pixel"] == ["0.01667 Hz", "0.008333 Hz"]
+    assert said["ON / OFF"] == ["5.000", "2.000"] and said["active pixels"] == ["16.7 %", "8.3 %"]
+    assert said["median interval of a pixel"] == ["0.00112 ms", "1.12 ms"]
+    assert said["event-rate ratio B / A per interval"] == ["", "0.700 (0.400 … 1.000)"]
+    assert said["interval distribution, KS distance"] == ["", "0.750"] and len(said) == 11
+    plain = result.to_dict()
+    assert plain["rate_ratio"] == [0.4, None, 1.0] and plain["a"]["count"] == 6 and "counts" not in plain["a"]
+    assert plain["duration_s"] == 30 and len(plain["iei_edges_us"]) == 71 and plain["edges_us"][1] == 10_001_000
+    alone = compare(tmp_path / "a.npz", interval_ms=10_000)
+    assert not alone.same_size and [len(row) for row in alone.rows()] == [3] * 7 and "b" not in alone.to_dict()
+
+
+def test_what_cannot_be_divided_is_said_so(tmp_path):
+    """No OFF event, no pixel with two events, nothing that differs between pixels."""
+    write_events(tmp_path / "a.npz", listed((0, 0, 5, 1), (1, 0, 7, 1)), 1, 2)
+    result = compare(tmp_path / "a.npz")
+    assert result.a.on_off_ratio == np.inf and np.isnan(result.a.median_iei_us)
+    assert result.to_dict()["a"]["on_off_ratio"] is result.to_dict()["a"]["median_iei_us"] is None
+    both = compare(tmp_path / "a.npz", tmp_path / "a.npz")
+    assert np.isnan(both.pixel_correlation) and np.isnan(both.polarity_correlation).all() and both.iei_distance == 0
+    assert {r[0]: r[2] for r in both.rows()}["polarity sums A : B per interval, correlation"] == "–"
+
+
+@pytest.mark.parametrize("cuts", [(), (1,), (2, 3), (1, 2, 3, 4, 5, 6), (6,)])
+def test_windows_of_any_chunks(cuts):
+    """An event on an edge belongs to the interval that begins there; intervals without events come, too."""
+    events = listed(*((k, 0, t, 1) for k, t in enumerate((10, 19, 20, 39, 40, 71, 80))))
+    bounds = [0, *cuts, len(events)]
+    chunks = [
+        Events(*(c[i:j] for c in (events.x, events.y, events.t, events.p))) for i, j in itertools.pairwise(bounds)
+    ]
+    windows = list(comparison._windows(SimpleNamespace(chunks=lambda: iter(chunks)), np.arange(20, 101, 20), 5))
+    assert [w.t.tolist() for w in windows] == [[15, 34], [35], [66], [75]]
+
+
+@pytest.mark.parametrize("first, begin", [(2500, 0), (2501, 10_000)])
+@pytest.mark.parametrize("last, end", [(37_499, 40_000), (37_498, 30_000)])
+def test_frames_may_reach_a_quarter_of_an_interval_beyond_the_events(tmp_path, first, begin, last, end):
+    """A recording ends one past its last event."""
+    write_events(tmp_path / "e.npz", listed((0, 0, first, 1), (1, 1, last, 0)), 3, 4)
+    np.savez(tmp_path / "f.npz", frames=np.random.default_rng(0).random((5, 3, 4)), timestamps_us=np.arange(5) * 10_000)
+    edges = compare(tmp_path / "e.npz", tmp_path / "f.npz").edges_us
+    assert edges.tolist() == list(range(begin, end + 1, 10_000))
+    assert compare(tmp_path / "e.npz", tmp_path / "f.npz", frame_delay_ms=2.4).edges_us[0] == 2400
+
+
+def test_the_picture_shows_the_figures(tmp_path, monkeypatch):
+    """What is drawn is read back from the axes: seconds, millions, milliseconds, and only what there is."""
+    from matplotlib.figure import Figure
+
+    a, b = (poisson(rate, 0.7, seconds=1.0, seed=seed) for rate, seed in ((20, 0), (40, 1)))
+    write_events(tmp_path / "a.npz", a, H, W)
+    write_events(tmp_path / "b.npz", b, H, W)
+    shown = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: (shown.append(self), path.write_bytes(b"")))
+    both = compare(tmp_path / "a.npz", tmp_path / "b.npz", interval_ms=250)
+    plot(both, tmp_path / "p.png")
+    plot(compare(tmp_path / "a.npz", interval_ms=250), tmp_path / "p.png")
+    rate, map_a, map_b, intervals, correlation, joint = shown[0].axes[:6]
+    for line, side in zip(rate.get_lines(), (both.a, both.b), strict=True):
+        assert np.allclose(line.get_xdata(), both.edges_us / 1e6)
+        assert np.allclose(line.get_ydata() * 1e6, [*side.rate_hz, side.rate_hz[-1]])
+    assert rate.get_ylim()[0] == 0 and [t.get_text() for t in rate.get_legend().get_texts()] == ["A", "B"]
+    top = max(np.percentile(s.counts, 99.5) for s in (both.a, both.b))
+    for ax, side in ((map_a, both.a), (map_b, both.b)):
+        assert np.array_equal(ax.images[0].get_array(), side.counts) and ax.images[0].get_clim() == (0, top)
+    used = np.flatnonzero(both.a.iei + both.b.iei)
+    assert np.allclose(intervals.get_xlim(), [IEI_EDGES_US[used[0]] / 1e3, IEI_EDGES_US[used[-1] + 1] / 1e3])
+    assert intervals.get_xscale() == "log" and intervals.get_ylim()[0] == 0
+    assert [sum(line.get_ydata()[:-1]) for line in intervals.get_lines()] == pytest.approx([1, 1])
+    (line,) = correlation.get_lines()
+    assert np.allclose(line.get_xdata(), (both.edges_us[:-1] + both.edges_us[1:]) / 2e6)
+    assert np.allclose(line.get_ydata(), both.polarity_correlation)
+    assert correlation.get_ylim()[0] <= 0 and correlation.get_ylim()[1] == 1
+    seen = np.asarray(joint.images[0].get_array())
+    limit = int(top) + 1
+    assert (10 ** seen[both.b.counts[0, 0], both.a.counts[0, 0]] - 1).round() >= 1, "A to the right, B upwards"
+    assert (10**seen - 1).sum() == pytest.approx(H * W) and joint.images[0].get_extent() == [0, limit + 1] * 2
+    for ax in (rate, intervals, correlation):
+        assert [ax.spines[side].get_visible() for side in ("top", "right", "left", "bottom")] == [
+            False,
+            False,
+            True,
+            True,
+        ]
+    assert [ax.axison for ax in shown[0].axes[:6]] == [True] * 6
+    assert [ax.axison for ax in shown[1].axes[:6]] == [True, True, False, True, False, False]

@@ -5,6 +5,7 @@ import inspect
 import subprocess
 import sys
 from importlib import import_module
+from keyword import iskeyword
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ COMMANDS = sorted(name for name, command in typer.main.get_command(cli.app).comm
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_its_module(name):
-    run = import_module(f"blinkgl.show.{name}").run
+    run = import_module(f"blinkgl.show.{name}_" if iskeyword(name) else f"blinkgl.show.{name}").run
     assert inspect.signature(run).return_annotation == "int", "the exit status"
 
 

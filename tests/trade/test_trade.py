@@ -12,6 +12,7 @@ import pytest
 import yaml
 from rich.console import Console
 
+from blinkgl.blender import process
 from blinkgl.cli import run
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.sequence import load_run
@@ -254,7 +255,7 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
             yield from source(times)
 
     monkeypatch.setattr(peer_cycles, "frames", frames)
-    monkeypatch.setattr(peer_cycles, "available", lambda: "")
+    monkeypatch.setattr(process, "available", lambda: "")
     options = replace(OPTIONS, tiles=(1, 1, 64, 48), reference="cycles")
     setting = (Setting("displacement 1 px"),)
     result = trade(load_run(config), settings=setting, options=options)
@@ -268,7 +269,7 @@ def test_a_path_tracer_in_the_references_place(gl, config, monkeypatch, tmp_path
     )
     assert result["settings"][0]["voxel"] == pytest.approx(same["settings"][0]["voxel"], rel=0.02)
 
-    monkeypatch.setattr(peer_cycles, "available", lambda: "no bpy here")
+    monkeypatch.setattr(process, "available", lambda: "no bpy here")
     assert run(["trade", str(config), "-o", str(tmp_path / "x"), "--reference", "cycles"]) == 2
     assert run(["trade", str(config), "-o", str(tmp_path / "x"), "--reference", "truth"]) == 2
     error = capsys.readouterr().err

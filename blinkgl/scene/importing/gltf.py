@@ -85,7 +85,7 @@ def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Node:
     """name, parent (None at the root), mesh and camera index (None without), rest translation, quaternion x y z w,
     scale or matrix."""
@@ -146,7 +146,7 @@ class Channel:
         return (1 - s) * values[i] + s * values[i + 1]
 
 
-@dataclass
+@dataclass(eq=False)
 class Document:
     """A parsed file. ``nodes`` are those of the default scene, parents before children, by their index in the file.
 

@@ -145,6 +145,59 @@ class SplinePath(KeyframePath):
         super().__init__(times_ns, positions, rotations, "spline", where)
 
 
+class HermitePath(KeyframePath):
+    """Motion through poses whose velocities are known, too: cubic between them, once continuously differentiable. What
+    an engine computed step by step; nothing is drawn over an impact, because no velocity is taken from neighbours.
+
+    times_ns      : (N,) int64, strictly increasing, N >= 1.
+    positions     : (N, 3) world coordinates of the body's origin.   velocities : (N, 3) theirs, units/s.
+    quaternions   : (N, 4) unit, w x y z, body to world; less than half a turn from one to the next.
+    rates         : (N, 3) angular velocity in the body's axes, rad/s.
+    The poses outside [t0, t1] are held, so that a body that still moves there stops.
+    """
+
+    def __init__(
+        self,
+        times_ns: np.ndarray,
+        positions: np.ndarray,
+        velocities: np.ndarray,
+        quaternions: np.ndarray,
+        rates: np.ndarray,
+    ):
+        knots = np.ascontiguousarray(times_ns, dtype=np.int64)
+        self.t0_ns, self.t1_ns, self.key_times_ns = int(knots[0]), int(knots[-1]), knots
+        if len(knots) == 1:
+            knots, still = np.array([knots[0], knots[0] + 1]), np.zeros((2, 3))
+            positions, quaternions = (np.repeat(a, 2, axis=0) for a in (positions, quaternions))
+            velocities = rates = still
+        self._knots = knots
+        self._cp, self._cr = np.empty((len(knots) - 1, 4, 3)), np.empty((len(knots) - 1, 4, 3))
+        for i in range(len(knots) - 1):
+            j, h = i + 1, (knots[i + 1] - knots[i]) * 1e-9
+            _hermite_piece(
+                h,
+                positions[i],
+                positions[j],
+                velocities[i],
+                velocities[j],
+                quaternions[i],
+                quaternions[j],
+                rates[i],
+                rates[j],
+                self._cp[i],
+                self._cr[i],
+            )
+        x, y, z = quaternions[:-1, 1:].T
+        self._rot = np.ascontiguousarray(Rotation.from_quat(np.stack([x, y, z, quaternions[:-1, 0]], 1)).as_matrix())
+        self.is_static = not (self._cp[:, 1:].any() or self._cr[:, 1:].any())
+
+    @property
+    def coefficients(self) -> tuple[np.ndarray, ...]:
+        """All that the path is: times (N,) int64 ns, polynomials of position and of rotation (N - 1, 4, 3), rotations
+        (N - 1, 3, 3)."""
+        return self._knots, self._cp, self._cr, self._rot
+
+
 class CutPath:
     """``path`` until ``t_cut_ns``, then standing still at the pose of that instant.
 
@@ -274,6 +327,117 @@ def _ascending(c: np.ndarray) -> np.ndarray:
     out = np.zeros((c.shape[1], 4, 3))
     out[:, : len(c)] = c[::-1].transpose(1, 0, 2)
     return out
+
+
+@njit(cache=True)
+def _hermite_piece(h, p0, p1, v0, v1, q0, q1, w0, w1, cp, cr):
+    """Fills ``cp`` and ``cr`` (4, 3), the cubics of one piece of ``h`` seconds (see the module's docstring), from
+    positions p, velocities v, quaternions q (w x y z) and body rates w at its ends. Returns the angle from the first
+    rotation to the last, rad.
+
+    phi = log(R0^T R1); the rate of phi at the end is J_r^-1(phi) w1, with J_r^-1 = I + [phi]x / 2 + k [phi]x^2,
+    k = 1 / a^2 - cot(a / 2) / (2 a), a = |phi|."""
+    # conj(q0) q1
+    w = q0[0] * q1[0] + q0[1] * q1[1] + q0[2] * q1[2] + q0[3] * q1[3]
+    x = q0[0] * q1[1] - q0[1] * q1[0] - q0[2] * q1[3] + q0[3] * q1[2]
+    y = q0[0] * q1[2] - q0[2] * q1[0] - q0[3] * q1[1] + q0[1] * q1[3]
+    z = q0[0] * q1[3] - q0[3] * q1[0] - q0[1] * q1[2] + q0[2] * q1[1]
+    s = math.sqrt(x * x + y * y + z * z)
+    a = 2.0 * math.atan2(s, abs(w))
+    f = (a / s if s > 1e-12 else 2.0) * (1.0 if w >= 0.0 else -1.0)
+    phi = np.array([f * x, f * y, f * z])
+    k = 1.0 / (a * a) - 0.5 / (a * math.tan(0.5 * a)) if a > 1e-2 else 1.0 / 12.0 + a * a / 720.0
+    c = np.cross(phi, w1)
+    end = w1 + 0.5 * c + k * np.cross(phi, c)
+    for r in range(3):
+        cp[0, r], cp[1, r] = p0[r], v0[r]
+        d = p1[r] - p0[r]
+        cp[2, r] = (3.0 * d / h - 2.0 * v0[r] - v1[r]) / h
+        cp[3, r] = (v0[r] + v1[r] - 2.0 * d / h) / (h * h)
+        cr[0, r], cr[1, r] = 0.0, w0[r]
+        cr[2, r] = (3.0 * phi[r] / h - 2.0 * w0[r] - end[r]) / h
+        cr[3, r] = (w0[r] + end[r] - 2.0 * phi[r] / h) / (h * h)
+    return a
+
+
+def thin(
+    step: float,
+    positions: np.ndarray,
+    velocities: np.ndarray,
+    quaternions: np.ndarray,
+    rates: np.ndarray,
+    tolerance: float,
+    angle: float,
+) -> np.ndarray:
+    """(N,) bool: which of N poses, ``step`` seconds apart, a :class:`HermitePath` needs to pass all of them within
+    ``tolerance`` (units) and ``angle`` (rad); both ends are. Arrays as there. From each pose that is kept the next is
+    looked for by halving."""
+    keep = np.empty(len(positions), dtype=bool)
+    p, v, q, w = (np.ascontiguousarray(a, dtype=np.float64) for a in (positions, velocities, quaternions, rates))
+    _thin(step, p, v, q, w, tolerance, angle, keep)
+    return keep
+
+
+@njit(cache=True)
+def _thin(step, positions, velocities, quaternions, rates, tolerance, angle, keep):
+    cp, cr = np.empty((4, 3)), np.empty((4, 3))
+    last = len(positions) - 1
+    keep[:] = False
+    keep[0] = keep[last] = True
+    a = 0
+    while a < last:
+        b = last
+        while b > a + 1:
+            turned = _hermite_piece(
+                (b - a) * step,
+                positions[a],
+                positions[b],
+                velocities[a],
+                velocities[b],
+                quaternions[a],
+                quaternions[b],
+                rates[a],
+                rates[b],
+                cp,
+                cr,
+            )
+            if turned < 2.0 and _passes(
+                a, b, step, positions, quaternions, cp, cr, tolerance * tolerance, math.sin(0.5 * angle)
+            ):
+                break
+            b = a + (b - a) // 2
+        keep[b] = True
+        a = b
+
+
+@njit(cache=True)
+def _passes(a, b, step, positions, quaternions, cp, cr, square, half):
+    for i in range(a + 1, b):
+        u = (i - a) * step
+        q = 0.0
+        for r in range(3):
+            d = ((cp[3, r] * u + cp[2, r]) * u + cp[1, r]) * u + cp[0, r] - positions[i, r]
+            q += d * d
+        if q > square:
+            return False
+        x = ((cr[3, 0] * u + cr[2, 0]) * u + cr[1, 0]) * u
+        y = ((cr[3, 1] * u + cr[2, 1]) * u + cr[1, 1]) * u
+        z = ((cr[3, 2] * u + cr[2, 2]) * u + cr[1, 2]) * u
+        n = math.sqrt(x * x + y * y + z * z)
+        f = math.sin(0.5 * n) / n if n > 1e-12 else 0.5
+        w, x, y, z = math.cos(0.5 * n), f * x, f * y, f * z
+        # The vector part of conj(q_i) q_a exp(phi / 2): half the angle between them.
+        o, s = quaternions[a], quaternions[i]
+        pw = o[0] * w - o[1] * x - o[2] * y - o[3] * z
+        px = o[0] * x + o[1] * w + o[2] * z - o[3] * y
+        py = o[0] * y - o[1] * z + o[2] * w + o[3] * x
+        pz = o[0] * z + o[1] * y - o[2] * x + o[3] * w
+        ex = s[0] * px - s[1] * pw - s[2] * pz + s[3] * py
+        ey = s[0] * py - s[2] * pw - s[3] * px + s[1] * pz
+        ez = s[0] * pz - s[3] * pw - s[1] * py + s[2] * px
+        if ex * ex + ey * ey + ez * ez > half * half:
+            return False
+    return True
 
 
 @njit(cache=True)

@@ -24,6 +24,7 @@ from blinkgl.scene.geometry.meshes import bounds, transform_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS
 from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.motion.ways import way_path
@@ -42,7 +43,7 @@ _PROCEDURAL_SIZE = 1024
 _LEVEL_CAMERA = Rotation.from_matrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InMemory:
     """Meshes and textures that are in no file, by the names of the mesh and of the material they belong to: they stand
     instead of what the configuration says there."""
@@ -57,7 +58,7 @@ def explicit_scene(
     """The scene as configured; nothing is drawn at random, and collisions are looked for only if it says so.
 
     Raises ConfigError (missing file, bad parameter; with ``collisions``,
-    bodies that touch at the start) and AssetError."""
+    bodies that touch at the start; with ``physics``, what :func:`simulate` raises) and AssetError."""
     log: list[str] = []
     omissions: dict[str, None] = {}
     materials = {
@@ -93,15 +94,24 @@ def explicit_scene(
             )
         objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
+    bodies = {name: item.physics for name, item in zip(names, config.objects) if item.physics is not None}
     if config.collisions:
-        result = resolve_collisions(tuple(objects), path, 1.01 * camera.near_corner, t0_ns, t1_ns)
+        # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
+        falling = {name for name, body in bodies.items() if body.kind == "dynamic"}
+        others = [obj for obj in objects if obj.name not in falling]
+        result = resolve_collisions(others, path, 1.01 * camera.near_corner, t0_ns, t1_ns)
         if result.at_start:
             raise ConfigError(
                 f"{result.at_start[0]}, at the start",
                 where="scene.collisions",
                 accepted="bodies apart at the start, or collisions: false",
             )
-        objects, path, log = result.objects, result.camera_path, log + list(result.log)
+        resolved = {obj.name: obj for obj in result.objects}
+        objects = [resolved.get(obj.name, obj) for obj in objects]
+        path, log = result.camera_path, log + list(result.log)
+    dynamics = None
+    if config.physics is not None:
+        objects, dynamics = simulate(objects, bodies, config.physics, t0_ns, t1_ns)
     return Scene(
         tuple(objects),
         Rig.alone(camera, path),
@@ -111,6 +121,7 @@ def explicit_scene(
         config.background,
         tuple(log),
         tuple(omissions),
+        dynamics,
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
+from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
 from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
 from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
@@ -22,6 +23,7 @@ from blinkgl.rng import Role, generator
 from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
 from blinkgl.scene.motion.collision import resolve_collisions
+from blinkgl.scene.motion.dynamics import Exploded, Side, simulate
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.reading import contents
@@ -89,8 +91,12 @@ def random_world(
     low, high = np.array([-half, -half, floor]), np.array([half, half, floor + config.region.height])
     ground_z = floor if config.ground else None
 
+    bodies = _bodies(config.physics, [name for name, *_ in placed], generator(seed, sequence, Role.PHYSICS))
     items = list(backdrop)
     for k, (name, parts, T, radius, resting) in enumerate(placed):
+        if name in bodies:
+            items.append((name, "object", parts, StaticPath(T, t0_ns, t1_ns)))
+            continue
         others = np.arange(len(placed)) != k
         space = FreeSpace(
             low,
@@ -108,18 +114,29 @@ def random_world(
     # A camera that was stopped would see a still world from then on: another path is better.
     for _ in range(_CAMERA_PATHS):
         path = random_camera_path(rng_motion, t0_ns, t1_ns, config.camera_motion, space, clearance, target, T_cam)
-        result = resolve_collisions(scene_objects, path, clearance, t0_ns, t1_ns)
+        # What falls is stopped by nothing: the engine knows the others' paths, as they are after this.
+        others = tuple(o for o in scene_objects if o.name not in bodies)
+        result = resolve_collisions(others, path, clearance, t0_ns, t1_ns)
         if not any("camera" in event.cut for event in result.events):
             break
     # Bounding spheres were apart, so only one that sinks into ground or wall can touch at t0: leave it out.
-    ours = {o.name for o in scene_objects if o.category == "object"}
+    ours = {o.name for o in others if o.category == "object"}
     bad = ours & {name for c in result.at_start for name in (c.first, c.second)}
     if bad:
-        result = resolve_collisions(tuple(o for o in scene_objects if o.name not in bad), path, clearance, t0_ns, t1_ns)
+        result = resolve_collisions(tuple(o for o in others if o.name not in bad), path, clearance, t0_ns, t1_ns)
         log.append("left out, touching something at the start: " + ", ".join(sorted(bad)))
     log += result.log
+    resolved = {o.name: o for o in result.objects}
+    kept, dynamics = tuple(resolved.get(o.name, o) for o in scene_objects if o.name not in bad), None
+    while config.physics is not None and dynamics is None and any(o.name in bodies for o in kept):
+        sides, eye = _sides(config, floor), (result.camera_path, clearance)
+        try:
+            kept, dynamics = simulate(kept, bodies, config.physics, t0_ns, t1_ns, camera=eye, sides=sides)
+        except Exploded as error:  # squeezed between two that nothing stops
+            kept = tuple(o for o in kept if o.name != error.body)
+            log.append(f"left out, it came to be faster than scene.physics.max_speed: {error.body}")
     return Scene(
-        objects=result.objects,
+        objects=kept,
         rig=Rig.alone(camera, result.camera_path),
         t0_ns=t0_ns,
         t1_ns=t1_ns,
@@ -127,6 +144,7 @@ def random_world(
         background=config.background,
         log=tuple(log),
         omissions=tuple(omissions),
+        dynamics=dynamics,
     )
 
 
@@ -249,6 +267,41 @@ def _dress(config, asset, radius, textures, rng, split, log) -> tuple[Part, ...]
             )
         parts.append(Part(mesh, material))
     return tuple(parts)
+
+
+def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[str, BodyConfig]:
+    """Those of the objects that fall, by name. As many numbers are drawn for each, whether it falls or not."""
+    found = {}
+    for name in names if config is not None else ():
+        falls, thrown, around, axis = rng.random(), rng.random(), rng.uniform(0, 2 * math.pi), rng.normal(size=3)
+        elevation, speed, spin = rng.uniform(0, math.pi / 3), rng.uniform(*config.speed), rng.uniform(*config.spin)
+        density, friction = _log_uniform(rng, config.density), rng.uniform(*config.friction)
+        restitution = rng.uniform(*config.restitution)
+        if falls >= config.share:
+            continue
+        if thrown >= config.thrown:
+            speed = spin = 0.0
+        flat = speed * math.cos(elevation)
+        found[name] = BodyConfig(
+            density=density,
+            friction=friction,
+            rolling=config.rolling,
+            restitution=restitution,
+            velocity=(flat * math.cos(around), flat * math.sin(around), speed * math.sin(elevation)),
+            spin=tuple(spin * axis / np.linalg.norm(axis)),
+        )
+    return found
+
+
+def _sides(config: RandomSceneConfig, floor: float) -> list[Side]:
+    """Of the region, as far out as walls stand, so that no object is in one; its floor where there is no ground."""
+    reach = 0.5 * config.objects.size[1] + _GAP
+    out = config.region.width / 2 + reach
+    sides = [Side((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
+    sides.append(Side((0.0, 0.0, -1.0), -(floor + config.region.height + reach)))
+    if config.ground is None:
+        sides.append(Side((0.0, 0.0, 1.0), floor - reach))
+    return sides
 
 
 def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[Part, ...]:

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from blinkgl.camera import PinHole
 from blinkgl.errors import AssetError
 from blinkgl.scene.geometry import meshes as M, primitives as P
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Material, Part, Scene, SceneObject
 
 CUBE = trimesh.creation.box()
 
@@ -173,3 +177,155 @@ def test_too_many_faces():
 
 def test_nan_in_an_unused_vertex_is_no_problem():
     assert M.make_mesh(np.vstack([CUBE.vertices, [[np.nan] * 3]]), CUBE.faces).closed
+
+
+# --- at the edges -----------------------------------------------------------------------------------------------------
+
+
+def scene_of(*meshes):
+    part = lambda mesh: Part(mesh, Material())
+    return Scene(
+        tuple(SceneObject(f"o{k}", k + 1, tuple(map(part, ms)), StaticPath(np.eye(4))) for k, ms in enumerate(meshes)),
+        Rig.alone(PinHole.centred(8, 8, 8.0), StaticPath(np.eye(4))),
+        0,
+        1,
+        log=("before",),
+    )  # fmt: skip
+
+
+def strip(height: float) -> M.Mesh:
+    """Two triangles over a base from x = 1 to 2, one of them of that height."""
+    vertices = np.array([[1.0, 1, 0], [2, 1, 0], [1.5, 1 + height, 0], [1.5, 2, 0]])
+    flat = np.tile(np.float32([0, 0, 1]), (4, 1))
+    return M.Mesh(vertices, np.int32([[0, 1, 2], [0, 1, 3]]), flat, np.zeros((4, 2), np.float32), False, "strip", "h")
+
+
+def test_what_a_card_rounds_to_a_line_is_not_drawn():
+    """Rounding moves a corner at 2 by 2^-24 or so; what is not higher than twice 2^-22 is a line."""
+    line, thin, fine = strip(2.0**-21), strip(2.0**-21 + 2.0**-23), strip(0.5)
+    assert M.faces_in_float32(line).tolist() == [False, True] and M.faces_in_float32(thin).all()
+    assert M.faces_in_float32(
+        M.Mesh(fine.vertices * np.nan, *(getattr(fine, n) for n in ("faces", "normals", "uvs")), False, "", "")
+    ).all()
+    untouched = scene_of([fine, thin], [fine])
+    assert M.without_collapsed_faces(untouched) is untouched
+    nothing = M.scale_mesh(M.replace(line, faces=line.faces[:1]), 3.0)
+    scene = M.without_collapsed_faces(scene_of([fine], [line, fine], [nothing], [line]))
+    assert scene.log == ("before", "3 triangles without width in float32 are not drawn")
+    assert [[len(p.mesh.faces) for p in o.parts] for o in scene.objects] == [[2], [1, 2], [], [1]]
+    assert scene.objects[0].parts[0].mesh is fine and scene.objects[1].parts[0].mesh is scene.objects[3].parts[0].mesh
+    assert scene.objects[1].parts[0].mesh.faces.tolist() == [[0, 1, 3]]
+
+
+@pytest.mark.parametrize("gap, points", [(0.4e-6, 3), (1.6e-6, 4)])
+def test_points_nearer_than_a_millionth_are_one(gap, points):
+    vertices = 7.0 * np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [gap, gap, gap]]) + 100
+    welded, faces = M.weld(vertices, np.array([[0, 1, 2], [3, 1, 2]]))
+    assert len(welded) == points and (faces[0, 0] == faces[1, 0]) == (points == 3)
+
+
+@pytest.mark.parametrize("apart, closed", [(0.9e-3, True), (1.1e-3, False)])
+def test_gaps_up_to_a_thousandth_of_the_extent_are_none(apart, closed):
+    vertices = np.vstack([CUBE.vertices, CUBE.vertices[CUBE.faces[0]] + [apart, 0, 0]])
+    assert M.make_mesh(vertices, np.vstack([CUBE.faces[1:], [[8, 9, 10]]])).closed is closed
+
+
+@pytest.mark.parametrize("holes, closed", [(64, True), (65, False)])
+def test_so_many_hollows(holes, closed):
+    shift = np.stack(np.meshgrid(*[np.arange(5)] * 3), axis=-1).reshape(-1, 3)[:holes] * 0.15 - 0.3
+    vertices = np.concatenate([CUBE.vertices, (CUBE.vertices * 0.1 + shift[:, None]).reshape(-1, 3)])
+    faces = np.concatenate(
+        [CUBE.faces, (CUBE.faces[:, ::-1] + 8 * (np.arange(holes)[:, None, None] + 1)).reshape(-1, 3)]
+    )
+    assert M.make_mesh(vertices, faces).closed is closed
+
+
+@pytest.mark.parametrize("slivers, said", [(1, False), (2, True)])
+def test_a_few_slivers_are_nothing_to_speak_of(slivers, said):
+    log: list[str] = []
+    M.make_mesh(CUBE.vertices, np.vstack([CUBE.faces, [[0, 0, 1]] * slivers]), name="box", log=log)
+    assert log == ([f"box: {slivers} of {12 + slivers} faces without area dropped"] if said else [])
+    assert len(M.make_mesh(CUBE.vertices, CUBE.faces, max_faces=12).faces) == 12
+
+
+@pytest.mark.parametrize("height, kept", [(2e-10, 2), (0.5e-10, 1)])
+def test_a_sliver_is_judged_by_its_own_longest_edge(height, kept):
+    for size in (1e-5, 1.0, 1e5):
+        vertices = np.array([[0, 0, 0], [1, 0, 0], [0.5, height, 0], [0.5, 1, 0]]) * size
+        assert len(M.make_mesh(vertices, [[0, 1, 2], [0, 1, 3]]).faces) == kept
+
+
+def test_normals_that_are_given_are_kept_unless_they_are_none():
+    slanted = np.tile([3.0, 0, 4], (8, 1))
+    log: list[str] = []
+    mesh = M.make_mesh(CUBE.vertices, CUBE.faces, normals=slanted, log=log)
+    assert np.allclose(mesh.normals, [0.6, 0, 0.8]) and log == []
+    turned = M.make_mesh(CUBE.vertices, CUBE.faces[:, ::-1], normals=-CUBE.vertices)
+    assert ((turned.normals * turned.vertices).sum(axis=1) > 0).all(), "inside out, and so were they"
+    kept = M.make_mesh(CUBE.vertices, CUBE.faces[:, ::-1], normals=CUBE.vertices)
+    assert ((kept.normals * kept.vertices).sum(axis=1) > 0).all()
+    for row, bad in ((0, 0.0), (3, np.nan), (7, 0.9e-6)):
+        broken = np.array(CUBE.vertices)
+        broken[row] = [bad, 0, 0]
+        log.clear()
+        mesh = M.make_mesh(CUBE.vertices, CUBE.faces, normals=broken, name="box", log=log)
+        assert (
+            log == ["box: the normals are unusable, made new ones"] and (np.abs(mesh.normals).max(axis=1) > 0.99).all()
+        )
+    assert (np.abs(M.make_mesh(CUBE.vertices, CUBE.faces, normals=slanted[:5]).normals).max(axis=1) > 0.99).all()
+    tiny = np.array(CUBE.vertices)
+    tiny[0] = [1.1e-6, 0, 0]
+    assert M.make_mesh(CUBE.vertices, CUBE.faces, normals=tiny).normals.max() == 1
+
+
+@pytest.mark.parametrize("uv, kept", [(0.9e9, True), (-0.9e9, True), (1e9, False), (np.inf, False)])
+def test_repeats_of_a_texture_have_an_end(uv, kept):
+    uvs = np.full((8, 2), 0.25)
+    uvs[3, 1] = uv
+    mesh = M.make_mesh(CUBE.vertices, CUBE.faces, uvs=uvs)
+    assert (0.25 in mesh.uvs and np.float32(uv) in mesh.uvs) is kept
+
+
+@pytest.mark.parametrize("axis, sign", [(a, s) for a in range(3) for s in (1, -1)])
+def test_a_projected_texture_is_upright_on_each_side(axis, sign):
+    """For a viewer outside with z up (y for the top and the bottom): u to the right, v down."""
+    outward = sign * np.eye(3)[axis]
+    up = np.eye(3)[1 if axis == 2 else 2]
+    right = np.cross(up, outward)
+    mesh = M.make_mesh(CUBE.vertices * [2.0, 3.0, 4.0] + [5, 6, 7], CUBE.faces, uv_size=2.0)
+    here = mesh.normals @ outward > 0.9
+    centred = mesh.vertices[here] - [5, 6, 7]
+    np.testing.assert_allclose(mesh.uvs[here], 0.5 + np.stack([centred @ right, -centred @ up], axis=1) / 2, atol=1e-6)
+
+
+def test_corner_normals_are_weighted_by_angle():
+    """A cube cut into small triangles on one side only: its corners point along the diagonal all the same."""
+    fan = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0.2, 0], [0.3, 1, 0], [0, 1, 0], [0, 0, 1]])
+    faces = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 5, 4], [0, 1, 5]])
+    made = M.crease_normals(fan, faces, faces, 180.0)
+    np.testing.assert_allclose(made[:, 0], np.tile(-np.ones(3) / np.sqrt(3), (5, 1)), atol=1e-12)
+    sharp = M.crease_normals(fan, faces, faces, 89.0)
+    np.testing.assert_allclose(sharp[:3, 0], np.tile([0, 0, -1.0], (3, 1)), atol=1e-12)
+
+
+def test_joining_moving_and_scaling():
+    ball, box = P.sphere(segments=5, rings=3), P.cuboid()
+    joined = M.concatenate((ball, box), name="n", source_hash="s")
+    assert (joined.name, joined.source_hash, joined.closed) == ("n", "s", True)
+    n = len(ball.vertices)
+    assert np.array_equal(joined.faces[len(ball.faces) :], box.faces + n) and np.array_equal(joined.uvs[n:], box.uvs)
+    alone = M.concatenate((ball,), name="x")
+    assert alone.name == "x" and alone.source_hash == ball.source_hash and alone.faces is ball.faces
+    assert M.concatenate((ball,), source_hash="y").name == ball.name
+    moved = M.transform_mesh(box, np.array([[2.0, 0, 0, 5], [0, 3, 0, 6], [0, 0, 4, 7], [0, 0, 0, 1]]))
+    np.testing.assert_allclose(moved.vertices, box.vertices * [2, 3, 4] + [5, 6, 7])
+    assert moved.faces is box.faces and np.array_equal(M.scale_mesh(box, 3.0).vertices, box.vertices * 3)
+    for matrix in (np.diag([1.0, 0, 1]), np.full((3, 3), np.nan)):
+        with pytest.raises(AssetError, match="cuboid: a transform flattens the mesh"):
+            M.transform_mesh(box, matrix)
+    two = M.normalise((M.transform_mesh(box, np.eye(4) + np.eye(4, k=3)), box))
+    low, high = M.bounds(two)
+    np.testing.assert_allclose([low, high], [[-v for v in high], high])
+    assert max(np.linalg.norm(m.vertices, axis=1).max() for m in two) == pytest.approx(1)
+    with pytest.raises(AssetError, match="here: the mesh has no extent"):
+        M.normalise((M.scale_mesh(box, 0.0),), where="here")

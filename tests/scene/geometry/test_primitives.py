@@ -153,3 +153,106 @@ def test_hash_is_of_the_parameters():
 
 def test_every_parameter_is_documented():
     assert {name for kind in P.BUILDERS for name in P.parameters(kind)} == set(P.PARAMETERS)
+
+
+# --- where the texture lies, and how large bodies are -----------------------------------------------------------------
+
+TALL = {
+    "sphere": dict(radius=2.0, segments=7, rings=5),
+    "cylinder": dict(radius=2.0, height=3.0, segments=7, rings=4),
+    "cone": dict(radius=2.0, height=3.0, segments=7, rings=5),
+    "torus": dict(radius=2.0, tube=0.5, segments=7, tube_segments=6),
+    "capsule": dict(radius=2.0, height=3.0, segments=7, rings=6),
+}
+
+
+def way_down(kind, x, y, z):
+    """v of a vertex beside the axis: how far down from the top, as the profile goes."""
+    if kind == "sphere":
+        return 0.5 - np.arcsin(np.clip(z / 2, -1, 1)) / math.pi
+    if kind in ("cylinder", "cone"):
+        return 0.5 - z / 3
+    if kind == "torus":
+        return None
+    arc = 2 * 2 * 3 * math.sin(math.pi / 12)  # three chords of 30 degrees on a radius of 2
+    latitude = np.arcsin(np.clip((np.abs(z) - 1.5) / 2, 0, 1))
+    along = np.where(np.abs(z) < 1.5 + 1e-9, np.abs(z), 1.5 + arc * latitude / (math.pi / 2))
+    return 0.5 - np.sign(z) * along / (2 * (1.5 + arc))
+
+
+@pytest.mark.parametrize("kind", TALL)
+def test_a_texture_goes_round_once_and_from_top_to_bottom(kind):
+    mesh = P.BUILDERS[kind](**TALL[kind])
+    flat = (
+        np.abs(np.abs(mesh.normals[:, 2]) - 1) < 1e-6 if kind in ("cylinder", "cone") else np.zeros(len(mesh.uvs), bool)
+    )
+    x, y, z = mesh.vertices[~flat].T
+    u, v = mesh.uvs[~flat].T.astype(float)
+    on_axis = np.hypot(x, y) < 1e-9
+    turn = (u - np.arctan2(y, x) / (2 * math.pi))[~on_axis]
+    np.testing.assert_allclose(turn, np.round(turn), atol=1e-6)
+    assert sorted(set(np.round(7 * u[~on_axis], 4))) == list(range(8)), "a column for each segment, and one to close it"
+    if on_axis.any():
+        assert sorted(set(np.round(7 * u[on_axis], 4))) == [k + 0.5 for k in range(8)], "a pole belongs to segments"
+    if kind == "torus":
+        around = 6 * (1 - v)  # upwards from the outermost ring
+        np.testing.assert_allclose(around, np.round(around), atol=1e-5)
+        np.testing.assert_allclose(z, 0.5 * np.sin(2 * math.pi * around / 6), atol=1e-6)
+        assert v.min() == 0 and v.max() == 1
+    else:
+        np.testing.assert_allclose(v, way_down(kind, x, y, z), atol=1e-6)
+    x, y, z = mesh.vertices[flat].T
+    side = np.sign(mesh.normals[flat, 2])
+    np.testing.assert_allclose(mesh.uvs[flat], np.stack([0.5 + side * x / 4, 0.5 - y / 4], axis=1), atol=1e-6)
+    assert (side == np.sign(z)).all() and set(side) == (
+        {-1, 1} if kind == "cylinder" else {-1} if kind == "cone" else set()
+    )
+
+
+@pytest.mark.parametrize("sides", [3, 5])
+@pytest.mark.parametrize("kind", ["prism", "pyramid"])
+def test_flat_sides_carry_the_texture_once_each(kind, sides):
+    mesh = P.BUILDERS[kind](sides=sides, radius=2.0, height=3.0)
+    walls = mesh.uvs[: sides * (4 if kind == "prism" else 3)].reshape(sides, -1, 2)
+    expected = [(0, 1), (1, 1), (0, 0), (1, 0)] if kind == "prism" else [(0, 1), (1, 1), (0.5, 0)]
+    assert (walls == np.array(expected)).all()
+    corners = np.round(np.unwrap(np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0])) * sides / (2 * math.pi), 6)
+    assert np.allclose(corners % 1, 0) and mesh.vertices[:, 2].min() == -1.5 and mesh.vertices[:, 2].max() == 1.5
+    flat = np.abs(mesh.normals[:, 2]) == 1
+    side = mesh.normals[flat, 2]
+    x, y = mesh.vertices[flat, :2].T
+    np.testing.assert_allclose(mesh.uvs[flat], np.stack([0.5 + side * x / 4, 0.5 - y / 4], axis=1), atol=1e-6)
+    unit = mesh.normals[~flat][:, 2]
+    inside = 2.0 * math.cos(math.pi / sides)
+    np.testing.assert_allclose(unit, 0 if kind == "prism" else inside / math.hypot(inside, 3.0), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", P.BUILDERS)
+def test_sizes_when_nothing_is_said(kind):
+    """About one unit, standing on nothing: centred on the origin."""
+    mesh = P.BUILDERS[kind]()
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    extent = {"torus": (1, 1, 0.3), "capsule": (0.5, 0.5, 1), "grid": (1, 1, 0)}.get(kind, (1, 1, 1))
+    if kind == "icosphere":
+        extent = np.full(3, 2 * 0.5)
+    slack = 0.14 if kind == "prism" else 0.02
+    np.testing.assert_allclose(high - low, extent, atol=slack)
+    if kind != "pyramid":
+        np.testing.assert_allclose(high + low, 0, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "kind, name, low, high",
+    [("sphere", "segments", 3, 4096), ("sphere", "rings", 2, 4096), ("prism", "sides", 3, 4096)]
+    + [("torus", "tube_segments", 3, 4096), ("grid", "subdivisions", 1, 4096), ("icosphere", "subdivisions", 0, 7)],
+)
+def test_numbers_of_faces_have_ends(kind, name, low, high, monkeypatch):
+    if kind != "icosphere":
+        assert high == P._MAX_SEGMENTS
+        monkeypatch.setattr(P, "_MAX_SEGMENTS", 40)  # what is built is not looked at here, and is large
+        high = 40
+    for value in (low, float(low), high) if kind != "icosphere" else (low, 2.0):
+        assert P.BUILDERS[kind](**{name: value}).source_hash == P.BUILDERS[kind](**{name: int(value)}).source_hash
+    for value in (low - 1, high + 1, low + 0.5):
+        with pytest.raises(AssetError, match=rf"{kind}.{name}: bad parameter"):
+            P.BUILDERS[kind](**{name: value})

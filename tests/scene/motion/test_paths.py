@@ -249,3 +249,37 @@ def test_a_pose_that_is_not_rigid_is_refused():
     for bad in (np.diag([2.0, 2, 2, 1]), np.diag([-1.0, 1, 1, 1]), np.full((4, 4), np.nan), np.eye(3)):
         with pytest.raises(ConfigError, match="not rigid"):
             rigid(bad)
+
+
+@pytest.mark.parametrize("reach", [0.0, 0.7])
+def test_approach_bound_is_tight_just_after_a_key(reach):
+    """There phi = 0, and what is left is |n . p'| + reach |n x w|; half a microsecond later it is hardly more."""
+    path = SplinePath(*random_keys(9, turn=0.6))
+    for k, t in enumerate(path.key_times_ns[:-1]):
+        normal = np.random.default_rng(k).normal(size=3)
+        normal /= np.linalg.norm(normal)
+        D, T = path.derivative(int(t)), path.pose(int(t))
+        spin = T[:3, :3] @ body_rate(T, D)
+        true = abs(normal @ D[:3, 3]) + reach * np.linalg.norm(np.cross(normal, spin))
+        assert true <= path.approach_bound(normal, reach, int(t), int(t) + 500) <= 1.0001 * true + 1e-5
+        assert path.approach_bound(normal, reach, int(t) + 1, int(t)) == 0.0
+    assert path.approach_bound(normal, reach, path.t0_ns - 9, path.t0_ns - 1) == 0.0
+    assert path.approach_bound(normal, reach, path.t1_ns + 1, path.t1_ns + 9) == 0.0
+    before = path.approach_bound(normal, reach, path.t0_ns - SECOND, path.t0_ns + 500)
+    assert before == path.approach_bound(normal, reach, path.t0_ns, path.t0_ns + 500) > 0
+
+
+def test_bounds_of_a_cubic_are_those_of_its_bezier_points():
+    """p = 2 u^3 - u^2 + 3 u along one axis: the rate from u to v has 6 u v - (u + v) + 3 between its ends."""
+    seconds = np.array([0.0, 0.25, 0.5, 0.75])
+    positions = np.zeros((4, 3))
+    positions[:, 1] = 2 * seconds**3 - seconds**2 + 3 * seconds
+    path = SplinePath((seconds * 1e9).astype(np.int64), positions, Rotation.identity(4))
+    rate = lambda u: 6 * u**2 - 2 * u + 3
+    for a, b in ((0.0, 0.25), (0.05, 0.2), (0.3, 0.45), (0.1, 0.6), (-1.0, 0.1), (0.7, 9.0)):
+        pieces = [(max(a, s), min(b, s + 0.25)) for s in (0.0, 0.25, 0.5) if max(a, s) < min(b, s + 0.25)]
+        points = [p for u, v in pieces for p in (rate(u), rate(v), 6 * u * v - (u + v) + 3)]
+        got = path.speed_bound(int(a * 1e9), int(b * 1e9))
+        assert got == pytest.approx((max(map(abs, points)), 0.0), rel=1e-7)
+    assert path.approach_bound(np.array([0.0, 1, 0]), 5.0, 0, 250_000_000) == pytest.approx(3.0, rel=1e-7)
+    assert path.approach_bound(np.array([0.6, 0.8, 0]), 5.0, 0, 250_000_000) == pytest.approx(2.4, rel=1e-7)

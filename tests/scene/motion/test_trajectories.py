@@ -200,3 +200,79 @@ def test_bad_settings_are_named(data, message):
 def test_numbers_written_as_text_and_single_numbers_are_taken():
     config = validate(ObjectMotion, {"speed": "1e-1", "rotation_rate": [10, "2e1"]})
     assert config.speed == (0.1, 0.1) and config.rotation_rate == (10.0, 20.0)
+
+
+# --- free space, by hand ----------------------------------------------------------------------------------------------
+
+BOX = FreeSpace((-4, -4, 0), (4, 4, 3), 0.25, [[0, 0, 1], [2, 0, 1]], [0.5, 1.0])
+
+
+@pytest.mark.parametrize(
+    "point, radius, outside",
+    [
+        ((-3, -3, 1), 0.25, 0.0),
+        ((-4, 4, 3), 0.25, 0.0),
+        ((-4.5, 3, 1), 0.25, 0.5),
+        ((3, 4.75, 1), 0.25, 0.75),
+        ((-3, -3, 4), 0.25, 1.0),
+        ((-3, -3, 0.25), 0.25, 0.25),
+        ((-3, -3, 0.5), 0.25, 0.0),
+        ((0, 0, 1), 0.25, 0.75),
+        ((0, 0.75, 1), 0.25, 0.0),
+        ((0, -0.5, 1), 0.25, 0.25),
+        ((2, 0, 2.0), 0.25, 0.25),
+    ],
+)
+def test_how_far_outside_of_free_space_a_body_is(point, radius, outside):
+    """By its origin from the box, by its sphere from the ground and from obstacles."""
+    got = BOX.depth(np.array([point, (-3, -3, 1.0)], float), radius)
+    assert got == pytest.approx([outside, 0.0])
+
+
+def test_obstacles_that_a_body_began_in_are_left_out():
+    at = np.array([[0, 0.5, 1.0]])
+    assert BOX.depth(at, 0.25) == pytest.approx(0.25) and BOX.depth(at, 0.25, np.array([True, False])) == 0.0
+    assert BOX.depth(at, 0.25, np.array([False, True])) == pytest.approx(0.25)
+    free = FreeSpace((0, 0, 0), (1, 1, 1))
+    assert free.depth(np.array([[0.5, 0.5, 0.0]]), 5.0) == 0.0, "neither ground nor obstacles"
+    assert free.leg_is_free(np.zeros(3), np.ones(3), 5.0) and not free.leg_is_free(np.zeros(3), np.full(3, 1.01), 5.0)
+
+
+@pytest.mark.parametrize(
+    "a, b, free",
+    [
+        ((-3, -3, 1), (3, -3, 1), True),
+        ((-3, -3, 1), (4.1, -3, 1), False),
+        ((-4.5, -3, 1), (-4.2, -3, 1), True),  # outside of the box already, and no farther
+        ((-4.5, -3, 1), (-4.6, -3, 1), False),
+        ((-3, -3, 1), (-3, -3, 0.5), True),
+        ((-3, -3, 1), (-3, -3, 0.4), False),  # into the ground
+        ((-3, -3, 0.3), (-2, -3, 0.3), True),  # in it from the beginning, and no deeper
+        ((-3, -3, 0.3), (-2, -3, 0.29), False),
+        ((-3, 0, 1), (-0.75, 0, 1), True),
+        ((-3, 0, 1), (-0.7, 0, 1), False),
+        ((-3, 0, 1), (3.9, 0, 1), False),
+        ((-3, 0.75, 1), (0.5, 0.75, 1), True),
+        ((-3, 0.7, 1), (0.5, 0.7, 1), False),
+        ((0, 0.5, 1), (0, 3, 1), True),  # out of an obstacle
+        ((0, 0.5, 1), (0, 0.4, 1), False),
+        ((0, 0.5, 1), (0, 0.5, 1), True),
+    ],
+)
+def test_straight_legs_between_obstacles(a, b, free):
+    assert BOX.leg_is_free(np.array(a, float), np.array(b, float), 0.25) is free
+
+
+def test_what_is_no_free_space():
+    assert FreeSpace((1, 1, 1), (1, 1, 1)).sample(rng(), 0.1).tolist() == [1, 1, 1]
+    for low, centres in (((0, 0, 1), []), ((0, 0, 0), [[1, 1, 1]])):
+        with pytest.raises(ValueError, match="low has to be below high, and each centre needs a radius"):
+            FreeSpace(low, (1, 1, 0.5), None, centres)
+
+
+def test_looking_up_and_down():
+    for z in (1, -1):
+        assert look_rotation([0, 0, z])[:, 0].tolist() == [1, 0, 0]
+    R = look_rotation([1e-10, 0, 1.0])
+    assert np.allclose(R @ R.T, np.eye(3), atol=1e-15) and abs(R[:, 0] @ R[:, 2]) < 1e-15
+    assert look_rotation([0, 2, 0]).tolist() == [[1, 0, 0], [0, 0, 1], [0, -1, 0]] == look_rotation([0, 0, 0]).tolist()

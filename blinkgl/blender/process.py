@@ -1,0 +1,163 @@
+"""Blender as a process: which interpreter has it, what it is given, and how it ends.
+
+    with Blender(PROGRAM, folder, limit_s=600) as blender:
+        for words in blender.answers():      # dict per line of JSON on the program's standard output
+            ...
+
+The program gets the folder's path as its argument and an environment of its own: no preferences, add-ons or scripts of
+the user's Blender, no ``PYTHON*``, nothing that this process set for its own OpenGL. It ends with the ``with``, also
+when that is left by an exception.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from blinkgl.errors import BlinkGLError
+
+ENVIRONMENT = "BLINKGL_BPY_PYTHON"
+REMEDY = (
+    "run pip install 'bpy>=4.5,<4.6' with Python 3.11, best in an environment of its own, and name its interpreter "
+    f"in {ENVIRONMENT} (or install it here)"
+)
+# What Blender needs to find its libraries, a display and a card. Everything else is the user's own business.
+_HANDED_ON = ("PATH", "LANG", "LC_", "TZ", "DISPLAY", "WAYLAND_", "XAUTHORITY", "LD_LIBRARY_PATH", "SYSTEMROOT")
+_CARDS = ("LIBGL_", "MESA_", "EGL_", "__EGL_", "GALLIUM_", "VK_", "CUDA_", "NVIDIA_", "HIP_")
+
+
+def interpreter() -> str:
+    """The Python that runs Blender: the environment's, or this one."""
+    return os.environ.get(ENVIRONMENT) or sys.executable
+
+
+def available() -> str:
+    """'' when a bpy is there (not whether it loads: that takes seconds and is found out by using
+    it), else a line that says what to do."""
+    chosen = interpreter()
+    if chosen == sys.executable:
+        found = importlib.util.find_spec("bpy") is not None
+    else:
+        probe = "import importlib.util, sys; sys.exit(importlib.util.find_spec('bpy') is None)"
+        try:
+            found = subprocess.run([chosen, "-c", probe], capture_output=True).returncode == 0
+        except OSError:
+            return f"{ENVIRONMENT} names no interpreter that runs: {chosen}"
+    return "" if found else f"no bpy (Blender as a Python module) for {chosen}: {REMEDY}"
+
+
+def require() -> None:
+    """Raises BlinkGLError when there is no bpy."""
+    if missing := available():
+        raise BlinkGLError(missing)
+
+
+def environment(home: Path) -> dict[str, str]:
+    """What Blender's process is given: ``home``, an empty folder, stands for everything that is the user's."""
+    given = {key: value for key, value in os.environ.items() if key.startswith(_HANDED_ON + _CARDS)}
+    for key in ("HOME", "TMPDIR", "BLENDER_USER_RESOURCES", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
+        given[key] = str(home)
+    return given
+
+
+class Blender:
+    """One process that runs ``program`` (a file, or a folder with a __main__.py) with ``folder`` as its argument.
+
+    limit_s : seconds that it may take altogether; None: as long as it likes.
+    Raises BlinkGLError when there is no bpy; its answers raise it when Blender refuses, does not come to an end, or
+    stops.
+    """
+
+    def __init__(self, program: Path, folder: Path, limit_s: float | None = None):
+        require()
+        self.program, self.folder, self.limit_s = program, folder, limit_s
+        self.doing = "starting"
+        home = folder / "home"
+        home.mkdir(exist_ok=True)
+        self._log = open(folder / "blender.log", "w+b")  # noqa: SIM115 - as long as the process
+        self._ends = None if limit_s is None else time.monotonic() + limit_s
+        self._process = subprocess.Popen(
+            [interpreter(), str(program), str(folder)],
+            env=environment(home),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            start_new_session=True,
+        )
+
+    def __enter__(self) -> Blender:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the process, and what it may have started."""
+        if self._process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._log.close()
+
+    def answers(self) -> Iterator[dict[str, Any]]:
+        """Each line's object, until the program closes its standard output. A ``{"doing": …}`` is kept for errors and
+        handed on; an ``{"error": …, "accepted": …}`` is raised."""
+        for line in self._lines():
+            try:
+                words = json.loads(line)
+            except ValueError:
+                raise BlinkGLError("Blender's answer cannot be read", where=interpreter(), value=line[:80]) from None
+            if "error" in words:
+                raise BlinkGLError(
+                    words["error"], where=words.get("where", interpreter()), accepted=words.get("accepted", REMEDY)
+                )
+            self.doing = words.get("doing", self.doing)
+            yield words
+
+    def status(self) -> int:
+        """Exit status, once the answers have ended; negative: the number of the signal that ended it."""
+        return self._process.wait()
+
+    def last_words(self) -> str:
+        """The last line that Blender printed for people."""
+        self._log.flush()
+        lines = (self.folder / "blender.log").read_text(errors="replace").strip().splitlines()
+        return lines[-1].strip() if lines else "no message"
+
+    def _lines(self) -> Iterator[str]:
+        assert self._process.stdout is not None
+        pipe, rest = self._process.stdout.fileno(), b""
+        while True:
+            left = None if self._ends is None else max(self._ends - time.monotonic(), 0.0)
+            if not select.select([pipe], [], [], left)[0]:
+                raise BlinkGLError(
+                    f"Blender did not come to an end in {self.limit_s:g} s (while {self.doing})",
+                    accepted="a longer time limit",
+                )
+            data = os.read(pipe, 1 << 16)
+            if not data:
+                break
+            *lines, rest = (rest + data).split(b"\n")
+            yield from (line.decode("utf-8", "replace") for line in lines if line.strip())
+
+
+def how_it_ended(status: int) -> str:
+    """Of an exit status: "stopped (status 3)", or "crashed (SIGSEGV)" for a negative one."""
+    if status >= 0:
+        return f"stopped (status {status})"
+    try:
+        return f"crashed ({signal.Signals(-status).name})"
+    except ValueError:
+        return f"crashed (signal {-status})"

@@ -1,0 +1,569 @@
+"""What falls, bounces and is thrown: rigid bodies by MuJoCo, from a scene's objects to paths, before anything is drawn.
+
+    objects, dynamics = simulate(objects, {"die": BodyConfig(velocity=(1, 0, 2))}, PhysicsConfig(), t0_ns, t1_ns)
+
+Everything that is not named moves as it did: fixed where it stands still, a pusher that nothing stops where it moves.
+
+**Steps.** The engine is MuJoCo's semi-implicit Euler with implicit Coriolis forces, ``rate`` steps a second (20,000,
+where 1,000 are usual). Such a method is a leapfrog: its velocities are those of the middle of the steps. Started half a
+step of gravity back, its positions are the parabola's exactly, and the mean of two of its velocities is the velocity at
+the time between them. Both go into the path.
+
+**Restitution.** MuJoCo's contacts are soft: a spring with a damper, ``solref = (-stiffness, -damping)``, per mass. A
+body that meets one leaves it after about half a period of the spring, ``IMPACT_S``, with a share e of its speed that
+hangs on the damping ratio alone. Which ratio gives which e is found with the very recurrence that the engine computes,
+over all the phases in which a step can meet the surface (:func:`damping_ratio`). What is left is the phase: at the
+default rate e varies by +-0.015 where it is 0.3, by +-0.006 where it is 0.8, and by less the more steps there are.
+
+**Paths.** Of the steps those are kept that a cubic needs to pass all others to 2e-6 of the body's radius
+(:func:`~blinkgl.scene.motion.paths.thin`): few in flight, every one or two in an impact. So the velocity jumps there in
+the 1.6 ms that the contact lasts, nothing overshoots, and memory does not grow with the rate. A body at rest is
+asleep: its pose is constant to the bit.
+
+**The same again.** MuJoCo is deterministic for one build on one machine, on one thread, which is all that is used here.
+Its version is in :class:`~blinkgl.scene.types.Dynamics`, with a digest of all paths.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from types import ModuleType
+
+import numpy as np
+from numba import njit
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.physics import IN_THE_WAY, BodyConfig, PhysicsConfig
+from blinkgl.errors import ConfigError
+from blinkgl.machine.extras import install
+from blinkgl.scene.motion.paths import HermitePath, StaticPath, thin
+from blinkgl.scene.types import Dynamics, PosePath, SceneObject
+
+IMPACT_S = 1.6e-3
+"""What an impact lasts, s: longer is softer. At a low rate it lasts ``LEAST_STEPS`` steps, which is longer."""
+LEAST_STEPS = 16
+_CHUNK = 1000  # steps between two looks at what came of them
+_TOLERANCE = 2e-6  # of the radius, and rad: how far a path may pass a step by
+_SINK = 1e-4  # of the smaller radius: how deep a body may be in another at the start
+_LIFT, _LIFTS = 0.01, 50  # of the same: out of how much it is lifted, and in how many turns
+_IMPEDANCE = 0.9999  # the most that MuJoCo allows: 1 would be a contact that obeys its spring exactly
+_HULL_VERTICES = 100
+_MOST_PARTS = 24  # of an object with more, all are one hull
+_SLOW_S = 5e-4  # slow is what gravity makes of rest in this time, s
+_HEAVY = 1e4  # mass of what nothing stops, of the heaviest body's
+
+
+class Exploded(ConfigError):
+    """body : name of the one that was nowhere, or too fast."""
+
+    body = ""
+
+
+@dataclass(frozen=True)
+class Side:
+    """A plane without end that nothing passes and nobody sees: points x with ``normal . x >= offset`` are inside."""
+
+    normal: tuple[float, float, float]
+    offset: float
+
+
+def engine() -> ModuleType:
+    """MuJoCo. Raises ConfigError with the command that installs it."""
+    # It would load a library of OpenGL's for pictures of its own.
+    said = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        import mujoco
+    except ImportError:
+        raise ConfigError(
+            "physics needs MuJoCo, which is not installed", where="scene.physics", accepted=f"run '{install('mujoco')}'"
+        ) from None
+    finally:
+        if said is None:
+            del os.environ["MUJOCO_GL"]
+        else:
+            os.environ["MUJOCO_GL"] = said
+    # Its own handler writes a file into the working folder; what it would say there is looked at here.
+    mujoco.set_mju_user_warning(_silent)  # type: ignore[missing-attribute]
+    return mujoco
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+def engine_version() -> str:
+    """Of the engine that is installed. Raises ConfigError where there is none."""
+    return engine().__version__
+
+
+def simulate(
+    objects: Sequence[SceneObject],
+    bodies: Mapping[str, BodyConfig],
+    settings: PhysicsConfig,
+    t0_ns: int,
+    t1_ns: int,
+    *,
+    camera: tuple[PosePath, float] | None = None,
+    sides: Sequence[Side] = (),
+) -> tuple[tuple[SceneObject, ...], Dynamics]:
+    """The objects, those that are dynamic on the paths they take over [t0, t1], and what
+    is known of how those came about.
+
+    bodies : by name of the object. Objects that it does not name: ``IN_THE_WAY``; sky: not there.
+    camera : its path and the radius of the sphere round it that nothing enters.   sides :
+    what holds bodies back unseen.
+    Raises ConfigError: no MuJoCo, bodies inside each other at t0, a simulation that explodes."""
+    world = _World(engine(), objects, bodies, settings, camera, sides, int(t0_ns), int(t1_ns))
+    return world.run()
+
+
+@dataclass(eq=False)
+class _Body:
+    """One object (or the camera) in the engine. role : dynamic, fixed or pusher.   centre : (3,) of mass, in the
+    object's axes.   volume : of its shapes, 0 until known.   at : which of those that move it is, -1: none."""
+
+    name: str
+    role: str
+    config: BodyConfig
+    path: PosePath
+    shapes: list[Shape]
+    radius: float
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    volume: float = 0.0
+    at: int = -1
+
+    @property
+    def mass(self) -> float:
+        return self.config.mass or self.config.density * self.volume
+
+
+class _World:
+    """A model, its state, and the paths that come of it."""
+
+    def __init__(self, mujoco, objects, bodies, settings, camera, sides, t0_ns, t1_ns):
+        self.mujoco, self.objects, self.settings, self.sides = mujoco, tuple(objects), settings, sides
+        self.t0_ns, self.t1_ns, self.step = t0_ns, t1_ns, 1.0 / settings.rate
+        self.impact_steps = max(IMPACT_S * settings.rate, LEAST_STEPS)
+        self.bodies: list[_Body] = []
+        for obj in self.objects:
+            config = bodies.get(obj.name, IN_THE_WAY)
+            if obj.category == "sky" or config.kind == "none" or not any(len(p.mesh.faces) for p in obj.parts):
+                continue
+            role = "dynamic" if config.kind == "dynamic" else "fixed" if obj.path.is_static else "pusher"
+            self.bodies.append(_Body(obj.name, role, config, obj.path, shapes_of(obj, config), obj.radius))
+        if camera is not None:
+            path, radius = camera
+            role = "fixed" if path.is_static else "pusher"
+            self.bodies.append(_Body("the camera", role, IN_THE_WAY, path, [Shape("SPHERE", (radius, 0, 0))], radius))
+        self.moving = [body for body in self.bodies if body.role != "fixed"]
+        for at, body in enumerate(self.moving):
+            body.at = at
+        self.dynamic = [body for body in self.moving if body.role == "dynamic"]
+        self.pushers = [body for body in self.moving if body.role == "pusher"]
+        self._side = _Body("the region's side", "fixed", IN_THE_WAY, StaticPath(), [], math.inf)
+        self._compile()
+        self.records = {body.name: _Record(body, self.step, self.impact_steps) for body in self.dynamic}
+
+    # ---- the model ---------------------------------------------------------------------------------------------------
+
+    def _compile(self) -> None:
+        """Once with unit density, to know volumes and centres of mass; then with those as the bodies' origins, so that
+        a body in flight is on a parabola."""
+        model = self._model(weighed=False)
+        for body in self.moving:
+            at = body.at + 1  # behind the world
+            body.centre, body.volume = model.body_ipos[at].copy(), float(model.body_mass[at])
+        self.model = self._model(weighed=True)
+        self.data = self.mujoco.MjData(self.model)
+
+    def _model(self, weighed: bool):
+        mujoco = self.mujoco
+        spec = mujoco.MjSpec()
+        option = spec.option
+        option.timestep, option.gravity = self.step, list(self.settings.gravity)
+        option.integrator, option.cone = mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtCone.mjCONE_ELLIPTIC
+        option.impratio = 10.0  # friction as hard as the contact: what lies on a slope does not creep
+        option.sleep_tolerance = _SLOW_S * float(np.linalg.norm(self.settings.gravity))
+        option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+        option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # an explosion has to be seen
+        heaviest = max((body.mass for body in self.dynamic), default=1.0)
+        for k, side in enumerate(self.sides):
+            self._geometry(spec, spec.worldbody, f"side {k}", _plane(side), IN_THE_WAY, 0.0, False, 1.0)
+        for number, body in enumerate(self.bodies):
+            T = body.path.pose(self.t0_ns)
+            holder, density = spec.worldbody, 1.0
+            if body.role != "fixed":
+                holder = spec.worldbody.add_body(
+                    pos=T[:3, :3] @ body.centre + T[:3, 3],
+                    quat=_quaternions(T[None, :3, :3])[0],
+                    sleep=mujoco.mjtSleepPolicy.mjSLEEP_NEVER,
+                    gravcomp=float(body.role == "pusher"),
+                )
+                holder.add_freejoint()
+                if weighed:
+                    density = (_HEAVY * heaviest if body.role == "pusher" else body.mass) / body.volume
+            frame = T if body.role == "fixed" else _shifted(-body.centre)
+            for k, shape in enumerate(body.shapes):
+                name, dynamic = f"{number} {k}", body.role == "dynamic"
+                self._geometry(spec, holder, name, shape.moved(frame), body.config, body.radius, dynamic, density)
+        try:
+            return spec.compile()
+        except ValueError as error:
+            raise ConfigError(
+                f"MuJoCo cannot use the scene's bodies: {' '.join(str(error).split())}", where="scene.physics"
+            ) from None
+
+    def _geometry(self, spec, holder, name, shape, config: BodyConfig, radius, dynamic, density) -> None:
+        frequency = math.pi / (self.impact_steps * self.step)
+        rolling = config.rolling * radius
+        mesh = {}
+        if shape.vertices is not None:
+            spec.add_mesh(name=name, uservert=shape.vertices.ravel(), maxhullvert=_HULL_VERTICES)
+            mesh = {"meshname": name}
+        holder.add_geom(
+            name=name,
+            type=getattr(self.mujoco.mjtGeom, f"mjGEOM_{shape.kind}"),
+            size=shape.size,
+            pos=shape.position,
+            quat=shape.quaternion,
+            density=density,
+            solref=[-(frequency**2), -2.0 * damping_ratio(config.restitution, self.impact_steps) * frequency],
+            solimp=[_IMPEDANCE, _IMPEDANCE, 1e-3, 0.5, 2.0],
+            friction=[config.friction, rolling, rolling],
+            condim=6,
+            # Dynamic bodies meet all; the others do not meet each other.
+            contype=1 if dynamic else 2,
+            conaffinity=3 if dynamic else 0,
+            **mesh,
+        )
+
+    # ---- the run -----------------------------------------------------------------------------------------------------
+
+    def run(self) -> tuple[tuple[SceneObject, ...], Dynamics]:
+        """See :func:`simulate`. Steps are done one ahead of the poses that are kept: the velocity at a pose is the mean
+        of the velocities before and after it."""
+        model, data = self.model, self.data
+        count = math.ceil((self.t1_ns - self.t0_ns) * 1e-9 * self.settings.rate - 1e-6)
+        qpos, qvel = np.empty((_CHUNK + 2, model.nq)), np.empty((_CHUNK + 2, model.nv))
+        pushed = self._pushed(0)
+        for body in self.dynamic:
+            at, R = 6 * body.at, body.path.pose(self.t0_ns)[:3, :3]
+            data.qvel[at : at + 3] = body.config.velocity - 0.5 * self.step * model.opt.gravity
+            data.qvel[at + 3 : at + 6] = np.radians(body.config.spin) @ R
+        self._push(pushed, 0)
+        self._lift()
+        qpos[0], qvel[0] = data.qpos, data.qvel
+        self._check_sound(0, qpos[:1], qvel[:1])
+        self._advance(pushed, 0)
+        qpos[1], qvel[1] = data.qpos, data.qvel
+        for first in range(0, count, _CHUNK):
+            steps = min(_CHUNK, count - first)
+            pushed = self._pushed(first)
+            for k in range(1, steps + 1):
+                self._advance(pushed, k)
+                qpos[k + 1], qvel[k + 1] = data.qpos, data.qvel
+            self._check_sound(first, qpos[: steps + 2], qvel[: steps + 2])
+            for body in self.dynamic:
+                self.records[body.name].add(first, qpos[: steps + 1], qvel[: steps + 2], model.opt.gravity)
+            self._let_sleep(qvel[: steps + 2])
+            qpos[:2], qvel[:2] = qpos[steps : steps + 2].copy(), qvel[steps : steps + 2].copy()
+        paths = {name: record.path(self.t0_ns, self.settings.rate) for name, record in self.records.items()}
+        digest = hashlib.sha256()
+        for path in paths.values():
+            for array in path.coefficients:
+                digest.update(array.tobytes())
+        impacts = sorted({step for record in self.records.values() for step in record.impacts})
+        times = _times(np.array(impacts, np.int64), self.t0_ns, self.settings.rate)
+        return (
+            tuple(replace(obj, path=paths.get(obj.name, obj.path)) for obj in self.objects),
+            Dynamics(
+                "mujoco",
+                self.mujoco.__version__,
+                len(paths),
+                count,
+                tuple(int(t) for t in times if self.t0_ns < t < self.t1_ns),
+                digest.hexdigest(),
+            ),
+        )
+
+    def _advance(self, pushed, k: int) -> None:
+        self._push(pushed, k)
+        self.mujoco.mj_step(self.model, self.data)
+
+    def _pushed(self, first: int) -> list[tuple[int, np.ndarray, np.ndarray]]:
+        """(which body, qpos (n, 7), qvel (n, 6)) of the pushers at steps ``first`` and after."""
+        times = _times(np.arange(first, first + _CHUNK + 2), self.t0_ns, self.settings.rate)
+        found = []
+        for body in self.pushers:
+            T = body.path.poses(times)
+            q, R = _quaternions(T[:, :3, :3]), Rotation.from_matrix(T[:, :3, :3])
+            p = T[:, :3, 3] + T[:, :3, :3] @ body.centre
+            turns = (R[:-1].inv() * R[1:]).as_rotvec()
+            found.append((body.at, np.hstack([p, q])[:-1], np.hstack([np.diff(p, axis=0), turns]) / self.step))
+        return found
+
+    def _push(self, pushed, k: int) -> None:
+        for at, qpos, qvel in pushed:
+            self.data.qpos[7 * at : 7 * at + 7] = qpos[k]
+            self.data.qvel[6 * at : 6 * at + 6] = qvel[k]
+
+    def _let_sleep(self, qvel: np.ndarray) -> None:
+        """Bodies that were slow for all of a chunk may fall asleep in the next: what is slow for a moment only is at
+        the top of its flight."""
+        policies = self.mujoco.mjtSleepPolicy
+        for body in self.dynamic:
+            v = qvel[:, 6 * body.at : 6 * body.at + 6] * np.repeat([1.0, body.radius], 3)
+            slow = float(np.abs(v).max()) < self.model.opt.sleep_tolerance
+            self.model.tree_sleep_policy[body.at] = int(policies.mjSLEEP_ALLOWED if slow else policies.mjSLEEP_NEVER)
+
+    def _lift(self) -> None:
+        """Moves bodies out of what they are a little in at the start: the springs would throw them out. Raises
+        ConfigError where they are in deeper than that."""
+        deep: list[tuple[_Body, _Body, float, np.ndarray]] = []
+        for _ in range(_LIFTS):
+            self.mujoco.mj_forward(self.model, self.data)
+            deep = [pair for pair in self._touching() if pair[2] > _SINK * min(pair[0].radius, pair[1].radius)]
+            if not deep:
+                return
+            for body, other, depth, away in deep:
+                if depth > _LIFT * min(body.radius, other.radius):
+                    break
+                # Where both can move, each its half.
+                share = 0.5 if other.role == "dynamic" else 1.0
+                self.data.qpos[7 * body.at : 7 * body.at + 3] += share * depth * away
+            else:
+                continue
+            break
+        body, other, depth, _ = max(deep, key=lambda pair: pair[2])
+        raise ConfigError(
+            f"at the start {body.name} is {depth:.3g} m inside {other.name}, or inside its convex hull",
+            where="scene.physics",
+            accepted="bodies apart at the start, or physics: {kind: none} for one that nothing is to meet",
+        )
+
+    def _touching(self) -> Iterator[tuple[_Body, _Body, float, np.ndarray]]:
+        """(a dynamic body, what it touches, how deep, the direction out of it); two dynamic ones both ways round."""
+        contact, model = self.data.contact, self.model
+        for pair, distance, frame in zip(contact.geom, contact.dist, contact.frame):
+            names = [model.geom(int(g)).name.split()[0] for g in pair]
+            one, other = (self.bodies[int(name)] if name.isdigit() else self._side for name in names)
+            for body, met, away in ((one, other, -frame[:3]), (other, one, frame[:3])):
+                if body.role == "dynamic":
+                    yield body, met, -float(distance), away
+
+    def _check_sound(self, first: int, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Raises ConfigError where a body is nowhere, or faster than anything should be."""
+        limit = self.settings.max_speed
+        for body in self.dynamic:
+            p, v = qpos[:, 7 * body.at : 7 * body.at + 7], qvel[:, 6 * body.at : 6 * body.at + 3]
+            with np.errstate(over="ignore", invalid="ignore"):
+                speed = np.where(np.isfinite(p).all(axis=1), np.linalg.norm(v, axis=1), np.inf)
+            if not (speed <= limit).all():
+                k = int(np.argmin(speed <= limit))
+                error = Exploded(
+                    f"{body.name} explodes {(first + k) * self.step:.6g} s after the start: its speed in m/s",
+                    where="scene.physics",
+                    value=float(speed[k]),
+                    accepted=f"at most max_speed {limit:g}; nothing thrown faster, and room between what "
+                    "cannot give way",
+                )
+                error.body = body.name
+                raise error
+        warnings = self.mujoco.mjtWarning
+        for kind in (warnings.mjWARN_CONTACTFULL, warnings.mjWARN_CNSTRFULL):
+            if self.data.warning[int(kind)].number:
+                raise ConfigError(
+                    "more contacts than MuJoCo has memory for",
+                    where="scene.physics",
+                    accepted="fewer or simpler bodies",
+                )
+
+
+class _Record:
+    """What is kept of one body: the poses that its path needs, and the steps of its impacts."""
+
+    def __init__(self, body: _Body, step: float, impact_steps: float):
+        self.body, self.step, self.impact_steps = body, step, impact_steps
+        self.pieces: list[tuple[np.ndarray, ...]] = []
+        self.impacts: list[int] = []
+        self._still = False
+        self._last, self._peak = -math.inf, 0.0
+
+    def add(self, first: int, qpos: np.ndarray, qvel: np.ndarray, gravity: np.ndarray) -> None:
+        """qpos : (n, …) of steps ``first`` and after.   qvel : (n + 1, …), of before each
+        of them and after the last."""
+        at, body = self.body.at, self.body
+        p, q = qpos[:, 7 * at : 7 * at + 3], qpos[:, 7 * at + 3 : 7 * at + 7]
+        raw = qvel[:, 6 * at : 6 * at + 6]
+        self._note_impacts(first, raw[:, :3], gravity)
+        still = not raw[1:].any()
+        if still and self._still:  # the same pose for longer
+            steps, *rest = self.pieces[-1]
+            self.pieces[-1] = (np.append(steps[:-1], first + len(p) - 1), *rest)
+            return
+        self._still = still
+        mean = 0.5 * (raw[:-1] + raw[1:])
+        v, w = mean[:, :3], mean[:, 3:]
+        q = q / np.linalg.norm(q, axis=1, keepdims=True)
+        R = Rotation.from_quat(q[:, [1, 2, 3, 0]])
+        p = p - R.apply(body.centre)
+        v = v - R.apply(np.cross(w, body.centre))
+        keep = thin(self.step, p, v, q, w, _TOLERANCE * body.radius, _TOLERANCE)
+        keep[0] = not self.pieces  # the last of the piece before
+        if still:
+            v, w = np.zeros_like(v), np.zeros_like(w)
+        self.pieces.append((first + np.flatnonzero(keep), p[keep], v[keep], q[keep], w[keep]))
+
+    def _note_impacts(self, first: int, v: np.ndarray, gravity: np.ndarray) -> None:
+        """The step of the hardest push of each impact. Of one there is talk when it would stop a twentieth of the
+        body's own speed, and is ten times what gravity does."""
+        push = np.linalg.norm(np.diff(v, axis=0) / self.step - gravity, axis=1)[1:]
+        frequency = math.pi / (self.impact_steps * self.step)
+        speed = np.linalg.norm(v[1:-1], axis=1)
+        hard = push > 10.0 * np.linalg.norm(gravity) + 0.05 * frequency * speed
+        for k in np.flatnonzero(hard):
+            step = first + 1 + int(k)
+            if step - self._last > self.impact_steps / 4:
+                self.impacts.append(step)
+                self._peak = 0.0
+            if push[k] > self._peak:
+                self.impacts[-1], self._peak = step, float(push[k])
+            self._last = step
+
+    def path(self, t0_ns: int, rate: float) -> HermitePath:
+        steps, *rest = (np.concatenate(arrays) for arrays in zip(*self.pieces))
+        return HermitePath(_times(steps, t0_ns, rate), *rest)
+
+
+def _times(steps: np.ndarray, t0_ns: int, rate: float) -> np.ndarray:
+    return t0_ns + np.rint(steps * (1e9 / rate)).astype(np.int64)
+
+
+def _quaternions(R: np.ndarray) -> np.ndarray:
+    """(n, 4) w x y z of (n, 3, 3)."""
+    return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
+
+
+# ---- restitution -----------------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=4096)
+def damping_ratio(restitution: float, steps: float) -> float:
+    """Of the contact of so many steps that gives back this share of the speed (0 to 1), in the mean over the phases in
+    which a step meets the surface. The strongest gives back 0.02: that is what 0 becomes."""
+    low, high = 0.0, 3.0
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _given_back(middle, steps) > restitution else (low, middle)
+    return low
+
+
+@njit(cache=True)
+def _given_back(ratio: float, steps: float) -> float:
+    """Mean of the share of its speed with which a body leaves the contact, by the engine's recurrence."""
+    w, total, phases = math.pi / steps, 0.0, 16
+    for phase in range(phases):
+        depth, v = (phase + 0.5) / phases, 1.0
+        while depth > 0.0:
+            v += min(-(w * w * depth + 2.0 * ratio * w * v), 0.0)
+            depth += v
+        total -= v / phases
+    return total
+
+
+# ---- shapes ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A convex solid in a body's axes. kind : MuJoCo's, BOX, SPHERE, PLANE or MESH.   size : as MuJoCo has it: half
+    edges, radius.   vertices : (V, 3) of a MESH's hull."""
+
+    kind: str
+    size: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
+    position: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    vertices: np.ndarray | None = None
+
+    @property
+    def quaternion(self) -> np.ndarray:
+        return _quaternions(self.rotation[None])[0]
+
+    def moved(self, T: np.ndarray) -> Shape:
+        return replace(self, position=T[:3, :3] @ self.position + T[:3, 3], rotation=T[:3, :3] @ self.rotation)
+
+
+def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
+    """What touches, of an object: its parts' solids in its axes."""
+    parts = [part.mesh.vertices[np.unique(part.mesh.faces)] for part in obj.parts if len(part.mesh.faces)]
+    if len(parts) > _MOST_PARTS:
+        parts = [np.concatenate(parts)]
+    if obj.category == "ground" and config.shape == "auto" and config.kind == "fixed" and len(parts) == 1:
+        mesh = next(part.mesh for part in obj.parts if len(part.mesh.faces))
+        if (plane := _flat(parts[0])) is not None:
+            centre, axes, _ = plane
+            up = axes[:, 2] * (1.0 if float(mesh.normals.mean(axis=0) @ axes[:, 2]) >= 0 else -1.0)
+            return [_plane(Side(tuple(up), float(up @ centre)))]
+    return [_solid(points, config) for points in parts]
+
+
+def _solid(points: np.ndarray, config: BodyConfig) -> Shape:
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    radii = np.linalg.norm(points - centre, axis=1)
+    if (plane := _flat(points)) is not None and config.shape in ("auto", "hull"):
+        middle, axes, extent = plane
+        return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
+    if config.shape == "sphere":
+        return Shape("SPHERE", (float(radii.max()), 0, 0), centre)
+    if config.shape == "box":
+        return Shape("BOX", np.maximum(half, 1e-3 * half.max()), centre)
+    hull, volume = _hull(points)
+    if config.shape == "auto":
+        ball = 4 / 3 * math.pi * radii.max() ** 3
+        if np.ptp(np.linalg.norm(hull - centre, axis=1)) < 1e-4 * radii.max() and volume > 0.9 * ball:
+            return Shape("SPHERE", (float(radii.max()), 0, 0), centre)
+        if (np.abs(np.abs(hull - centre) - half) < 1e-6 * half.max()).all():
+            return Shape("BOX", half, centre)
+    return Shape("MESH", vertices=hull)
+
+
+def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Its vertices (V, 3), and its volume."""
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return np.unique(points, axis=0), 0.0
+    return points[hull.vertices], float(hull.volume)
+
+
+def _flat(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """(centre (3,), axes (3, 3) as columns, the last across, half extents (3,)) of points in a plane; else None."""
+    mean = points.mean(axis=0)
+    _, sizes, rows = np.linalg.svd(points - mean, full_matrices=False)
+    if len(points) > 2 and sizes[2] > 1e-6 * sizes[0]:
+        return None
+    axes = rows.T * np.sign(np.linalg.det(rows))
+    along = (points - mean) @ axes
+    low, high = along.min(axis=0), along.max(axis=0)
+    return mean + axes @ (0.5 * (low + high)), axes, 0.5 * (high - low)
+
+
+def _plane(side: Side) -> Shape:
+    """An endless one, its z axis the normal."""
+    normal = np.asarray(side.normal, dtype=np.float64)
+    rotation, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])
+    return Shape("PLANE", (1.0, 1.0, 1.0), normal * side.offset, rotation.as_matrix())
+
+
+def _shifted(by: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = by
+    return T

@@ -1,0 +1,75 @@
+"""``blinkgl import``: what came, what could not, and the lines of YAML that play it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from typing import Any
+
+import yaml
+from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from blinkgl.show.terminal import plain_column, plain_console, say
+
+_LONGER_SIDE = 640  # px: an event camera's, not a film's
+
+
+def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False, **options: Any) -> int:
+    """``options``: of :func:`~blinkgl.blender.importing.import_scene`."""
+    from blinkgl.blender.importing import import_scene
+
+    console = plain_console(quiet=quiet)
+    with Progress(
+        SpinnerColumn(),
+        plain_column("{task.description}"),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=quiet or as_json or not console.is_terminal,
+    ) as bar:
+        task = bar.add_task("starting Blender")
+        came = import_scene(source, target, progress=lambda doing: bar.update(task, description=doing), **options)
+    if as_json:
+        say(plain_console(), json.dumps(came.as_dict(), indent=2))
+        return 0
+    size = os.path.getsize(target)
+    say(console, f"{target}: {size / 1e6:.1f} MB, from {os.path.basename(source)} by Blender {came.blender}")
+    table = Table(box=None, pad_edge=False)
+    for name, justify in (("", "left"), ("in the file", "right"), ("came", "right"), ("how", "left")):
+        table.add_column(name, justify=justify)
+    for row in came.rows:
+        whole = row.came >= row.found
+        table.add_row(
+            row.kind,
+            str(row.found) if row.found else "",
+            Text(str(row.came) if row.found else "", style="" if whole else "bold yellow"),
+            "\n".join(row.notes),
+        )
+    console.print(table)
+    for line in came.omissions:
+        say(console, f"note: {line}")
+    say(console, "to play it:")
+    for line in _recipe(target, came).splitlines():
+        say(console, f"  {line}")
+    return 0
+
+
+def _recipe(target: str, came: Any) -> str:
+    """The YAML that plays what was imported, as far as the file decides it."""
+    scene: dict[str, Any] = {"kind": "file", "path": target}
+    if came.cameras:
+        scene |= {"camera": came.camera or came.cameras[0], "intrinsics": "file"}
+    else:
+        scene["pose"] = {"position": [-5, 0, 1.5], "look_at": [0, 0, 1]}
+    recipe: dict[str, Any] = {"scene": scene}
+    if came.duration_s:
+        # Labels need an interval before the first and one after the last.
+        rate = max(10, math.ceil(4 / came.duration_s))
+        recipe["time"] = {"duration": math.floor(1e6 * (came.duration_s - 2 / rate)) / 1e6, "label_rate": rate}
+    if came.cameras:
+        less = max(max(came.size) / _LONGER_SIDE, 1)
+        recipe = {"camera": {"width": round(came.size[0] / less), "height": round(came.size[1] / less)}, **recipe}
+    return yaml.safe_dump(recipe, sort_keys=False, default_flow_style=None, width=110)

@@ -1,0 +1,245 @@
+"""``blinkgl import`` without Blender: what is refused before it starts, how it is run, how it ends."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from blinkgl import cli
+from blinkgl.blender import importing, process
+from blinkgl.blender.importing import import_scene
+from blinkgl.errors import AssetError, BlinkGLError, ConfigError, OutputError
+
+WRITES = '(folder / "scene.glb").write_bytes(glb); say(report=REPORT)\n'
+
+
+def one_line(error) -> str:
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def nothing_left(folder: Path, *expected: str) -> None:
+    assert sorted(p.name for p in folder.iterdir() if p.name not in ("fake", "who")) == sorted(expected)
+
+
+def test_blender_stays_in_its_own_programs():
+    """GPL: bpy is imported by the programs that Blender runs alone, and they import nothing of ours."""
+    root = Path(process.__file__).resolve().parents[2]
+    inside = root / "blinkgl" / "blender" / "inside"
+    own = {file.stem for file in inside.glob("*.py")}
+    for file in [*root.glob("blinkgl/**/*.py"), *root.glob("tools/**/*.py"), *root.glob("eflow/**/*.py")]:
+        found = set()
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                found.add((node.module or "").split(".")[0])
+        theirs = file.parent == inside or file.name == "cycles_worker.py"
+        assert theirs or not found & {"bpy", "mathutils", "bmesh"}, file
+        assert not theirs or not found & {"blinkgl", "tools", "scipy", ""}, file
+        if file.parent == inside:
+            allowed = own | {"bpy", "mathutils", "numpy", "zstandard"} | set(sys.stdlib_module_names)
+            assert found <= allowed, (file, found - allowed)
+
+
+# ----------------------------------------------------------------------------------------------------- before it starts
+
+
+@pytest.mark.parametrize(
+    "name, options, error, words",
+    [
+        ("a.max", {}, AssetError, "a.max: not a kind of scene that Blender reads; expected .blend, .fbx"),
+        ("a.glb", {}, AssetError, "a glTF file is used as it is"),
+        ("missing.blend", {}, AssetError, "missing.blend: cannot read the scene: No such file or directory"),
+        ("folder.fbx", {}, AssetError, "folder.fbx: cannot read the scene: Is a directory"),
+        ("empty.usd", {}, AssetError, "empty.usd: the file is empty"),
+        ("a.blend", {"frames": (9, 2)}, ConfigError, r"--frames: no range of frames \(got \(9, 2\)\)"),
+        ("a.blend", {"fps": 0.0}, ConfigError, "--fps: out of range"),
+        ("a.blend", {"keys_per_frame": 0}, ConfigError, "--keys-per-frame: out of range"),
+        ("a.blend", {"texture_size": 10**6}, ConfigError, "--texture-size: out of range"),
+        ("a.blend", {"time_limit_s": float("nan")}, ConfigError, "--time-limit: out of range"),
+    ],
+)
+def test_what_is_refused_before_blender_starts(tmp_path, monkeypatch, name, options, error, words):
+    monkeypatch.setattr(importing, "Blender", None)
+    for file in ("a.blend", "a.max", "a.glb"):
+        (tmp_path / file).write_bytes(b"BLENDER-v405")
+    (tmp_path / "empty.usd").touch()
+    (tmp_path / "folder.fbx").mkdir()
+    with pytest.raises(error, match=words) as caught:
+        import_scene(tmp_path / name, tmp_path / "out.glb", **options)
+    one_line(caught)
+    assert not (tmp_path / "out.glb").exists()
+
+
+def test_output_that_cannot_be_is_refused_before_blender_starts(blend, tmp_path, fake):
+    fake("(folder.parent / 'ran').touch()")
+    with pytest.raises(ConfigError, match="--out: not a GLB"):
+        import_scene(blend, tmp_path / "out.obj")
+    (tmp_path / "there.glb").write_text("mine")
+    with pytest.raises(OutputError, match="there.glb: output file exists; expected a new name, or --overwrite"):
+        import_scene(blend, tmp_path / "there.glb")
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="cannot write"):
+        import_scene(blend, tmp_path / "file" / "out.glb")
+    (tmp_path / "folder.glb").mkdir()
+    with pytest.raises(OutputError, match="is a folder"):
+        import_scene(blend, tmp_path / "folder.glb")
+    assert not (tmp_path / "who").exists() and (tmp_path / "there.glb").read_text() == "mine"
+
+
+def test_no_bpy_says_how_to_get_it(blend, tmp_path, monkeypatch, capsys):
+    bare = tmp_path / "bare"
+    bare.write_text(f"#!/bin/sh\nexec '{sys.executable}' -I -S \"$@\"\n")
+    bare.chmod(0o755)
+    monkeypatch.setenv(process.ENVIRONMENT, str(bare))
+    assert cli.run(["import", str(blend), "--out", str(tmp_path / "out.glb")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: no bpy") and "pip install 'bpy>=4.5,<4.6'" in error and error.count("\n") == 1
+    monkeypatch.setenv(process.ENVIRONMENT, str(tmp_path / "nothing"))
+    with pytest.raises(BlinkGLError, match="names no interpreter that runs"):
+        import_scene(blend, tmp_path / "out.glb")
+    bare.unlink()
+    nothing_left(tmp_path, blend.name)
+
+
+# ------------------------------------------------------------------------------------------------------------ it runs
+
+
+def test_what_blender_is_asked_and_what_it_is_given(blend, tmp_path, fake, monkeypatch):
+    for name, value in (
+        ("PYTHONPATH", "/x"),
+        ("BLENDER_USER_SCRIPTS", "/x"),
+        ("BLENDER_SYSTEM_SCRIPTS", "/x"),
+        ("LP_NUM_THREADS", "3"),
+        ("PXR_PLUGINPATH_NAME", "/x"),
+        ("SECRET", "x"),
+        ("LANG", "C.UTF-8"),
+    ):
+        monkeypatch.setenv(name, value)
+    kept = tmp_path / "kept.json"
+    fake(f"Path({str(kept)!r}).write_text(json.dumps([job, dict(os.environ), sys.argv, str(folder)]))\n" + WRITES)
+    told = []
+    came = import_scene(
+        blend, tmp_path / "new" / "out.glb", scene="S", frames=(3, 7), fps=25.0, keys_per_frame=4, clips=True,
+        texture_size=64, bake_s=5, progress=told.append,
+    )  # fmt: skip
+    job, environment, argv, folder = json.loads(kept.read_text())
+    assert job == {
+        "source": str(blend), "shown": str(blend), "scene": "S", "frames": [3, 7], "fps": 25.0, "keys_per_frame": 4,
+        "clips": True, "bake": {"size": 64, "seconds": 5},
+    }  # fmt: skip
+    home = f"{folder}/home"
+    assert environment["HOME"] == environment["BLENDER_USER_RESOURCES"] == environment["TMPDIR"] == home
+    assert environment["LANG"] == "C.UTF-8"
+    unknown = [k for k in environment if not k.startswith(("LC_", "LIBGL", "MESA", "EGL", "__EGL", "CUDA", "NVIDIA"))]
+    assert set(unknown) <= {
+        "HOME", "TMPDIR", "BLENDER_USER_RESOURCES", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "PATH",
+        "LANG", "TZ", "DISPLAY", "XAUTHORITY", "LD_LIBRARY_PATH", "LC_CTYPE",
+    }  # fmt: skip
+    assert argv[1] == str(Path(importing.__file__).parent / "inside") and not Path(folder).exists()
+    assert came.rows[0].kind == "meshes" and came.left_out == came.rows and came.frames == (1, 49)
+    assert (tmp_path / "new" / "out.glb").read_bytes()[:4] == b"glTF"
+
+
+def test_the_table_and_the_recipe(blend, tmp_path, fake, monkeypatch, capsys):
+    fake('say(blender="4.5.15"); say(doing="opening the file")\n' + WRITES)
+    monkeypatch.chdir(tmp_path)
+    assert cli.run(["import", str(blend), "--out", "out.glb"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"out\.glb: 0\.0 MB, from a scene\.blend by Blender 4\.5\.15\n", out)
+    assert re.search(r"meshes +2 +1 +'B' has no \[faces\]", out)
+    recipe = out.split("to play it:\n")[1]
+    (tmp_path / "play.yaml").write_text(recipe)
+    from blinkgl.config.sequence import load_run
+
+    config = load_run(tmp_path / "play.yaml").sequence(0)
+    assert (config.camera.width, config.camera.height) == (640, 360) and config.scene.camera == "Eye"
+    assert config.time.duration == pytest.approx(1.8) and config.time.label_rate == 10
+    assert cli.run(["import", str(blend), "--out", "out.glb", "--overwrite", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0]["found"] == 2
+    assert cli.run(["import", str(blend), "--out", "out.glb", "--overwrite", "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+
+
+# ------------------------------------------------------------------------------------------------------------ it ends
+
+
+@pytest.mark.parametrize(
+    "code, words",
+    [
+        ("say(doing='baking'); os.kill(os.getpid(), signal.SIGSEGV)", r"crashed \(SIGSEGV\) while baking: no message"),
+        ("print('out of it', file=sys.stderr); sys.exit(11)", r"stopped \(status 11\) while starting: out of it"),
+        ("pass", r"stopped \(status 0\) while starting"),
+        ("say(report=REPORT)", r"stopped \(status 0\)"),
+        ("(folder / 'scene.glb').write_bytes(glb)", r"stopped \(status 0\)"),
+        (WRITES + "os.abort()", r"crashed \(SIGABRT\)"),
+        ("print('[1, 2')", r"answer cannot be read"),
+        (
+            "say(error='the scene shows no shape', where=job['shown'], accepted='a scene with a mesh')",
+            r"a scene\.blend: the scene shows no shape; expected a scene with a mesh$",
+        ),
+        ("(folder / 'scene.glb').write_bytes(glb[:-4]); say(report=REPORT)", r"what Blender wrote cannot be read"),
+    ],
+)
+def test_blender_that_refuses_crashes_or_stops_is_one_line(blend, tmp_path, fake, code, words):
+    fake(code + "\n")
+    (tmp_path / "out.glb").write_text("before")
+    with pytest.raises(BlinkGLError, match=words) as caught:
+        import_scene(blend, tmp_path / "out.glb", overwrite=True)
+    one_line(caught)
+    assert (tmp_path / "out.glb").read_text() == "before"
+    nothing_left(tmp_path, blend.name, "out.glb")
+    assert not Path((tmp_path / "who").read_text().split(" ", 1)[1]).exists()
+
+
+def test_blender_that_hangs_is_ended_with_what_it_started(blend, tmp_path, fake):
+    fake(
+        "child = os.fork()\nif child == 0: time.sleep(600)\n"
+        f"Path({str(tmp_path / 'fake' / 'child')!r}).write_text(str(child))\n"
+        "say(doing=\"baking the colours of 'Wall'\"); time.sleep(600)\n"
+    )
+    with pytest.raises(BlinkGLError, match=r"did not come to an end in 1 s \(while baking the colours of 'Wall'\)"):
+        import_scene(blend, tmp_path / "out.glb", time_limit_s=1)
+    nothing_left(tmp_path, blend.name)
+    for pid in ((tmp_path / "who").read_text().split()[0], (tmp_path / "fake" / "child").read_text()):
+        assert gone(int(pid))
+
+
+def gone(pid: int) -> bool:
+    """No such process any more, once its new parent has noticed."""
+    for _ in range(200):
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z":
+                return True
+            os.kill(pid, 0)
+        except (ProcessLookupError, FileNotFoundError):
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_an_interrupted_import_leaves_nothing(blend, tmp_path, fake):
+    fake("say(doing='baking'); time.sleep(600)\n")
+
+    def interrupt(doing: str) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_scene(blend, tmp_path / "out.glb", progress=interrupt)
+    assert gone(int((tmp_path / "who").read_text().split()[0]))
+    nothing_left(tmp_path, blend.name)
+
+
+def test_how_a_process_ended_in_words():
+    assert process.how_it_ended(3) == "stopped (status 3)"
+    assert process.how_it_ended(-signal.SIGKILL) == "crashed (SIGKILL)"
+    assert process.how_it_ended(-200) == "crashed (signal 200)"

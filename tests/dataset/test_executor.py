@@ -1,0 +1,268 @@
+"""The driver's side of worker processes, with workers that are a few lines of Python: who is ready, who is replaced,
+what is said of whom, and that nothing of them is left."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from blinkgl.dataset import executor
+from blinkgl.dataset.executor import Inline, Local, StartError
+from blinkgl.errors import BlinkGLError, ConfigError
+
+WORKER = """
+import json, os, sys, time
+fd = int(sys.argv[1])
+tell = lambda m: os.write(fd, json.dumps(m).encode() + b"\\n")
+start = json.loads(sys.stdin.readline())
+if start["job"]["how"] == "refuses": tell({"kind": "refused", "error": "no OpenGL here"})
+if start["job"]["how"] == "dies": sys.exit(3)
+tell({"kind": "hello", "device": start["device"], "threads": os.environ.get("NUMBA_NUM_THREADS"), "pid": os.getpid()})
+for line in sys.stdin:
+    order = json.loads(line)
+    if order["task"] == 13: os.kill(os.getpid(), 9)
+    if order["task"] == 14: time.sleep(60)
+    if order["task"] == 15:
+        half = json.dumps({"kind": "done", "task": 15, "report": "x" * 100_000}).encode() + b"\\n"
+        for k in range(0, len(half), 30_000): os.write(fd, half[k : k + 30_000])
+        continue
+    tell({"kind": "alive"})
+    tell({"kind": "progress", "task": order["task"]})
+    tell({"kind": "failed" if order["task"] == 16 else "done", "task": order["task"], "attempt": order["attempt"]})
+"""
+
+
+@pytest.fixture
+def job(tmp_path, monkeypatch):
+    """What a run is, of workers as above."""
+
+    def popen(command, **options):
+        assert command[:3] == [sys.executable, "-m", "blinkgl.dataset.worker"]
+        return subprocess.Popen([sys.executable, "-ISc", WORKER, command[3]], **options)
+
+    monkeypatch.setattr(executor, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": popen}))
+    monkeypatch.setattr(executor, "several_cards", lambda job: None)
+    return lambda how="works": SimpleNamespace(out=str(tmp_path / "out"), to_dict=lambda: {"how": how})
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left():
+    before = os.listdir("/proc/self/fd")
+    yield
+    assert len(os.listdir("/proc/self/fd")) == len(before), "a pipe stayed open"
+
+
+@pytest.fixture
+def local():
+    made = []
+    yield lambda *given: made.append(Local(*given)) or made[-1]
+    for pool in made:
+        pool.close()
+        assert pool._processes == [] and pool.free() == 0
+
+
+def gathered(pool: Local, *kinds: str, seconds: float = 20.0) -> list[dict]:
+    """Messages up to the first of one of these kinds."""
+    found, end = [], time.monotonic() + seconds
+    while not any(m["kind"] in kinds for m in found):
+        found += pool.poll(0.2)
+        assert time.monotonic() < end, found
+    return found
+
+
+def test_tasks_go_to_who_is_free_and_come_back(job, local, tmp_path):
+    pool = local(2, [5, 7])
+    hellos = pool.open(job())
+    assert sorted(m["device"] for m in hellos) == [5, 7] and pool.free() == 2, "cards are dealt out in turn"
+    assert len({m["pid"] for m in hellos}) == 2
+    assert {m["threads"] for m in hellos} == {str(max(1, len(os.sched_getaffinity(0)) // 2))}
+    pool.submit(1, 4)
+    assert pool.free() == 1
+    pool.submit(16, 2)
+    assert pool.free() == 0
+    said = []
+    while len([m for m in said if m["kind"] != "progress"]) < 2:
+        said += pool.poll(5.0)
+    assert pool.free() == 2 and not [m for m in said if m["kind"] == "alive"]
+    assert {(m["kind"], m["task"], m.get("attempt")) for m in said} == {
+        ("progress", 1, None), ("done", 1, 4), ("progress", 16, None), ("failed", 16, 2)
+    }  # fmt: skip
+    assert sorted(p.name for p in (tmp_path / "out/.run/logs").iterdir()) == ["worker-0.log", "worker-1.log"]
+
+
+def test_three_workers_on_two_cards_and_on_none(job, local):
+    assert sorted(m["device"] for m in local(3, [4, 9]).open(job())) == [4, 4, 9]
+    assert [m["device"] for m in local(1, None).open(job())] == [None]
+
+
+def test_a_message_in_several_pieces_is_one(job, local):
+    pool = local(1, [])
+    pool.open(job())
+    pool.submit(15, 1)
+    (message,) = gathered(pool, "done")
+    assert message["task"] == 15 and len(message["report"]) == 100_000 and pool.free() == 1
+
+
+def test_a_worker_that_dies_costs_its_task_alone_and_is_replaced(job, local):
+    pool = local(1, [])
+    (first,) = pool.open(job())
+    pool.submit(13, 1)
+    said = gathered(pool, "failed")
+    assert [m for m in said if m["kind"] == "failed"] == [
+        {"kind": "failed", "task": 13, "error": "the worker was ended by SIGKILL", "final": False, "stop": False}
+    ]
+    second = [m for m in said if m["kind"] == "hello"] or gathered(pool, "hello")
+    assert second[0]["pid"] != first["pid"] and pool.free() == 1
+    pool.submit(2, 1)
+    assert gathered(pool, "done")[-1]["task"] == 2
+
+
+def test_a_task_that_took_too_long_is_ended_for_that_reason(job, local):
+    pool = local(2, [])
+    pool.open(job())
+    pool.submit(14, 1)
+    pool.submit(14 + 100, 1)
+    pool.kill(14, "more than 3 s")
+    pool.kill(99, "nobody has it")
+    failed = [m for m in gathered(pool, "failed") if m["kind"] == "failed"]
+    assert [(m["task"], m["error"]) for m in failed] == [(14, "more than 3 s")]
+    os.kill(pool._processes[-1].popen.pid, signal.SIGTERM)  # idle, the replacement: nobody's task fails
+    assert gathered(pool, "hello")[-1]["kind"] == "hello"
+
+
+def test_workers_that_cannot_start(job, local, tmp_path):
+    with pytest.raises(BlinkGLError, match="^no OpenGL here$"):
+        local(1, []).open(job("refuses"))
+    started = []
+    start = Local._start
+    pool = local(2, [])
+    pool._start = lambda slot: (started.append(slot), start(pool, slot))
+    with pytest.raises(
+        StartError,
+        match=r"--workers: workers cannot start: the worker ended with status 3; see .*worker-\d.log",
+    ):
+        pool.open(job("dies"))
+    assert len(started) == 4, "two, and two in their places: the third that ends ends it"
+    with pytest.raises(ConfigError, match=r"--workers: too few \(got 0\); expected 1 or more"):
+        Local(0)
+
+
+def test_workers_that_never_start(job, local, monkeypatch):
+    monkeypatch.setattr(executor, "_START_S", 0.0)
+    pool = local(1, [])
+    pool.poll = lambda timeout: []
+    with pytest.raises(StartError, match="workers did not start within 0 s"):
+        pool.open(job())
+
+
+def test_a_worker_that_says_nothing_is_mentioned_once(job, local, monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr(executor, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    pool = local(1, [])
+    pool.open(job())
+    pool.submit(14, 1)
+    for after, count in ((59.9, 0), (60.0, 1), (500.0, 0)):
+        now[0] = 1000.0 + after
+        said = pool.poll(0)
+        assert len(said) == count, after
+        if said:
+            assert (
+                said[0]["kind"] == "silent" and said[0]["task"] == 14 and said[0]["pid"] == pool._processes[0].popen.pid
+            )
+            assert "hangs: no word from it for 60 s; waiting for it" in said[0]["error"]
+    process = pool._processes[0]
+    process.task = None
+    process._mentioned = False
+    assert process.silence() is None, "who has no task need not speak"
+
+
+def test_closing_ends_who_does_not_leave(job, monkeypatch):
+    """SIGTERM first; SIGKILL for who does not hear it within the time that is given."""
+    pool = Local(2, [])
+    pids = [m["pid"] for m in pool.open(job())]
+    os.kill(pids[0], signal.SIGSTOP)
+    monkeypatch.setattr(executor, "_STOP_S", 0.0)
+    pool.close()
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+@pytest.mark.parametrize(
+    "state, said",
+    [("S", "hangs"), ("T", "is stopped"), ("t", "is held by a debugger"), ("D", "waits for a disk or a driver")],
+)
+def test_what_a_process_does_that_says_nothing(monkeypatch, state, said):
+    monkeypatch.setattr(Path, "read_text", lambda self: f"7 (a) name) {state} 1 7 7")
+    assert executor._condition(7) == said
+    monkeypatch.setattr(Path, "read_text", lambda self: "")
+    assert executor._condition(7) == "hangs"
+
+
+CARDS = ["NVIDIA 0", "llvmpipe Software Rasterizer", "NVIDIA 1"]
+
+
+@pytest.mark.parametrize(
+    "cards, asked, chosen",
+    [
+        (CARDS, [("egl", 0)], [0, 2]),
+        (CARDS[:2], [("egl", 0)], None),
+        ([], [("egl", 0)], None),
+        (CARDS, [("egl", 2)], None),
+        (CARDS, [("osmesa", 0)], None),
+        (CARDS, [("egl", 0), ("osmesa", 0)], None),
+        (CARDS, [("auto", 0), ("egl", 0)], [0, 2]),
+    ],
+)
+def test_cards_are_dealt_out_where_the_configuration_leaves_it_open(monkeypatch, cards, asked, chosen):
+    monkeypatch.setattr(executor, "egl_devices", lambda: cards)
+    monkeypatch.delenv("GLCONTEXT_DEVICE_INDEX", raising=False)
+    groups = [
+        SimpleNamespace(
+            template=SimpleNamespace(check=lambda b=b, d=d: SimpleNamespace(gl=SimpleNamespace(backend=b, device=d)))
+        )
+        for b, d in asked
+    ]
+    job = SimpleNamespace(plan=lambda: SimpleNamespace(used=groups))
+    assert executor.several_cards(job) == chosen
+    monkeypatch.setenv("GLCONTEXT_DEVICE_INDEX", "1")
+    assert executor.several_cards(job) is None
+
+
+def test_this_process_makes_one_at_a_time(monkeypatch):
+    said, released = [], []
+
+    class Maker:
+        def __init__(self, job):
+            self.job = job
+
+        def open(self):
+            return {"kind": "hello", "job": self.job}
+
+        def make(self, task, attempt, listener):
+            listener({"kind": "progress", "task": task})
+            return {"kind": "done", "task": task, "attempt": attempt}
+
+        def __exit__(self, *_):
+            released.append(self)
+
+    monkeypatch.setattr(executor, "Maker", Maker)
+    inline = Inline()
+    inline.close()
+    inline.listener = said.append
+    assert inline.open("job") == [{"kind": "hello", "job": "job"}] and inline.free() == 1 and inline.poll(0) == []
+    inline.submit(3, 2)
+    assert inline.free() == 0 and inline.poll(0) == [{"kind": "done", "task": 3, "attempt": 2}] and inline.free() == 1
+    assert said == [{"kind": "progress", "task": 3}] and json.dumps(said)
+    with pytest.raises(AssertionError):
+        inline.kill(3, "late")
+    inline.close()
+    assert len(released) == 1

@@ -1,0 +1,282 @@
+"""What each row of labels says of its values and files, by plain arrays. That rows can be added: test_seams.py."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from blinkgl.config.labels import LabelsConfig
+from blinkgl.labels import LABELS, Flow, LabelFrame, LabelRequest, asked_for, grading, label_of
+from blinkgl.labels.files import Form
+
+H, W = 4, 5
+
+
+def whole(name: str):
+    """A value that is right, of (H, W) px."""
+    label = LABELS[name]
+    if name.startswith("flow"):
+        return Flow(np.ones((H, W, 2), np.float32), np.ones((H, W), bool))
+    channels = 3 if label.channels is None else label.channels
+    return np.ones((H, W, channels) if channels else (H, W), np.float32 if label.dtype is None else label.dtype)
+
+
+# --- configuration ----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_asked_for_when_nothing_is_said():
+    assert list(asked_for(LabelsConfig())) == ["images", "flow_forward", "occlusion_forward"]
+    assert not asked_for(LabelsConfig(flow=(), images=False)) and asked_for(LabelsConfig())
+
+
+def test_each_is_asked_for_by_its_own_name_in_python():
+    """And asks for no other, but for what it cannot be without."""
+    for name, label in LABELS.items():
+        tree: dict = {"images": False, "flow": [], "occlusion": False}
+        label.ask(tree)
+        if name.startswith("occlusion"):
+            tree["flow"] = [label.towards]
+        got = set(asked_for(LabelsConfig(**tree)))
+        assert got - {f"flow_{label.towards}"} <= {name} and name in got
+    said = {name: label.said for name, label in LABELS.items()}
+    assert said["flow_forward"] == "flow" and said["flow_backward"] == "flow_backward" and said["depth"] == "depth"
+    assert said["occlusion_forward"] == said["occlusion_backward"] == "occlusion"
+    tree = {"flow": ["forward"]}
+    LABELS["flow_backward"].ask(tree)
+    assert tree == {"flow": ["forward", "backward"]}
+
+
+def test_a_request_knows_what_has_to_be_drawn():
+    request = LabelRequest("occlusion_forward", "images", "depth", "depth")
+    assert list(request) == ["images", "depth", "occlusion_forward"] and "depth" in request and "ids" not in request
+    assert set(request.buffers) == {"depth", "flow_forward", "ids"} and set(request.there) == {"depth", "ids"}
+    assert request == LabelRequest("depth", "images", "occlusion_forward") != LabelRequest("depth")
+    assert hash(request) == hash(LabelRequest(*request)) and request != "depth" and not LabelRequest()
+    assert list(request.without("depth", "ids")) == ["images", "occlusion_forward"]
+    assert LabelRequest("images").buffers == LabelRequest("images").there == ()
+    assert repr(request) == "LabelRequest('images', 'depth', 'occlusion_forward')"
+    with pytest.raises(KeyError, match="no label 'deep'; there are images, depth"):
+        label_of("deep")
+
+
+def test_a_frame_has_what_was_asked_for_and_none_for_the_rest():
+    flow, mask = whole("flow_backward"), np.zeros((H, W), bool)
+    frame = LabelFrame(7, {"images": 1, "flow_backward": flow, "occlusion_backward": mask})
+    assert frame.t_ns == 7 and frame.colour == frame.images == 1 and frame.depth is frame.forward is None
+    assert frame.backward.flow is flow.flow and frame.backward.valid is flow.valid and frame.backward.occluded is mask
+    assert set(LABELS) < set(dir(frame)) and "forward" in dir(frame)
+    with pytest.raises(AttributeError, match="no label 'fame'"):
+        frame.fame  # noqa: B018
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+FLOW = ("flow/{}/000007.png", "flow/{}_npy/000007.npy", "flow/{}_flo/000007.flo", "flow/{}.h5")
+FILES = {
+    "images": ["images/000007.png"],
+    "flow_forward": [name.format("forward") for name in FLOW],
+    "flow_backward": [name.format("backward") for name in FLOW],
+    "occlusion_forward": ["occlusion/forward/000007.png"],
+    "occlusion_backward": ["occlusion/backward/000007.png"],
+    "depth": ["depth/000007.npy"],
+    "ids": ["ids/000007.png"],
+    "normals": ["normals/000007.npy"],
+    "velocity": ["velocity/000007.npy"],
+}
+"""The layout that docs/ and DSEC's loaders know."""
+
+
+def test_where_labels_lie():
+    assert {name: [form.file(7) for form in label.forms] for name, label in LABELS.items()} == FILES
+    assert {name: label.stamps for name, label in LABELS.items() if label.stamps} == {
+        "images": "images/timestamps.txt",
+        "flow_forward": "flow/forward_timestamps.txt",
+        "flow_backward": "flow/backward_timestamps.txt",
+    }
+    assert {name: label.shard for name, label in LABELS.items() if label.shard} == {
+        "images": "image.png",
+        "flow_forward": "flow.png",
+        "flow_backward": "back.png",
+        "occlusion_forward": "occlusion.png",
+    }
+
+
+@pytest.mark.parametrize("endings", [(), ("npy",), ("flo", "h5"), ("npy", "flo", "h5")])
+def test_float_flow_lies_beside_the_png(endings):
+    labels = LabelsConfig(flow=["forward"], float_flow=endings)
+    assert [form.ending for form in LABELS["flow_forward"].written(labels)] == ["png", *endings]
+    assert [form.file(0) for form in LABELS["depth"].written(labels)] == ["depth/000000.npy"]
+
+
+def test_a_form_knows_its_own_files():
+    each, one = Form("flow/forward", "png"), Form("flow/forward", "h5", rows=lambda value: {})
+    assert list(each.files(2)) == ["flow/forward/000000.png", "flow/forward/000001.png"] and list(each.files(0)) == []
+    assert list(one.files(2)) == ["flow/forward.h5"] and list(one.files(0)) == []
+    assert each.holds("flow/forward/000000.png") and one.holds("flow/forward.h5")
+    for other in (
+        "flow/forward.png",
+        "flow/forward/a/0.png",
+        "flow/forward/0.npy",
+        "flow/forward0.png",
+        "flow/forwards/0.png",
+    ):
+        assert not each.holds(other) and not one.holds(other)
+    assert not one.holds("flow/forward/000000.h5") and not each.holds("flow/forward.h5")
+
+
+# --- values -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", LABELS)
+def test_a_value_of_another_shape_or_kind_is_refused(name):
+    label, value = LABELS[name], whole(name)
+    assert label.wrong(value, H, W) is None
+    for height, width in ((W, H), (H + 1, W), (H, W - 1)):
+        assert f"not {width}x{height} px" in label.wrong(value, height, width)
+    if name.startswith("flow"):
+        assert label.wrong(Flow(value.flow[..., :1], value.valid), H, W) and label.wrong(
+            Flow(value.flow, value.flow), H, W
+        )
+        return
+    more = np.ones((H, W, 4), value.dtype)
+    assert f"{more.shape} {more.dtype} and not (4, 5" in label.wrong(more, H, W)
+    other = value.astype(complex)
+    assert (label.wrong(other, H, W) is None) == (label.dtype is None)
+    if value.dtype.kind == "f" and label.dtype is not None:
+        assert label.wrong(value > 0, H, W).endswith(" float32") and label.wrong(value.astype(np.float64), H, W) is None
+    if name == "images":
+        assert label.wrong(value[..., 0], H, W) is None and label.wrong(value[..., :2], H, W)
+
+
+@pytest.mark.parametrize("name", LABELS)
+def test_what_is_kept_is_a_copy(name):
+    value = whole(name)
+    own = LABELS[name].own(value)
+    for a, b in ((own.flow, value.flow), (own.valid, value.valid)) if name.startswith("flow") else ((own, value),):
+        assert np.array_equal(a, b) and a.dtype == b.dtype and not np.shares_memory(a, b)
+
+
+def test_double_precision_is_kept_as_it_is_written():
+    assert (
+        LABELS["depth"].own(np.ones((H, W))).dtype == np.float32
+        and LABELS["images"].own(np.ones((H, W))).dtype == float
+    )
+    assert LABELS["ids"].own(np.ones((H, W), np.int64)).dtype == np.int64
+
+
+PROBLEMS = [
+    ("depth", 0.0, "a depth that is not above 0"), ("depth", -1.0, "a depth"), ("depth", np.nan, "a depth"),
+    ("depth", np.inf, None), ("depth", 1e-30, None),
+    ("velocity", np.inf, "no finite number"), ("velocity", np.nan, "no finite number"), ("velocity", 1e30, None),
+    ("normals", 1.0005, None), ("normals", -1.0005, None), ("normals", 0.0, None), ("normals", 1.01, "longer than 1"),
+    ("normals", np.nan, "longer than 1"),
+    ("flow_forward", np.nan, "no finite number"), ("flow_backward", np.inf, "no finite number"),
+    ("flow_forward", 1e6, None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name, number, said", PROBLEMS)
+def test_what_cannot_be_in_a_value(name, number, said):
+    """One pixel is enough."""
+    value = whole(name)
+    array = value.flow if isinstance(value, Flow) else value
+    if name == "normals":
+        array[...] = (1, 0, 0)
+    if array.ndim == 3:
+        array[1, 2] = 0
+    array[(1, 2, 0) if array.ndim == 3 else (1, 2)] = number
+    problem = LABELS[name].problem(value)
+    assert problem is None if said is None else said in problem
+    assert LABELS["ids"].problem(np.ones(3, np.uint16)) is None and "uint8" in LABELS["ids"].problem(
+        np.ones(3, np.uint8)
+    )
+
+
+def buffers(**raw):
+    return SimpleNamespace(raw=lambda name: raw[name], value=lambda name: LABELS[name].finish(buffers(**raw)))
+
+
+def test_what_the_shader_writes_becomes_the_value():
+    raw = np.zeros((1, 4, 4), np.float32)
+    raw[0, :, :2], raw[0, :, 2], raw[0, :, 3] = (3, -4), (1, 0, -1, 2), (1, 1, 1, 0)
+    flow = LABELS["flow_forward"].finish(buffers(flow_forward=raw))
+    assert flow.valid.tolist() == [[True, False, False, False]], "hit, and in front of the camera then"
+    assert flow.flow[0].tolist() == [[3, -4], [0, 0], [0, 0], [0, 0]] and flow.flow.dtype == np.float32
+    depth = LABELS["depth"].finish(buffers(depth=np.array([[0, -1, 2]], np.float32)))
+    assert depth.tolist() == [[np.inf, np.inf, 2]] and depth.dtype == np.float32
+    normals = LABELS["normals"].finish(buffers(normals=raw))
+    assert np.array_equal(normals, raw[..., :3]) and normals.flags.c_contiguous
+    assert LABELS["ids"].finish(buffers(ids=raw)) is raw
+
+
+# --- how far from the reference ---------------------------------------------------------------------------------------
+
+
+def test_errors_are_of_the_label_s_own_kind():
+    inf = np.inf
+    drawn, true = np.array([[1, inf, inf, 5]]), np.array([[1.5, inf, 2, inf]])
+    assert grading.absolute(drawn, true, 1).tolist() == [[0.5, 0, inf, inf]]
+    assert grading.relative(drawn, true, 1).tolist() == [[pytest.approx(1 / 3), 0, inf, 1]]
+    assert grading.different(drawn, true, 1).tolist() == [[1, 0, 1, 1]]
+    vectors = np.array([[[3.0, 4, 0], [inf, 0, 0]]])
+    assert grading.absolute(vectors, np.array([[[0.0, 0, 0], [inf, 0, 0]]]), 1).tolist() == [[5, 0]]
+    for at, expected in ((0, 5), (60, 5), (100, 5), (200, 2.5), (1000, 0.5)):
+        true = np.array([[[float(at), 0]]])
+        assert grading.motion(true + [3, 4], true, 1)[0, 0] == pytest.approx(expected)
+        assert grading.motion_per_interval((true + [3, 4]) * 20, true * 20, 0.05)[0, 0] == pytest.approx(expected)
+    assert grading.length(np.array([[-2.0]])).tolist() == [[2]] and grading.length(np.array([[[3, 4]]])).tolist() == [
+        [5]
+    ]
+
+
+def test_what_the_reference_says():
+    """0 or inf where nothing is hit, normals in the camera's axes."""
+    hit = np.array([[True, False]])
+    turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    scene = SimpleNamespace(camera_path=SimpleNamespace(pose=lambda t: pose if t == 9 else None))
+    ways = Flow(np.ones((1, 2, 2)), hit, ~hit)
+    frame = SimpleNamespace(
+        t_ns=9,
+        hit=hit,
+        normal=np.ones((1, 2, 3)) * (1, 2, 3),
+        velocity=np.ones((1, 2, 2)),
+        depth=3,
+        instance=4,
+        forward=ways,
+    )
+    says = lambda name, which=0: LABELS[name].views[which].reference(scene, frame)
+    assert says("normals").tolist() == [[(np.array([1, 2, 3]) @ turn).tolist(), [0, 0, 0]]]
+    assert says("velocity").tolist() == [[[1, 1], [0, 0]]] and says("depth") == 3 and says("ids") == 4
+    assert says("flow_forward").tolist() == [[[1, 1], [0, 0]]] and says("flow_forward", 1) is hit
+    assert np.array_equal(says("occlusion_forward"), ~hit)
+
+
+def test_how_strictly_each_is_judged():
+    """Figures of docs/, loosened by nobody unnoticed."""
+    judged = {v.name: (v.tolerance, v.statistic, v.judged_in) for label in LABELS.values() for v in label.views}
+    assert judged == {
+        "depth": (1e-5, "max", "relative"),
+        "id": (0.0, "max", "mismatch"),
+        "normals": (1e-3, "max", "of a unit vector"),
+        "velocity": (1e-2, "max", "px per label interval"),
+        "flow_forward": (1e-2, "max", "px"),
+        "valid_forward": (0.0, "max", "mismatch"),
+        "flow_backward": (1e-2, "max", "px"),
+        "valid_backward": (0.0, "max", "mismatch"),
+        "occluded_forward": (1e-2, "mean", "fraction of pixels"),
+        "occluded_backward": (1e-2, "mean", "fraction of pixels"),
+    }
+    loose = {v.name for label in LABELS.values() for v in label.views if not v.same_triangle}
+    assert loose == {"id", "occluded_forward", "occluded_backward"}
+    assert {v.name for label in LABELS.values() for v in label.views if v.band_there} == loose - {"id"}
+
+
+def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():
+    """Then whoever asks for one all the same is told."""
+    with pytest.raises(NotImplementedError):
+        LABELS["images"].reference(None, None)
+    assert LABELS["images"].views == ()

@@ -85,49 +85,80 @@ class _Piece(NamedTuple):
         return (np.linalg.norm(p - t[:, None] * along, axis=1) - radius) * min(*self.flat, 1.0)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def body_of(body: Proportions) -> Body:
-    """The skin of a body, bound with its limbs apart, its soles on z = 0. Not to be written to."""
-    bind = _bind(body)
-    pieces = _pieces(body, bind)
-    ends = np.concatenate([[p.a, p.b] for p in pieces])
-    room = 0.25 * body.unit
-    low, high = ends.min(axis=0) - room, ends.max(axis=0) + room
-
-    def distance(points: np.ndarray) -> np.ndarray:
-        """Of the blend of all, cut off below the soles."""
-        k = _BLEND * body.unit
-        near = np.stack([p.distance(points) for p in pieces])
-        least = near.min(axis=0)
-        blend = least - k * np.log(np.exp(-np.maximum(near - least, 0) / k).sum(axis=0))
-        return np.maximum(blend, floor - points[:, 2])
-
-    floor = bind[J["foot_l"]][2, 3] - body.ankle
-    low[2] = floor - 2.4 * _STEP * body.unit
-    points, faces, normals = isosurface(distance, low, high, _STEP * body.unit)
-    weights = _weights(points, faces, pieces, _SOFT * body.unit)
-    order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
-    bones = np.take_along_axis(weights, order, 1)
-    chart, uvs = _unwrapped(points, faces, normals, weights, bind, body)
-    # Vertices are split where the texture has a seam.
-    corners = np.concatenate([faces.reshape(-1, 1), np.round(uvs.reshape(-1, 2) * 1e6).astype(np.int64)], axis=1)
-    _, first, index = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-    old = faces.reshape(-1)[first]
-    points = points - [0, 0, floor]
-    bind = bind.copy()
+    """The skin of a body, bound with its limbs apart, its soles on z = 0: the average one, each bone made longer and
+    thicker. Not to be written to."""
+    points, normals, faces, uvs, joints, weights = _average()
+    bind, shape = _bind(body), _shape(body)
+    turns = bind[:, :3, :3]
+    shape = turns * shape[:, None] @ turns.transpose(0, 2, 1)
+    local = points[:, None] - _bind(Proportions())[joints, :3, 3]
+    placed = (shape[joints] @ local[..., None])[..., 0] + bind[joints, :3, 3]
+    vertices = (weights[..., None] * placed).sum(axis=1)
+    outward = (weights[..., None] * (np.linalg.inv(shape)[joints] @ normals[:, None, :, None])[..., 0]).sum(axis=1)
+    floor = bind[J["foot_l"], 2, 3] - body.ankle
+    vertices[:, 2] -= floor
     bind[:, 2, 3] -= floor
-    made = Body(
-        points[old],
-        normals[old],
-        uvs.reshape(-1, 2)[first],
-        index.reshape(-1, 3).astype(np.int32),
-        order[old],
-        bones[old] / bones[old].sum(axis=1, keepdims=True),
-        np.linalg.inv(bind),
-    )
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    made = Body(vertices, outward, uvs, faces, joints, weights, np.linalg.inv(bind))
     for array in made:
         array.setflags(write=False)
     return made
+
+
+def _shape(body: Proportions) -> np.ndarray:
+    """(21, 3): how many times an average body's size each bone is, in its own frame: z along it, but for the feet."""
+    out = np.full((len(JOINTS), 3), body.unit)
+    for number, name in enumerate(JOINTS):
+        bone = name.partition("_")[0]
+        if bone == "head":
+            out[number] *= body.head
+        elif bone == "neck":
+            out[number] *= [0.8 + 0.2 * body.build] * 2 + [body.head]
+        elif bone in ("foot", "toes", "hand"):
+            out[number, 2] *= body.arms if bone == "hand" else body.legs
+        else:
+            length = body.arms if "arm" in bone else body.legs if bone in ("thigh", "shank") else 1.0
+            out[number] *= [body.build, body.build, length]
+    return out
+
+
+@lru_cache(maxsize=1)
+def _average() -> tuple[np.ndarray, ...]:
+    """Of an average body, as bound, the pelvis where its joints say: (V, 3) points, (V, 3) normals, (F, 3) faces,
+    (V, 2) texture coordinates, (V, 4) joints and their weights. Vertices are split where the texture has a seam."""
+    body = Proportions()
+    bind = _bind(body)
+    pieces = _pieces(body, bind)
+    floor = bind[J["foot_l"], 2, 3] - body.ankle
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        """Of the blend of all, cut off below the soles."""
+        near = np.stack([p.distance(points) for p in pieces])
+        least = near.min(axis=0)
+        blend = least - _BLEND * np.log(np.exp(-np.maximum(near - least, 0) / _BLEND).sum(axis=0))
+        return np.maximum(blend, floor - points[:, 2])
+
+    ends = np.concatenate([[p.a, p.b] for p in pieces])
+    low, high = ends.min(axis=0) - 0.2, ends.max(axis=0) + 0.2
+    low[2] = floor - 2.4 * _STEP
+    points, faces, normals = isosurface(distance, low, high, _STEP)
+    weights = _weights(points, faces, pieces)
+    uvs = _unwrapped(points, faces, normals, weights, bind)
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    four = np.take_along_axis(weights, order, 1)
+    corners = np.concatenate([faces.reshape(-1, 1), np.round(uvs.reshape(-1, 2) * 1e6).astype(np.int64)], axis=1)
+    _, first, index = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    old = faces.reshape(-1)[first]
+    return (
+        points[old],
+        normals[old],
+        index.reshape(-1, 3).astype(np.int32),
+        uvs.reshape(-1, 2)[first],
+        order[old],
+        (four / four.sum(axis=1, keepdims=True))[old],
+    )
 
 
 def _bind(body: Proportions) -> np.ndarray:
@@ -141,46 +172,41 @@ def _bind(body: Proportions) -> np.ndarray:
 
 
 def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
-    """The capsules of all bones. Places are m in the joint's frame, of an average body."""
-    u, thick = body.unit, body.build
+    """The capsules of an average body's bones. Places are m in the joint's frame."""
     made = []
 
-    def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0), scale=(1.0, 1.0, 1.0), girth: float | None = None):
-        T, size = bind[J[joint]], np.asarray(scale) * u
-        ends = [T[:3, :3] @ (np.asarray(p) * size) + T[:3, 3] for p in (a, b)]
-        wide = u * (thick if girth is None else girth)
-        made.append(_Piece(J[joint], *ends, (r0 * wide, r1 * wide), flat))
+    def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0)) -> None:
+        T = bind[J[joint]]
+        made.append(_Piece(J[joint], *(T[:3, :3] @ np.array(p) + T[:3, 3] for p in (a, b)), (r0, r1), flat))
 
-    broad = 0.6 + 0.4 * thick
     add("pelvis", (-0.005, 0, -0.055), (0, 0, 0.04), 0.118, 0.112, (0.92, 1.30))
     add("pelvis", (-0.045, 0.06, -0.06), (-0.045, -0.06, -0.06), 0.083, 0.083)
     add("spine", (0.0, 0, 0), (0.002, 0, 0.12), 0.106, 0.112, (0.88, 1.22))
     add("chest", (0.0, 0, 0.02), (-0.005, 0, 0.15), 0.120, 0.108, (0.90, 1.40))
-    add("neck", (-0.005, 0, -0.02), (0.01, 0, 0.09), 0.056, 0.052, girth=0.8 + 0.2 * thick)
-    h = body.head
-    add("head", (0.012, 0, 0.085), (0.002, 0, 0.115), 0.082, 0.095, (1.08, 0.84), (h, h, h), h)
-    add("head", (0.035, 0, 0.012), (0.03, 0, 0.07), 0.048, 0.062, (1.0, 0.92), (h, h, h), h)
-    add("head", (0.10, 0, 0.055), (0.09, 0, 0.085), 0.014, 0.008, scale=(h, h, h), girth=h)  # a nose
+    add("neck", (-0.005, 0, -0.02), (0.01, 0, 0.09), 0.056, 0.052)
+    add("head", (0.012, 0, 0.085), (0.002, 0, 0.115), 0.082, 0.095, (1.08, 0.84))
+    add("head", (0.035, 0, 0.012), (0.03, 0, 0.07), 0.048, 0.062, (1.0, 0.92))
+    add("head", (0.10, 0, 0.055), (0.09, 0, 0.085), 0.014, 0.008)  # a nose
     for side, sign in (("l", 1.0), ("r", -1.0)):
-        arms, legs, sole = body.arms, body.legs, body.ankle / u
-        add(f"head", (0.0, sign * 0.078, 0.06), (-0.006, sign * 0.082, 0.085), 0.016, 0.018, (1, 0.6), (h, h, h), h)
-        add(f"clavicle_{side}", (-0.005, sign * 0.0, -0.035), (-0.005, sign * 0.12 * broad, -0.02), 0.066, 0.060)
-        add(f"arm_{side}", (-0.004, 0, -0.005), (0, 0, -0.27), 0.060, 0.043, scale=(1, 1, arms))
-        add(f"forearm_{side}", (0, 0, -0.005), (0, 0, -0.23), 0.042, 0.029, scale=(1, 1, arms))
-        add(f"hand_{side}", (0, 0, -0.02), (0.004, 0, -0.085), 0.029, 0.033, (1.25, 0.62), (1, 1, arms), 1.0)
-        add(f"hand_{side}", (0.006, 0, -0.09), (0.002, 0, -0.155), 0.030, 0.022, (1.2, 0.5), (1, 1, arms), 1.0)
-        add(f"hand_{side}", (0.02, 0, -0.03), (0.05, 0, -0.085), 0.015, 0.012, scale=(1, 1, arms), girth=1.0)  # a thumb
-        add(f"thigh_{side}", (0.0, 0, -0.02), (0.004, 0, -0.40), 0.089, 0.057, scale=(1, 1, legs))
-        add(f"shank_{side}", (0.002, 0, 0), (0, 0, -0.38), 0.055, 0.037, scale=(1, 1, legs))
-        add(f"shank_{side}", (-0.018, 0, -0.09), (-0.014, 0, -0.18), 0.047, 0.040, scale=(1, 1, legs))  # a calf
-        add(f"foot_{side}", (-0.018, 0, 0.037 - sole), (0.07, 0, 0.039 - sole), 0.042, 0.043, (1, 0.92), girth=1.0)
-        add(f"foot_{side}", (0, 0, -0.01), (0.03, 0, 0.042 - sole), 0.040, 0.043, (1, 0.92), girth=1.0)
-        add(f"foot_{side}", (0.04, 0, 0.037 - sole), (0.125, 0, 0.028 - sole), 0.041, 0.034, (1, 1.15), girth=1.0)
-        add(f"toes_{side}", (0.005, 0, 0.008), (0.045, 0, 0.004), 0.032, 0.027, (1, 1.35), girth=1.0)
+        sole = body.ankle
+        add("head", (0.0, sign * 0.078, 0.06), (-0.006, sign * 0.082, 0.085), 0.016, 0.018, (1, 0.6))
+        add(f"clavicle_{side}", (-0.005, 0, -0.035), (-0.005, sign * 0.12, -0.02), 0.066, 0.060)
+        add(f"arm_{side}", (-0.004, 0, -0.005), (0, 0, -0.27), 0.060, 0.043)
+        add(f"forearm_{side}", (0, 0, -0.005), (0, 0, -0.23), 0.042, 0.029)
+        add(f"hand_{side}", (0, 0, -0.02), (0.004, 0, -0.085), 0.029, 0.033, (1.25, 0.62))
+        add(f"hand_{side}", (0.006, 0, -0.09), (0.002, 0, -0.155), 0.030, 0.022, (1.2, 0.5))
+        add(f"hand_{side}", (0.02, 0, -0.03), (0.05, 0, -0.085), 0.015, 0.012)  # a thumb
+        add(f"thigh_{side}", (0.0, 0, -0.02), (0.004, 0, -0.40), 0.089, 0.057)
+        add(f"shank_{side}", (0.002, 0, 0), (0, 0, -0.38), 0.055, 0.037)
+        add(f"shank_{side}", (-0.018, 0, -0.09), (-0.014, 0, -0.18), 0.047, 0.040)  # a calf
+        add(f"foot_{side}", (-0.018, 0, 0.037 - sole), (0.07, 0, 0.039 - sole), 0.042, 0.043, (1, 0.92))
+        add(f"foot_{side}", (0, 0, -0.01), (0.03, 0, 0.042 - sole), 0.040, 0.043, (1, 0.92))
+        add(f"foot_{side}", (0.04, 0, 0.037 - sole), (0.125, 0, 0.028 - sole), 0.041, 0.034, (1, 1.15))
+        add(f"toes_{side}", (0.005, 0, 0.008), (0.045, 0, 0.004), 0.032, 0.027, (1, 1.35))
     return made
 
 
-def _weights(points: np.ndarray, faces: np.ndarray, pieces: list[_Piece], soft: float) -> np.ndarray:
+def _weights(points: np.ndarray, faces: np.ndarray, pieces: list[_Piece]) -> np.ndarray:
     """(V, 21): the nearer a bone, the larger; of bones that are no further than two joints from the nearest one."""
     far = np.full((len(points), len(JOINTS)), np.inf)
     for piece in pieces:
@@ -192,7 +218,7 @@ def _weights(points: np.ndarray, faces: np.ndarray, pieces: list[_Piece], soft: 
             near[joint, parent] = near[parent, joint] = True
     near = near.astype(int) @ near.astype(int) > 0
     least = far.argmin(axis=1)
-    weights = np.exp(-(far - far.min(axis=1, keepdims=True)) / soft) * near[least]
+    weights = np.exp(-(far - far.min(axis=1, keepdims=True)) / _SOFT) * near[least]
     weights[weights < 0.02] = 0
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     links = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(points),) * 2).tocsr()
@@ -213,11 +239,12 @@ _AXES = {  # chart: (joint, its upper and its lower end in m of an average body,
     "shank": ("shank", (0, 0, 0.0), (0, 0, -0.41), (1, 0, 0)),
     "foot": ("foot", (0.20, 0, -0.05), (-0.055, 0, -0.05), (0, 0, 1)),
 }
-_SCALED = {"head": "head", "upper_arm": "arms", "forearm": "arms", "hand": "arms", "thigh": "legs", "shank": "legs"}
 
 
-def _unwrapped(points, faces, normals, weights, bind, body) -> tuple[np.ndarray, np.ndarray]:
-    """((F,) chart of each face, (F, 3, 2) texture coordinates of its corners)."""
+def _unwrapped(
+    points: np.ndarray, faces: np.ndarray, normals: np.ndarray, weights: np.ndarray, bind: np.ndarray
+) -> np.ndarray:
+    """(F, 3, 2) texture coordinates of the corners of an average body's faces."""
     names = list(CHARTS)
     share = np.zeros((len(points), 2 * len(names)))  # left and right
     for joint, name in enumerate(JOINTS):
@@ -234,8 +261,7 @@ def _unwrapped(points, faces, normals, weights, bind, body) -> tuple[np.ndarray,
                 continue
             paired = f"{joint}_l" in J
             T = bind[J[f"{joint}_{'lr'[right]}" if paired else joint]]
-            size = body.unit * (getattr(body, _SCALED[name]) if name in _SCALED else 1.0)
-            local = (points[faces[here]] - T[:3, 3]) @ T[:3, :3] / size
+            local = (points[faces[here]] - T[:3, 3]) @ T[:3, :3]
             outward = normals[faces[here]] @ T[:3, :3]
             top_, bottom_, ahead = (np.array(v, float) for v in (top, bottom, middle))
             mirror = paired and right
@@ -257,4 +283,4 @@ def _unwrapped(points, faces, normals, weights, bind, body) -> tuple[np.ndarray,
             below = np.clip(p @ down / length * inner + _MARGIN, 0.0, area.length)
             uvs[here, :, 0] = (area.left + area.around * (0.5 + angle)) / ATLAS
             uvs[here, :, 1] = (area.top + below) / ATLAS
-    return chart, uvs
+    return uvs

@@ -1,6 +1,6 @@
 """A closed surface round whatever a function says is inside: naive surface nets (Gibson 1998), then Newton's method.
 
-    points, faces, normals = isosurface(distance, low, high, step)
+points, faces, normals = isosurface(distance, low, high, step)
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ def isosurface(
     distance: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, step: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """((V, 3) points, (F, 3) int32 faces, (V, 3) unit normals) of where ``distance`` ((N, 3) points to (N,)) is zero;
-    it is negative inside, changes by at most 1.2 per unit and need not be exact. Cells of edge ``step`` fill the box low to high, (3,), outside whose
-    inner cells nothing may be inside. Faces are counter-clockwise seen from outside."""
+    it is negative inside, changes by at most 1.2 per unit and need not be exact. Cells of edge ``step`` fill the box
+    low to high, (3,); its outermost cells have to lie outside. Faces are counter-clockwise seen from outside."""
     shape = np.ceil((np.asarray(high) - low) / step).astype(int) + 1
     grid = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1)
     values = _values(distance, low + step * grid, step)
@@ -49,7 +49,9 @@ def isosurface(
         out, back = solid[:-1] & ~solid[1:], ~solid[:-1] & solid[1:]
         for way, mask in ((1, out), (-1, back)):
             i, j, k = np.nonzero(mask[:, 1:-1, 1:-1])
-            faces.append(np.stack([cell[i, j, k], cell[i, j + 1, k], cell[i, j + 1, k + 1], cell[i, j, k + 1]], 1)[:, ::way])
+            faces.append(
+                np.stack([cell[i, j, k], cell[i, j + 1, k], cell[i, j + 1, k + 1], cell[i, j, k + 1]], 1)[:, ::way]
+            )
     quads = np.concatenate(faces)
     for _ in range(2):
         gradient = _gradient(distance, points, 1e-3 * step)

@@ -42,14 +42,14 @@ PARAMETERS = {
     "height": "along z, m; capsule: of the cylinder between the two half spheres; figure: from the soles to the crown",
     "length": "fish: from the nose to the end of the tail, m",
     "deep": "fish: height of its body, parts of an average fish's",
-    "build": "figure: how thick it is, parts of an average body's, 0.6 to 1.6",
-    "legs": "figure: how long they are, parts of an average body's of this height, 0.6 to 1.6; likewise arms, head",
+    "build": "figure: how thick it is, parts of an average body's, 0.7 to 1.4",
+    "legs": "figure: how long they are, parts of an average body's of this height, 0.7 to 1.4; likewise arms, head",
     "arms": "figure: see legs",
     "head": "figure: see legs",
     "clip": "figure: what it does, one of " + ", ".join(CLIPS),
     "variant": "figure: which of many dances, and how it walks, runs, stands, waves; 0 is the plain one",
-    "tempo": "1 is the natural one of a body of this size, up to 4; a figure that walks or runs, and a fish, also go on "
-    "faster",
+    "tempo": "1 is the natural one of a body of this size, 0.1 to 4; a figure that walks or runs, and a fish, also go "
+    "on faster",
     "phase": "0 to 1, of a round, where it is at time 0",
     "wind": "flag: 1 is a breeze, up to 4; more of it lifts the cloth higher, and faster",
     "coat": "figure, flag, fish: which colours they wear where the object names no material",
@@ -65,7 +65,7 @@ _LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisio
 _MAX_SEGMENTS = 4096
 _MOST = {"variant": 10**9, "coat": 10**9}
 _WORDS = {"clip": tuple(CLIPS)}
-_PART = (0.6, 1.6)
+_PART = (0.7, 1.4)
 _RANGES = {"figure.build": _PART, "figure.legs": _PART, "figure.arms": _PART, "figure.head": _PART, "fish.deep": _PART}
 _RANGES |= {"phase": (0.0, 1.0), "tempo": (0.1, 4.0), "wind": (0.1, 4.0)}
 
@@ -102,7 +102,10 @@ def _primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Call
             if isinstance(default, str):
                 if value not in _WORDS[key]:
                     raise AssetError(
-                        f"no such {key}", where=f"{where}.{key}", value=value, accepted="one of " + ", ".join(_WORDS[key])
+                        f"no such {key}",
+                        where=f"{where}.{key}",
+                        value=value,
+                        accepted="one of " + ", ".join(_WORDS[key]),
                     )
             elif isinstance(value, str):
                 raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted="a number")
@@ -395,8 +398,8 @@ def figure(
     phase: float = 0.0,
     coat: int = 0,
 ) -> tuple[Surface, Deformer]:
-    """A person, standing on z = 0, looking along x: walks, runs, dances, waves or stands, on the spot (an object's `way`
-    takes it along). The texture is an atlas in which each part of the body has its place, in one scale all over."""
+    """A person on z = 0, looking along x: walks, runs, dances, waves or stands, on the spot (an object's `way` takes it
+    along). The texture is an atlas in which each part of the body has its place, in one scale all over."""
     if height > 1000:
         raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
     proportions = Proportions(height, build, legs, arms, head)
@@ -408,7 +411,12 @@ def figure(
 
 @_primitive
 def flag(
-    width: float = 1.5, height: float = 1.0, wind: float = 1.0, phase: float = 0.0, subdivisions: int = 40, coat: int = 0
+    width: float = 1.5,
+    height: float = 1.0,
+    wind: float = 1.0,
+    phase: float = 0.0,
+    subdivisions: int = 40,
+    coat: int = 0,
 ) -> tuple[Surface, Deformer]:
     """Cloth in wind, from its held edge at x = 0 along x, from z = 0 up, waving in y; the texture once on each side,
     seen through from the other."""
@@ -426,7 +434,9 @@ def flag(
     beat = Beat(0.75 / wind**0.7, -2 * math.pi * phase)
     config = FlagConfig(amplitude=0.1 * wind**0.3, period=beat.period, phase=360 * phase)
     low, high = np.array([0, -thick, 0]), np.array([width, thick, height])
-    return _join([front, back, *rim]), Flag.of(config, low, high)
+    cloth = Flag.of(config, low, high)
+    cloth.goes = "level"
+    return _join([front, back, *rim]), cloth
 
 
 @_primitive

@@ -15,9 +15,13 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from blinkgl.scene.motion.paths import SplinePath
-from blinkgl.scene.motion.trajectories import look_rotation
+from blinkgl.config.trajectory import ObjectMotion
+from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, waypoints
+from blinkgl.scene.types import PosePath
 
+_LEGS = 4  # way-points of a random way, besides its beginning
+_SMOOTHNESS = 0.8
 _SAMPLES = 64  # per leg, of the curve's length
 _KNOTS = 8  # per leg, of the path
 _MAX_KNOTS = 20_000
@@ -35,8 +39,9 @@ class Way:
         legs = np.linalg.norm(np.diff(points, axis=0), axis=1)
         parameter = np.r_[0.0, np.cumsum(np.sqrt(legs))]  # centripetal: no loops where legs differ
         self._curve = CubicSpline(parameter, points, bc_type="periodic" if closed else "not-a-knot")
-        self._at = np.concatenate([np.linspace(a, b, _SAMPLES, endpoint=False) for a, b in zip(parameter, parameter[1:])])
-        self._at = np.r_[self._at, parameter[-1]]
+        share = np.arange(_SAMPLES) / _SAMPLES
+        within = parameter[:-1, None] + np.diff(parameter)[:, None] * share
+        self._at = np.r_[within.ravel(), parameter[-1]]
         # Simpson's rule between samples.
         ends, middles = self._at, (self._at[1:] + self._at[:-1]) / 2
         at_ends, at_middles = (np.linalg.norm(self._curve(u, 1), axis=1) for u in (ends, middles))
@@ -86,3 +91,25 @@ def way_path(
         cameras = np.stack([look_rotation(direction) for direction in ahead])
         turns = Rotation.from_matrix(np.stack([cameras[:, :, 2], -cameras[:, :, 0], -cameras[:, :, 1]], axis=2))
     return SplinePath(times, places, turns)
+
+
+def random_way(
+    rng: np.random.Generator,
+    t0_ns: int,
+    t1_ns: int,
+    space: FreeSpace,
+    radius: float,
+    start_pose: np.ndarray,
+    speed: float,
+    flat: bool,
+) -> PosePath:
+    """A way through free space from a pose's place, gone along at ``speed`` from t0 on. flat : at one height; otherwise
+    the body's nose goes up and down with it. Stands still where there is no room to go."""
+    config = ObjectMotion(waypoints=_LEGS + 1, smoothness=_SMOOTHNESS)
+    points = waypoints(rng, t0_ns, t1_ns, config, space, radius, start_pose[:3, 3], speed, flat)[1]
+    apart = np.r_[True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-3 * radius]
+    if apart.sum() < 2:
+        return StaticPath(start_pose, t0_ns, t1_ns)
+    way = Way(points[apart])
+    behind = -speed * t0_ns * 1e-9 / way.length  # at time 0, so that it begins at t0
+    return way_path(points[apart], speed, t0_ns, t1_ns, level=flat, start=behind)

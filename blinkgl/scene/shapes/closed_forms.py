@@ -59,7 +59,8 @@ def _dot(points: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 class Waves(Deformer):
     """Two plane waves along one direction. direction : (3,) where amplitudes of 1 lead.
-    envelope : ((3,), float): e(p) = e . p + e0.   numbers : ((3,) rad per unit, phase rad) of both waves.   amplitudes : units."""
+    envelope : ((3,), float): e(p) = e . p + e0.   numbers : ((3,) rad per unit, phase rad) of both waves.
+    amplitudes : units."""
 
     glsl = "waves"
     rows = 5  # type: ignore[assignment]

@@ -51,9 +51,7 @@ class Cycle:
         out = Locals.rest(len(self._offsets))
         rounds = (int(t_ns) % self.period_ns) / self.period_ns + self.phase
         rate = 2e9 * np.pi / self.period_ns
-        _evaluate(
-            2 * np.pi * rounds, rate, self._cosines, self._sines, self._offsets, out[0], out[1], out[3], out[4]
-        )
+        _evaluate(2 * np.pi * rounds, rate, self._cosines, self._sines, self._offsets, out[0], out[1], out[3], out[4])
         return out
 
 

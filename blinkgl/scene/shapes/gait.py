@@ -1,9 +1,9 @@
 """What a figure does: stand, walk, run, dance, wave, as angles of its joints over one round.
 
 The pelvis and the feet are told where to be, the legs follow by the law of cosines; the rest is said in angles. In
-``walk`` and ``run`` a foot on the ground goes back, as seen from the body, exactly as fast as the body goes on, first on
-its heel, then flat, then on its ball: it does not slide but for what :mod:`~blinkgl.scene.shapes.cycle` leaves out of
-it. Angles: about x (to the side), y (positive: a leg or an arm goes back, a trunk leans on), z; all zero is a body that
+``walk`` and ``run`` a foot on the ground goes back, as seen from the body, exactly as fast as the body goes on, first
+on its heel, then flat, then on its ball: it does not slide but for what :mod:`~blinkgl.scene.shapes.cycle` leaves out
+of it. Angles: about x (to the side), y (positive: a leg or an arm goes back, a trunk leans on), z; all zero is a body that
 stands with its arms down. x is forward, y left, z up.
 """
 
@@ -299,7 +299,7 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
     rng = np.random.default_rng([variant, 5])
     big, loose, late = rng.uniform(0.8, 1.2), rng.uniform(0.7, 1.3), rng.uniform(-0.03, 0.03)
     step, arms = int(rng.integers(4)), int(rng.integers(5))
-    beat, bar = pose.wave(4, late), pose.wave(2, late)
+    beat = pose.wave(4, late)
     side = pose.wave(2, 0.125 + late)
     apart = 0.15 * u
     pose.pelvis[:, 2] -= (0.045 + 0.022 * big * (1 + beat)) * u
@@ -334,7 +334,7 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
             ankle, pitch, yaw, toes = feet[name]
             feet[name] = ankle, pitch, yaw + np.radians(0.8 * turn), toes
     else:  # marching on the spot, knees up
-        for name, sign, first in _SIDES:
+        for name, _, first in _SIDES:
             ankle, pitch, yaw, toes = feet[name]
             up = np.maximum(np.sin(2 * math.pi * (2 * pose.phi - first - 0.05)), 0) ** 2
             ankle[:, 2] += 0.17 * u * big * up
@@ -361,9 +361,7 @@ def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle
     elif arms == 3:  # rolling forearms
         for name, sign, first in _SIDES:
             pose.turn(f"arm_{name}", sign * (18 + 8 * pose.wave(4, 0.5 * first)), -48 + 14 * pose.wave(4, 0.25 * first))
-            pose.turn(
-                f"forearm_{name}", -sign * 30, -80 + 26 * pose.wave(4, 0.125 * first + 0.06), -sign * 10
-            )
+            pose.turn(f"forearm_{name}", -sign * 30, -80 + 26 * pose.wave(4, 0.125 * first + 0.06), -sign * 10)
     else:  # a wave that runs from one hand to the other
         for name, sign, _ in _SIDES:
             run = 0.06 * sign

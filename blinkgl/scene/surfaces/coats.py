@@ -104,7 +104,9 @@ def _face(image, x, y, skin, hair, rng) -> None:
         du, dv = (u - side * 0.062) / 0.032, (v - 0.50) / 0.026
         image[on & (du**2 + dv**2 < 1)] = 245
         image[on & ((du * 1.9) ** 2 + (dv * 1.25) ** 2 < 1)] = iris
-        image[on & (np.abs(u - side * 0.062) < 0.036) & (np.abs(v - 0.452 + 6 * (u - side * 0.062) ** 2) < 0.009)] = hair
+        image[on & (np.abs(u - side * 0.062) < 0.036) & (np.abs(v - 0.452 + 6 * (u - side * 0.062) ** 2) < 0.009)] = (
+            hair
+        )
     smile = 0.665 - 5 * u**2
     image[on & (np.abs(u) < 0.052) & (np.abs(v - smile) < 0.012)] = 0.55 * skin + np.array([80.0, 20, 25])
 

@@ -30,6 +30,7 @@ from blinkgl.scene.motion.trajectories import look_rotation
 from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.shapes.deformer import gait
 from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
@@ -87,11 +88,9 @@ def explicit_scene(
         if item.way is None:
             path = motion_path(item, t0_ns, t1_ns, where)
         else:
-            speed = item.way.speed or speed_of(parts) or 1.0
+            speed = item.way.speed or gait(part.mesh for part in parts)[1] or 1.0
             way = item.way
-            path = way_path(
-                way.points, speed, t0_ns, t1_ns, closed=way.closed, level=way.level, start=way.start
-            )
+            path = way_path(way.points, speed, t0_ns, t1_ns, closed=way.closed, level=way.level, start=way.start)
         objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
     bodies = {name: item.physics for name, item in zip(names, config.objects) if item.physics is not None}
@@ -129,11 +128,6 @@ def deforming(parts: Sequence[Part], config: DeformConfig) -> list[Part]:
     """The parts of one object, whose shape changes together as ``deform:`` says."""
     deformer = deformer_of(config, *bounds(part.mesh for part in parts))
     return [replace(part, mesh=replace(part.mesh, deformer=deformer)) for part in parts]
-
-
-def speed_of(parts: Sequence[Part]) -> float:
-    """Units/s that an object's shape goes with, 0: none."""
-    return max((part.mesh.deformer.speed for part in parts if part.mesh.deformer is not None), default=0.0)
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:

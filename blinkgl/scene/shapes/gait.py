@@ -3,8 +3,8 @@
 The pelvis and the feet are told where to be, the legs follow by the law of cosines; the rest is said in angles. In
 ``walk`` and ``run`` a foot on the ground goes back, as seen from the body, exactly as fast as the body goes on, first
 on its heel, then flat, then on its ball: it does not slide but for what :mod:`~blinkgl.scene.shapes.cycle` leaves out
-of it. Angles: about x (to the side), y (positive: a leg or an arm goes back, a trunk leans on), z; all zero is a body that
-stands with its arms down. x is forward, y left, z up.
+of it. Angles: about x (to the side), y (positive: a leg or an arm goes back, a trunk leans on), z; all zero is a body
+that stands with its arms down. x is forward, y left, z up.
 """
 
 from __future__ import annotations

@@ -87,7 +87,8 @@ def random_world(
         for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))
     ]
 
-    placed = _place(config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor, log, omissions)
+    given = config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor
+    placed = _place(*given, t0_ns, t1_ns, log, omissions)
     centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
     radii = np.array([radius for *_, radius, _ in placed])
     half = config.region.width / 2
@@ -193,7 +194,20 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
 
 
 def _place(
-    config, camera, objects: Pool, textures: Pool, rng, rng_texture, split, T_cam, clearance, floor, log, omissions
+    config,
+    camera,
+    objects: Pool,
+    textures: Pool,
+    rng,
+    rng_texture,
+    split,
+    T_cam,
+    clearance,
+    floor,
+    t0_ns,
+    t1_ns,
+    log,
+    omissions,
 ):
     """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
@@ -212,7 +226,7 @@ def _place(
             resting = goes == "upright" and config.ground is not None
             rotation = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * math.pi)]).as_matrix()
         parts = _dress(config, asset, radius, textures, rng_texture, split, log)
-        lowest = min(float((p.mesh.vertices @ rotation[2]).min()) for p in parts)
+        lowest = min(_lowest(p.mesh, rotation, t0_ns, t1_ns) for p in parts)
         in_view = rng.random() < settings.in_view
         for _ in range(_PLACEMENTS):
             position = _candidate(config, camera, rng, T_cam, floor, in_view, resting)
@@ -253,6 +267,16 @@ def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarra
     if resting:
         ray[2] = 0.0
     return T_cam[:3, 3] + ray / np.linalg.norm(ray) * _log_uniform(rng, config.objects.distance)
+
+
+def _lowest(mesh: Mesh, rotation: np.ndarray, t0_ns: int, t1_ns: int) -> float:
+    """Height of a turned mesh's lowest point over its origin; of one that deforms while it stays upright, whenever it
+    is lowest."""
+    at_rest = float((mesh.vertices @ rotation[2]).min())
+    if mesh.deformer is None or mesh.deformer.goes != "upright":
+        return at_rest
+    swept = mesh.deformer.sweep(mesh, t0_ns, t1_ns)
+    return float(swept.low[2]) + swept.margin
 
 
 def _gait(parts: Iterable[Part]) -> tuple[str, float]:

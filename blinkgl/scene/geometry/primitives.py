@@ -464,7 +464,7 @@ def fish(
     x = length * (0.5 - s)[:, None] - notch
     positions = np.stack([x, y, z], axis=2)
     positions[[0, -1]] = positions[[0, -1]].mean(axis=1, keepdims=True)
-    faces = _lattice(segments, rings)
+    faces = _lattice(segments, rings)[:, ::-1]  # rows go to the tail
     flat = positions.reshape(-1, 3)
     corners = flat[faces]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

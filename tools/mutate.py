@@ -33,6 +33,7 @@ import gc
 import hashlib
 import importlib
 import json
+import math
 import os
 import random
 import re
@@ -69,6 +70,8 @@ SHARED_CODE = (
     "pyproject.toml",
     "examples",
 )
+FOR_CHECKERS_ALONE = ("TYPE_CHECKING", "False")
+"""The one edit that is none by its kind."""
 DEBUGGERS = "shaders/include/lookup.glsl"
 """the include that only the shader debugger asks for"""
 LOOKERS = tuple(f"tests/test_rooms.py::test_{name}" for name in ("a_record", "records", "doors"))
@@ -549,6 +552,8 @@ def _on_import(mutant: Mutant) -> bool:
 class Reach:
     """Test ids by line, from :func:`make_map`."""
 
+    most_s = math.inf
+
     def __init__(self):
         if not (MAP / "coverage.db").exists():
             raise SystemExit("run with --map first: it finds out which test runs which line")
@@ -648,6 +653,57 @@ class Reach:
                 reached = [c for c in lines[line] if c]
                 return reached or (list(self.anywhere(mutant.path)) if "" in lines[line] else [])
         return []
+
+
+class ByName:
+    """Without a map: the test files of a mutant are its module's own and those that name it, those of its room, or that
+    import from it, that name something it defines, the room's others, and the others that import from the room, in this
+    order, the quick ones among them first. For a machine that is too busy for the whole suite under coverage. Who
+    survives might die in tests that are not among them, so the share of those that die is a lower bound."""
+
+    seconds: ClassVar[dict[str, float]] = {}
+    most_s = MOST_S / 3
+    PEERS = (
+        "tests/tools/",
+        "tests/eflow/",
+        "tests/render/test_peer_",
+        "tests/render/test_pyrender",
+        "tests/test_packaging",
+    )
+
+    def __init__(self):
+        slow = re.compile(
+            r"\b(run_dataset|generate_run|run|two_nodes|create_context|gl|Renderer|subprocess|explain|trade)\b"
+        )
+        files = {path.relative_to(ROOT).as_posix(): path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
+        order = sorted(files, key=lambda f: (len(slow.findall(files[f])), f))
+        self.texts = {file: files[file] for file in order}  # quick ones first
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        path, text = Path(mutant.path), (ROOT / mutant.path).read_text()
+        if path.suffix == ".glsl":
+            debugger = mutant.path == DEBUGGERS
+            start = ("tests/tools/test_shader_",) if debugger else ("tests/render/", "tests/extremes/")
+            return [f for f in self.texts if f.startswith(start) and (debugger or not self._peer(f))]
+        defined = [n.name for n in ast.parse(text).body if hasattr(n, "name") and not n.name.startswith("_")]
+        package, stem = ".".join(path.parts[:-1]), path.stem
+        named = re.compile(rf"{re.escape(package)}\.{stem}\b|from {re.escape(package)} import [^)]*?\b{stem}\b", re.S)
+        mentions = re.compile(rf"\b({'|'.join(map(re.escape, defined))})\b") if defined else None
+
+        def rank(file: str) -> int:
+            if Path(file).stem == f"test_{stem}" or named.search(self.texts[file]):
+                return 0
+            inside = file.startswith(f"tests/{path.parts[1]}/")
+            if not inside and not re.search(rf"from blinkgl\.{path.parts[1]}\b", self.texts[file]):
+                return 9
+            return 1 if mentions and mentions.search(self.texts[file]) else 2 if inside else 3
+
+        ranks = {file: rank(file) for file in self.texts if not self._peer(file)}
+        looking = [test for test in LOOKERS if _on_import(mutant)]
+        return [*looking, *sorted((f for f in ranks if ranks[f] < 9), key=ranks.get)]
+
+    def _peer(self, file: str) -> bool:
+        return file.startswith(self.PEERS)
 
 
 # ---- running -------------------------------------------------------------------------------------------------------
@@ -753,24 +809,42 @@ def _run_tests(order: dict) -> int:
     sys.argv = ["pytest"]
     import pytest
 
+    witness = _Witness(
+        Path(order["output"]).with_suffix(".failed"),
+        order["seconds"],
+        order["spare_s"],
+        order["wait_s"],
+        order.get("most_s", math.inf),
+    )
+    left_out = [f"--deselect={test}" for test in order.get("left_out", ())]
     status = pytest.main(
-        ["-x", "-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:cov", "-p", "no:xdist", *order["tests"]],
-        plugins=[
-            _Witness(Path(order["output"]).with_suffix(".failed"), order["seconds"], order["spare_s"], order["wait_s"])
-        ],
+        ["-x", "-q", "--no-header", *(f"-pno:{name}" for name in ("cacheprovider", "cov", "xdist"))]
+        + [*left_out, *order["tests"]],
+        plugins=[witness],
     )
     sys.stdout.flush()
     sys.stderr.flush()
-    return int(status)
+    return 0 if witness.enough else int(status)
 
 
 class _Witness:
     """A plugin of pytest that writes down which test failed, or which file could not be collected, and ends the process
     when a test takes many times the processor time that it took once (``seconds``; ``spare_s`` more
-    for kernels that have to be compiled), or waits (``wait_s`` and 20 times as long as it took)."""
+    for kernels that have to be compiled), or waits (``wait_s`` and 20 times as long as it took). After ``most_s`` of
+    processor time it is ``enough``: no further test begins."""
 
-    def __init__(self, path: Path, seconds: dict[str, float], spare_s: float, wait_s: float):
+    def __init__(self, path: Path, seconds: dict[str, float], spare_s: float, wait_s: float, most_s: float):
         self.path, self.seconds, self.spare_s, self.wait_s = path, seconds, spare_s, wait_s
+        self.end_s, self.enough = time.process_time() + most_s, False
+
+    @staticmethod
+    def pytest_sessionstart(session) -> None:
+        _Witness.session = session
+
+    def pytest_runtest_logfinish(self, nodeid, location) -> None:
+        if time.process_time() > self.end_s and not self.path.exists():
+            self.enough = True
+            self.session.shouldstop = "enough"
 
     def pytest_runtest_logstart(self, nodeid, location) -> None:
         seconds = self.seconds.get(nodeid, 10.0)
@@ -809,9 +883,11 @@ class Copy:
         spare_s: float,
         stale: set[str] = frozenset(),
         original: dict[str, str] | None = None,
+        most_s: float = math.inf,
     ) -> tuple[str, str]:
         """("passed" | "failed" | "time", the test that failed, "" where the process died). ``tests``: with the seconds
-        that each took. ``original``: digests of the sources of files that were edited outside of kernels."""
+        that each took. ``original``: digests of the sources of files that were edited outside of kernels. ``most_s`` of
+        processor time after which no further test begins; then how long it takes is not limited by the tests' times."""
         failed = self.folder / "output.failed"
         failed.unlink(missing_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
@@ -822,7 +898,9 @@ class Copy:
                     "seconds": tests,
                     "spare_s": spare_s,
                     "wait_s": 120.0,
-                    "limit_s": 10 * spare_s + 4 * sum(tests.values()),
+                    "limit_s": 10 * spare_s + 4 * sum(tests.values()) if most_s == math.inf else 3600.0,
+                    "most_s": most_s,
+                    "left_out": sorted(self.unfit),
                     "kernels": scratch,
                     "original": original or {},
                     "output": str(self.folder / "output.txt"),
@@ -851,7 +929,7 @@ class Copy:
             (self.sound if self.run({test: 60.0}, 60)[0] == "passed" else self.unfit).add(test)
         return test in self.sound
 
-    def judge(self, mutant: Mutant, reach: Reach) -> dict:
+    def judge(self, mutant: Mutant, reach: Reach | ByName) -> dict:
         tests = {t: reach.seconds.get(t, 1.0) for t in reach.tests(mutant) if t not in self.unfit}
         result = {**asdict(mutant), "name": mutant.name, "tests": len(tests), "by": ""}
         if not tests:
@@ -863,12 +941,12 @@ class Copy:
         started = time.monotonic()
         path.write_text(mutant.apply(source.decode()))
         try:
-            outcome, failed = self.run(tests, 60 if stale else 15, stale, original)
+            outcome, failed = self.run(tests, 60 if stale else 15, stale, original, reach.most_s)
         finally:
             path.write_bytes(source)
-        if outcome == "failed" and failed in tests and not self.passes(failed):
+        if outcome == "failed" and "::" in failed and not self.passes(failed):
             return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
-        if outcome == "failed" and not failed and self.run(tests, 60)[0] != "passed":
+        if outcome == "failed" and not failed and self.run(tests, 60, most_s=reach.most_s)[0] != "passed":
             return {**result, "outcome": "broken"}  # the process died, and does so without the mutant
         return {
             **result,
@@ -900,19 +978,25 @@ def key_of(mutant: Mutant, source: str) -> str:
 
 
 def excuses(mutants: list[Mutant]) -> dict[str, str]:
-    """Name -> reason of those that are listed as equivalent."""
+    """Name -> reason of those that are listed as equivalent, or are by their kind."""
     reasons = equivalent()
     found = {m.name: key_of(m, (ROOT / m.path).read_text()) for m in mutants}
-    return {name: reasons[key] for name, key in found.items() if key in reasons}
+    kind = {
+        m.name: "False is what it is wherever a program runs"
+        for m in mutants
+        if (m.before, m.after) == FOR_CHECKERS_ALONE
+    }
+    return kind | {name: reasons[key] for name, key in found.items() if key in reasons}
 
 
-def judged(mutants: list[Mutant], reach: Reach, jobs: int) -> Iterator[dict]:
+def judged(mutants: list[Mutant], reach: Reach | ByName, jobs: int) -> Iterator[dict]:
     with (
         tempfile.TemporaryDirectory(prefix="blinkgl-mutants-") as scratch,
         concurrent.futures.ThreadPoolExecutor(jobs) as pool,
     ):
         idle = [Copy(_made(Path(scratch) / f"copy{k}")) for k in range(jobs)]
-        idle[0].leave_out_what_is_gone(reach)
+        if isinstance(reach, Reach):
+            idle[0].leave_out_what_is_gone(reach)
 
         def one(mutant: Mutant) -> dict:
             copy = idle.pop()
@@ -947,6 +1031,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=200, help=f"mutants drawn, over {', '.join(ROOMS)}")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2, help="mutants side by side")
+    parser.add_argument(
+        "--by-name", action="store_true", help="without a map: the tests that name the module, and its room's"
+    )
     parser.add_argument("--show", metavar="FILE", help="list the mutants of a module")
     parser.add_argument("--only", metavar="FILE[:LINE]", help="all mutants of a module or a line")
     parser.add_argument("--at-least", type=float, default=0.9, help="share that must die")
@@ -975,7 +1062,8 @@ def main(arguments: list[str] | None = None) -> int:
         names = {m.name for m in mutants if m not in excused}
         results = [r for r in json.loads(options.out.read_text()) if r["name"] in names]
     known = {r["name"] for r in results}
-    for result in judged([m for m in mutants if m not in excused and m.name not in known], Reach(), options.jobs):
+    reach = ByName() if options.by_name else Reach()
+    for result in judged([m for m in mutants if m not in excused and m.name not in known], reach, options.jobs):
         results.append(result)
         print(
             f"[{len(results)}/{len(mutants) - len(excused)}] {result['outcome']:9} {result['name']}  {result['by']}",

@@ -262,14 +262,14 @@ def placed_rules(model: type[Config]) -> tuple[tuple[Path, Rule], ...]:
 def _looked_at(model: type[Config], every: list[Path]) -> Iterator[list[tuple[Path, bool]]]:
     """The keys of every rule that a distribution has to do with, its place bound to the entries where those are."""
     for place, one in placed_rules(model):
-        for prefix in sorted({_bound(place, site) for site in every}):
+        for prefix in sorted({bound for site in every for bound in _bound(place, site)}):
             keys = [((*prefix, *path), deep) for path, deep in one.paths()]
             if any(_related(site, key, deep) for site in every for key, deep in keys):
                 yield keys
 
 
-def _bound(place: Path, site: Path) -> Path:
-    """``place`` with its "*" replaced by where ``site`` is, if it is there."""
-    if len(site) >= len(place) and _related(site[: len(place)], place, False):
-        return site[: len(place)]
-    return place
+def _bound(place: Path, site: Path) -> Iterator[Path]:
+    """``place`` with its "*" replaced by where ``site`` is, if it is there; as it is where the site holds the place.
+    Nothing for a site elsewhere: it would bind all entries of a list together."""
+    if _related(site[: len(place)], place, False):
+        yield site[: len(place)] if len(site) >= len(place) else place

@@ -13,6 +13,9 @@
         enabled: false                        # described, but not made until somebody turns it on
         ...
 
+``scene: {from: FILE, …}`` is the scene of another YAML file (:func:`~blinkgl.config.sequence.load_run` puts it in its
+place when the recipe is read).
+
 A group is the common part with the group's own keys laid over it. Each group has a seed of its own, derived from the
 recipe's seed and the group's name, so that growing, adding or leaving out one group changes no sequence of another.
 """

@@ -379,7 +379,7 @@ class WayConfig(Config):
 class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
-    primitive: Literal[PrimitiveKind, "grid", LivingKind] | None = Field(None, description="kind of primitive")
+    primitive: Literal[PrimitiveKind, "grid", "die", LivingKind] | None = Field(None, description="kind of primitive")
     parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(_parameter)]] = Field(
         {},
         description="the primitive's sizes, numbers of faces, and what it does: see [primitives](#primitives)",
@@ -416,7 +416,9 @@ class MaterialConfig(Config):
     """A colour, times at most one texture."""
 
     texture: str | None = Field(None, description="image file, sRGB, or .hdr, linear")
-    procedural: TextureKind | None = Field(None, description="kind of procedural texture")
+    procedural: Literal[TextureKind, "pips"] | None = Field(
+        None, description="kind of procedural texture; pips: the faces of a die"
+    )
     seed: int = Field(0, ge=0, description="which procedural texture of that kind")
     photograph: str | None = Field(
         None, description="name of a photograph bundled with scikit-image, such as astronaut"

@@ -372,10 +372,11 @@ def _validated(tree: dict[str, Any]) -> SequenceConfig:
 
 
 def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | None = None) -> RunTemplate:
-    """Reads a YAML file, applies ``a.b=c`` overrides (c is YAML) and an optional seed, checks all that can be drawn.
+    """Reads a YAML file and the files that its scenes come from, applies ``a.b=c`` overrides (c is YAML) and an
+    optional seed, checks all that can be drawn.
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
-    tree = apply_overrides(read_table(path), overrides)
+    tree = apply_overrides(_with_scenes(read_table(path), Path(path).parent), overrides)
     if seed is not None:
         tree["seed"] = seed
     if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses
@@ -383,6 +384,30 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
     template = RunTemplate(tree, Path(path).parent)
     template.check()
     return template
+
+
+def _with_scenes(tree: dict[str, Any], base: Path) -> dict[str, Any]:
+    """``scene: {from: FILE, …}``, at the top and in groups, becomes the scene of that file with the other keys laid
+    over it; the tree then says all by itself, wherever it is read next. Raises ConfigError."""
+    from blinkgl.config.recipe import merge
+
+    groups = tree.get("groups")
+    named = [("groups." + str(name), group) for name, group in groups.items()] if isinstance(groups, dict) else []
+    for where, table in (("", tree), *named):
+        own = table.get("scene") if isinstance(table, dict) else None
+        if not isinstance(own, dict) or "from" not in own:
+            continue
+        where, own = f"{where}.scene.from".lstrip("."), dict(own)
+        given = own.pop("from")
+        if not isinstance(given, str):
+            raise ConfigError("not a file", where=where, value=given, accepted="a YAML file with a scene")
+        scene = read_table(base / given).get("scene")
+        if not isinstance(scene, dict) or "from" in scene:
+            raise ConfigError(
+                "the file has no scene of its own", where=where, value=given, accepted="a file with a table scene"
+            )
+        table["scene"] = merge(scene, own)
+    return tree
 
 
 def apply_overrides(tree: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:

@@ -413,3 +413,21 @@ def test_a_field_alone_has_no_rule():
 
     assert One.rules == () and validate(One, {"a": 2}).a == 2
     assert all_groups(RunTemplate({}, None))[0].count == 1
+
+
+def test_entries_of_a_list_are_not_looked_at_together_for_a_rule_of_one_entry():
+    """Seven objects with six numbers each that are drawn, and a camera that is: each object's pose is a matter of its
+    own, whatever else is drawn elsewhere."""
+    drawn = {"uniform": [0, 1]}
+    tree = {
+        "scene": {
+            "kind": "explicit",
+            "meshes": {"a": {"primitive": "cuboid"}},
+            "objects": [{"mesh": "a", "position": [drawn] * 3, "euler": [drawn] * 3} for _ in range(7)],
+            "camera": {"position": [drawn, 0, 0]},
+        }
+    }
+    found = list(corners(SequenceConfig, tree))
+    assert len(found) < 1000
+    poses = {tuple(t["scene"]["objects"][3]["position"] + t["scene"]["objects"][3]["euler"]) for t in found}
+    assert len([p for p in poses if set(p) <= {0, 1}]) == 64, "and all of its own are"

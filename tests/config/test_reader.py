@@ -93,7 +93,7 @@ def test_the_shipped_files_read_as_any_safe_loader_reads_them():
     folder = resources.files("blinkgl.configs")
     files = [
         f
-        for part in ("", "eflow", "quality", "sensors")
+        for part in ("", "eflow", "quality", "scenes", "sensors")
         for f in (folder / part if part else folder).iterdir()
         if f.name.endswith(".yaml")
     ]

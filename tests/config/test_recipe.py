@@ -208,3 +208,34 @@ def test_shipped_recipes(name, counts):
         config = plan.config(task)
         threshold = config.events.contrast_threshold if config.events.emulator == "v2e" else 1 / config.events.k1
         assert 0.18 <= threshold <= 0.25
+
+
+def test_a_scene_from_another_file(tmp_path):
+    """It is as if it stood there: other keys lie over it, options too, and the recipe that is kept has it."""
+    (tmp_path / "scenes").mkdir()
+    scene = {"kind": "explicit", "meshes": {"a": {"primitive": "cuboid"}}, "objects": [{"mesh": "a"}], "camera": {}}
+    (tmp_path / "scenes/one.yaml").write_text(yaml.safe_dump({"seed": 9, "camera": {"width": 20}, "scene": scene}))
+    tree = {
+        "camera": {"width": 64},
+        "groups": {"a": {"scene": {"from": "scenes/one.yaml", "background": 0.5}}, "b": {}},
+    }
+    a, b = all_groups(load(tmp_path, tree, ["groups.a.scene.light.unlit=true"]))
+    config = a.template.sequence(0)
+    assert config.scene.objects[0].mesh == "a" and config.scene.background == 0.5 and config.scene.light.unlit
+    assert config.camera.width == 64, "nothing else comes from there"
+    assert b.template.sequence(0).scene.kind == "random"
+    alone = load(tmp_path, {"scene": {"from": "scenes/one.yaml"}})
+    assert alone.tree["scene"] == scene
+    for given, message in (
+        ("scenes/two.yaml", "two.yaml: no such file"),
+        (3, "scene.from: not a file"),
+        ("recipe.yaml", "scene.from: the file has no scene of its own"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load(tmp_path, {"scene": {"from": given}})
+
+
+def test_the_falling_dice_of_the_recipe_are_those_of_their_own_file():
+    recipe = {group.name: group for group in all_groups(load_run(CONFIGS / "blinkflow.yaml"))}["falling_dice"]
+    assert recipe.template.tree["scene"] == load_run(CONFIGS / "scenes/falling_dice.yaml").tree["scene"]
+    assert recipe.template.sequence(0).scene != recipe.template.sequence(1).scene

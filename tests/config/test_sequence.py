@@ -22,8 +22,9 @@ def test_an_empty_file_is_a_valid_run(tmp_path):
 
 
 def test_shipped_configurations_are_valid():
-    shipped = [p for p in resources.files("blinkgl.configs").iterdir() if p.name.endswith(".yaml")]
-    assert {p.name for p in shipped} >= {"demo.yaml", "flying_objects.yaml"}
+    folder = resources.files("blinkgl.configs")
+    shipped = [p for f in (folder, folder / "scenes") for p in f.iterdir() if p.name.endswith(".yaml")]
+    assert {p.name for p in shipped} >= {"demo.yaml", "flying_objects.yaml", "falling_dice.yaml"}
     for path in shipped:
         for group in all_groups(load_run(path)):
             group.template.sequence(0)

@@ -280,3 +280,11 @@ def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():
     with pytest.raises(NotImplementedError):
         LABELS["images"].reference(None, None)
     assert LABELS["images"].views == ()
+
+
+def test_two_renderers_need_not_agree_but_in_what_is_measured():
+    """Colours, numbers of objects, normals and velocities may differ in every pixel; depth and flow may not."""
+    zero, one = np.zeros((H, W), np.float32), np.ones((H, W), np.float32)
+    free = {name for name, label in LABELS.items() if not name.startswith("flow") and label.agrees(zero, one)}
+    assert free == set(LABELS) - {"depth", "flow_forward", "flow_backward"}
+    assert LABELS["depth"].agrees(one, one) and not LABELS["depth"].agrees(one, one[:, :3])

@@ -1,11 +1,24 @@
 """The mutation run: what counts as a mutant, and that one is told from an untouched tree."""
 
 import ast
+import math
 from pathlib import Path
 
 import pytest
 
-from blinkgl.tools.mutate import ROOT, Kernels, Mutant, Reach, Server, equivalent, key_of, mutants_of
+from blinkgl.tools.mutate import (
+    ROOT,
+    ByName,
+    Kernels,
+    Mutant,
+    Reach,
+    Server,
+    _on_import,
+    equivalent,
+    excuses,
+    key_of,
+    mutants_of,
+)
 
 SOURCE = '''
 """Not this: 1 + 1."""
@@ -112,6 +125,12 @@ def test_what_is_called_equivalent_exists_and_says_why():
         assert len(reason) > 10, entry
 
 
+def test_what_only_type_checkers_read_is_excused_and_nothing_else_by_its_kind():
+    mutants = mutants_of("blinkgl/labels/depth.py", (ROOT / "blinkgl/labels/depth.py").read_text())
+    kinds = {(m.before, m.after) for m in mutants if m.name in excuses(mutants)}
+    assert kinds == {("TYPE_CHECKING", "False")}
+
+
 def test_what_is_compiled_into_a_kernel_is_compiled_itself():
     source = "@register_jitable\ndef f(a):\n    return a + 1\n\ndef g(a):\n    return a - 1\n"
     assert {m.before: m.compiled for m in mutants_of("m.py", source) if m.operator == "arithmetic"} == {
@@ -171,6 +190,33 @@ def test_own_tests_are_asked_first():
     )
 
 
+def of(path: str, text: str) -> Mutant:
+    """A mutant of the first line of a module that holds ``text``."""
+    lines = (ROOT / path).read_text().splitlines()
+    return Mutant(path, 1 + next(k for k, line in enumerate(lines) if text in line), 1, "a", "b", "x")
+
+
+def test_without_a_map_tests_are_found_by_name():
+    """Its own, those that name the module, its room's, those that import from the room; no peers, no networks."""
+    names = ByName()
+    found = names.tests(of("blinkgl/timeline/budget.py", "return 0.0"))
+    assert found[0] == "tests/timeline/test_budget.py" and "tests/timeline/test_strategy.py" in found
+    found = names.tests(of("blinkgl/labels/table.py", "return keys"))
+    assert "tests/labels/test_labels.py" in found and "tests/test_seams.py" in found
+    assert not any(file.startswith(ByName.PEERS) for file in found) and len(set(found)) == len(found)
+    shader = names.tests(Mutant("shaders/luminance.glsl", 1, 1, "a", "b", "x"))
+    assert {Path(file).parts[1] for file in shader} == {"render", "extremes"}
+    debugger = names.tests(Mutant("shaders/include/lookup.glsl", 1, 1, "a", "b", "x"))
+    assert debugger and all(file.startswith("tests/tools/test_shader_") for file in debugger)
+
+
+def test_what_runs_on_import_is_seen_by_those_who_look_at_the_package():
+    frozen, inside = of("blinkgl/render/raycast.py", "@dataclass"), of("blinkgl/render/raycast.py", "return Tree(")
+    default = of("blinkgl/recordings/simulation.py", "factor: int = 4")
+    assert _on_import(frozen) and _on_import(default) and not _on_import(inside)
+    assert [t for t in ByName().tests(frozen) if "::" in t] and not [t for t in ByName().tests(inside) if "::" in t]
+
+
 @pytest.mark.slow
 def test_verdicts(tmp_path):
     """A test that passes, one that fails, one that never ends, one that waits for ever, a process that
@@ -178,6 +224,7 @@ def test_verdicts(tmp_path):
     (tmp_path / "thing.py").write_text("VALUE = 1\n")
     (tmp_path / "test_thing.py").write_text(
         "import os, thing\ndef test_right(): assert thing.VALUE == 1\ndef test_spins():\n    while True: pass\n"
+        "def test_spends(): sum(range(10**6))\n"
         "def test_dies(): os._exit(3)\ndef test_waits():\n    import threading; threading.Event().wait()\n"
     )
     server, seen = Server(tmp_path), []
@@ -189,6 +236,7 @@ def test_verdicts(tmp_path):
             (["waits"], 1),
             (["right", "dies"], 1),
             (["right"], 1),
+            (["spends", "right"], 2),
         ):
             (tmp_path / "thing.py").write_text(f"VALUE = {value}\n")
             (tmp_path / "output.failed").unlink(missing_ok=True)
@@ -200,6 +248,7 @@ def test_verdicts(tmp_path):
                     "spare_s": 1,
                     "wait_s": 2,
                     "limit_s": 60,
+                    "most_s": 0.0 if "spends" in tests else math.inf,
                     "kernels": str(tmp_path / "kernels"),
                     "original": {},
                     "output": str(tmp_path / "output.txt"),
@@ -217,4 +266,5 @@ def test_verdicts(tmp_path):
         ("time", ""),
         ("failed", ""),
         ("passed", ""),
-    ]
+        ("passed", ""),
+    ], "the last: after a moment it is enough, and what would fail is not begun"

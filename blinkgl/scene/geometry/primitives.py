@@ -33,6 +33,8 @@ from blinkgl.scene.shapes.skin import Skin
 from blinkgl.scene.types import Mesh
 
 PARAMETERS = {
+    "size": "edge length, m",
+    "rounding": "radius of the rounded edges, parts of size, at most 0.5",
     "extents": "edge lengths in x, y, z, m",
     "width": "edge in x, m; flag: from the pole to the free end",
     "depth": "edge in y, m",
@@ -57,7 +59,8 @@ PARAMETERS = {
     "tube_segments": "faces round the tube",
     "rings": "rows of faces along z; cylinder, cone: rows of vertices",
     "sides": "corners of the polygon",
-    "subdivisions": "cells per edge; icosphere: how often each of 20 triangles is cut into four, 0 to 7",
+    "subdivisions": "cells per edge; die: per rounded edge; icosphere: how often each of 20 triangles is cut into "
+    "four, 0 to 7",
 }
 """What the builders' parameters mean, for the documentation. Metres are world units, before the object's scale."""
 
@@ -220,6 +223,37 @@ def cuboid(extents: Sequence[float] = (1.0, 1.0, 1.0), subdivisions: int = 1) ->
             square((x, -y, -z), (-2 * x, 0, 0), (0, 2 * y, 0), n, n),
         ]
     )
+
+
+DIE_FACES = 2, 3
+"""Rows and columns of a die's texture: 1 2 3 above 4 5 6, a face each."""
+
+
+@_primitive
+def die(size: float = 1.0, rounding: float = 0.12, subdivisions: int = 4) -> Surface:
+    """Cube with rounded edges and corners, of ``subdivisions`` cells each (``rounding`` is a part of ``size``, at most
+    a half, which is a ball). Its six faces are in one texture, 1 2 3 above 4 5 6, opposite ones 7 together: see
+    `procedural: pips`."""
+    if rounding > 0.5:
+        raise AssetError("bad parameter", where="die.rounding", value=rounding, accepted="at most 0.5")
+    half, radius = 0.5 * size, rounding * size
+    # Over an edge equal angles, not equal lengths.
+    turn = np.tan(np.linspace(0, math.pi / 4, subdivisions + 1))
+    edge = half - radius + radius * turn
+    ticks = np.concatenate([-edge[::-1], edge]) if rounding < 0.5 else np.concatenate([-edge[:0:-1], edge])
+    across, up = np.meshgrid(ticks, ticks)
+    n, lattice, sides = len(ticks) - 1, _lattice(len(ticks) - 1, len(ticks) - 1), []
+    x, y, z = np.eye(3)
+    # Seen from outside: what is out of the face, to its right, up in it.
+    faces = ((z, x, y), (x, y, z), (y, -x, z), (-y, x, z), (-x, -y, z), (-z, -x, y))
+    for number, (out, right, above) in enumerate(faces):
+        cube = half * out + across[..., None] * right + up[..., None] * above
+        core = np.clip(cube, -(half - radius), half - radius)
+        normals = (cube - core) / np.linalg.norm(cube - core, axis=2, keepdims=True)
+        row, column = divmod(number, DIE_FACES[1])
+        uvs = np.stack([(column + 0.5 + across / size) / DIE_FACES[1], (row + 0.5 - up / size) / DIE_FACES[0]], axis=2)
+        sides.append((*(a.reshape((n + 1) ** 2, -1) for a in (core + radius * normals, normals, uvs)), lattice))
+    return _join(sides)
 
 
 @_primitive
@@ -497,7 +531,7 @@ def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) 
 
 BUILDERS = {
     f.__name__: f
-    for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid, figure, flag, fish)
+    for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid, die, figure, flag, fish)
 }
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from blinkgl.config.scene import TEXTURE_KINDS
-from blinkgl.scene.geometry.primitives import parameter_hash
+from blinkgl.scene.geometry.primitives import DIE_FACES, parameter_hash
 from blinkgl.scene.types import Texture
 
 DARKEST, BRIGHTEST = 20, 240  # sRGB: radiance stays within about (0.007, 0.87)
@@ -23,7 +23,10 @@ def procedural_hash(kind: str, index: int) -> str:
 
 def procedural_texture(kind: str, index: int, size: int = 512) -> Texture:
     """The ``index``-th texture of a kind, (size, size, 3) uint8 sRGB; the same on every run."""
-    rng = np.random.default_rng([TEXTURE_KINDS.index(kind), index])
+    rng = np.random.default_rng([_ALL_KINDS.index(kind), index])
+    if kind == "pips":
+        image = _pips(rng, size)
+        return Texture(image=image, name=f"{kind}-{index}", source_hash=procedural_hash(kind, index))
     field = _FIELDS[kind](rng, size)
     image = _grade(field, _palette(rng), rng)
     return Texture(image=image, name=f"{kind}-{index}", source_hash=procedural_hash(kind, index))
@@ -186,6 +189,38 @@ def _bricks(rng, size):
     return np.where(mortar, 0.0, np.clip(tone, 0.2, 1)).astype(np.float32)
 
 
+_PIPS = ("4", "08", "048", "0268", "02468", "023568")
+"""Of the faces 1 to 6, on a lattice of three by three, numbered row by row."""
+
+
+_STUFFS = ((236, 226, 198), (196, 34, 40), (38, 38, 44), (32, 84, 176), (30, 128, 72), (226, 150, 34), (112, 52, 148))
+"""Ivory, red, black, blue, green, amber, violet."""
+
+
+def _pips(rng: np.random.Generator, size: int) -> np.ndarray:
+    """(size, size, 3) uint8: the six faces of a :func:`~blinkgl.scene.geometry.primitives.die`, of marbled stuff, the
+    pips light on dark or dark on light. One of the pools' kinds it is not: it makes sense on a die alone."""
+    base = np.array(_STUFFS[int(rng.integers(len(_STUFFS)))], float) * rng.uniform(0.85, 1.1, 3)
+    grain = rng.uniform(0.1, 0.4)
+    warped = _stretch(sum(0.6**k * _perlin_noise(rng, size, 8 * 2**k) for k in range(4)))
+    vein = 0.5 + 0.5 * np.sin(rng.uniform(4, 14) * warped)
+    stuff = np.clip((1 - grain * vein)[..., None] * base, DARKEST, BRIGHTEST)
+    light = float((stuff @ [0.299, 0.587, 0.114]).mean()) > 110
+    ink = np.full(3, 22.0) if light else np.full(3, 232.0)
+    rows, columns = DIE_FACES
+    at, soft = (np.arange(size) + 0.5) / size, rows / size  # soft: a texel's height in a face
+    for face, lattice in enumerate(_PIPS):
+        row, column = divmod(face, columns)
+        for r, c in (divmod(int(place), 3) for place in lattice):
+            v, u = at * rows - row - (0.27 + 0.23 * r), at * columns - column - (0.27 + 0.23 * c)
+            down, across = (np.flatnonzero(np.abs(d) < 0.1 + soft) for d in (v, u))
+            distance = np.hypot(v[down, None], u[None, across])
+            pip = np.clip((0.082 - distance) / soft + 0.5, 0, 1)[..., None]
+            patch = np.ix_(down, across)
+            stuff[patch] = stuff[patch] * (1 - pip) + ink * pip
+    return np.round(stuff).astype(np.uint8)
+
+
 _FIELDS = {
     "value": _value,
     "perlin": _perlin,
@@ -198,3 +233,4 @@ _FIELDS = {
     "bricks": _bricks,
 }
 assert tuple(_FIELDS) == TEXTURE_KINDS
+_ALL_KINDS = (*TEXTURE_KINDS, "pips")

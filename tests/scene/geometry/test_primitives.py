@@ -155,6 +155,35 @@ def test_every_parameter_is_documented():
     assert {name for kind in P.BUILDERS for name in P.parameters(kind)} == set(P.PARAMETERS)
 
 
+@pytest.mark.parametrize("rounding", [0.05, 0.12, 0.5])
+def test_a_die_is_a_rounded_cube_with_a_face_in_each_sixth_of_its_texture(rounding):
+    mesh = P.die(size=0.2, rounding=rounding)
+    assert mesh.closed
+    r, h = 0.2 * rounding, 0.1
+    core = np.clip(mesh.vertices, -(h - r), h - r)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - core, axis=1), r, rtol=1e-9)
+    np.testing.assert_allclose(mesh.vertices - core, r * mesh.normals, atol=1e-8)
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", across, corners.mean(axis=1)) > 0).all()
+    # Opposite faces are 7 together; not mirrored.
+    numbers = {}
+    for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1), (2, 1), (2, -1)):
+        inside = sign * mesh.normals[:, axis] > 0.999 if rounding < 0.5 else sign * mesh.normals[:, axis] > 0.9
+        u, v = mesh.uvs[inside].mean(axis=0)
+        numbers[axis, sign] = 1 + int(v * 2) * 3 + int(u * 3)
+    assert sorted(numbers.values()) == [1, 2, 3, 4, 5, 6]
+    assert all(numbers[axis, 1] + numbers[axis, -1] == 7 for axis in range(3))
+    uv = mesh.uvs[mesh.faces].astype(float)
+    e1, e2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    assert (-(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]) > -1e-9).all()
+
+
+def test_a_die_cannot_be_rounder_than_a_ball():
+    with pytest.raises(AssetError, match=r"die.rounding: bad parameter \(got 0.6\); expected at most 0.5"):
+        P.die(rounding=0.6)
+
+
 # --- where the texture lies, and how large bodies are -----------------------------------------------------------------
 
 TALL = {

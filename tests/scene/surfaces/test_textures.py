@@ -45,6 +45,23 @@ def test_a_texture_is_the_same_pattern_at_any_size(kind):
     assert procedural_texture(kind, 3, 8).image.shape == (8, 8, 3)
 
 
+def test_pips_are_those_of_a_die():
+    """As many as the face says, dark on light or light on dark; and no kind of the pools."""
+    for index in range(8):
+        image = procedural_texture("pips", index, 384).image.astype(float)
+        assert image.min() >= 15 and image.max() <= 245
+        luma = image @ [0.299, 0.587, 0.114]
+        ink = np.abs(luma - np.median(luma)) > 0.6 * np.abs(luma - np.median(luma)).max()
+        counts = []
+        for face in range(6):
+            r, c = divmod(face, 3)
+            part = ink[192 * r : 192 * (r + 1), 128 * c : 128 * (c + 1)].astype(np.uint8)
+            _, _, stats, _ = cv2.connectedComponentsWithStats(part)
+            counts.append(int((stats[1:, cv2.CC_STAT_AREA] > 100).sum()))
+        assert counts == [1, 2, 3, 4, 5, 6]
+    assert "pips" not in TEXTURE_KINDS
+
+
 def test_srgb_round_trip():
     codes = np.arange(256) / 255
     np.testing.assert_allclose(srgb_from_linear(linear_from_srgb(codes)), codes, atol=1e-5)

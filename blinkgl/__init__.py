@@ -15,6 +15,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "blinkgl.front.scenes": (
+        "Body",
         "Camera",
         "Keyframes",
         "Light",
@@ -63,7 +64,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         write_flow,
     )
     from blinkgl.front.runs import Timeline, generate, load, verify
-    from blinkgl.front.scenes import Camera, Keyframes, Light, Material, Mesh, Pose, Primitive, Scene, look_at
+    from blinkgl.front.scenes import Body, Camera, Keyframes, Light, Material, Mesh, Pose, Primitive, Scene, look_at
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
     from blinkgl.front.sequences import Recording, record, simulate_sequence
     from blinkgl.labels.frames import Flow, LabelFrame
@@ -72,6 +73,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
 __all__ = [
     "AssetError",
     "BlinkGLError",
+    "Body",
     "Camera",
     "ConfigError",
     "DvsVoltmeter",

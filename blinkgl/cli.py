@@ -1,6 +1,6 @@
 """The ``blinkgl`` command: thin functions over the library, one line per error.
 
-Exit status: 0 done; 1 `shader diff` or `shader check` found something wrong; 2 the user's input or machine
+Exit status: 0 done; 1 `shader diff`, `shader check` or `qualify` found something wrong; 2 the user's input or machine
 (``error: …`` on stderr, one line); 3 done but for sequences that were set aside; 130 interrupted. A traceback means a
 bug in BlinkGL, or ``--debug``. What a command does and prints is ``blinkgl.show.COMMAND.run``, which returns the
 status; it is imported inside the function, so that ``--help`` answers at once.
@@ -156,6 +156,26 @@ def explain(
 
 
 @app.command()
+def qualify(
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="SOURCE...", help="Folders of frames, or one YAML file with frames: in it."),
+    ],
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="a.b=c", help="Override a value, such as frames.flow=null; may be repeated."),
+    ] = None,
+    pairs: Annotated[bool, typer.Option("--pairs", help="A row for every pair of frames.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Machine-readable output.")] = False,
+) -> int:
+    """Say which folders of frames are fit to be interpolated, and why the others are not.
+    Writes nothing. Exit status 1: some are not."""
+    from blinkgl.show import qualify as command
+
+    return command.run(sources, overrides=overrides or [], pairs=pairs, as_json=as_json)
+
+
+@app.command()
 def trade(
     config: Annotated[str, typer.Argument(help="YAML file; see configs/ for examples.")],
     out: Annotated[
@@ -250,7 +270,12 @@ def export(
 
 @app.command()
 def simulate(
-    source: Annotated[str, typer.Argument(metavar="INPUT", help="Video, folder of images, .npy or .npz of frames.")],
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="INPUT", help="Video, folder of images, .npy or .npz of frames, .aedat4 or .aedat with frames."
+        ),
+    ],
     out: Annotated[
         str, typer.Option("--out", "-o", help="Event file: .h5 (DSEC), .raw (EVT3), .aedat4, .txt, .csv, .npz, .npy.")
     ],
@@ -347,7 +372,8 @@ def convert(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="IN", help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .txt, .csv, .npz, .npy."
+            metavar="IN",
+            help="Event file: DSEC/BlinkFlow/MVSEC .h5, EVT2/EVT3 .raw, .aedat4, .aedat, .txt, .csv, .npz, .npy.",
         ),
     ],
     target: Annotated[str, typer.Argument(metavar="OUT", help="Event file; its ending names the format.")],

@@ -21,6 +21,7 @@ class Role(IntEnum):
     TEXTURE = 3
     EVENTS = 4
     PHYSICS = 5
+    SHAPE = 6
 
 
 def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:

@@ -351,3 +351,31 @@ def test_wrong_calls_name_the_argument(where, call, tmp_path):
     assert line.startswith(where.format(d=tmp_path) + ": ") and "\n" not in line, line
     assert len(line) < 400 and "pydantic" not in line
     assert list(tmp_path.iterdir()) == [], "half-written"
+
+
+# --- what falls -------------------------------------------------------------------------------------------------------
+
+
+def test_bodies_fall_as_those_of_yaml_do():
+    """The same tree, whichever object is added first; gravity is of no effect while nothing falls."""
+    pytest.importorskip("mujoco")
+    table = blinkgl.Primitive("grid", width=9.0, depth=9.0, category="ground", body=blinkgl.Body("fixed", friction=0.8))
+    die = blinkgl.Primitive("die", pose=(2, 0, 1), scale=0.2, body=blinkgl.Body(velocity=(0.5, 0, 0), spin=(0, 300, 0)))
+    still = blinkgl.Scene(blinkgl.Camera(32, 24), duration=0.5, gravity=(0, 0, -1.62)) + table
+    assert "physics" not in still.tree and "physics" not in still.tree["objects"][0]
+    scene = still + die
+    assert (
+        scene.tree["physics"] == {"gravity": [0, 0, -1.62]} and scene.tree["objects"][0]["physics"]["kind"] == "fixed"
+    )
+    built = scene.build(scene.template().sequence(0))
+    assert built.dynamics.bodies == 1
+    end = built.objects[1].path.pose(500_000_000)[:3, 3]
+    np.testing.assert_allclose(end, [2.25, 0, 1 - 0.81 * 0.25], atol=1e-6)
+    again = build_scene(
+        scene.template().sequence(0).scene, scene.template().sequence(0).camera, built.t0_ns, built.t1_ns
+    )
+    assert again.dynamics == built.dynamics
+    with pytest.raises(blinkgl.ConfigError, match=r"Body.restitution: too large \(got 2\)"):
+        blinkgl.Body(restitution=2)
+    with pytest.raises(blinkgl.ConfigError, match=r"Primitive.body: .* a Body"):
+        blinkgl.Primitive("cuboid", body=3.0)

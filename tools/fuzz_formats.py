@@ -149,6 +149,42 @@ def _judge_events(name: str) -> Callable[[Path], str | None]:
     return judge
 
 
+def _make_aedat2(folder: Path) -> list[str]:
+    """Events, two frames of a part of the sensor, and samples of the inertial unit."""
+    e = _events()
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(30, 42), np.arange(20, 28), indexing="ij"))
+    place = 1 << 31 | y << 22 | x << 12
+    parts = [
+        ((127 - e.y.astype(np.int64)) << 22 | (127 - e.x.astype(np.int64)) << 12 | e.p.astype(np.int64) << 11, e.t)
+    ]
+    for k in range(2):
+        for read, value, begin in ((0, 900, 1000), (1, 300 + 100 * k, 9000)):
+            parts.append((place | read << 10 | value, 20_000 * k + begin + np.arange(len(place))))
+    for k in range(20):
+        which = np.arange(7)
+        parts.append((1 << 31 | which << 28 | (100 * which + k) << 12 | 3 << 10, np.full(7, 2000 * k)))
+    address, t = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+    order = np.argsort(t, kind="stable")
+    lines = ("#!AER-DAT2.0", "# AEChip: eu.seebetter.ini.chips.davis.DAVIS128", "# End Of ASCII Header")
+    head = "".join(f"{line}\r\n" for line in lines).encode()
+    (folder / "e.aedat").write_bytes(head + np.stack([address, t], 1)[order].astype(">u4").tobytes())
+    return ["e.aedat"]
+
+
+def _judge_aedat2(folder: Path) -> str | None:
+    from blinkgl.io.formats import open_events
+
+    if problem := _judge_events("e.aedat")(folder):
+        return problem
+    with open_events(folder / "e.aedat") as file:
+        frames, imu = list(file.frames()), file.imu()
+    if any(f.image.shape != (file.height, file.width) or f.image.max() > 1023 or f.end_us < f.begin_us for f in frames):
+        return "a frame of another size, of more than ten bits, or that ends before it begins"
+    if (np.diff(imu.t) < 0).any() or not (np.isfinite(imu.acceleration).all() and np.isfinite(imu.rate).all()):
+        return "samples of the inertial unit that run backwards, or are not finite"
+    return None
+
+
 # ---- flow, labels, frames --------------------------------------------------------------------------------------------
 
 
@@ -936,6 +972,12 @@ FORMATS: tuple[Format, ...] = (
         (*m.BLIND, m.token, *[m.fields(m.words_layout(2))] * 5),
     ),
     Format("events aedat4", _write_events("e.aedat4"), _judge_events("e.aedat4"), m.BLIND, "dv_processing"),
+    Format(
+        "events aedat2",
+        _make_aedat2,
+        _judge_aedat2,
+        (*m.BLIND, m.token, *[m.fields(m.words_layout(4, b"Header\r\n"))] * 5),
+    ),
     Format("flow png dsec", _make_flow_png(128.0), _judge_flow_png(128.0, 256), _PNG),
     Format("flow png kitti", _make_flow_png(64.0), _judge_flow_png(64.0, 512), _PNG),
     Format("flow flo", _make_flo, _judge_flo, (*m.BLIND, *[m.fixed((0, "<f"), (4, "<I"), (8, "<I"))] * 4)),

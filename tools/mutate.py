@@ -677,7 +677,14 @@ class ByName:
         )
         files = {path.relative_to(ROOT).as_posix(): path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
         order = sorted(files, key=lambda f: (len(slow.findall(files[f])), f))
-        self.texts = {file: files[file] for file in order}  # quick ones first
+        self.texts = {file: files[file] + self._tools(files[file]) for file in order}  # quick ones first
+
+    @staticmethod
+    def _tools(text: str) -> str:
+        """The programs of ``tools/`` that a test file imports: what they name is tested by it."""
+        names = re.findall(r"from blinkgl\.tools(?:\.(\w+))? import ([\w, ]+)", text)
+        tools = {ROOT / "tools" / f"{a or b}.py" for a, named in names for b in re.split(r",\s*", named)}
+        return "".join(path.read_text() for path in sorted(tools) if path.exists())
 
     def tests(self, mutant: Mutant) -> list[str]:
         path, text = Path(mutant.path), (ROOT / mutant.path).read_text()
@@ -696,7 +703,8 @@ class ByName:
             inside = file.startswith(f"tests/{path.parts[1]}/")
             if not inside and not re.search(rf"from blinkgl\.{path.parts[1]}\b", self.texts[file]):
                 return 9
-            return 1 if mentions and mentions.search(self.texts[file]) else 2 if inside else 3
+            of_all = len(Path(file).parts) == 2  # golden numbers and the like
+            return 1 if of_all or (mentions and mentions.search(self.texts[file])) else 2 if inside else 3
 
         ranks = {file: rank(file) for file in self.texts if not self._peer(file)}
         looking = [test for test in LOOKERS if _on_import(mutant)]
@@ -946,7 +954,7 @@ class Copy:
             path.write_bytes(source)
         if outcome == "failed" and "::" in failed and not self.passes(failed):
             return self.judge(mutant, reach)  # it fails in a copy whatever the source says: it has no say
-        if outcome == "failed" and not failed and self.run(tests, 60, most_s=reach.most_s)[0] != "passed":
+        if outcome == "failed" and not failed and self.run(tests, 60, most_s=reach.most_s) == ("failed", ""):
             return {**result, "outcome": "broken"}  # the process died, and does so without the mutant
         return {
             **result,

@@ -6,14 +6,22 @@ Lengths are in parts of the mesh's own size, so that one setting suits any mesh.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
-from blinkgl.config.base import Family, Members, Refused, rule
+from blinkgl.config.base import Config, Family, Members, Refused, rule
+from blinkgl.config.trajectory import as_pair, ordered
+
+if TYPE_CHECKING:
+    import numpy as np
 
 Axis = Literal["x", "y", "z"]
 Period = Annotated[float, Field(ge=0.001, le=1e6, description="s of one oscillation")]
+_Strength = Annotated[float, Field(ge=0, le=10)]
+_Period = Annotated[float, Field(ge=0.001, le=1e6)]
+StrengthRange = Annotated[tuple[_Strength, _Strength], BeforeValidator(as_pair), AfterValidator(ordered)]
+PeriodRange = Annotated[tuple[_Period, _Period], BeforeValidator(as_pair), AfterValidator(ordered)]
 Phase = Annotated[float, Field(ge=-360, le=360, description="degrees of the oscillation at time 0")]
 
 
@@ -22,6 +30,17 @@ class DeformConfig(Family):
     argument without a default."""
 
     members: ClassVar[Members[DeformConfig]] = Members("kind", default="wave")
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
+        """One of the kind for a random world. strength : of its motion, 1: what its defaults are.   period : s."""
+        given = {"period": period, "phase": float(rng.uniform(-180, 180))}
+        return cls(**{key: value for key, value in given.items() if key in cls.model_fields})
+
+
+def _two_axes(rng: np.random.Generator) -> tuple[str, str]:
+    first, second = rng.permutation(3)[:2]
+    return "xyz"[first], "xyz"[second]
 
 
 def _across(along: str, towards: str) -> None:
@@ -42,6 +61,13 @@ class WaveConfig(DeformConfig):
 
     _axes = rule("along", "towards")(_across)
 
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
+        (along, towards), wavelength = _two_axes(rng), float(rng.uniform(0.5, 1.5))
+        given = super().drawn(rng, strength, period).model_dump()
+        amplitude = min(0.08 * strength, 1.0)
+        return cls(**given | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
+
 
 class FlagConfig(DeformConfig):
     """Cloth in wind: held at its low end of ``along``, waving the more the further from it, with a second, shorter
@@ -59,6 +85,13 @@ class FlagConfig(DeformConfig):
 
     _axes = rule("along", "towards")(_across)
 
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
+        (along, towards), wavelength = _two_axes(rng), float(rng.uniform(0.6, 1.2))
+        given = super().drawn(rng, strength, period).model_dump()
+        amplitude = min(0.12 * strength, 1.0)
+        return cls(**given | {"along": along, "towards": towards, "amplitude": amplitude, "wavelength": wavelength})
+
 
 class TwistConfig(DeformConfig):
     """To and fro about an axis, the more the further from one end."""
@@ -71,6 +104,12 @@ class TwistConfig(DeformConfig):
     )
     period: Period = 2.0
     phase: Phase = 0.0
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
+        along, held = "xyz"[rng.integers(3)], float(rng.random())
+        given = super().drawn(rng, strength, period).model_dump()
+        return cls(**given | {"along": along, "held": held, "angle": min(60.0 * strength, 720.0)})
 
 
 class BendConfig(DeformConfig):
@@ -88,6 +127,12 @@ class BendConfig(DeformConfig):
 
     _axes = rule("along", "towards")(_across)
 
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
+        (along, towards), held = _two_axes(rng), float(rng.random())
+        given = super().drawn(rng, strength, period).model_dump()
+        return cls(**given | {"along": along, "towards": towards, "held": held, "angle": min(35.0 * strength, 180.0)})
+
 
 class BreatheConfig(DeformConfig):
     """Larger and smaller about the middle."""
@@ -102,6 +147,56 @@ class BreatheConfig(DeformConfig):
     )
     period: Period = 1.5
     phase: Phase = 0.0
+
+    @classmethod
+    def drawn(cls, rng: np.random.Generator, strength: float, period: float) -> DeformConfig:
+        amount = tuple(min(0.12 * strength, 0.9) * float(part) for part in rng.uniform(-1, 1, 3))
+        return cls(**super().drawn(rng, strength, period).model_dump() | {"amount": amount})
+
+
+class ClipConfig(Config):
+    """One clip of a glTF file, and how it runs."""
+
+    clip: str | int = Field(0, description="name or index of the animation")
+    file: str | None = Field(
+        None,
+        description="another gltf or glb file to take the clip from, whose joints have the same names; null: the same",
+    )
+    speed: float = Field(1.0, ge=-100, le=100, description="of the clip's own; negative: backwards")
+    phase: float = Field(0.0, ge=-1e6, le=1e6, description="s of the clip at time 0")
+    loop: bool = Field(True, description="begins again at its end; false: held before its first and after its last key")
+
+
+class AnimationConfig(ClipConfig):
+    """A clip, or two at once."""
+
+    blend: ClipConfig | None = Field(None, description="a second clip, mixed with the first joint by joint")
+    share: float = Field(0.5, ge=0, le=1, description="of the second clip in the mixture")
+
+
+def animation_of(value: str | int | AnimationConfig | None, loop: bool = True) -> AnimationConfig | None:
+    """A clip's name or index as what it stands for."""
+    return AnimationConfig(clip=value, loop=loop) if isinstance(value, (str, int)) else value
+
+
+class RandomDeformConfig(Config):
+    """The share of a random world's objects that change their shapes, by formula."""
+
+    share: float = Field(0.0, ge=0, le=1, description="fraction of the objects")
+    kinds: tuple[str, ...] = Field((), description="kinds of ``deform`` that are drawn, with equal chances; []: all")
+    strength: StrengthRange = Field((0.5, 1.5), description="of the motion, 1: the defaults of each kind; uniform")
+    period: PeriodRange = Field((0.5, 3.0), description="s of one oscillation; log-uniform")
+
+    @rule("kinds")
+    def _known(kinds: tuple[str, ...]):
+        for number, kind in enumerate(kinds):
+            if kind not in DeformConfig.members.models:
+                raise Refused(
+                    "no such kind of deformation",
+                    where=f"kinds.{number}",
+                    value=kind,
+                    accepted="one of: " + ", ".join(DeformConfig.members.models),
+                )
 
 
 for _member in (WaveConfig, FlagConfig, TwistConfig, BendConfig, BreatheConfig):

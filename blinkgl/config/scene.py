@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from blinkgl.config.base import Config, Refused, one_of, rule
-from blinkgl.config.deform import DeformConfig
+from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig, RandomPhysicsConfig
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 
@@ -119,6 +119,7 @@ class ObjectsConfig(Config):
     texture_scale: PositiveRange = Field(
         (0.7, 2.0), description="texture repeats over an object's texture coordinates; log-uniform"
     )
+    deform: RandomDeformConfig = RandomDeformConfig()
 
 
 class PoolConfig(Config):
@@ -147,6 +148,9 @@ class PoolConfig(Config):
     max_file_mb: float = Field(512.0, gt=0, description="a larger mesh file is refused unread")
     test_fraction: Fraction = Field(0.1, description="fraction of meshes kept for split 'test', chosen by content hash")
     keep_materials: bool = Field(False, description="use the meshes' own colours and textures where they have any")
+    animation: Literal["random", "rest"] = Field(
+        "random", description="what a file with animations does: it plays one of them, looped, or keeps its rest shape"
+    )
     bad_assets: Literal["error", "skip"] = Field("error", description="skip logs an unusable mesh and draws another")
 
 
@@ -366,14 +370,11 @@ class WayConfig(Config):
     level: bool = Field(True, description="its z axis stays up; false: its x axis goes up and down with the way")
     start: Fraction = Field(0.0, description="share of the way that lies behind it at time 0")
 
-    @rule("points", "closed")
+    @rule("#points", "closed")
     def _a_way(points, closed):
         least = 3 if closed else 2
         if len(points) < least:
             raise Refused(f"a way needs {least} points or more", where="points", value=len(points))
-        for k, (a, b) in enumerate(zip(points, [*points[1:], points[0]] if closed else points[1:])):
-            if max(abs(p - q) for p, q in zip(a, b)) < 1e-6:
-                raise Refused("must differ from the next point", where=f"points.{k}", value=list(a))
 
 
 class MeshConfig(Config):
@@ -448,12 +449,14 @@ class ObjectConfig(KeyedMotionConfig):
     category: Literal["object", "ground", "wall", "sky"] = Field(
         "object", description="what it is: collisions and drawing order"
     )
+    animation: str | int | AnimationConfig | None = Field(
+        None, description="clip of the mesh's gltf or glb file that it plays, looped; null: the file's rest shape"
+    )
     physics: BodyConfig | None = Field(
         None,
         description="what it is to the engine of a scene with physics; null: it is in the way, where it stands "
         "or moves",
     )
-
     deform: DeformConfig | None = Field(
         None,
         description="how its shape changes with time, by formula, whatever it does by itself; null: it is rigid, but "
@@ -567,7 +570,9 @@ class FileSceneConfig(Config):
     intrinsics: Literal["config", "file"] = Field(
         "config", description="focal length from the YAML's camera or from the file's (yfov)"
     )
-    animation: str | int | None = Field(0, description="name or index of the animation played; null: none")
+    animation: str | int | AnimationConfig | None = Field(
+        0, description="name or index of the animation played, at the file's own times; null: none"
+    )
     light: LightConfig = LightConfig()
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")

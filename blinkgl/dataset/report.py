@@ -108,12 +108,20 @@ class Totals:
         }
 
 
+_NOT_SAID_AS_NULL = ("frames", "physics", "deform")
+"""Keys of what came later than the first data sets: a sequence without it has the bytes that it had."""
+
+
 def config_yaml(config: SequenceConfig, index: int) -> str:
     """The resolved configuration as YAML; ``blinkgl generate`` takes it and makes this one sequence again."""
     tree = json.loads(config.model_dump_json())
     tree["output"].update(first_index=index, sequences=1)
-    if tree.get("frames") is None:
-        tree.pop("frames", None)
+    scene = tree.get("scene") or {}
+    objects = scene.get("objects")
+    for table in (tree, scene, *(objects if isinstance(objects, list) else ())):
+        for key in _NOT_SAID_AS_NULL:
+            if table.get(key, ...) is None:
+                del table[key]
     return (
         f"# BlinkGL {blinkgl.__version__}, sequence {index}: every value as drawn.\n"
         "# Relative paths start from the folder of the run's own configuration file.\n" + to_yaml(tree)

@@ -208,7 +208,8 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             cap = min(np.int64(farthest * v.inverse_threshold) + 2, v.bound_per_pixel)
             if count * cap > share:
                 cap = max(1, share // count)
-            # No room for the worst case; nothing of this block has been touched: the caller makes room and comes back to it.
+            # No room for the worst case; nothing of this block has been touched: the caller makes room and comes
+            # back to it.
             if filled + count * cap > packed.size:
                 return block, filled, cut
             filled, cut_here = _emit_block(active, count, s, now, p, v, cap, packed, filled, None, None)

@@ -25,7 +25,8 @@ _SIDE = 65535
 def open_events(path: str | os.PathLike) -> EventFile:
     """An event file for reading in pieces: ``with open_events(path) as file: for events in file.chunks(): …``;
     ``height``, ``width`` in px, None where the file does not say (``file.sized()`` finds out), times in µs. Endings:
-    .h5 .hdf5 .raw .aedat4 .txt .csv .npz .npy.
+    .h5 .hdf5 .raw .aedat4 .aedat .txt .csv .npz .npy. Of .aedat4 and .aedat also ``file.frames()``, the camera's own
+    frames, and ``file.imu()``, its inertial unit (docs/formats.md).
 
     Raises AssetError: missing, unknown ending, or not what the ending says."""
     return formats.open_events(check.path(path, "path"))

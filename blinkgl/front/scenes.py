@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blinkgl.config.base import Config, validate
+from blinkgl.config.physics import BodyConfig, PhysicsConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
     KeyedMotionConfig,
@@ -226,7 +227,44 @@ def _texture(image: Any) -> data.Texture:
     return data.Texture(pixels, "image", content_hash(str((pixels.dtype, pixels.shape)).encode(), pixels.tobytes()))
 
 
-class _Body(_Piece):
+class Body(_Piece):
+    """What falls, or is fallen on: ``Primitive("cuboid", body=Body(velocity=(1, 0, 2)))`` (docs/scenes.md, "Dynamics").
+
+    kind : "dynamic" falls; "fixed" stays, or goes its way, whatever hits it; "none" is not there.
+    shape : what touches, "auto", "hull", "box" or "sphere".   mass : kg, or by density : kg/m³ (default 700).
+    friction : Coulomb's coefficient.   rolling : the same of rolling, of the radius.
+    restitution : share of the speed that an impact leaves.
+    velocity : (3,) m/s, of the centre of mass at the start.   spin : (3,) degrees/s about the world's axes.
+    Raises ConfigError; no MuJoCo, and bodies inside each other, are found when the scene is built."""
+
+    def __init__(
+        self,
+        kind: Literal["dynamic", "fixed", "none"] = "dynamic",
+        *,
+        shape: Literal["auto", "hull", "box", "sphere"] = "auto",
+        mass: float | None = None,
+        density: float | None = None,
+        friction: float = 0.5,
+        rolling: float = 0.01,
+        restitution: float = 0.5,
+        velocity: Vector = (0.0, 0.0, 0.0),
+        spin: Vector = (0.0, 0.0, 0.0),
+    ):
+        tree = check.given(
+            kind=kind,
+            shape=shape,
+            mass=mass,
+            density=density,
+            friction=friction,
+            rolling=rolling,
+            restitution=restitution,
+            velocity=velocity,
+            spin=spin,
+        )
+        self.tree = self._checked(BodyConfig, tree)
+
+
+class _Object(_Piece):
     """What primitives and meshes share: an object of the scene, its mesh and its material."""
 
     mesh: dict[str, Any]
@@ -239,6 +277,7 @@ class _Body(_Piece):
         pose: Pose | Keyframes | Vector,
         scale: float | Vector,
         category: str,
+        body: Body | None,
     ) -> dict[str, Any]:
         kind = type(self).__name__
         self.material = None if material is None else check.one_of(material, f"{kind}.material", Material, "a Material")
@@ -247,10 +286,12 @@ class _Body(_Piece):
             **check.given(name=name, scale=scale, category=category),
             **_motion(pose, f"{kind}.pose"),
         }
+        if body is not None:
+            tree["physics"] = check.one_of(body, f"{kind}.body", Body, "a Body").tree
         return self._checked(ObjectConfig, tree)
 
 
-class Primitive(_Body):
+class Primitive(_Object):
     """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid.
 
     parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``
@@ -258,6 +299,7 @@ class Primitive(_Body):
     material : :class:`Material`, default white.   scale : one factor, or (3,).
     pose : :class:`Pose`, :class:`Keyframes` or a position (3,).
     name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
+    body : what it is where things fall, :class:`Body`; None: in the way.
     Raises ConfigError."""
 
     def __init__(
@@ -269,6 +311,7 @@ class Primitive(_Body):
         scale: float | Vector = 1.0,
         name: str | None = None,
         category: Literal["object", "ground", "wall", "sky"] = "object",
+        body: Body | None = None,
         **parameters: float | Vector,
     ):
         check.one_of(kind, "Primitive.kind", str, "the name of a shape")
@@ -281,18 +324,18 @@ class Primitive(_Body):
             raise ConfigError(
                 error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted
             ) from None
-        self.tree = self._placed(name, material if material is not None else Material(), pose, scale, category)
+        self.tree = self._placed(name, material if material is not None else Material(), pose, scale, category, body)
         self.tree.setdefault("name", kind)
 
 
-class Mesh(_Body):
+class Mesh(_Object):
     """A body from a file, ``Mesh("chair.glb")``, or from triangles, ``Mesh(vertices=v, faces=f)``.
 
     file : obj, ply, stl, glb or gltf.   up : the file's axis that points up, "auto", "y" or "z".
     vertices : (V, 3) m, body axes.   faces : (F, 3) indices, counter-clockwise seen from outside.
     uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
     material : :class:`Material`; default: the file's own, or white.   pose, scale, name,
-    category : as of :class:`Primitive`.
+    category, body : as of :class:`Primitive`.
     Raises ConfigError; a missing or damaged file raises when the scene is built."""
 
     def __init__(
@@ -308,6 +351,7 @@ class Mesh(_Body):
         scale: float | Vector = 1.0,
         name: str | None = None,
         category: Literal["object", "ground", "wall", "sky"] = "object",
+        body: Body | None = None,
     ):
         if (file is None) == (vertices is None) or (vertices is None) != (faces is None):
             raise ConfigError("give a file, or vertices and faces", where="Mesh.file", value=file)
@@ -317,7 +361,7 @@ class Mesh(_Body):
             # The model wants a shape or a file; explicit_scene is given these triangles under the mesh's name.
             self.mesh, self.triangles = {"primitive": "grid"}, _triangles(vertices, faces, uvs)
             material = material if material is not None else Material()
-        self.tree = self._placed(name, material, pose, scale, category)
+        self.tree = self._placed(name, material, pose, scale, category, body)
         self.tree.setdefault("name", "mesh" if file is None else Path(file).stem)
 
 
@@ -350,7 +394,8 @@ class Scene(_Piece):
     light : :class:`Light`.   background : linear radiance where nothing is hit.
     duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label
     interval after ``start``, so that a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
-    collisions : stop what collides where it does.   seed : of the sensor's noise.
+    collisions : stop what collides where it does.   gravity : (3,) m/s², of no effect while no object is a dynamic
+    :class:`Body`.   seed : of the sensor's noise.
     Raises ConfigError."""
 
     def __init__(
@@ -364,14 +409,16 @@ class Scene(_Piece):
         label_rate: float = 10.0,
         start: float = 0.0,
         collisions: bool = False,
+        gravity: Vector = (0.0, 0.0, -9.81),
         seed: int = 0,
     ):
         self.camera = Camera() if camera is None else check.one_of(camera, "Scene.camera", Camera, "a Camera")
         self.light = Light() if light is None else check.one_of(light, "Scene.light", Light, "a Light")
         self.objects = tuple(check.one_of(objects, "Scene.objects", (list, tuple), "a list of Primitive and Mesh"))
         for k, body in enumerate(self.objects):
-            check.one_of(body, f"Scene.objects[{k}]", _Body, "a Primitive or a Mesh")
+            check.one_of(body, f"Scene.objects[{k}]", _Object, "a Primitive or a Mesh")
         self._plain = {"background": check.plain(background), "collisions": check.plain(collisions)}
+        self._gravity = self._checked(PhysicsConfig, {"gravity": check.plain(gravity)})
         self._run = {
             "seed": check.plain(seed),
             "time": {
@@ -385,8 +432,11 @@ class Scene(_Piece):
         named, meshes, materials = [], {}, {}
         self._memory = InMemory()
         taken: set[str] = set()
+        falls = any(body.tree.get("physics", {}).get("kind") == "dynamic" for body in self.objects)
         for k, body in enumerate(self.objects):
             item = {**body.tree, "mesh": f"mesh{k}"}
+            if not falls:
+                item.pop("physics", None)
             item["name"] = item["name"] if item["name"] not in taken else f"{item['name']}#{k}"
             taken.add(item["name"])
             meshes[f"mesh{k}"] = body.mesh
@@ -406,16 +456,18 @@ class Scene(_Piece):
             "camera": self.camera.motion,
             "light": self.light.tree,
             **self._plain,
+            **({"physics": self._gravity} if falls else {}),
         }
         if named:
             self._checked(ExplicitSceneConfig, self.tree)
 
     def __add__(self, body: Primitive | Mesh) -> Scene:
-        check.one_of(body, "Scene + …", _Body, "a Primitive or a Mesh")
+        check.one_of(body, "Scene + …", _Object, "a Primitive or a Mesh")
         return Scene(
             self.camera,
             (*self.objects, body),
             light=self.light,
+            gravity=self._gravity["gravity"],
             seed=self._run["seed"],
             **self._plain,
             **self._run["time"],

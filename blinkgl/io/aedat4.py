@@ -21,6 +21,7 @@ from blinkgl.events.types import Events
 from blinkgl.io import aedat4_decode
 from blinkgl.io.atomic import output_errors
 from blinkgl.io.columns import check_events, check_size, events_of
+from blinkgl.io.davis import CameraFrame, ImuSamples
 from blinkgl.machine.extras import install
 
 MAGIC = b"#!AER-DAT4"
@@ -35,7 +36,9 @@ def _missing(error: type[BlinkGLError], path) -> BlinkGLError:
 
 
 class Aedat4Reader:
-    """The event stream of a recording; times are the file's own int64 µs (usually since 1970)."""
+    """The streams of a recording; times are the file's own int64 µs (usually since 1970).
+
+    height, width : px of the events' sensor. Raises AssetError: no AEDAT4, damaged, no stream of what is asked for."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
@@ -64,6 +67,32 @@ class Aedat4Reader:
         if pending:
             yield Events.concatenate(pending)
 
+    def frames(self) -> Iterator[CameraFrame]:
+        """Frames in their order, uint8, RGB where they have colours; one in memory at a time."""
+        last = None
+        with contextlib.closing(_Decoder(self.path, "frames")) as decoder:
+            for number, (row, image) in enumerate(decoder.pictures()):
+                begin, end = int(row["begin"]), int(row["end"])
+                if not (last is None or begin > last) or end < begin:
+                    raise EventDataError(
+                        f"times of frame {number} do not increase", where=str(self.path), value=(last, begin, end)
+                    )
+                last = begin
+                yield CameraFrame(image, begin, end)
+
+    def imu(self) -> ImuSamples:
+        """All samples of the inertial unit."""
+        with contextlib.closing(_Decoder(self.path, "imu")) as decoder:
+            rows = np.concatenate([np.empty(0, aedat4_decode.IMU), *decoder])
+        if (back := np.diff(rows["t"]) < 0).any():
+            i = int(np.argmax(back))
+            raise EventDataError(
+                f"times run backwards at sample {i + 1} of the inertial unit",
+                where=str(self.path),
+                value=(int(rows["t"][i]), int(rows["t"][i + 1])),
+            )
+        return ImuSamples(*(np.ascontiguousarray(rows[name]) for name in ("t", "acceleration", "rate", "temperature")))
+
     def close(self) -> None:
         if self._decoder is not None:
             self._decoder.close()
@@ -74,26 +103,43 @@ class _Decoder:
     """dv-processing in a process of its own, :mod:`blinkgl.io.aedat4_decode`: damaged bytes crash it or keep it busy
     for ever. Iterating yields its arrays. Raises AssetError."""
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, stream: str = "events"):
+        self.path, self._row = path, aedat4_decode.ROWS[stream]
         if importlib.util.find_spec("dv_processing") is None:
             raise _missing(AssetError, path)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         self._process = subprocess.Popen(
-            [sys.executable, aedat4_decode.__file__, os.fspath(path)],
+            [sys.executable, aedat4_decode.__file__, os.fspath(path), stream],
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             stdin=subprocess.DEVNULL,
             env=environment,
         )
         self._finalizer = weakref.finalize(self, _end, self._process)
-        self.size: tuple[int, int] = tuple(self._line()["size"])
+        size = self._line()["size"]
+        self.size: tuple[int, int] = (0, 0) if size is None else tuple(size)
 
     def __iter__(self) -> Iterator[np.ndarray]:
         while (count := int(np.frombuffer(self._read(8), np.int64)[0])) >= 0:
             if count:
-                yield np.frombuffer(self._read(count * aedat4_decode.ROW.itemsize), aedat4_decode.ROW)
+                yield np.frombuffer(self._read(count * self._row.itemsize), self._row)
         self._line()
+
+    def pictures(self) -> Iterator[tuple[np.void, np.ndarray]]:
+        """Rows of frames, and their pictures."""
+        for rows in self:
+            row = rows[0]
+            height, width, channels = (int(row[name]) for name in ("height", "width", "channels"))
+            if channels not in (1, 3) or row["bytes"] != 1:
+                raise AssetError(
+                    "frames of another kind",
+                    where=str(self.path),
+                    value=f"{channels} channels of {int(row['bytes'])} bytes",
+                    accepted="1 or 3 channels of 8 bits",
+                )
+            flat = np.frombuffer(self._read(height * width * channels), np.uint8)
+            image = flat.reshape((height, width) if channels == 1 else (height, width, channels))
+            yield row, image.copy() if channels == 1 else np.ascontiguousarray(image[..., ::-1])  # OpenCV's BGR
 
     def close(self) -> None:
         self._finalizer()
@@ -103,6 +149,9 @@ class _Decoder:
         if not line.endswith(b"\n"):
             self._died()
         said = json.loads(line)
+        if "absent" in said:
+            self.close()
+            raise AssetError(f"{said['absent']} in the recording", where=str(self.path))
         if "problem" in said:
             self.close()
             raise AssetError(f"damaged AEDAT4 file: {said['problem']}", where=str(self.path))

@@ -6,6 +6,7 @@
 | mvsec | .hdf5 .h5 | x | |
 | evt3, evt2 | .raw | x | x (.raw is EVT3; EVT2 by name) |
 | aedat4 (extra [formats]) | .aedat4 | x | x |
+| aedat2 (jAER, DAVIS cameras) | .aedat | x | |
 | text, csv | .txt .csv | x | x |
 | npz, npy | .npz .npy | x | x |
 """
@@ -14,7 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,12 +26,14 @@ from blinkgl.errors import AssetError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file
 from blinkgl.io.columns import check_events, check_size
+from blinkgl.io.davis import CameraFrame, ImuSamples
 
 ENDINGS = {
     ".h5": "dsec",
     ".hdf5": "dsec",
     ".raw": "evt3",
     ".aedat4": "aedat4",
+    ".aedat": "aedat2",
     ".txt": "text",
     ".csv": "csv",
     ".npz": "npz",
@@ -77,6 +80,25 @@ class EventFile:
             count += len(events)
             if len(events):
                 yield events
+
+    def frames(self) -> Iterator[CameraFrame]:
+        """What the camera's own frames show, one in memory at a time. AssetError: the format, or the recording, has
+        none; damaged. EventDataError: times that do not increase."""
+        return self._stream("frames")()
+
+    def imu(self) -> ImuSamples:
+        """The samples of the camera's inertial unit. Raises as :meth:`frames`."""
+        return self._stream("imu")()
+
+    def _stream(self, name: str) -> Callable[[], Any]:
+        stream = getattr(self._reader, name, None)
+        if stream is None:
+            raise AssetError(
+                f"{self.format} files hold events alone",
+                where=str(self.path),
+                accepted="an .aedat4 or .aedat recording",
+            )
+        return stream
 
     def close(self) -> None:
         """Lets go of the file (only HDF5's stay open between reads)."""
@@ -132,6 +154,10 @@ def open_events(path: str | os.PathLike) -> EventFile:
         from blinkgl.io.aedat4 import Aedat4Reader
 
         reader = Aedat4Reader(path)
+    elif kind == "aedat2":
+        from blinkgl.io.aedat2 import Aedat2Reader
+
+        reader = Aedat2Reader(path)
     elif kind in ("text", "csv"):
         from blinkgl.io.text import TextReader
 
@@ -151,7 +177,7 @@ def output_format(path: str | os.PathLike, format: str | None = None) -> str:
             "unknown event format" if format else "unknown event file ending",
             where=str(path),
             value=format or Path(path).suffix,
-            accepted=", ".join(WRITABLE if format else ENDINGS),
+            accepted=", ".join(WRITABLE if format else (end for end, kind in ENDINGS.items() if kind in WRITABLE)),
         )
     return kind
 

@@ -16,6 +16,7 @@ from blinkgl.io.images import NpzReader, check_npy, numpy_errors, read_image
 
 VIDEO = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".gif", ".mpg", ".mpeg", ".ts", ".wmv"}
 IMAGE = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".exr", ".hdr", ".pfm"}
+RECORDING = {".aedat", ".aedat4"}
 _STAMP_FILES = ("timestamps.txt", "images.txt", "timestamps.csv")
 
 
@@ -67,7 +68,8 @@ class FrameSource:
 def open_frames(
     path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None
 ) -> FrameSource:
-    """A video (by ending), a folder of images, or .npy/.npz with frames (N, H, W) or (N, H, W, 3).
+    """A video (by ending), a folder of images, .npy/.npz with frames (N, H, W) or (N, H, W, 3), or the frames that a
+    camera recorded beside its events (.aedat, .aedat4), at the middle of their exposures.
 
     fps : frame rate; overrides the video's own and any time stamps. timestamps : file with one time per frame, or "time
     name" lines as the Event Camera Dataset's images.txt (integers are µs, numbers with a point seconds). A folder's own
@@ -86,12 +88,14 @@ def open_frames(
         source = _video(path, fps, timestamps)
     elif path.suffix.lower() in (".npy", ".npz"):
         source = _array(path, fps, timestamps)
+    elif path.suffix.lower() in RECORDING:
+        source = _recording(path, fps, timestamps)
     else:
         raise AssetError(
             "unknown input",
             where=str(path),
             value=path.suffix,
-            accepted="a video (" + " ".join(sorted(VIDEO)) + "), a folder of images, .npy or .npz",
+            accepted="a video (" + " ".join(sorted(VIDEO)) + "), a folder of images, .npy, .npz, .aedat or .aedat4",
         )
     if source.count == 1:
         raise EventDataError("events need at least two frames", where=str(path), value="1 frame")
@@ -222,6 +226,26 @@ def _array(path: Path, fps: float | None, timestamps) -> FrameSource:
             )
 
     return FrameSource(path, *frames.shape[1:3], len(frames), fps, iterate)
+
+
+def _recording(path: Path, fps: float | None, timestamps) -> FrameSource:
+    from blinkgl.io.formats import open_events
+
+    times = [t for t, _ in read_timestamps(Path(timestamps))] if timestamps and fps is None else None
+    file = open_events(path)
+    first = next(file.frames(), None)
+    if first is None:
+        raise EventDataError("events need at least two frames", where=str(path), value="0 frames")
+
+    def frames() -> Iterator[tuple[np.ndarray, int | None, str]]:
+        for i, frame in enumerate(file.frames()):
+            if times is not None and i >= len(times):
+                raise EventDataError(
+                    f"no time stamp for frame {i}", where=str(timestamps), value=f"{len(times)} stamps"
+                )
+            yield frame.image, None if fps else times[i] if times is not None else frame.t_us * 1000, f"#{i}"
+
+    return FrameSource(path, *first.image.shape[:2], None, fps, frames)
 
 
 def _stamps(name: str, values: np.ndarray) -> list[int]:

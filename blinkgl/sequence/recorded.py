@@ -1,14 +1,8 @@
 """A sequence of recorded frames: the E-Tartan way. Frames go through the emulator, the
-frames' own flow becomes the label.
-
-A folder is expected to look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of frames in
-another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero: the point is
-hidden or outside the image in the next frame).
-"""
+frames' own flow becomes the label. :mod:`blinkgl.sequence.folders` says what a folder has to look like."""
 
 from __future__ import annotations
 
-import glob
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,83 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from blinkgl.config.base import Refused
-from blinkgl.config.frames import FramesConfig, check_span
 from blinkgl.config.sequence import SequenceConfig
-from blinkgl.errors import AssetError, ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.events.types import Events
-from blinkgl.io.flow import read_flow
-from blinkgl.io.frames import IMAGE, read_any_image
-from blinkgl.io.images import read_npy
 from blinkgl.labels import Flow, LabelFrame, asked_for
 from blinkgl.recordings.simulation import Decoder, stepped, timed
 from blinkgl.rng import Role, kernel_seed
-from blinkgl.scene.worlds.pool import resolve
 from blinkgl.sequence.clock import StageClock
+from blinkgl.sequence.folders import flow_files, folder_of, read_flow_of, read_frame, read_mask_of, used_images
 from blinkgl.sequence.items import GroundTruth, Picture
+from blinkgl.sequence.qualify import verdict
 from blinkgl.sequence.simulate import Simulation
 
 RECORDED = ("images", "flow_forward", "occlusion_forward")
 """Labels that recorded frames may bring."""
-_FLOW = (".npy", ".flo", ".png")
-
-
-def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
-    """The folders that ``frames.folders`` names, sorted. ConfigError: none named, none
-    found, or no image folder inside."""
-    found: list[Path] = []
-    for number, pattern in enumerate(config.folders):
-        matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
-        if not matches:
-            raise ConfigError(
-                "no such folder",
-                where=f"frames.folders.{number}",
-                value=pattern,
-                accepted="a folder of frames, or a pattern",
-            )
-        found += matches
-    if not found:
-        raise ConfigError(
-            "no folders of frames", where="frames.folders", value=[], accepted="one folder per sequence, or patterns"
-        )
-    for folder in found:
-        if not (folder / config.images).is_dir():
-            raise ConfigError(
-                "no such folder",
-                where="frames.images",
-                value=str(folder / config.images),
-                accepted="a folder of images",
-            )
-    return found
-
-
-def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
-    """The ``index``-th folder of frames; the only one for every index. Raises ConfigError as
-    :func:`matching_folders`, or for too few."""
-    folders = matching_folders(config, base)
-    if len(folders) > 1 and index >= len(folders):
-        raise ConfigError(f"{len(folders)} folders are too few for sequence {index}", where="frames.folders")
-    return folders[index] if len(folders) > 1 else folders[0]
-
-
-def used_images(config: FramesConfig, folder: Path) -> list[Path]:
-    """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer
-    than an event file can hold."""
-    files = _listed(folder / config.images, IMAGE)[config.first :]
-    files = files[: config.count]
-    if len(files) < 3 or (config.count and len(files) < config.count):
-        raise AssetError(
-            "too few frames",
-            where=str(folder / config.images),
-            value=len(files),
-            accepted=f"at least {config.count or 3}",
-        )
-    try:
-        check_span(len(files), config.fps)
-    except Refused as error:
-        raise ConfigError(error.problem, where="frames.fps", value=error.value, accepted=error.accepted) from None
-    return files
 
 
 class RecordedSequence(Simulation):
@@ -100,8 +31,8 @@ class RecordedSequence(Simulation):
 
     Label k is the flow from frame k + 1 to k + 2 (counted in the frames used), so that every label has a full interval
     of events before it, as in drawn sequences. Its ``config`` names the folder.   files : the
-    images.   flows, masks : files of labels, or none.
-    Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them."""
+    images.   flows, masks : files of labels, or none.   verdict : what ``frames.qualify`` found; None: not looked at.
+    Raises BlinkGLError: unreadable or unequal frames, flow that does not fit them, frames that do not qualify."""
 
     def __init__(
         self, config: SequenceConfig, index: int, *, base: Path, events: bool, labels: bool, pictures_hz: float | None
@@ -116,6 +47,12 @@ class RecordedSequence(Simulation):
             0: read_frame(self.files[0])
         }  # read already, and an image of a label to come
         size = self._kept[0].shape[:2]
+        self.verdict = None
+        if frames.qualify is not None:
+            with clock("scene"):
+                self.verdict = verdict(frames, self.folder)
+            if refused := self.verdict.refusal():
+                raise refused
         resolved = config.model_copy(
             update={"frames": frames.model_copy(update={"folders": (os.path.relpath(self.folder, base),)})}
         )
@@ -179,9 +116,9 @@ class RecordedSequence(Simulation):
         if number == len(self.files) - 1 or not self.flows or "flow_forward" not in request:
             return GroundTruth(k, t_ns, LabelFrame(t_ns, values))
         size = (self.height, self.width)
-        values["flow_forward"] = Flow(*_flow(self.flows[number], size))
+        values["flow_forward"] = Flow(*read_flow_of(self.flows[number], size))
         if self.masks and "occlusion_forward" in request:
-            values["occlusion_forward"] = _mask(self.masks[number], size)
+            values["occlusion_forward"] = read_mask_of(self.masks[number], size)
         return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self._recorded.fps))
 
     def _picture(self, t_ns: int) -> Picture:
@@ -198,50 +135,6 @@ class RecordedSequence(Simulation):
                 "images": len(self.files),
                 "first": self.files[0].name,
                 "last": self.files[-1].name,
-            }
+            },
+            **({} if self.verdict is None else {"qualified": self.verdict.facts()}),
         }
-
-
-def _listed(folder: Path, suffixes) -> list[Path]:
-    if not folder.is_dir():
-        raise AssetError("no such folder", where=str(folder))
-    return sorted(
-        p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
-    )
-
-
-def flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path], list[Path]]:
-    """(flow, masks) of the frames used; the k-th goes from frame k to frame k + 1."""
-    if frames.flow is None:
-        return [], []
-    everything = _listed(folder / frames.flow, _FLOW)
-    masks = [p for p in everything if p.stem.endswith("_mask")]
-    flows = [p for p in everything if p not in set(masks)][frames.first :]
-    if len(flows) < used - 1 or (masks and len(masks) < frames.first + used - 1):
-        raise AssetError(
-            "not one flow file per pair of frames",
-            where=str(folder / frames.flow),
-            value=f"{len(flows)} flow files, {len(masks)} masks",
-            accepted=f"at least {used - 1} for {used} frames",
-        )
-    return flows, masks[frames.first :]
-
-
-def _flow(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    flow, valid = read_flow(path)
-    if flow.shape[:2] != size:
-        raise AssetError("flow and image differ in size", where=str(path), value=flow.shape[:2], accepted=str(size))
-    return flow, valid
-
-
-def _mask(path: Path, size: tuple[int, int]) -> np.ndarray:
-    mask = read_npy(path)
-    if mask.shape != size:
-        raise AssetError("mask and image differ in size", where=str(path), value=mask.shape, accepted=str(size))
-    return mask != 0
-
-
-def read_frame(path: Path) -> np.ndarray:
-    """(H, W) or (H, W, 3) RGB of an image file, alpha dropped. Raises AssetError."""
-    image = read_any_image(path)
-    return image if image.ndim == 2 else np.ascontiguousarray(image[..., :3])

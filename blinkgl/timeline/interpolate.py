@@ -18,9 +18,6 @@ from blinkgl.srgb import to_srgb8
 
 Timed = tuple[np.ndarray, int]
 _EPS = np.float32(1e-3)
-_LEAST = (
-    16  # px, of a side: below, OpenCV's dense flow raises, returns NaN or ends the process, depending on the other side
-)
 
 
 def cubic(frames: Iterable[Timed], factor: int = 4) -> Iterator[Timed]:
@@ -118,21 +115,14 @@ def motion(
     counts. What no frame shows is guessed: the result is an interpolation and
     ``displacement`` says over how many pixels.
     """
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    dense = DenseFlow()
     statistics = displacement if displacement is not None else Displacement()
     last: tuple[np.ndarray, np.ndarray, int] | None = None
     for frame, t in frames:
-        if min(frame.shape[:2]) < _LEAST:
-            raise EventDataError(
-                "too small for dense flow",
-                where="interpolate: motion",
-                value=f"{frame.shape[1]}x{frame.shape[0]}",
-                accepted=f"at least {_LEAST}x{_LEAST}, or interpolate: linear",
-            )
-        grey = _to8(frame)
+        grey = dense.codes(frame)
         if last is not None:
             a, grey_a, t_a = last
-            forward, backward = dis.calc(grey_a, grey, None), dis.calc(grey, grey_a, None)
+            forward, backward = dense(grey_a, grey)
             speed = np.hypot(forward[..., 0], forward[..., 1])
             statistics.add(speed)
             steps = int(min(max(np.ceil(np.percentile(speed, 99.5) / max_px), 1), most, t - t_a))
@@ -140,6 +130,37 @@ def motion(
             statistics.inserted += steps - 1
         yield frame, t
         last = frame, grey, t
+
+
+class DenseFlow:
+    """The flow that :func:`motion` follows: OpenCV's DIS (Kroeger et al. 2016), medium preset, both ways."""
+
+    LEAST = 16
+    """px, of a side: below, OpenCV's dense flow raises, returns NaN or ends the process, depending on the other side"""
+
+    def __init__(self) -> None:
+        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    @classmethod
+    def codes(cls, frame: np.ndarray) -> np.ndarray:
+        """(H, W) uint8, what it looks at, of linear light. EventDataError: a side of less than ``LEAST`` px."""
+        if min(frame.shape[:2]) < cls.LEAST:
+            raise EventDataError(
+                "too small for dense flow",
+                where="interpolate: motion",
+                value=f"{frame.shape[1]}x{frame.shape[0]}",
+                accepted=f"at least {cls.LEAST}x{cls.LEAST}, or interpolate: linear",
+            )
+        return to_srgb8(frame)
+
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Flow (H, W, 2) float32 px from a to b and from b to a, of codes."""
+        return self._dis.calc(a, b, None), self._dis.calc(b, a, None)
+
+
+def halfway(a: np.ndarray, b: np.ndarray, forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
+    """The frame that :func:`motion` makes in the middle of two, (H, W) float32, by flows (H, W, 2) px."""
+    return next(_between(a, b, 0, 2, forward, backward, 2))[0]
 
 
 def _between(a, b, t_a, t_b, forward, backward, steps) -> Iterator[Timed]:
@@ -166,7 +187,3 @@ def _consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     """1 where going there and back returns, 0.01 where not."""
     miss = np.hypot(*np.moveaxis(flow + back, -1, 0))
     return np.where(miss <= 1 + 0.05 * np.hypot(flow[..., 0], flow[..., 1]), np.float32(1), np.float32(0.01))
-
-
-def _to8(luminance: np.ndarray) -> np.ndarray:
-    return to_srgb8(luminance)

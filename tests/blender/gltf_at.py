@@ -23,26 +23,35 @@ class Played:
             sampler = animation["samplers"][channel["sampler"]]
             times = self.document.accessor(sampler["input"]).astype(float).ravel()
             values = self.document.accessor(sampler["output"]).astype(float)
-            values = values.reshape(len(times), -1)
-            assert sampler.get("interpolation", "LINEAR") == "LINEAR"
-            found[channel["target"]["node"], channel["target"]["path"]] = times, values
+            kind = sampler.get("interpolation", "LINEAR")
+            parts = values.reshape(len(times), 3 if kind == "CUBICSPLINE" else 1, -1)
+            found[channel["target"]["node"], channel["target"]["path"]] = times, parts, kind
         return found
 
     @property
     def duration(self) -> float:
-        return max(times[-1] for times, _ in self.moved.values())
+        return max(times[-1] for times, *_ in self.moved.values())
 
     def value(self, node: int, path: str, t: float):
         if (node, path) not in self.moved:
             return None
-        times, values = self.moved[node, path]
-        if path != "rotation":
-            return np.stack([np.interp(t, times, column) for column in values.T])
+        times, parts, kind = self.moved[node, path]
         i = int(np.clip(np.searchsorted(times, t, side="right") - 1, 0, max(len(times) - 2, 0)))
-        if len(times) == 1:
-            return values[0]
-        u = np.clip((t - times[i]) / (times[i + 1] - times[i]), 0, 1)
-        return slerp(values[i], values[i + 1], u)
+        if len(times) == 1 or t <= times[0]:
+            return parts[0, parts.shape[1] // 2]
+        if t >= times[-1]:
+            return parts[-1, parts.shape[1] // 2]
+        h = times[i + 1] - times[i]
+        u = (t - times[i]) / h
+        if kind == "STEP":
+            return parts[i, 0]
+        if kind == "CUBICSPLINE":
+            (_, a, out), (into, b, _) = parts[i], parts[i + 1]
+            q = (2 * u**3 - 3 * u**2 + 1) * a + h * (u**3 - 2 * u**2 + u) * out
+            q = q + (3 * u**2 - 2 * u**3) * b + h * (u**3 - u**2) * into
+            return q / np.linalg.norm(q) if path == "rotation" else q
+        a, b = parts[i, 0], parts[i + 1, 0]
+        return slerp(a, b, u) if path == "rotation" else (1 - u) * a + u * b
 
     def world(self, node: int, t: float) -> np.ndarray:
         """(4, 4) of a node, y up."""

@@ -60,6 +60,7 @@ def test_the_manifest_says_which_engine(made):
     assert len(falls["dynamics"]["paths_sha256"]) == 64 and falls["dynamics"]["steps"] == 3000
     # A sequence without physics does not change by there being an engine.
     assert "mujoco" not in still["versions"] and "dynamics" not in still
+    assert "physics" not in (made / "out/train/still_000000/config.yaml").read_text()
     record = json.loads((made / "out/.run/run.json").read_text())
     assert record["environment"]["mujoco"] == mujoco.__version__
 

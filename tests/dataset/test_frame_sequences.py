@@ -214,11 +214,11 @@ def test_the_shipped_recipe_takes_frames(tmp_path, tartan):
 
 
 def test_asset_errors_name_the_file(tmp_path, tartan):
-    from blinkgl.sequence.recorded import _flow
+    from blinkgl.sequence.folders import read_flow_of
 
     np.save(tmp_path / "f.npy", np.zeros((3, 4, 5), np.float32))
     with pytest.raises(AssetError, match="not a flow field"):
-        _flow(tmp_path / "f.npy", (3, 4))
+        read_flow_of(tmp_path / "f.npy", (3, 4))
     np.save(tmp_path / "g.npy", np.zeros((3, 4, 2), np.float32))
     with pytest.raises(AssetError, match="flow and image differ in size"):
-        _flow(tmp_path / "g.npy", (4, 4))
+        read_flow_of(tmp_path / "g.npy", (4, 4))

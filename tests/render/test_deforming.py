@@ -261,7 +261,7 @@ class Spinning:
 def test_a_turning_skeleton_is_the_turning_body(gl):
     """All vertices follow one joint that moves as the body's path does: the same picture, to the last id."""
     path = drift((0.2, 4, 0.1), (-0.1, 4.4, 0.3), Rotation.identity(), Rotation.from_rotvec([0.9, 0.4, -0.7]))
-    ball = cube(0.8)
+    ball = sphere(0.8, 4)
     skinned = replace(ball, deformer=Skin.rigid(Skeleton([-1], Spinning(path)), 0, len(ball.vertices)))
     rigid, bones = (
         scene([thing("body", 3, mesh, way, Material(base_color=(0.9, 0.5, 0.3)))], rig())
@@ -269,11 +269,13 @@ def test_a_turning_skeleton_is_the_turning_body(gl):
     )
     with Renderer(gl, rigid, RenderConfig()) as a, Renderer(gl, bones, RenderConfig(), whole=True) as b:
         for t in range(50 * MS, 950 * MS, 100 * MS):
-            one, two = (r.labels(t, LABELS, t + 50 * MS, t - 50 * MS) for r in (a, b))
+            one, two = (r.labels(t, LABELS, t + 10 * MS, t - 10 * MS) for r in (a, b))
             np.testing.assert_array_equal(one.ids, two.ids)
             for flow, other in ((one.forward, two.forward), (one.backward, two.backward)):
                 error = np.abs(flow.flow - other.flow)
-                assert np.quantile(error, 0.999) <= 1e-5 and error.max() <= 1e-4  # of up to 5 px
-                assert np.abs(flow.flow).max() > 1
-            assert np.abs(one.velocity - two.velocity).max() <= 1e-5 * np.abs(one.velocity).max()
-            np.testing.assert_allclose(one.depth, two.depth, rtol=1e-6)
+                assert error.max() <= 1e-5
+                assert np.abs(flow.flow).max() > 0.3
+            on = one.ids > 0
+            apart = np.abs(one.velocity - two.velocity)[on]
+            assert np.quantile(apart, 0.999) <= 1e-5 * np.abs(one.velocity).max()
+            assert np.quantile(np.abs(one.depth[on] / two.depth[on] - 1), 0.99) <= 1e-6

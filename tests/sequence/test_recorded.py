@@ -43,7 +43,7 @@ def opened(clip: Path, index: int = 0, folders=("clip",), tree=None, **wanted):
     path.write_text(
         yaml.safe_dump(
             {
-                "frames": {"folders": list(folders), "fps": FPS, "interpolate": "linear", **frames},
+                "frames": {"folders": list(folders), "fps": FPS, "interpolate": "linear", "qualify": None, **frames},
                 "events": {"emulator": "esim", "contrast_threshold": 0.1},
                 **(tree or {}),
             }

@@ -23,6 +23,7 @@ SHORT = (
     "events mvsec",
     "events npz",
     "events evt3",
+    "events aedat2",
     "flow png dsec",
     "flow npy",
     "frames png",

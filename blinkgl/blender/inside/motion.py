@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import gcd
 
 import bpy
-from said import Refused, names
+from said import Refused, Table, names
 
 _MOST_FRAMES = 100_000
 
@@ -64,3 +64,53 @@ def set_clock(scene: bpy.types.Scene, frames: list[int] | None, per: int) -> Clo
         render.fps *= per
     scene.frame_start, scene.frame_end = first * per, last * per
     return Clock(first * per, last * per, per, render.fps / render.fps_base)
+
+
+def offer_clips(table: Table) -> None:
+    """Every action in a track of its own, at those whose names its slots bear or, for bones, that have them: that is
+    where the exporter looks. What no object takes is said."""
+    pairs: dict[tuple[str, str], tuple] = {}
+    for owner in [*bpy.data.objects, *bpy.data.shape_keys]:
+        moved = owner.animation_data
+        if moved is None:
+            continue
+        strips = [strip for track in moved.nla_tracks for strip in track.strips]
+        for player in [moved, *strips]:
+            if player.action is not None:
+                pairs.setdefault((owner.name_full, player.action.name_full), (owner, player.action, player.action_slot))
+    taken = {action for _, action in pairs}
+    for action in bpy.data.actions:
+        for slot in action.slots if action.name_full not in taken else ():
+            for owner in _takers(action, slot):
+                pairs.setdefault((owner.name_full, action.name_full), (owner, action, slot))
+    for owner, _, _ in pairs.values():
+        moved = owner.animation_data or owner.animation_data_create()
+        moved.action = None
+        for track in list(moved.nla_tracks):
+            moved.nla_tracks.remove(track)
+    for owner, action, slot in pairs.values():
+        track = owner.animation_data.nla_tracks.new()
+        track.name = action.name
+        strip = track.strips.new(action.name, max(round(action.frame_range[0]), 0), action)
+        if slot is not None:
+            strip.action_slot = slot
+    row = table["actions"]
+    offered = {action for _, action in pairs}
+    row.came = len(offered)
+    row.notes = [note for note in row.notes if "--clips" not in note]
+    lost = [action for action in bpy.data.actions if action.name_full not in offered]
+    if lost:
+        row.notes.append(f"of nothing in the file: {names(lost)}")
+
+
+def _takers(action: bpy.types.Action, slot: bpy.types.ActionSlot) -> list[bpy.types.ID]:
+    if slot.target_id_type == "KEY":
+        return [key for key in bpy.data.shape_keys if key.name == slot.name_display]
+    if slot.target_id_type not in ("OBJECT", "UNSPECIFIED"):
+        return []
+    curves = [c for layer in action.layers for strip in layer.strips for bag in strip.channelbags for c in bag.fcurves]
+    bones = {c.data_path.split('"')[1] for c in curves if c.data_path.startswith('pose.bones["')}
+    if bones:
+        rigs = [o for o in bpy.data.objects if o.type == "ARMATURE"]
+        return [o for o in rigs if bones & {b.name for b in o.data.bones}]
+    return [o for o in bpy.data.objects if o.name == slot.name_display]

@@ -74,7 +74,7 @@ def fit_range() -> None:
     spans = [tuple(action.frame_range) for action in bpy.data.actions]
     if spans:
         scene = bpy.context.scene
-        scene.frame_start = int(min(first for first, _ in spans))
+        scene.frame_start = round(min(first for first, _ in spans))
         scene.frame_end = max(scene.frame_start, round(max(last for _, last in spans)))
 
 

@@ -56,6 +56,8 @@ def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:
     scene.frame_set(clock.first)
 
     doing("writing the GLB")
+    if job["clips"]:
+        motion.offer_clips(table)
     exporting.export(out, things, everything, made, unseen, job["clips"], table)
     cameras = [o for o in things if o.type == "CAMERA"]
     return {

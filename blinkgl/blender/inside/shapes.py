@@ -63,17 +63,23 @@ def stop_simulations(things: Iterable[bpy.types.Object], table: Table) -> None:
 
 def evaluated_positions(thing: bpy.types.Object) -> np.ndarray | None:
     """(V, 3) float32 in the object's own coordinates, as Blender shows it now; None without a mesh."""
+    return evaluated(thing)[0]
+
+
+def evaluated(thing: bpy.types.Object) -> tuple[np.ndarray | None, int]:
+    """:func:`evaluated_positions`, and the number of corners of all faces."""
     shown = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
     try:
         mesh = shown.to_mesh()
     except RuntimeError:
-        return None
+        return None, 0
     if mesh is None:
-        return None
+        return None, 0
     found = np.empty((len(mesh.vertices), 3), np.float32)
     mesh.vertices.foreach_get("co", found.ravel())
+    corners = len(mesh.loops)
     shown.to_mesh_clear()
-    return found
+    return found, corners
 
 
 @contextmanager
@@ -356,8 +362,8 @@ def compare(made: dict[str, bpy.types.Object], frames: list[int], table: Table) 
         for name, twin in made.items():
             if budget < 0 or not np.isfinite(worst[name]):
                 continue
-            true, ours = evaluated_positions(twin), evaluated_positions(bpy.data.objects[name])
-            if true is None or ours is None or len(true) != len(ours):
+            (true, corners), (ours, our_corners) = evaluated(twin), evaluated(bpy.data.objects[name])
+            if true is None or ours is None or len(true) != len(ours) or corners != our_corners:
                 worst[name] = np.inf
                 continue
             budget -= len(true)
@@ -369,7 +375,7 @@ def compare(made: dict[str, bpy.types.Object], frames: list[int], table: Table) 
         thing = bpy.data.objects[name]
         if not np.isfinite(apart):
             row.came -= 1
-            row.notes.append(f"'{name}' changes how many vertices it has: as in the first frame")
+            row.notes.append(f"'{name}' changes how many faces it has: as in the first frame")
         elif apart > TOLERANCE:
             if thing.data.shape_keys is None and not any(skinning(m) for m in thing.modifiers):
                 baked.append(thing)

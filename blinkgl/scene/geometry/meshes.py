@@ -3,7 +3,7 @@ coordinates, and known to be closed or not."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from blinkgl.errors import AssetError
+from blinkgl.scene.shapes.deformer import filled
 from blinkgl.scene.types import Mesh, Scene
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def make_mesh(
     uv_size: float | None = None,
     project_degenerate: bool = False,
     log: list[str] | None = None,
+    source: list[np.ndarray] | None = None,
 ) -> Mesh:
     """A valid mesh from raw triangles.
 
@@ -55,6 +57,8 @@ def make_mesh(
     project_degenerate : also project when the given coordinates cannot carry a texture (:func:`uvs_degenerate`). They
         are kept otherwise, because palette textures use exactly such coordinates.
     log : gets a line for each repair.
+    source : gets (W,) int64, which of the given vertices each of the mesh's is; then no two of different origin are
+        joined.
 
     Faces without area are dropped, unused vertices removed, a closed mesh that is inside out is turned round.
     Raises :class:`AssetError` (``where`` or ``name`` in it) for NaN or infinite vertices, indices out of range, too
@@ -85,6 +89,7 @@ def make_mesh(
             accepted="finite coordinates",
         )
 
+    origin = np.flatnonzero(used)
     vertices, faces = vertices[used], (np.cumsum(used) - 1)[faces]
     normals = None if normals is None or len(normals) != len(used) else np.asarray(normals, np.float64)[used]
     uvs_given = uvs is not None
@@ -123,7 +128,13 @@ def make_mesh(
         faces, corner_uvs, corner_normals = faces[:, ::-1], corner_uvs[:, ::-1], corner_normals[:, ::-1]
         if (corner_normals.sum(axis=1) * _face_cross(vertices, faces)).sum() < 0:
             corner_normals = -corner_normals
-    return _from_corners(vertices[faces], corner_normals, corner_uvs, closed=closed, name=name, source_hash=source_hash)
+    corners = None if source is None else origin[faces]
+    mesh, first = _from_corners(
+        vertices[faces], corner_normals, corner_uvs, corners, closed=closed, name=name, source_hash=source_hash
+    )
+    if source is not None and corners is not None:
+        source.append(corners.ravel()[first])
+    return mesh
 
 
 def _faces_with_area(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -343,8 +354,11 @@ def uvs_degenerate(vertices: np.ndarray, faces: np.ndarray, uvs: np.ndarray) -> 
     return bool(area[uv_area < 1e-10].sum() > 0.5 * area.sum())
 
 
-def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, **fields) -> Mesh:
-    """Corners with equal position, normal and coordinates become one vertex."""
+def _from_corners(
+    positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, origin: np.ndarray | None = None, **fields
+) -> tuple[Mesh, np.ndarray]:
+    """Corners with equal position, normal and coordinates, and of one origin where that is given, become one vertex.
+    Also (W,) which corner, of all one after the other, each vertex was first."""
     positions = positions.reshape(-1, 3)
     normals = normals.reshape(-1, 3)
     normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
@@ -355,24 +369,25 @@ def _from_corners(positions: np.ndarray, normals: np.ndarray, uvs: np.ndarray, *
             (positions + 0.0).view(np.int64),
             np.round(normals * 1e5).astype(np.int64),
             (uvs + 0.0).view(np.int32).astype(np.int64),
+            *([] if origin is None else [origin.reshape(-1, 1).astype(np.int64)]),
         ],
         axis=1,
     )
-    _, first, index = np.unique(
-        np.ascontiguousarray(rows).view([("", np.int64)] * 8).ravel(), return_index=True, return_inverse=True
-    )
+    whole = [("", np.int64)] * rows.shape[1]
+    _, first, index = np.unique(np.ascontiguousarray(rows).view(whole).ravel(), return_index=True, return_inverse=True)
     # Vertices in order of first use: good for the vertex cache, and independent of how np.unique sorts.
     order = np.argsort(first, kind="stable")
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     first = first[order]
-    return Mesh(
+    mesh = Mesh(
         vertices=positions[first],
         faces=rank[index.reshape(-1)].reshape(-1, 3).astype(np.int32),
         normals=normals[first],
         uvs=uvs[first],
         **fields,
     )
+    return mesh, first
 
 
 def transform_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
@@ -405,7 +420,7 @@ def scale_mesh(mesh: Mesh, scale: float) -> Mesh:
     return replace(mesh, vertices=mesh.vertices * scale, deformer=_transformed(mesh, np.eye(3) * scale, np.zeros(3)))
 
 
-def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
+def bounds(meshes: Sequence[Mesh]) -> tuple[np.ndarray, np.ndarray]:
     """((3,), (3,)) corners of the common bounding box."""
     return (
         np.min([m.vertices.min(axis=0) for m in meshes], axis=0),
@@ -415,10 +430,12 @@ def bounds(meshes: Iterable[Mesh]) -> tuple[np.ndarray, np.ndarray]:
 
 def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]:
     """The meshes of one object together, moved so that the bounding box is centred on the origin and scaled to bounding
-    radius 1."""
-    low, high = bounds(meshes)
+    radius 1. Of a mesh that deforms all that it sweeps counts."""
+    room = [(m.vertices, 0.0) if m.deformer is None else filled(m) for m in meshes]
+    low = np.min([points.min(axis=0) - margin for points, margin in room], axis=0)
+    high = np.max([points.max(axis=0) + margin for points, margin in room], axis=0)
     centre = (low + high) / 2
-    radius = max(float(np.sqrt(((m.vertices - centre) ** 2).sum(axis=1).max())) for m in meshes)
+    radius = max(float(np.sqrt(((points - centre) ** 2).sum(axis=1).max())) + margin for points, margin in room)
     if not radius > 0:
         raise AssetError("the mesh has no extent", where=where)
     return tuple(
@@ -427,6 +444,32 @@ def normalise(meshes: tuple[Mesh, ...], where: str = "mesh") -> tuple[Mesh, ...]
         )
         for m in meshes
     )
+
+
+def finer(mesh: Mesh, edge: float, max_faces: int = 5_000) -> Mesh:
+    """The same surface of smaller triangles: each is split into four until no edge is longer than ``edge``, or
+    there would be more than ``max_faces``."""
+    while True:
+        corners = mesh.vertices[mesh.faces]
+        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
+        if longest <= edge or 4 * len(mesh.faces) > max_faces:
+            return mesh
+        pairs = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        edges, middle = np.unique(pairs, axis=0, return_inverse=True)
+        halfway = lambda values, edges=edges: np.concatenate([values, values[edges].mean(axis=1, dtype=np.float64)])
+        normals = halfway(mesh.normals.astype(np.float64))
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        a, b, c = mesh.faces.T
+        ab, bc, ca = (middle.reshape(-1, 3) + len(mesh.vertices)).T
+        faces = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], axis=1).reshape(-1, 3).astype(np.int32)
+        normals[: len(mesh.vertices)] = mesh.normals
+        mesh = replace(
+            mesh,
+            vertices=halfway(mesh.vertices),
+            faces=faces,
+            normals=normals.astype(np.float32),
+            uvs=halfway(mesh.uvs).astype(np.float32),
+        )
 
 
 def concatenate(meshes: tuple[Mesh, ...], *, name: str = "", source_hash: str = "") -> Mesh:

@@ -86,8 +86,7 @@ def _primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Call
     """Checks the parameters, builds, and stamps name, hash and closedness."""
     signature = inspect.signature(build)
 
-    @wraps(build)
-    def made(**parameters: Any) -> Mesh:
+    def checked(**parameters: Any) -> inspect.BoundArguments:
         where = build.__name__
         unknown = set(parameters) - set(signature.parameters)
         if unknown:
@@ -132,6 +131,11 @@ def _primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Call
                 raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
             else:
                 bound.arguments[key] = tuple(map(float, value)) if np.shape(default) else float(value)
+        return bound
+
+    @wraps(build)
+    def made(**parameters: Any) -> Mesh:
+        where, bound = build.__name__, checked(**parameters)
         built = build(**bound.arguments)
         (positions, normals, uvs, faces), deformer = built if len(built) == 2 else (built, None)
         return Mesh(
@@ -145,6 +149,7 @@ def _primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Call
             deformer=deformer,
         )
 
+    made.checked = checked  # type: ignore[attr-defined]
     return made
 
 

@@ -2,7 +2,7 @@
 
 Its own reader rather than trimesh's, because a scene's cameras, unlit and double-sided materials, node names and
 animations are wanted, and because every count and path a file claims has to be checked before it is believed.
-Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (buffers, accessors), 3.7 (meshes), 3.9
+Reference: Khronos glTF 2.0 specification, sections 3.5 (scenes), 3.6 (buffers, accessors), 3.7 (meshes, skins), 3.9
 (materials), 3.10 (cameras), 3.11 (animations); extensions KHR_materials_unlit, KHR_texture_transform.
 
 Coordinates stay as in the file (y up) until whoever asked turns them z up (:data:`Z_UP`). What a file asks for
@@ -27,6 +27,8 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.importing import gltf_schema
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import contents, reading
+from blinkgl.scene.shapes.clips import PATHS, Track
+from blinkgl.scene.shapes.skeleton import Locals, Motion, Skeleton
 from blinkgl.scene.surfaces.images import content_hash, decode_image
 from blinkgl.scene.types import Material, Texture
 from blinkgl.srgb import linear_from_srgb
@@ -57,17 +59,24 @@ _MAX_ZEROS = 64_000_000  # bytes of an accessor without a buffer behind it (all 
 _WRAPS = {33071: "CLAMP_TO_EDGE", 33648: "MIRRORED_REPEAT"}
 _NEAREST = 9728
 _MAX_TIME = 1e7  # s, of an animation's keys
+_MAX_SETS = 4  # of four joints per vertex
+_MAX_TARGET_VERTICES = 8_000_000  # of a primitive's morph targets together
 
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Raw triangles. normals, uvs (v down) and material may be None."""
+    """Raw triangles. normals, uvs (v down) and material may be None.
+
+    binding : (V, k) joints of the node's skin and (V, k) weights; None: it has no skin.
+    targets : morph targets, (n, V, 3) positions, likewise normals or None; None: it has none."""
 
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray | None = None
     uvs: np.ndarray | None = None
     material: Material | None = None
+    binding: tuple[np.ndarray, np.ndarray] | None = None
+    targets: tuple[np.ndarray, np.ndarray | None] | None = None
 
 
 def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
@@ -87,8 +96,8 @@ def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """name, parent (None at the root), mesh and camera index (None without), rest translation, quaternion x y z w,
-    scale or matrix."""
+    """name, parent (None at the root), mesh, camera and skin index (None without), rest translation, quaternion
+    x y z w, scale or matrix; weights of the mesh's morph targets where the node says its own."""
 
     name: str
     parent: int | None
@@ -98,52 +107,17 @@ class Node:
     rotation: tuple
     scale: tuple
     matrix: np.ndarray | None
+    skin: int | None = None
+    weights: tuple | None = None
 
-    def local(
-        self, translation: ArrayLike | None = None, rotation: ArrayLike | None = None, scale: ArrayLike | None = None
-    ) -> np.ndarray:
-        """(4, 4) transform to the parent, with animated values in place of the resting ones."""
+    def local(self) -> np.ndarray:
+        """(4, 4) transform to the parent, at rest."""
         if self.matrix is not None:
             return self.matrix
         T = np.eye(4)
-        turn = Rotation.from_quat(self.rotation if rotation is None else rotation).as_matrix()
-        T[:3, :3] = turn * (self.scale if scale is None else scale)
-        T[:3, 3] = self.translation if translation is None else translation
+        T[:3, :3] = Rotation.from_quat(self.rotation).as_matrix() * self.scale
+        T[:3, 3] = self.translation
         return T
-
-
-@dataclass(frozen=True, eq=False)
-class Channel:
-    """One animated property of a node: path translation | rotation | scale, times (K,) s, values (K, 3 or 4),
-    interpolation LINEAR | STEP | CUBICSPLINE (then values (K, 3, n): in-tangent, value, out-tangent)."""
-
-    node: int
-    path: str
-    times: np.ndarray
-    values: np.ndarray
-    interpolation: str
-
-    def at(self, t: float) -> np.ndarray:
-        """Value at t seconds, held outside the key frames (specification, 3.11 and appendix C)."""
-        times = self.times
-        values = self.values[:, 1] if self.interpolation == "CUBICSPLINE" else self.values
-        i = int(np.searchsorted(times, t, side="right")) - 1
-        if i < 0 or i >= len(times) - 1 or self.interpolation == "STEP":
-            return values[min(max(i, 0), len(times) - 1)]
-        h = times[i + 1] - times[i]
-        s = (t - times[i]) / h
-        if self.interpolation == "CUBICSPLINE":
-            v = (
-                (2 * s**3 - 3 * s**2 + 1) * values[i]
-                + h * (s**3 - 2 * s**2 + s) * self.values[i, 2]
-                + (3 * s**2 - 2 * s**3) * values[i + 1]
-                + h * (s**3 - s**2) * self.values[i + 1, 0]
-            )
-            return v / np.linalg.norm(v) if self.path == "rotation" else v
-        if self.path == "rotation":
-            a, b = Rotation.from_quat(values[i]), Rotation.from_quat(values[i + 1])
-            return (a * Rotation.from_rotvec(s * (a.inv() * b).as_rotvec())).as_quat()
-        return (1 - s) * values[i] + s * values[i + 1]
 
 
 @dataclass(eq=False)
@@ -171,17 +145,19 @@ class Document:
         return str(self.path)
 
     # ---- geometry
-    def world(self, node: int, overrides: dict[int, dict] | None = None) -> np.ndarray:
-        """(4, 4) transform of a node to the file's world; ``overrides``: node -> animated values."""
+    def world(self, node: int) -> np.ndarray:
+        """(4, 4) transform of a node to the file's world, at rest."""
         T = np.eye(4)
         step: int | None = node
         while step is not None:
-            T = self.nodes[step].local(**(overrides or {}).get(step, {})) @ T
+            T = self.nodes[step].local() @ T
             step = self.nodes[step].parent
         return T
 
-    def mesh_pieces(self, mesh: int) -> list[Piece]:
-        """The triangles of a mesh in its own coordinates, a piece per primitive; points and lines are left out."""
+    def mesh_pieces(self, mesh: int, changing: bool = False) -> list[Piece]:
+        """The triangles of a mesh in its own coordinates, a piece per primitive; points and lines are left out.
+        changing : with bindings to joints and morph targets; otherwise the file is said to ask for what is not
+        drawn."""
         pieces = []
         for primitive in _item(self.tree, "meshes", mesh, self.where)["primitives"]:
             mode, attributes = primitive.get("mode", 4), primitive["attributes"]
@@ -200,9 +176,9 @@ class Document:
                 if order.dtype.kind != "u" or order.shape[1] != 1:
                     raise AssetError(f"the indices of mesh {mesh} are no whole numbers", where=self.where)
                 order = order.astype(np.int64).ravel()
-            if primitive.get("targets"):
+            if primitive.get("targets") and not changing:
                 self.omissions.add("morph targets (the base shape is drawn)")
-            if "JOINTS_0" in attributes:
+            if "JOINTS_0" in attributes and not changing:
                 self.omissions.add("skins (the rest shape is drawn)")
             material, uv_set, uv_matrix = self.material(primitive.get("material"))
             normals = self._attribute(primitive, "NORMAL", 3, len(vertices))
@@ -212,8 +188,117 @@ class Document:
             if self.materials:
                 self._note_wrapping(primitive.get("material"), uvs)
                 material = self._coloured(primitive, material, len(vertices))
-            pieces.append(Piece(vertices, _triangles(order, mode), normals, uvs, material))
+            piece = Piece(vertices, _triangles(order, mode), normals, uvs, material)
+            if changing:
+                bound, targets = self._binding(primitive, len(vertices)), self._targets(primitive, len(vertices))
+                piece = replace(piece, binding=bound, targets=targets)
+            pieces.append(piece)
         return pieces
+
+    def _binding(self, primitive: dict, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """((V, 4 n) joints, (V, 4 n) weights) of all the sets that a primitive has."""
+        attributes, joints, weights = primitive["attributes"], [], []
+        for number in range(_MAX_SETS):
+            if f"JOINTS_{number}" not in attributes:
+                break
+            joints.append(self._attribute(primitive, f"JOINTS_{number}", 4, count))
+            weights.append(self._attribute(primitive, f"WEIGHTS_{number}", 4, count))
+            if weights[-1] is None:
+                raise AssetError(
+                    f"the file is no valid glTF (JOINTS_{number} without WEIGHTS_{number})", where=self.where
+                )
+        return (np.hstack(joints), np.hstack(weights)) if joints else None
+
+    def _targets(self, primitive: dict, count: int) -> tuple[np.ndarray, np.ndarray | None] | None:
+        targets = primitive.get("targets", [])
+        if len(targets) * count > _MAX_TARGET_VERTICES:
+            raise AssetError(
+                "the mesh has too many morph targets",
+                where=self.where,
+                value=f"{len(targets)} of {count} vertices",
+                accepted=f"{_MAX_TARGET_VERTICES} vertices in all",
+            )
+        if not targets:
+            return None
+
+        def read(target: dict, name: str) -> np.ndarray:
+            if name not in target:
+                return np.zeros((count, 3))
+            a = _item(self.tree, "accessors", target[name], self.where)
+            if a["count"] != count or a["type"] != "VEC3":
+                raise AssetError(
+                    f"a morph target has another size than its mesh ({name})",
+                    where=self.where,
+                    value=f"{a['count']} {a['type']}",
+                    accepted=f"{count} VEC3",
+                )
+            values = self.accessor(target[name]).astype(np.float64)
+            if not (np.abs(values) <= 1e12).all():  # NaN compares false
+                raise AssetError(f"a morph target is no number, or beyond 1e12 ({name})", where=self.where)
+            return values
+
+        normals = np.stack([read(t, "NORMAL") for t in targets]) if any("NORMAL" in t for t in targets) else None
+        return np.stack([read(t, "POSITION") for t in targets]), normals
+
+    def skin(self, index: int) -> tuple[list[int], np.ndarray]:
+        """(joints as places among :attr:`nodes`, (m, 4, 4) inverse bind matrices). AssetError for a joint that is not
+        in
+        the scene, and for matrices that are missing or no numbers."""
+        skin = _item(self.tree, "skins", index, self.where)
+        joints, places = skin["joints"], self.places
+        if len(joints) > _MAX_NODES:
+            raise AssetError(
+                "a skin has too many joints", where=self.where, value=len(joints), accepted=f"at most {_MAX_NODES}"
+            )
+        for joint in joints:
+            if joint not in places:
+                _index(joint, len(self.tree.get("nodes", [])), "node", self.where)
+                raise AssetError("a skin names a joint that is not in the scene", where=self.where, value=joint)
+        bind = np.tile(np.eye(4), (len(joints), 1, 1))
+        if "inverseBindMatrices" in skin:
+            a = _item(self.tree, "accessors", skin["inverseBindMatrices"], self.where)
+            if a["type"] != "MAT4" or a["count"] < len(joints):
+                raise AssetError(
+                    "a skin has not one inverse bind matrix per joint",
+                    where=self.where,
+                    value=f"{a['count']} {a['type']}",
+                    accepted=f"{len(joints)} MAT4",
+                )
+            bind = self.accessor(skin["inverseBindMatrices"])[: len(joints)].astype(np.float64)
+            bind = bind.reshape(-1, 4, 4).swapaxes(1, 2)
+        return [places[joint] for joint in joints], bind
+
+    @property
+    def places(self) -> dict[int, int]:
+        """Node of the file -> its number among :attr:`nodes`, which is that of its joint in :meth:`skeleton`."""
+        return {node: place for place, node in enumerate(self.nodes)}
+
+    def rest(self) -> Locals:
+        """Of all nodes; one that has a matrix has it in :meth:`skeleton`."""
+        out = Locals.rest(len(self.nodes))
+        for place, node in enumerate(self.nodes.values()):
+            if node.matrix is None:
+                turn = np.array(node.rotation)
+                out.translation[place], out.rotation[place] = node.translation, turn / np.linalg.norm(turn)
+                out.scale[place] = node.scale
+        return out
+
+    def skeleton(self, motion: Motion) -> Skeleton:
+        """All nodes, moved by ``motion``, in the file's world."""
+        places, nodes = self.places, list(self.nodes.values())
+        parents = [-1 if node.parent is None else places[node.parent] for node in nodes]
+        fixed = [np.eye(4) if node.matrix is None else node.matrix for node in nodes]
+        return Skeleton(parents, motion, np.array(fixed).reshape(-1, 4, 4), [node.name for node in nodes], self.where)
+
+    def morph_weights(self, node: int, count: int) -> np.ndarray:
+        """(count,) of a node's mesh at rest. AssetError where there are others than targets."""
+        mesh = _item(self.tree, "meshes", self.nodes[node].mesh, self.where)
+        given = self.nodes[node].weights if self.nodes[node].weights is not None else mesh.get("weights", [0.0] * count)
+        if len(given) != count:
+            raise AssetError(
+                "a mesh has not one weight per morph target", where=self.where, value=len(given), accepted=str(count)
+            )
+        return np.array(given, np.float64)
 
     def _attribute(self, primitive: dict, name: str, width: int, count: int) -> np.ndarray | None:
         """(count, width) float64, None without it. Its length is checked before it is read."""
@@ -265,13 +350,14 @@ class Document:
             return {}
         return _item(self.tree, "materials", material, self.where).get("pbrMetallicRoughness", {})
 
-    def pieces(self) -> list[Piece]:
-        """The whole scene at rest as one object, in the file's axes."""
+    def pieces(self, changing: bool = False) -> list[tuple[int, Piece]]:
+        """(node, piece) of the whole scene at rest as one object, in the file's axes; changing : as
+        :meth:`mesh_pieces`."""
         return [
-            transformed(p, self.world(i))
+            (i, transformed(p, self.world(i)))
             for i, node in self.nodes.items()
             if node.mesh is not None
-            for p in self.mesh_pieces(node.mesh)
+            for p in self.mesh_pieces(node.mesh, changing)
         ]
 
     def accessor(self, index: int) -> np.ndarray:
@@ -375,49 +461,60 @@ class Document:
         return self._textures[source]
 
     # ---- animations
-    def channels(self, animation: int) -> list[Channel]:
-        """Node animations; what else an animation moves (morph weights) is an omission."""
+    def tracks(self, animation: int) -> list[Track]:
+        """What an animation moves, joints being places among :attr:`nodes`; what of it is not drawn is an omission."""
         a = _item(self.tree, "animations", animation, self.where)
-        samplers, found = a["samplers"], []
+        samplers, places, found = a["samplers"], self.places, []
         for channel in a["channels"]:
             node, path = channel["target"].get("node"), channel["target"]["path"]
-            if path not in ("translation", "rotation", "scale"):
-                self.omissions.add(f"animation of {path if path == 'weights' else 'other properties'}")
+            if path not in (*PATHS, "weights"):
+                self.omissions.add("animation of other properties")
                 continue
             if node not in self.nodes:
                 continue
-            if self.nodes[node].matrix is not None:
+            if path != "weights" and self.nodes[node].matrix is not None:
                 self.omissions.add("animation of nodes that have a matrix")
                 continue
             sampler = samplers[_index(channel["sampler"], len(samplers), "animation sampler", self.where)]
-            kind, width = sampler.get("interpolation", "LINEAR"), 4 if path == "rotation" else 3
+            kind = sampler.get("interpolation", "LINEAR")
+            width = 4 if path == "rotation" else self._target_count(node) if path == "weights" else 3
             per_key = 3 if kind == "CUBICSPLINE" else 1
             keys, given = (_item(self.tree, "accessors", sampler[key], self.where) for key in ("input", "output"))
+            per_value = width if path == "weights" else 1  # weights are scalars, one after the other
             # Lengths first: the two are as long as the file says, whatever is behind them.
             fits = (
                 keys["type"] == "SCALAR"
-                and given["count"] == per_key * keys["count"] > 0
-                and _WIDTHS[given["type"]] == width
+                and given["count"] == per_key * per_value * keys["count"] > 0
+                and _WIDTHS[given["type"]] * per_value == width
             )
             times = self.accessor(sampler["input"]).astype(np.float64).ravel() if fits else np.zeros(0)
             values = self.accessor(sampler["output"]).astype(np.float64) if fits else np.zeros(0)
-            # Written so that NaN is refused: it compares false.
-            if (
-                not fits
-                or not (np.abs(values) <= 1e12).all()
-                or not (np.abs(times) < _MAX_TIME).all()
-                or (np.diff(times) <= 0).any()
-            ):
+            where = f"the animation of {path} of node '{self.nodes[node].name}'"
+            if fits and (np.diff(times) <= 0).any():
+                first = int(np.argmax(np.diff(times) <= 0))
                 raise AssetError(
-                    f"the animation of {path} of node '{self.nodes[node].name}' is corrupt", where=self.where
+                    f"{where} has times that do not increase (key {first + 1})",
+                    where=self.where,
+                    value=float(times[first + 1]),
+                    accepted=f"more than {times[first]:g} s",
                 )
+            # Written so that NaN is refused: it compares false.
+            if not fits or not (np.abs(values) <= 1e12).all() or not (np.abs(times) < _MAX_TIME).all():
+                raise AssetError(f"{where} is corrupt", where=self.where)
             values = values.reshape(-1, per_key, width)
             if path == "rotation" and (np.linalg.norm(values[:, per_key // 2], axis=1) < 1e-9).any():
                 raise AssetError(
                     f"the animation of node '{self.nodes[node].name}' has a rotation of zero", where=self.where
                 )
-            found.append(Channel(node, path, times, values if per_key == 3 else values[:, 0], kind))
+            found.append(Track(places[node], path, times, values if per_key == 3 else values[:, 0], kind))
         return found
+
+    def _target_count(self, node: int) -> int:
+        """Morph targets of a node's mesh; 0 for one without."""
+        mesh = self.nodes[node].mesh
+        if mesh is None:
+            return 0
+        return max(len(p.get("targets", [])) for p in _item(self.tree, "meshes", mesh, self.where)["primitives"])
 
 
 def read(
@@ -586,7 +683,9 @@ def _nodes(tree: dict, where: str) -> dict[int, Node]:
             tuple(map(float, n.get(k, d)))
             for k, d in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))
         ]
-        nodes[i] = Node(str(n.get("name") or f"node-{i}"), parent, n.get("mesh"), n.get("camera"), *rest, matrix)
+        own = tuple(n["weights"]) if "weights" in n else None
+        name = str(n.get("name") or f"node-{i}")
+        nodes[i] = Node(name, parent, n.get("mesh"), n.get("camera"), *rest, matrix, n.get("skin"), own)
         stack += [(c, i, depth + 1) for c in reversed(n.get("children", []))]
     return nodes
 

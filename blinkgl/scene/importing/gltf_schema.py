@@ -121,6 +121,7 @@ class Primitive(_Part):
 
 class Mesh(_Part):
     primitives: list[Primitive]
+    weights: list[Number] = []
 
 
 class Node(_Part):
@@ -132,6 +133,7 @@ class Node(_Part):
     translation: Vector3 = [0, 0, 0]
     rotation: Vector4 = [0, 0, 0, 1]
     scale: Vector3 = [1, 1, 1]
+    weights: list[Number] = None
     extensions: Extensions = {}
 
     @model_validator(mode="after")
@@ -139,6 +141,11 @@ class Node(_Part):
         if sum(q * q for q in self.rotation) < 1e-18:
             raise ValueError("a node's rotation is zero")
         return self
+
+
+class Skin(_Part):
+    joints: Annotated[list[Index], Field(min_length=1)]
+    inverseBindMatrices: Index = None
 
 
 class Scene(_Part):
@@ -207,6 +214,7 @@ class File(_Part):
     meshes: list[Mesh] = []
     cameras: list[Camera] = []
     nodes: list[Node] = []
+    skins: list[Skin] = []
     scenes: list[Scene] = []
     scene: Index = 0
     animations: list[Animation] = []

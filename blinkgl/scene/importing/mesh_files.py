@@ -11,7 +11,9 @@ import io
 import logging
 import re
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -19,13 +21,16 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from blinkgl.errors import AssetError
+from blinkgl.config.deform import AnimationConfig
+from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, concatenate, make_mesh, normalise
 from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.animations import clip_names, play
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import MAX_BYTES, contents, reading
+from blinkgl.scene.shapes.skin import Skin, joined
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, shrink
-from blinkgl.scene.types import Material, Part, Texture
+from blinkgl.scene.types import Material, Mesh, Part, Texture
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb", ".gltf")
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # its warnings say nothing a user could act on
@@ -37,6 +42,7 @@ class Asset:
 
     has_materials : the parts carry the file's own materials.   log : repairs made.
     omissions : what the file asks for and is not drawn, in one line (:mod:`blinkgl.scene.omissions`), or empty.
+    clips : names of the animations that its file has.   replay : loads it again as it plays one; None: it has none.
     """
 
     name: str
@@ -45,9 +51,11 @@ class Asset:
     has_materials: bool = False
     log: tuple[str, ...] = ()
     omissions: tuple[str, ...] = ()
+    clips: tuple[str, ...] = ()
+    replay: Callable[[AnimationConfig], Asset] | None = None
 
     def normalised(self) -> Asset:
-        """Bounding box centred on the origin, bounding radius 1."""
+        """Bounding box centred on the origin, bounding radius 1; of all that it sweeps, where it deforms."""
         meshes = normalise(tuple(p.mesh for p in self.parts), self.name)
         return replace(self, parts=tuple(Part(m, p.material) for m, p in zip(meshes, self.parts)))
 
@@ -63,8 +71,15 @@ def load_asset(
     project_uvs: bool = False,
     uv_size: float | None = None,
     up: str = "auto",
+    animation: AnimationConfig | None = None,
+    base: Path | str = ".",
+    where: str = "animation",
 ) -> Asset:
     """One object from a file.
+
+    animation : of a glTF file, which it plays; None: its rest shape.   base : folder that paths in it start from.
+    where : its key of the
+        configuration.
 
     up : the file's axis that points up and becomes z, "y" or "z"; "auto" is y for glb and gltf, whose standard says so,
         and z for the others, which say nothing.
@@ -75,9 +90,23 @@ def load_asset(
     ``max_bytes`` bytes, references outside its folder, an extension required that is not drawn.
     """
     with reading("mesh", str(path)):
-        return _load(
-            Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size, up
-        )
+        given = Path(path), max_faces, max_bytes, keep_materials, max_texture, source_hash, project_uvs, uv_size, up
+        asset = _load(*given, animation, Path(base), where)
+    again = partial(
+        load_asset,
+        path,
+        max_faces=max_faces,
+        max_bytes=max_bytes,
+        keep_materials=keep_materials,
+        max_texture=max_texture,
+        source_hash=source_hash,
+        project_uvs=project_uvs,
+        uv_size=uv_size,
+        up=up,
+        base=base,
+        where=where,
+    )
+    return replace(asset, replay=lambda clip: again(animation=clip)) if asset.clips else asset
 
 
 def _load(
@@ -90,6 +119,9 @@ def _load(
     project_uvs: bool,
     uv_size: float | None,
     up: str,
+    animation: AnimationConfig | None,
+    base: Path,
+    key: str,
 ) -> Asset:
     where = str(path)
     suffix = path.suffix.lower()
@@ -100,22 +132,33 @@ def _load(
     log: list[str] = []
     if suffix in (".glb", ".gltf"):
         document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=keep_materials)
-        pieces, log, omissions = document.pieces(), document.log, document.omissions
-        if document.tree.get("animations"):
+        log, omissions, clips = document.log, document.omissions, clip_names(document)
+        played = None if animation is None else play(document, animation, base, key)
+        placed = document.pieces(changing=played is not None)
+        nodes, at_rest, pieces = [n for n, _ in placed], [document.world(n) for n, _ in placed], [p for _, p in placed]
+        if clips and played is None:
             omissions.add("animations (the rest pose is drawn)")
     else:
+        if animation is not None:
+            raise ConfigError(
+                "only glTF files have animations", where=key, value=path.name, accepted="a gltf or glb file, or null"
+            )
+        clips, played = [], None
         omissions = Omissions(path.name)
         pieces = _trimesh_pieces(path, data, suffix[1:], max_faces, max_texture if keep_materials else None, omissions)
     if up == "y" or (up == "auto" and suffix in (".glb", ".gltf")):
-        pieces = [gltf.transformed(p, gltf.Z_UP) for p in pieces]
+        pieces, turn = [gltf.transformed(p, gltf.Z_UP) for p in pieces], gltf.Z_UP
+    else:
+        turn = np.eye(4)
     total = sum(len(p.faces) for p in pieces)
     if total > max_faces:
         raise AssetError("the mesh has too many faces", where=where, value=total, accepted=f"at most {max_faces}")
     has_materials = keep_materials and any(p.material is not None for p in pieces)
     parts = []
-    for piece in pieces:
+    for number, piece in enumerate(pieces):
         if len(piece.faces) == 0 and len(pieces) > 1:
             continue
+        source: list[np.ndarray] | None = None if played is None else []
         # A palette picked by degenerate coordinates is fine with the file's own texture, useless with any other.
         own_texture = has_materials and piece.material is not None and piece.material.texture is not None
         mesh = make_mesh(
@@ -129,16 +172,34 @@ def _load(
             uv_size=uv_size,
             project_degenerate=not own_texture,
             log=log,
+            source=source,
         )
+        if played is not None and source is not None:
+            deformer = played.deformer(nodes[number], piece, source[0], turn @ at_rest[number], turn)
+            mesh = replace(mesh, deformer=deformer)
         material = piece.material if has_materials and piece.material is not None else Material()
         parts.append(Part(mesh, material))
     if not parts:
         raise AssetError("the file has no faces", where=where, accepted="a mesh with triangles")
     if not has_materials:
-        parts = [Part(concatenate(tuple(p.mesh for p in parts), name=path.stem, source_hash=digest), Material())]
+        meshes = tuple(p.mesh for p in parts)
+        whole = joined_mesh(meshes, path.stem, digest)
+        parts = [Part(mesh, Material()) for mesh in ((whole,) if whole is not None else meshes)]
     elif closed_together(tuple(p.mesh for p in parts)):
         parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]  # one solid, split by material
-    return Asset(path.stem, digest, tuple(parts), has_materials, tuple(dict.fromkeys(log)), omissions.lines())
+    said = tuple(dict.fromkeys(log)), omissions.lines()
+    return Asset(path.stem, digest, tuple(parts), has_materials, *said, tuple(clips))
+
+
+def joined_mesh(meshes: tuple[Mesh, ...], name: str, source_hash: str) -> Mesh | None:
+    """One mesh of several; None where they change their shapes in ways that are not one."""
+    whole = concatenate(meshes, name=name, source_hash=source_hash)
+    changing = [mesh.deformer for mesh in meshes if mesh.deformer is not None]
+    if not changing or len(meshes) == 1:
+        return whole
+    skins = [deformer for deformer in changing if isinstance(deformer, Skin)]
+    one = joined(skins) if len(skins) == len(meshes) else None
+    return None if one is None else replace(whole, deformer=one)
 
 
 def dependencies(path: Path, data: bytes | None = None) -> list[bytes]:

@@ -43,6 +43,7 @@ from blinkgl.config.physics import IN_THE_WAY, BodyConfig, PhysicsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.machine.extras import install
 from blinkgl.scene.motion.paths import HermitePath, StaticPath, thin
+from blinkgl.scene.shapes.deformer import filled
 from blinkgl.scene.types import Dynamics, PosePath, SceneObject
 
 IMPACT_S = 1.6e-3
@@ -53,7 +54,7 @@ _TOLERANCE = 2e-6  # of the radius, and rad: how far a path may pass a step by
 _SINK = 1e-4  # of the smaller radius: how deep a body may be in another at the start
 _LIFT, _LIFTS = 0.01, 50  # of the same: out of how much it is lifted, and in how many turns
 _IMPEDANCE = 0.9999  # the most that MuJoCo allows: 1 would be a contact that obeys its spring exactly
-_HULL_VERTICES = 200
+_HULL_VERTICES = 500
 _MOST_PARTS = 24  # of an object with more, all are one hull
 _SLOW_S = 5e-4  # slow is what gravity makes of rest in this time, s
 _HEAVY = 1e4  # mass of what nothing stops, of the heaviest body's
@@ -501,8 +502,8 @@ class Shape:
 
 
 def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
-    """What touches, of an object: its parts' solids in its axes."""
-    parts = [part.mesh.vertices[np.unique(part.mesh.faces)] for part in obj.parts if len(part.mesh.faces)]
+    """What touches, of an object: its parts' solids in its axes; of one that deforms the hull of all its shapes."""
+    parts = [filled(part.mesh)[0] for part in obj.parts if len(part.mesh.faces)]
     if len(parts) > _MOST_PARTS:
         parts = [np.concatenate(parts)]
     if obj.category == "ground" and config.shape == "auto" and config.kind == "fixed" and len(parts) == 1:

@@ -211,7 +211,17 @@ def _turned(rng, config: MotionConfig, last: np.ndarray | None, flat: bool) -> n
     return v / n if n > 1e-9 else np.array([1.0, 0.0, 0.0])
 
 
-def waypoints(rng, t0_ns, t1_ns, config, space, radius, start, speed, flat):
+def waypoints(
+    rng: np.random.Generator,
+    t0_ns: int,
+    t1_ns: int,
+    config: MotionConfig,
+    space: FreeSpace,
+    radius: float,
+    start: np.ndarray,
+    speed: float,
+    flat: bool,
+) -> tuple[np.ndarray, np.ndarray]:
     """Times (K,) int64 and positions (K, 3), K >= 2, of a walk whose mean speed over [t0, t1] is ``speed``."""
     duration = (t1_ns - t0_ns) * 1e-9
     if duration <= 0:

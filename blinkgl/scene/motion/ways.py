@@ -16,6 +16,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from blinkgl.config.trajectory import ObjectMotion
+from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import SplinePath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, waypoints
 from blinkgl.scene.types import PosePath
@@ -71,11 +72,16 @@ def way_path(
     closed: bool = False,
     level: bool = True,
     start: float = 0.0,
+    where: str = "way",
 ) -> SplinePath:
-    """The motion along a way over [t0, t1].
+    """The motion along a way over [t0, t1]. Raises ConfigError for points that coincide with the next.
 
     points : as of :class:`Way`.   speed : units/s, > 0.   level : the body's z axis stays up; otherwise its x axis goes
     up and down with the way, its y axis staying level.   start : share of the way that lies behind at time 0."""
+    given = np.asarray(points, np.float64)
+    after = np.roll(given, -1, axis=0) if closed else given[1:]
+    for k in np.flatnonzero(np.abs(after - given[: len(after)]).max(axis=1) < 1e-6):
+        raise ConfigError("must differ from the next point", where=f"{where}.points.{k}", value=given[k].tolist())
     way = Way(points, closed)
     span = (t1_ns - t0_ns) * 1e-9
     legs = len(np.asarray(points)) - (not closed)

@@ -87,20 +87,16 @@ class Waves(Deformer):
         return not any(self.amplitudes)
 
     def transformed(self, matrix: np.ndarray) -> Waves:
-        back = np.linalg.inv(matrix)
+        linear, shift = matrix[:3, :3], matrix[:3, 3]
+        inverse = np.linalg.inv(linear)
 
-        def seen(vector: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
-            """v . p + c of a point that the matrix took to where it is."""
-            return vector @ back[:3, :3], float(vector @ back[:3, 3]) + constant
+        def form(vector: np.ndarray, constant: float) -> tuple[np.ndarray, float]:
+            """v . p + c of the points' new coordinates."""
+            return vector @ inverse, constant - float(vector @ inverse @ shift)
 
-        out = Waves(
-            matrix[:3, :3] @ self.direction,
-            seen(*self.envelope),
-            (seen(*self.waves[0]), seen(*self.waves[1])),
-            self.amplitudes,
-            self.beats,
-        )
-        out.goes, out.speed = self.goes, self.speed * float(np.linalg.norm(matrix[:3, 0]))
+        first, second = (form(*wave) for wave in self.waves)
+        out = type(self)(linear @ self.direction, form(*self.envelope), (first, second), self.amplitudes, self.beats)
+        out.goes, out.speed = self.goes, self.speed * float(np.linalg.norm(linear[:, 0]))
         return out
 
     def _terms(self, mesh: Mesh, t_ns: int):
@@ -205,6 +201,12 @@ class Turn(Deformer):
     def is_static(self) -> bool:
         return self.angle == 0
 
+    def transformed(self, matrix: np.ndarray) -> Turn:
+        scale, turn = _similarity(self, matrix)
+        vector = turn @ self.share[0] / scale
+        share = vector, self.share[1] - float(vector @ matrix[:3, 3])
+        return type(self)(turn @ self.axis, matrix[:3, :3] @ self.pivot + matrix[:3, 3], share, self.angle, self.beat)
+
     def _share(self, mesh: Mesh) -> np.ndarray:
         return _dot(mesh.vertices, self.share[0]) + self.share[1]
 
@@ -305,6 +307,12 @@ class Breathe(Deformer):
     def is_static(self) -> bool:
         return not self.amount.any()
 
+    def transformed(self, matrix: np.ndarray) -> Breathe:
+        _, turn = _similarity(self, matrix)
+        if not np.allclose(turn, np.eye(3), atol=1e-12):
+            raise TypeError("Breathe cannot be turned")
+        return type(self)(matrix[:3, :3] @ self.centre + matrix[:3, 3], self.amount, self.beat)
+
     def _factor(self, t_ns: int) -> np.ndarray:
         return 1 + self.amount * math.sin(self.beat.at(t_ns))
 
@@ -333,6 +341,15 @@ class Breathe(Deformer):
 
     def changes(self, t_ns: int, there_ns: int) -> np.ndarray:
         return self._rows(np.zeros(3), self.amount * self.beat.sine_change(t_ns, there_ns))
+
+
+def _similarity(deformer: Deformer, matrix: np.ndarray) -> tuple[float, np.ndarray]:
+    """(scale, (3, 3) rotation) of an affine map that is nothing else, but for a shift. Raises TypeError."""
+    linear = matrix[:3, :3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if scale <= 0 or not np.allclose(linear @ linear.T, scale**2 * np.eye(3), rtol=0, atol=1e-9 * scale**2):
+        raise TypeError(f"{type(deformer).__name__} can be turned and scaled evenly, and nothing else")
+    return scale, linear / scale
 
 
 def _length(low: np.ndarray, high: np.ndarray, along: np.ndarray) -> float:

@@ -47,6 +47,12 @@ class Morphs:
         normals = None if self.normals is None else self.normals[:, vertices]
         return replace(self, positions=self.positions[:, vertices], normals=normals)
 
+    def transformed(self, linear: np.ndarray) -> Morphs:
+        """Of the mesh under a (3, 3) map; exact for turns and even scales, which keep normals at length 1."""
+        scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
+        normals = None if self.normals is None else self.normals @ np.linalg.inv(linear) * scale
+        return replace(self, positions=self.positions @ linear.T, normals=normals)
+
 
 class Skin(Deformer):
     """Vertices that follow joints.
@@ -146,13 +152,7 @@ class Skin(Deformer):
 
     def transformed(self, matrix: np.ndarray) -> Skin:
         matrix = np.asarray(matrix, np.float64)
-        morphs = self.morphs
-        if morphs is not None:
-            linear = matrix[:3, :3]
-            # Exact for turns and even scales, which keep the length that a mesh's normals have.
-            scale = abs(float(np.linalg.det(linear))) ** (1 / 3)
-            normals = None if morphs.normals is None else morphs.normals @ np.linalg.inv(linear) * scale
-            morphs = replace(morphs, positions=morphs.positions @ linear.T, normals=normals)
+        morphs = None if self.morphs is None else self.morphs.transformed(matrix[:3, :3])
         given = self.skeleton, self.bones, self.inverse_bind, self.joints, self.weights, morphs
         return Skin(*given, after=matrix @ self.after, before=self.before @ np.linalg.inv(matrix), where=self.where)
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
-from blinkgl.config.deform import DeformConfig
+from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.scene import (
+    LIVING_KINDS,
     ExplicitSceneConfig,
     KeyedMotionConfig,
     MaterialConfig,
@@ -20,7 +22,8 @@ from blinkgl.config.scene import (
     object_names,
 )
 from blinkgl.errors import AssetError, ConfigError
-from blinkgl.scene.geometry.meshes import bounds, transform_mesh
+from blinkgl.scene.geometry.deforming import deforming
+from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS
 from blinkgl.scene.importing.mesh_files import Asset, load_asset
 from blinkgl.scene.motion.collision import resolve_collisions
@@ -31,7 +34,6 @@ from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import gait
-from blinkgl.scene.shapes.table import deformer_of
 from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
@@ -66,31 +68,44 @@ def explicit_scene(
         name: _material(m, base, f"scene.materials.{name}", memory.textures.get(name))
         for name, m in config.materials.items()
     }
-    assets: dict[tuple[str, bool], Asset] = {}
+    assets: dict[tuple[str, bool, AnimationConfig | None], Asset] = {}
     objects, names = [], object_names([item.name for item in config.objects], [item.mesh for item in config.objects])
     for k, item in enumerate(config.objects):
         where = f"scene.objects.{k}"
-        own = item.material is None
-        if (item.mesh, own) not in assets:
-            assets[item.mesh, own] = _asset(
-                config.meshes[item.mesh], item.mesh, own, base, config.max_faces, memory.meshes
+        own, animation = item.material is None, animation_of(item.animation)
+        key = item.mesh, own, animation
+        if key not in assets:
+            assets[key] = _asset(
+                config.meshes[item.mesh],
+                item.mesh,
+                own,
+                base,
+                config.max_faces,
+                memory.meshes,
+                animation,
+                f"{where}.animation",
             )
-            log += [line for line in assets[item.mesh, own].log if line not in log]
-            omissions.update(dict.fromkeys(assets[item.mesh, own].omissions))
+            log += [line for line in assets[key].log if line not in log]
+            omissions.update(dict.fromkeys(assets[key].omissions))
         matrix = np.diag(np.broadcast_to(np.asarray(item.scale, float), 3))
         parts = []
-        for part in assets[item.mesh, own].parts:
+        for part in assets[key].parts:
             material = part.material if own else materials[item.material]
             material = replace(material, unlit=material.unlit or config.light.unlit)
             parts.append(Part(transform_mesh(part.mesh, matrix), material))
         if item.deform is not None:
-            parts = deforming(parts, item.deform)
-        if item.way is None:
+            if animation is not None:
+                raise ConfigError(
+                    "an object deforms by one thing", where=f"{where}.deform", accepted="deform or animation"
+                )
+            parts = list(deforming(parts, item.deform))
+        way = item.way
+        if way is None:
             path = motion_path(item, t0_ns, t1_ns, where)
         else:
-            speed = item.way.speed or gait(part.mesh for part in parts)[1] or 1.0
-            way = item.way
-            path = way_path(way.points, speed, t0_ns, t1_ns, closed=way.closed, level=way.level, start=way.start)
+            speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
+            form = {"closed": way.closed, "level": way.level, "start": way.start}
+            path = way_path(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
         objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
     bodies = {name: item.physics for name, item in zip(names, config.objects) if item.physics is not None}
@@ -122,12 +137,6 @@ def explicit_scene(
         tuple(omissions),
         dynamics,
     )
-
-
-def deforming(parts: Sequence[Part], config: DeformConfig) -> list[Part]:
-    """The parts of one object, whose shape changes together as ``deform:`` says."""
-    deformer = deformer_of(config, *bounds(part.mesh for part in parts))
-    return [replace(part, mesh=replace(part.mesh, deformer=deformer)) for part in parts]
 
 
 def motion_path(config: KeyedMotionConfig, t0_ns: int, t1_ns: int, where: str, camera: bool = False) -> PosePath:
@@ -166,8 +175,21 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
 
 def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
     """The primitive that ``scene.meshes.name`` asks for. Raises ConfigError for a bad parameter."""
-    try:
+    with _parameters_of(name):
         return BUILDERS[config.primitive](**config.parameters)
+
+
+def check_primitive(kind: str, parameters: Mapping[str, Any], name: str) -> None:
+    """Raises ConfigError for what :func:`primitive_mesh` would refuse; of living things, whose parameters have nothing
+    to do with each other, without making one."""
+    with _parameters_of(name):
+        (BUILDERS[kind].checked if kind in LIVING_KINDS else BUILDERS[kind])(**parameters)
+
+
+@contextmanager
+def _parameters_of(name: str) -> Iterator[None]:
+    try:
+        yield
     except AssetError as error:
         key = (error.where or "").partition(".")[2]
         raise ConfigError(
@@ -179,8 +201,19 @@ def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
 
 
 def _asset(
-    config: MeshConfig, name: str, own_materials: bool, base: Path, max_faces: int, memory: Mapping[str, Mesh]
+    config: MeshConfig,
+    name: str,
+    own_materials: bool,
+    base: Path,
+    max_faces: int,
+    memory: Mapping[str, Mesh],
+    animation: AnimationConfig | None,
+    animation_key: str,
 ) -> Asset:
+    if animation is not None and (name in memory or config.file is None):
+        raise ConfigError(
+            "only glTF files have animations", where=animation_key, value=name, accepted="null, or deform"
+        )
     if name in memory or config.primitive is not None:
         mesh = memory[name] if name in memory else primitive_mesh(config, name)
         wears = own_materials and name not in memory and config.primitive in COATS
@@ -197,6 +230,9 @@ def _asset(
         project_uvs=config.project_uvs,
         uv_size=config.uv_size,
         up=config.up,
+        animation=animation,
+        base=base,
+        where=animation_key,
     )
 
 

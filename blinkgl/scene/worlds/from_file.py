@@ -11,8 +11,9 @@ three, get OpenCV axes. glTF's world (y up) is turned z up.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,15 +21,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel, PinHole, focal_length
+from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, make_mesh
 from blinkgl.scene.importing import gltf
+from blinkgl.scene.importing.animations import Animation, clip_names, play
 from blinkgl.scene.importing.mesh_files import piece_of_trimesh
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import reading
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.surfaces.images import content_hash, shrink
 from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.explicit import motion_path
@@ -60,6 +64,7 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
         camera_path=camera_path,
         intrinsics=config.intrinsics,
         animation=config.animation,
+        base=base,
         light=make_light(config.light),
         background=config.background,
         max_faces=config.max_faces,
@@ -77,7 +82,8 @@ def from_gltf(
     camera_name: str | int | None = None,
     camera_path: PosePath | None = None,
     intrinsics: str = "config",
-    animation: str | int | None = 0,
+    animation: str | int | AnimationConfig | None = 0,
+    base: Path | str = ".",
     light: Light = Light(),
     background: float = 0.2,
     max_faces: int = 5_000_000,
@@ -87,31 +93,56 @@ def from_gltf(
 
     camera_name : name or index of the file's camera (None: the first), unless ``camera_path`` is given.
     intrinsics : "config": those of ``camera``; "file": fx = fy = height / 2 / tan(yfov / 2), centred, near = znear.
-    animation : name or index; translations, rotations of nodes are sampled at 60 Hz and joined by a C2 spline. Changing
-        scales keep their first value, which the scene's log says.
+    animation : name or index, or more (:class:`~blinkgl.config.deform.AnimationConfig`, whose files are below
+    ``base``).
+        Translations and rotations of nodes are sampled at 60 Hz and joined by a C2 spline; what a path cannot be
+        (scales that change, jumps, skins, morph targets) changes the object's shape instead, exactly.
     What the file asks for and is not drawn is in the scene's ``omissions``.
     Raises AssetError (file), ConfigError (camera or animation that is not there).
     """
     with reading("scene", str(path)):
         document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture)
         return _from_document(
-            document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light, background
+            document,
+            camera,
+            t0_ns,
+            t1_ns,
+            camera_name,
+            camera_path,
+            intrinsics,
+            _animation(document, animation, Path(base)),
+            light,
+            background,
         )
 
 
 def _from_document(
     document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light, background
 ) -> Scene:
-    channels = _channels(document, animation)
     objects = []
     for index, node in document.nodes.items():
         if node.mesh is None:
             continue
-        pieces = document.mesh_pieces(node.mesh)
+        pieces = document.mesh_pieces(node.mesh, changing=animation is not None)
         if not any(len(p.faces) for p in pieces):
             continue
-        motion, baked = _motion(document, index, channels, t0_ns, t1_ns)
-        objects.append((node.name, _parts(pieces, baked, node.name, document.where, document.log), motion))
+        skinned = animation is not None and node.skin is not None and any(p.binding is not None for p in pieces)
+        if animation is not None and (skinned or _beyond_a_path(animation, index)):
+            motion, baked, on_path, turn = (
+                StaticPath(None, t0_ns, t1_ns),
+                gltf.Z_UP @ document.world(index),
+                False,
+                gltf.Z_UP,
+            )
+        else:
+            motion, baked = _motion(document, index, animation, t0_ns, t1_ns)
+            on_path, turn = True, np.eye(4)
+
+        deformer = None
+        if animation is not None and (skinned or not on_path or any(p.targets is not None for p in pieces)):
+            deformer = partial(animation.deformer, index, at_rest=baked, turn=turn, on_path=on_path)
+        parts = _parts(pieces, baked, node.name, document.where, document.log, deformer)
+        objects.append((node.name, parts, motion))
     if not objects:
         raise AssetError("the scene has no faces", where=document.where, accepted="a scene with a mesh")
     if camera_path is None or intrinsics == "file":
@@ -119,7 +150,7 @@ def _from_document(
         if document.tree["cameras"][document.nodes[index].camera]["type"] == "orthographic":
             document.omissions.add("an orthographic camera (drawn in perspective)")
         if camera_path is None:
-            camera_path, _ = _motion(document, index, channels, t0_ns, t1_ns, CV_FROM_GL)
+            camera_path, _ = _motion(document, index, animation, t0_ns, t1_ns, CV_FROM_GL)
         if intrinsics == "file":
             camera = _gltf_intrinsics(document, index, camera)
     return _scene(
@@ -281,9 +312,17 @@ def _scene(objects: Iterable, rig: Rig, t0_ns, t1_ns, light, background, log, om
     return Scene(tuple(made), rig, t0_ns, t1_ns, light, background, tuple(dict.fromkeys(log)), omissions.lines())
 
 
-def _parts(pieces: list[gltf.Piece], baked: np.ndarray, name: str, where: str, log: list[str]) -> tuple[Part, ...]:
+def _parts(
+    pieces: list[gltf.Piece],
+    baked: np.ndarray,
+    name: str,
+    where: str,
+    log: list[str],
+    deformer: Callable[[gltf.Piece, np.ndarray], Deformer | None] | None = None,
+) -> tuple[Part, ...]:
     parts = []
     for piece in (gltf.transformed(p, baked) for p in pieces if len(p.faces)):
+        source: list[np.ndarray] | None = None if deformer is None else []
         textured = piece.material is not None and piece.material.texture is not None
         mesh = make_mesh(
             piece.vertices,
@@ -295,7 +334,10 @@ def _parts(pieces: list[gltf.Piece], baked: np.ndarray, name: str, where: str, l
             source_hash=content_hash(piece.vertices.tobytes(), np.ascontiguousarray(piece.faces, np.int64).tobytes()),
             project_degenerate=not textured,
             log=log,
+            source=source,
         )
+        if deformer is not None and source is not None:
+            mesh = replace(mesh, deformer=deformer(piece, source[0]))
         parts.append(Part(mesh, piece.material or Material()))
     if closed_together(tuple(p.mesh for p in parts)):
         parts = [Part(replace(p.mesh, closed=True), p.material) for p in parts]
@@ -309,58 +351,47 @@ def _turn(up: str) -> np.ndarray:
 
 
 # ---- glTF
-def _channels(document: gltf.Document, animation: str | int | None) -> list[gltf.Channel]:
-    listed = document.tree.get("animations", [])
-    if animation is None or (animation == 0 and not listed):
-        return []
-    names = [str(a.get("name", i)) for i, a in enumerate(listed)]
-    if len(listed) > 1 and animation == 0:
+def _animation(document: gltf.Document, given: str | int | AnimationConfig | None, base: Path) -> Animation | None:
+    names = clip_names(document)
+    if given is None or (given == 0 and not names):
+        return None
+    if len(names) > 1 and given == 0:
         document.omissions.add(f"animations beside '{names[0]}' (scene.animation chooses one of: {', '.join(names)})")
-    index = names.index(animation) if animation in names else animation
-    if not isinstance(index, int) or not 0 <= index < len(listed):
-        accepted = (
-            f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
-        )
-        raise ConfigError("no such animation in the file", where="scene.animation", value=animation, accepted=accepted)
-    return document.channels(index)
+    return play(document, animation_of(given, loop=False), base, "scene.animation")
+
+
+def _beyond_a_path(animation: Animation, node: int) -> bool:
+    """Whether a node moves in a way that is no rigid path: its scale changes, or it jumps."""
+    return any(
+        track.interpolation == "STEP" or (track.path == "scale" and np.ptp(track.values, axis=0).max() > 0)
+        for track in animation.tracks_of(node)
+    )
 
 
 _HERE = np.eye(4)
 
 
 def _motion(
-    document: gltf.Document, node: int, channels: list[gltf.Channel], t0_ns: int, t1_ns: int, local: np.ndarray = _HERE
+    document: gltf.Document,
+    node: int,
+    animation: Animation | None,
+    t0_ns: int,
+    t1_ns: int,
+    local: np.ndarray = _HERE,
 ):
     """(PosePath of T_world_node @ local, matrix to bake into the node's vertices)."""
-    chain, step = set(), node
-    while step is not None:
-        chain.add(step)
-        step = document.nodes[step].parent
-    mine = [c for c in channels if c.node in chain]
+    mine = [] if animation is None else animation.tracks_of(node)
     rest, baked = split_rigid(gltf.Z_UP @ document.world(node))
-    if not mine:
+    if animation is None or not mine:
         return StaticPath(rest @ local, t0_ns, t1_ns), baked
-    start, end = min(c.times[0] for c in mine), max(c.times[-1] for c in mine)
-    start, end = max(start, min(t0_ns * 1e-9, end)), min(end, max(t1_ns * 1e-9, start))
-    keys = np.concatenate([c.times for c in mine])
-    regular = np.linspace(start, end, int(min(max((end - start) / _ANIMATION_STEP, 1), _MAX_SAMPLES)) + 1)
-    times = np.unique(np.round(np.concatenate([keys[(keys >= start) & (keys <= end)], regular]) * 1e9).astype(np.int64))
-    times = times[np.concatenate([[True], np.diff(times) > 100_000])]  # a key next to a sample adds nothing but ringing
+    times = animation.sample_times([track.times for track in mine], t0_ns, t1_ns, _ANIMATION_STEP, _MAX_SAMPLES)
+    place = document.places[node]
     poses, first = [], None
     for t in times:
-        values: dict[int, dict] = {}
-        for c in mine:
-            values.setdefault(c.node, {})[c.path] = c.at(t * 1e-9)
-        T, A = split_rigid(gltf.Z_UP @ document.world(node, values))
+        T, A = split_rigid(gltf.Z_UP @ animation.skeleton.at(int(t))[0][place])
         first = A if first is None else first
-        if np.abs(A - first).max() > 1e-3 * np.abs(first).max():
-            line = (
-                f"{document.path.name}: the changing scale of node '{document.nodes[node].name}' is not supported, "
-                "its first one is kept"
-            )
-            document.log.append(line)
         poses.append(T @ local)
-    if any(c.interpolation == "STEP" for c in mine):
+    if any(track.interpolation == "STEP" for track in mine):
         document.log.append(
             f"{document.path.name}: jumps in the animation of node '{document.nodes[node].name}' are smoothed"
         )

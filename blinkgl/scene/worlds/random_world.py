@@ -16,13 +16,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from blinkgl.camera import CameraModel
+from blinkgl.config.base import tag_of
+from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
 from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
 from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
+from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
+from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import Exploded, Side, simulate
 from blinkgl.scene.motion.paths import StaticPath
@@ -30,7 +34,7 @@ from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_c
 from blinkgl.scene.motion.ways import random_way
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.shapes.deformer import gait
+from blinkgl.scene.shapes.deformer import filled, gait
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
@@ -53,8 +57,8 @@ def random_world(
     base: Path,
 ) -> Scene:
     """The ``sequence``-th random scene of a run; arguments as :func:`blinkgl.scene.build.build_scene`."""
-    rng, rng_motion, rng_texture = (
-        generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE)
+    rng, rng_motion, rng_texture, rng_shape = (
+        generator(seed, sequence, role) for role in (Role.SCENE, Role.TRAJECTORY, Role.TEXTURE, Role.SHAPE)
     )
     objects, textures = pools(config, base)
     log: list[str] = []
@@ -87,8 +91,8 @@ def random_world(
         for k, (parts, T) in enumerate(_walls(config.walls, config, textures, rng, rng_texture, split, floor, log))
     ]
 
-    given = config, camera, objects, textures, rng, rng_texture, split, T_cam, clearance, floor
-    placed = _place(*given, t0_ns, t1_ns, log, omissions)
+    dice = rng, rng_texture, rng_shape
+    placed = _place(config, camera, objects, textures, dice, split, T_cam, clearance, floor, log, omissions)
     centres = np.array([T[:3, 3] for *_, T, _, _ in placed]).reshape(-1, 3)
     radii = np.array([radius for *_, radius, _ in placed])
     half = config.region.width / 2
@@ -193,30 +197,16 @@ def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray
     return T, target
 
 
-def _place(
-    config,
-    camera,
-    objects: Pool,
-    textures: Pool,
-    rng,
-    rng_texture,
-    split,
-    T_cam,
-    clearance,
-    floor,
-    t0_ns,
-    t1_ns,
-    log,
-    omissions,
-):
+def _place(config, camera, objects: Pool, textures: Pool, dice, split, T_cam, clearance, floor, log, omissions):
     """[(name, parts, T_world_obj, bounding radius, resting)]: no two bounding spheres, nor the camera's, overlap."""
     settings, region = config.objects, config.region
+    rng, rng_texture, rng_shape = dice
     placed: list[tuple] = []
     if settings.count == 0:
         return placed
     centres, radii = [T_cam[:3, 3]], [clearance]
     for k in range(settings.count):
-        asset = objects.draw(rng, split, log)
+        asset, said = _playing(objects.draw(rng, split, log), config, rng_shape)
         radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
         resting = config.ground is not None and rng.random() >= settings.flying
         goes, _ = _gait(asset.parts)
@@ -225,8 +215,9 @@ def _place(
         else:
             resting = goes == "upright" and config.ground is not None
             rotation = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * math.pi)]).as_matrix()
-        parts = _dress(config, asset, radius, textures, rng_texture, split, log)
-        lowest = min(_lowest(p.mesh, rotation, t0_ns, t1_ns) for p in parts)
+        changed, word = _changing(asset, settings.deform, rng_shape)
+        parts = _dress(config, changed, radius, textures, rng_texture, split, log)
+        lowest = min(_lowest(p.mesh, rotation[2]) for p in parts)
         in_view = rng.random() < settings.in_view
         for _ in range(_PLACEMENTS):
             position = _candidate(config, camera, rng, T_cam, floor, in_view, resting)
@@ -251,9 +242,44 @@ def _place(
         centres.append(position)
         radii.append(radius)
         placed.append((f"{asset.name}#{k}", parts, T, radius, resting))
+        log.extend(f"{asset.name}#{k} {text}" for text in (said, word) if text)
         log.extend(line for line in asset.log if line not in log)
         omissions.update(dict.fromkeys(asset.omissions))
     return placed
+
+
+def _playing(asset: Asset, config: RandomSceneConfig, rng) -> tuple[Asset, str]:
+    """The asset as it plays one of its file's animations, and what to say of it. Nothing is drawn for others."""
+    if asset.replay is None or config.pool.animation == "rest":
+        return asset, ""
+    clip, speed, phase = int(rng.integers(len(asset.clips))), float(rng.uniform(0.8, 1.25)), float(rng.uniform(0, 10))
+    playing = asset.replay(AnimationConfig(clip=clip, speed=speed, phase=phase)).normalised()
+    return playing, f"plays '{asset.clips[clip]}'"
+
+
+def _changing(asset: Asset, config: RandomDeformConfig, rng) -> tuple[Asset, str]:
+    """The asset, of bounding radius 1, as its shape changes, and what to say of it: now and then, by formula. All
+    shapes fit into the sphere of radius 1."""
+    if config.share == 0 or rng.random() >= config.share or any(p.mesh.deformer is not None for p in asset.parts):
+        return asset, ""
+    kinds = config.kinds or tuple(DeformConfig.members.models)
+    model = DeformConfig.members.models[kinds[int(rng.integers(len(kinds)))]]
+    drawn = model.drawn(rng, float(rng.uniform(*config.strength)), _log_uniform(rng, config.period))
+    parts = deforming(asset.parts, drawn)
+    reach = max(
+        float(np.linalg.norm(points, axis=1).max()) + margin for points, margin in (filled(p.mesh) for p in parts)
+    )
+    smaller = [replace(part, mesh=scale_mesh(part.mesh, 1 / reach)) for part in asset.parts]
+    return replace(asset, parts=deforming(smaller, drawn)), f"deforms: {tag_of(model)[1]}"
+
+
+def _lowest(mesh: Mesh, up: np.ndarray) -> float:
+    """Height of its lowest point at any time, along (3,) up in its axes."""
+    if mesh.deformer is None:
+        return float((mesh.vertices @ up).min())
+    points, margin = filled(mesh)
+    # A figure's feet are on the ground, and not as far above it as they might be below between two times.
+    return float((points @ up).min()) - (0.0 if mesh.deformer.goes == "upright" else margin)
 
 
 def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarray:
@@ -267,16 +293,6 @@ def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarra
     if resting:
         ray[2] = 0.0
     return T_cam[:3, 3] + ray / np.linalg.norm(ray) * _log_uniform(rng, config.objects.distance)
-
-
-def _lowest(mesh: Mesh, rotation: np.ndarray, t0_ns: int, t1_ns: int) -> float:
-    """Height of a turned mesh's lowest point over its origin; of one that deforms while it stays upright, whenever it
-    is lowest."""
-    at_rest = float((mesh.vertices @ rotation[2]).min())
-    if mesh.deformer is None or mesh.deformer.goes != "upright":
-        return at_rest
-    swept = mesh.deformer.sweep(mesh, t0_ns, t1_ns)
-    return float(swept.low[2]) + swept.margin
 
 
 def _gait(parts: Iterable[Part]) -> tuple[str, float]:

@@ -1,0 +1,298 @@
+"""AEDAT 2.0 (jAER) of DAVIS cameras: events, frames and IMU samples, decoded by numba kernels.
+
+A header of lines that begin with ``#``; then records of eight bytes, big-endian: an address and a time in µs, 32 bits
+each. Addresses (jAER's ``DavisChip`` and iniVation's page "AEDAT file formats"):
+
+    bit 31 = 0: event         30..22 y   21..12 x   11 polarity   10 = 1: pin of the camera, no pixel
+    bit 31 = 1: frame sample  30..22 y   21..12 x   11..10: 0 reset read, 1 signal read   9..0 ADC sample
+                IMU value     30..28 which: acceleration x y z, temperature, rate x y z   27..12 value   11..10: 3
+
+y counts from the bottom, and x of events (alone) from the right. A time is counted modulo 2^32 (71.6 minutes).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numba
+import numpy as np
+
+from blinkgl.errors import AssetError
+from blinkgl.events.types import Events
+from blinkgl.io.davis import CameraFrame, G, ImuSamples
+
+MAGIC = b"#!AER-DAT"
+SIZES = {
+    "DAVIS128": (128, 128),
+    "DAVIS208": (192, 208),
+    "DAVIS240": (180, 240),
+    "DAVIS346": (260, 346),
+    "DAVIS640": (480, 640),
+}
+"""(height, width) of chips; their names go on with letters that do not matter here."""
+_MAX_LINE, _MAX_HEADER = 1 << 16, 1 << 26
+_RECORD = np.dtype([("address", ">u4"), ("t", ">u4")])
+_VALUES = 7
+_FULL_SCALE = 1 << 15
+_DEFAULT_RATE, _DEFAULT_ACCELERATION = 1000.0, 8.0
+"""Full scales, degrees/s and g, that jAER sets a camera to where its header does not say."""
+_DVS, _PIN, _APS, _IMU = range(4)
+
+
+class Aedat2Reader:
+    """A recording of a DAVIS camera; times are the file's own µs, unwrapped. height, width : px, by the chip's name.
+    frames_cut : frames without all of their samples (at the file's ends), known after :meth:`frames`.
+
+    Raises AssetError: another magic or version, a chip that is not known, a header without an end; while reading,
+    naming the byte: stray bytes at the end (truncated), an address outside the sensor, times that run backwards."""
+
+    def __init__(self, path: str | os.PathLike):
+        self.path = Path(path)
+        self._header, self._start = _read_header(self.path)
+        chip = re.search(r"^#\s*AEChip:\s*(\S+)", self._header, re.M)
+        name = chip.group(1).rpartition(".")[2] if chip else None
+        size = next((size for known, size in SIZES.items() if name and name.upper().startswith(known)), None)
+        if size is None:
+            raise AssetError(
+                "a camera whose addresses are not known" if chip else "no camera named in the header ('# AEChip: …')",
+                where=str(path),
+                value=name,
+                accepted=", ".join(SIZES),
+            )
+        self.height, self.width = size
+        self.frames_cut = 0
+
+    def chunks(self, records: int = 1 << 17) -> Iterator[Events]:
+        """All events, as decoded from ``records`` records at a time."""
+        for _, address, t in self._kind(_DVS, records):
+            x = self.width - 1 - (address >> 12 & 0x3FF)
+            y = self.height - 1 - (address >> 22 & 0x1FF)
+            yield Events(x.astype(np.uint16), y.astype(np.uint16), t, (address >> 11 & 1).astype(np.uint8))
+
+    def frames(self, records: int = 1 << 17) -> Iterator[CameraFrame]:
+        """Frames in their order: reset minus signal sample, (H, W) uint16 of 0 … 1023, 0 where it would be negative.
+
+        Frames of a part of the sensor (a region of interest) are 0 elsewhere. The exposure of a global shutter is from
+        the last reset read to the first signal read; of a rolling one, that of the row read first."""
+        assembler = _Frames(self.height, self.width)
+        for _, address, t in self._kind(_APS, records):
+            yield from assembler.add(address, t)
+        yield from assembler.end()
+        self.frames_cut = assembler.cut
+
+    def imu(self) -> ImuSamples:
+        """All whole samples. Scales are the header's (``ImuGyroScale``, ``ImuAccelScale``), or jAER's usual ones."""
+        parts = [(address, t) for _, address, t in self._kind(_IMU)]
+        address = np.concatenate([a for a, _ in parts]) if parts else np.empty(0, np.int64)
+        t = np.concatenate([t for _, t in parts]) if parts else np.empty(0, np.int64)
+        which, value = address >> 28 & 7, (address >> 12 & 0xFFFF).astype(np.uint16).view(np.int16).astype(np.float64)
+        # A sample is seven values in their order; a file may begin or end within one.
+        begins = np.flatnonzero(which == 0)
+        begins = begins[begins + _VALUES <= len(which)]
+        rows = begins[:, None] + np.arange(_VALUES)
+        rows = rows[(which[rows] == np.arange(_VALUES)).all(1)]
+        values = value[rows] if len(rows) else np.empty((0, _VALUES))
+        rate = _scale(self._header, "ImuGyroScale", "GyroFullScaleDegPerSec", _DEFAULT_RATE) / _FULL_SCALE
+        pull = _scale(self._header, "ImuAccelScale", "ImuAccelScaleG", _DEFAULT_ACCELERATION) / _FULL_SCALE
+        return ImuSamples(
+            t[rows[:, 0]] if len(rows) else np.empty(0, np.int64),
+            values[:, :3] * (pull * G),
+            np.radians(values[:, 4:] * rate),
+            values[:, 3] / 340 + 35,  # InvenSense MPU-6150, the unit of these cameras
+        )
+
+    def counts(self) -> dict[str, int]:
+        """Records of each kind: events, pins, frame samples, IMU values."""
+        found = np.zeros(4, np.int64)
+        for _, raw in self._raw(1 << 17):
+            found += np.bincount(_kinds(raw["address"].astype(np.int64)), minlength=4)
+        return dict(zip(("events", "pins", "samples", "imu"), found.tolist()))
+
+    def _kind(self, kind: int, records: int = 1 << 17) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """(index of the first record looked at, addresses, times) of one kind of records; the others are checked, too,
+        that what a file holds is refused whatever is asked of it."""
+        state = np.full(5, -1, np.int64)  # last time, and the last time of every kind
+        for first, raw in self._raw(records):
+            address, stamp = raw["address"].astype(np.int64), raw["t"].astype(np.int64)
+            kinds = _kinds(address)
+            t = np.empty(len(raw), np.int64)
+            bad, why = _unwrap(address, kinds, stamp, state, self.height, self.width, t)
+            if bad >= 0:
+                self._refuse(first + bad, int(address[bad]), int(stamp[bad]), why, state)
+            chosen = kinds == kind
+            if chosen.any():
+                yield first, address[chosen], t[chosen]
+
+    def _raw(self, records: int) -> Iterator[tuple[int, np.ndarray]]:
+        first = 0
+        try:
+            with open(self.path, "rb") as file:
+                file.seek(self._start)
+                while data := file.read(records * _RECORD.itemsize):
+                    whole = len(data) // _RECORD.itemsize
+                    yield first, np.frombuffer(data, _RECORD, whole)
+                    first += whole
+                    if stray := len(data) - whole * _RECORD.itemsize:
+                        raise AssetError(
+                            f"truncated: {stray} stray bytes after record {first - 1}, at byte {self._byte(first)}",
+                            where=str(self.path),
+                        )
+        except OSError as error:
+            raise AssetError(f"cannot read: {error.strerror}", where=str(self.path)) from error
+
+    def _byte(self, record: int) -> int:
+        return self._start + record * _RECORD.itemsize
+
+    def _refuse(self, record: int, address: int, stamp: int, why: int, state: np.ndarray) -> None:
+        at = f"record {record}, at byte {self._byte(record)}"
+        if why == 1:
+            place = (address >> 12 & 0x3FF, address >> 22 & 0x1FF)
+            raise AssetError(
+                f"an address outside the sensor: {at}",
+                where=str(self.path),
+                value=f"x {place[0]}, y {place[1]} (address 0x{address:08x})",
+                accepted=f"x < {self.width}, y < {self.height}",
+            )
+        raise AssetError(
+            f"times run backwards: {at}",
+            where=str(self.path),
+            value=stamp,
+            accepted=f"at least {int(state[0]) & 0xFFFFFFFF} µs, or a wrap of 32 bits",
+        )
+
+
+def _read_header(path: Path) -> tuple[str, int]:
+    """The lines that begin with '#', and where they end. A record, too, may begin with that byte (y of 140 … 143); no
+    line holds the control characters that its low bytes are, and newer files say where they end."""
+    lines, size = [], 0
+    try:
+        with open(path, "rb") as file:
+            magic = file.read(len(MAGIC) + 3)
+            if not magic.startswith(MAGIC):
+                raise AssetError(
+                    "not an AEDAT file: wrong magic", where=str(path), value=magic, accepted="#!AER-DAT2.0"
+                )
+            if magic != MAGIC + b"2.0":
+                raise AssetError(
+                    "another version of AEDAT",
+                    where=str(path),
+                    value=magic[len(MAGIC) :].decode("latin-1"),
+                    accepted="2.0 (4.0 is .aedat4)",
+                )
+            file.seek(0)
+            while True:
+                start = file.tell()
+                line = file.readline(_MAX_LINE)
+                if not line.startswith(b"#") or (not line.endswith(b"\n") and len(line) < _MAX_LINE):
+                    break
+                if any(c < 32 and c not in b"\t\r\n" for c in line):
+                    break
+                size += len(line)
+                if len(line) == _MAX_LINE or size > _MAX_HEADER:
+                    raise AssetError(f"a header without an end, at byte {start}", where=str(path))
+                lines.append(line.decode("utf-8", "replace").rstrip())
+                if re.match(r"#\s*End Of ASCII Header", lines[-1], re.I):
+                    start = file.tell()
+                    break
+    except OSError as error:
+        raise AssetError(f"cannot read: {error.strerror}", where=str(path)) from error
+    return "\n".join(lines), start
+
+
+def _scale(header: str, key: str, prefix: str, usual: float) -> float:
+    said = re.search(rf'key="{key}" value="{prefix}(\d+)"', header)
+    return float(said.group(1)) if said else usual
+
+
+def _kinds(address: np.ndarray) -> np.ndarray:
+    """_DVS, _PIN, _APS or _IMU of every address (int64); frame samples of the sub-type that nobody has are _PIN."""
+    low = address >> 10 & 3
+    return np.where(
+        address >> 31 == 0, np.where(low & 1, _PIN, _DVS), np.where(low == 3, _IMU, np.where(low == 2, _PIN, _APS))
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _unwrap(address, kinds, stamp, state, height, width, t):
+    """Fills times, int64 µs; returns (index of the first bad record, or -1; 1: outside the sensor, 2: backwards).
+
+    Records of one kind keep the order of time; of different kinds they may be out of order by less than half of what 32
+    bits count."""
+    for i in range(len(address)):
+        kind = kinds[i]
+        if kind == 0 or kind == 2:
+            if (address[i] >> 12 & 0x3FF) >= width or (address[i] >> 22 & 0x1FF) >= height:
+                return i, 1
+        if state[0] < 0:
+            now = stamp[i]
+        else:
+            step = (stamp[i] - state[0]) & 0xFFFFFFFF
+            now = state[0] + (step if step < 0x80000000 else step - 0x100000000)
+        if now < state[1 + kind] or now < 0:
+            state[0] = state[1 + kind]
+            return i, 2
+        t[i] = now
+        state[0] = max(now, state[0])
+        state[1 + kind] = now
+    return -1, 0
+
+
+class _Frames:
+    """Frame samples, in their order, put together. cut : frames without all of their samples."""
+
+    def __init__(self, height: int, width: int):
+        self._shape, self.cut = (height, width), 0
+        self._clear()
+
+    def _clear(self) -> None:
+        self._reset, self._signal = (np.full(self._shape, -1, np.int32) for _ in range(2))
+        self._times = np.array([-1, -1, -1], np.int64)  # first reset, last reset, first signal
+
+    def add(self, address: np.ndarray, t: np.ndarray) -> Iterator[CameraFrame]:
+        begin = 0
+        while begin < len(address):
+            begin = _assemble(address, t, begin, self._reset, self._signal, self._times)
+            if begin < len(address):  # a sample of the frame that follows
+                yield from self.end()
+
+    def end(self) -> Iterator[CameraFrame]:
+        """The frame so far, where it is one."""
+        read, there = self._signal >= 0, self._reset >= 0
+        if read.any() or there.any():
+            if read.any() and np.array_equal(read, there) and _rectangular(read):
+                image = np.where(read, np.maximum(self._reset - self._signal, 0), 0).astype(np.uint16)
+                first, last, signal = self._times.tolist()
+                begin = last if last <= signal else first
+                yield CameraFrame(image[::-1].copy(), begin, max(signal, begin))
+            else:
+                self.cut += 1
+        self._clear()
+
+
+def _rectangular(mask: np.ndarray) -> bool:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return bool(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1].all())
+
+
+@numba.njit(cache=True, nogil=True)
+def _assemble(address, t, begin, reset, signal, times):
+    """Index of the first sample of the frame after: of a pixel that was read, a reset or another read."""
+    for i in range(begin, len(address)):
+        x, y, sample = address[i] >> 12 & 0x3FF, address[i] >> 22 & 0x1FF, address[i] & 0x3FF
+        if address[i] >> 10 & 1:
+            if signal[y, x] >= 0:
+                return i
+            signal[y, x] = sample
+            if times[2] < 0:
+                times[2] = t[i]
+        else:
+            if reset[y, x] >= 0 or signal[y, x] >= 0:
+                return i
+            reset[y, x] = sample
+            if times[0] < 0:
+                times[0] = t[i]
+            times[1] = t[i]
+    return len(address)

@@ -1,0 +1,218 @@
+"""What a glTF file's animations do to its shapes: clips chosen, mixed, taken from other files, and the deformers of the
+pieces that follow them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.config.deform import AnimationConfig, ClipConfig
+from blinkgl.errors import ConfigError
+from blinkgl.scene.importing import gltf
+from blinkgl.scene.shapes.clips import PATHS, Blend, Clip, Playing, Track
+from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.skeleton import Motion, Skeleton
+from blinkgl.scene.shapes.skin import Morphs, Skin
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One of the clips that are played at once. share : of it in the whole."""
+
+    tracks: list[Track]
+    playing: Playing
+    share: float
+
+
+class Animation:
+    """A file's clips as they are played. document : whose nodes move.   skeleton : all of its nodes, in the file's
+    world."""
+
+    def __init__(self, document: gltf.Document, parts: Sequence[_Part]):
+        self.document, self._parts, self._places = document, parts, document.places
+        rest = document.rest()
+        motions: list[Motion] = [Clip(rest, part.tracks, part.playing) for part in parts]
+        self.motion = motions[0] if len(motions) == 1 else Blend(motions[0], motions[1], parts[1].share)
+        self.skeleton: Skeleton = document.skeleton(self.motion)
+        self._moved = {track.joint for part in parts for track in part.tracks if track.path in PATHS}
+
+    @property
+    def tracks(self) -> list[Track]:
+        return [track for part in self._parts for track in part.tracks]
+
+    def moves(self, node: int) -> bool:
+        """Whether a node or one that it hangs on is moved."""
+        return any(self._places[step] in self._moved for step in self._chain(node))
+
+    def _chain(self, node: int) -> list[int]:
+        """A node, and those that it hangs on."""
+        chain, step = [], node
+        while step is not None:
+            chain.append(step)
+            step = self.document.nodes[step].parent
+        return chain
+
+    def tracks_of(self, node: int) -> list[Track]:
+        """Those that move a node, or one that it hangs on."""
+        chain = {self._places[step] for step in self._chain(node)}
+        return [track for track in self.tracks if track.joint in chain and track.path in PATHS]
+
+    def sample_times(self, keys: list[np.ndarray], t0_ns: int, t1_ns: int, step: float, most: int) -> np.ndarray:
+        """(N,) int64 ns in [t0, t1] to lay a path through: regular ones and, of a clip at the sequence's own times,
+        the key frames (keys : s), as far as it lasts."""
+        playing = self._parts[0].playing
+        start, end = t0_ns * 1e-9, t1_ns * 1e-9
+        plain = len(self._parts) == 1 and not playing.loop and playing.speed == 1 and playing.phase == -playing.first
+        if plain:
+            first, last = min(k[0] for k in keys), max(k[-1] for k in keys)
+            start, end = max(first, min(start, last)), min(last, max(end, first))
+        regular = np.linspace(start, end, int(min(max((end - start) / step, 1), most)) + 1)
+        inside = np.concatenate(keys) if plain else np.zeros(0)
+        inside = inside[(inside >= start) & (inside <= end)]
+        times = np.unique(np.round(np.concatenate([inside, regular]) * 1e9).astype(np.int64))
+        # A key next to a sample adds nothing but ringing.
+        return times[np.concatenate([[True], np.diff(times) > 100_000])]
+
+    def deformer(
+        self,
+        node: int,
+        piece: gltf.Piece,
+        source: np.ndarray,
+        at_rest: np.ndarray,
+        turn: np.ndarray,
+        on_path: bool = False,
+    ) -> Deformer | None:
+        """Of a mesh that was made of a piece of a node's mesh; None where it is rigid, or follows the object's path.
+
+        source : (W,) which of the piece's vertices each of the mesh's is.   at_rest : (4, 4) what took the piece to
+        the object's axes.
+        turn : (4, 4) from the file's world to the object's axes.   on_path : the object's own path moves the node."""
+        skin = self.document.nodes[node].skin
+        bound = piece.binding if skin is not None else None
+        morphs = self._morphs(node, piece, source, at_rest)
+        where = f"{self.document.path.name}, mesh of node '{self.document.nodes[node].name}'"
+        if bound is not None and skin is not None:
+            joints, bind = self.document.skin(skin)
+            before = np.linalg.inv(at_rest)
+            return Skin(
+                self.skeleton,
+                joints,
+                bind,
+                bound[0][source],
+                bound[1][source],
+                morphs,
+                after=turn,
+                before=before,
+                where=where,
+            )
+        if self.moves(node) and not on_path:
+            place = self._places[node]
+            return Skin.rigid(
+                self.skeleton, place, len(source), morphs, inverse_bind=np.linalg.inv(at_rest), after=turn, where=where
+            )
+        return None if morphs is None else Skin.morphing(morphs, where)
+
+    def _morphs(self, node: int, piece: gltf.Piece, source: np.ndarray, at_rest: np.ndarray) -> Morphs | None:
+        """Those targets that have a weight at any time."""
+        if piece.targets is None:
+            return None
+        positions, normals = piece.targets
+        count, place = len(positions), self._places[node]
+        mine = [
+            (part.share, part.playing, [t for t in part.tracks if t.joint == place and t.path == "weights"])
+            for part in self._parts
+        ]
+        whole = self.document.morph_weights(node, max(count, 1))
+        values = [t.values[:, 1] if t.values.ndim == 3 else t.values for _, _, tracks in mine for t in tracks]
+        used = np.flatnonzero(np.any([whole != 0, *(np.abs(v).max(axis=0) > 0 for v in values)], axis=0))
+        if not len(used):
+            return None
+
+        def weights(t_ns: int) -> tuple[np.ndarray, np.ndarray]:
+            value, rate = np.zeros(count), np.zeros(count)
+            for share, playing, tracks in mine:
+                time, speed = playing.at(t_ns)
+                now, change = tracks[-1].at(time) if tracks else (whole, np.zeros(count))
+                value, rate = value + share * now, rate + share * speed * change
+            return value[used], rate[used]
+
+        moving = [playing for _, playing, tracks in mine if tracks and not playing.is_static]
+        periods = {playing.period_ns for playing in moving}
+        morphs = Morphs(
+            positions[used],
+            None if normals is None else normals[used],
+            weights,
+            not moving,
+            periods.pop() if len(periods) == 1 else None,
+            max((playing.span_ns for playing in moving), default=0),
+        )
+        return morphs.taken(source).transformed(at_rest[:3, :3])
+
+
+def play(document: gltf.Document, config: AnimationConfig, base: Path, where: str) -> Animation:
+    """A file's animation as the configuration asks for it. where : key of the configuration.
+    Raises ConfigError (a clip or file that is not there) and AssetError (what is wrong with the clip)."""
+    shares = (1.0,) if config.blend is None else (1 - config.share, config.share)
+    clips = (config,) if config.blend is None else (config, config.blend)
+    keys = (where, f"{where}.blend")
+    return Animation(
+        document, [_part(document, clip, share, base, key) for clip, share, key in zip(clips, shares, keys)]
+    )
+
+
+def clip_names(document: gltf.Document) -> list[str]:
+    """Of a file's animations; the number of one that has none."""
+    return [str(a.get("name", i)) for i, a in enumerate(document.tree.get("animations", []))]
+
+
+def _part(document: gltf.Document, config: ClipConfig, share: float, base: Path, where: str) -> _Part:
+    theirs = document
+    if config.file is not None:
+        path = Path(config.file).expanduser()
+        path = path if path.is_absolute() else base / path
+        if not path.is_file():
+            raise ConfigError("no such file", where=f"{where}.file", value=config.file, accepted="a gltf or glb file")
+        theirs = gltf.read(path, materials=False)
+    names = clip_names(theirs)
+    index = names.index(config.clip) if config.clip in names else config.clip
+    if not isinstance(index, int) or not 0 <= index < len(names):
+        accepted = (
+            f"one of: {', '.join(names)}, or an index below {len(names)}" if names else "null (the file has none)"
+        )
+        raise ConfigError("no such animation in the file", where=where, value=config.clip, accepted=accepted)
+    tracks = theirs.tracks(index)
+    if theirs is not document:
+        tracks = _by_name(theirs, tracks, document, f"{where}.file", config.file or "")
+    times = [track.times for track in tracks]
+    first, last = (min(t[0] for t in times), max(t[-1] for t in times)) if times else (0.0, 0.0)
+    # A clip that is held is at its own time 0 at the sequence's: as its file says.
+    phase = config.phase if config.loop else config.phase - first
+    return _Part(tracks, Playing(float(first), float(last), config.speed, float(phase), config.loop), share)
+
+
+def _by_name(theirs: gltf.Document, tracks: list[Track], mine: gltf.Document, where: str, file: str) -> list[Track]:
+    """Tracks of another file's nodes on the nodes of the same names; those of nodes that are not here are left out,
+    and said."""
+    places = {node.name: place for place, node in reversed(list(enumerate(mine.nodes.values())))}
+    names = [node.name for node in theirs.nodes.values()]
+    matrices = {node.name for node in mine.nodes.values() if node.matrix is not None}
+    found = [
+        Track(places[names[t.joint]], t.path, t.times, t.values, t.interpolation)
+        for t in tracks
+        if names[t.joint] in places and t.path in PATHS and names[t.joint] not in matrices
+    ]
+    if not found:
+        raise ConfigError(
+            "the clip's file moves no joint of this file's names",
+            where=where,
+            value=file,
+            accepted="a file with joints such as: " + ", ".join(list(places)[:5]),
+        )
+    if missing := {names[t.joint] for t in tracks} - set(places):
+        some = sorted(missing)
+        said = ", ".join(some[:5]) + (", …" if len(some) > 5 else "")
+        mine.omissions.add(f"joints of '{Path(file).name}' that it has not: {said}")
+    return found

@@ -1,0 +1,136 @@
+"""Folders of recorded frames and what is in them: which there are, their images, their flow.
+
+A folder is expected to look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of frames in
+another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero: the point is
+hidden or outside the image in the next frame). A third may hold the flow back, one file per pair of frames, too.
+"""
+
+from __future__ import annotations
+
+import glob
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.config.base import Refused
+from blinkgl.config.frames import FramesConfig, check_span
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.io.flow import read_flow
+from blinkgl.io.frames import IMAGE, read_any_image
+from blinkgl.io.images import read_npy
+from blinkgl.scene.worlds.pool import resolve
+
+_FLOW = (".npy", ".flo", ".png")
+
+
+def matching_folders(config: FramesConfig, base: Path) -> list[Path]:
+    """The folders that ``frames.folders`` names, sorted. ConfigError: none named, none
+    found, or no image folder inside."""
+    found: list[Path] = []
+    for number, pattern in enumerate(config.folders):
+        matches = sorted(Path(p) for p in glob.glob(str(resolve(pattern, base))) if Path(p).is_dir())
+        if not matches:
+            raise ConfigError(
+                "no such folder",
+                where=f"frames.folders.{number}",
+                value=pattern,
+                accepted="a folder of frames, or a pattern",
+            )
+        found += matches
+    if not found:
+        raise ConfigError(
+            "no folders of frames", where="frames.folders", value=[], accepted="one folder per sequence, or patterns"
+        )
+    for folder in found:
+        if not (folder / config.images).is_dir():
+            raise ConfigError(
+                "no such folder",
+                where="frames.images",
+                value=str(folder / config.images),
+                accepted="a folder of images",
+            )
+    return found
+
+
+def folder_of(config: FramesConfig, index: int, base: Path) -> Path:
+    """The ``index``-th folder of frames; the only one for every index. Raises ConfigError as
+    :func:`matching_folders`, or for too few."""
+    folders = matching_folders(config, base)
+    if len(folders) > 1 and index >= len(folders):
+        raise ConfigError(f"{len(folders)} folders are too few for sequence {index}", where="frames.folders")
+    return folders[index] if len(folders) > 1 else folders[0]
+
+
+def used_images(config: FramesConfig, folder: Path) -> list[Path]:
+    """The images of ``folder`` that become a sequence, in order. AssetError: too few; ConfigError: they last longer
+    than an event file can hold."""
+    files = _listed(folder / config.images, IMAGE)[config.first :]
+    files = files[: config.count]
+    if len(files) < 3 or (config.count and len(files) < config.count):
+        raise AssetError(
+            "too few frames",
+            where=str(folder / config.images),
+            value=len(files),
+            accepted=f"at least {config.count or 3}",
+        )
+    try:
+        check_span(len(files), config.fps)
+    except Refused as error:
+        raise ConfigError(error.problem, where="frames.fps", value=error.value, accepted=error.accepted) from None
+    return files
+
+
+def _listed(folder: Path, suffixes) -> list[Path]:
+    if not folder.is_dir():
+        raise AssetError("no such folder", where=str(folder))
+    return sorted(
+        p for p in folder.iterdir() if p.suffix.lower() in suffixes and p.is_file() and not p.name.startswith(".")
+    )
+
+
+def flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path], list[Path]]:
+    """(flow, masks) of the frames used; the k-th goes from frame k to frame k + 1. AssetError: too few, no folder."""
+    if frames.flow is None:
+        return [], []
+    return _flow_and_masks(folder / frames.flow, frames.first, used)
+
+
+def backward_files(folder: Path, frames: FramesConfig, used: int) -> list[Path]:
+    """Flow back, the k-th from frame k + 1 to frame k. AssetError as :func:`flow_files`."""
+    return [] if frames.backward is None else _flow_and_masks(folder / frames.backward, frames.first, used)[0]
+
+
+def _flow_and_masks(folder: Path, first: int, used: int) -> tuple[list[Path], list[Path]]:
+    everything = _listed(folder, _FLOW)
+    masks = [p for p in everything if p.stem.endswith("_mask")]
+    flows = [p for p in everything if p not in set(masks)][first:]
+    if len(flows) < used - 1 or (masks and len(masks) < first + used - 1):
+        raise AssetError(
+            "not one flow file per pair of frames",
+            where=str(folder),
+            value=f"{len(flows)} flow files, {len(masks)} masks",
+            accepted=f"at least {used - 1} for {used} frames",
+        )
+    return flows, masks[first:]
+
+
+def read_flow_of(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """flow (H, W, 2) float32 px and valid (H, W) bool of frames of (H, W) px. AssetError: unreadable, another size."""
+    flow, valid = read_flow(path)
+    if flow.shape[:2] != size:
+        raise AssetError("flow and image differ in size", where=str(path), value=flow.shape[:2], accepted=str(size))
+    return flow, valid
+
+
+def read_mask_of(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) bool of frames of (H, W) px. AssetError: unreadable, another size."""
+    mask = read_npy(path)
+    if mask.shape != size:
+        raise AssetError("mask and image differ in size", where=str(path), value=mask.shape, accepted=str(size))
+    return mask != 0
+
+
+def read_frame(path: Path) -> np.ndarray:
+    """(H, W) or (H, W, 3) RGB of an image file, alpha dropped. Raises AssetError."""
+    image = read_any_image(path)
+    return image if image.ndim == 2 else np.ascontiguousarray(image[..., :3])

@@ -1,0 +1,325 @@
+"""AEDAT 2.0: what is written bit by bit is read, a real recording holds what is known of it, and damage is refused by
+its place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aedat2_files import (
+    CHIP,
+    event_addresses,
+    frame_addresses,
+    header,
+    imu_addresses,
+    records,
+)
+from blinkgl.cli import run
+from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.events.types import Events
+from blinkgl.io.aedat2 import Aedat2Reader
+from blinkgl.io.formats import convert, open_events
+from blinkgl.io.frames import open_frames
+from tests.shared_data import shared
+
+H, W = 180, 240
+
+
+def events(n=5000, seed=0, height=H, width=W, t0=10_000) -> Events:
+    rng = np.random.default_rng(seed)
+    t = t0 + np.sort(rng.integers(0, 300_000, n))
+    return Events(
+        rng.integers(0, width, n).astype(np.uint16),
+        rng.integers(0, height, n).astype(np.uint16),
+        t,
+        rng.integers(0, 2, n).astype(np.uint8),
+    )
+
+
+def same(a: Events, b: Events) -> bool:
+    return all(np.array_equal(getattr(a, k), getattr(b, k)) for k in "xytp")
+
+
+def put(path, data: bytes):
+    path.write_bytes(data)
+    return path
+
+
+def test_events_as_they_were(tmp_path):
+    given = events()
+    path = put(tmp_path / "e.aedat", header() + records(event_addresses(given), given.t))
+    file = open_events(path)
+    assert (file.format, file.height, file.width) == ("aedat2", H, W)
+    assert same(file.read(), given)
+    parts = list(Aedat2Reader(path).chunks(records=777))
+    assert len(parts) == 7 and same(Events.concatenate(parts), given)
+
+
+def test_the_axes_are_turned_as_jaer_turns_them(tmp_path):
+    """Raw x 0 is the right column, raw y 0 the bottom row; bit 11 is ON."""
+    path = put(tmp_path / "e.aedat", header() + records([0, (H - 1) << 22 | (W - 1) << 12 | 1 << 11], [1, 2]))
+    found = open_events(path).read()
+    assert (found.x.tolist(), found.y.tolist(), found.p.tolist()) == ([W - 1, 0], [H - 1, 0], [0, 1])
+
+
+@pytest.mark.parametrize(
+    "chip, size",
+    [
+        (CHIP, (180, 240)),
+        ("eu.seebetter.ini.chips.davis.Davis346blue", (260, 346)),
+        ("eu.seebetter.ini.chips.davis.DAViS640", (480, 640)),
+        ("DAVIS128", (128, 128)),
+    ],
+)
+def test_the_chips_name_is_the_size(tmp_path, chip, size):
+    file = open_events(put(tmp_path / "e.aedat", header(chip) + records([0], [5])))
+    assert (file.height, file.width) == size and file.read().y[0] == size[0] - 1
+
+
+def test_times_go_on_where_32_bits_end(tmp_path):
+    t = np.array([2**31 - 5, 2**31 + 5, 2**32 - 3, 2**32 + 4, 2**32 + 2**31 + 1, 2**33 - 1, 2**33 + 7])
+    given = Events(*(np.arange(len(t)).astype(np.uint16) for _ in "xy"), t, np.zeros(len(t), np.uint8))
+    path = put(tmp_path / "e.aedat", header() + records(event_addresses(given), given.t))
+    assert open_events(path).read().t.tolist() == t.tolist()
+    assert np.concatenate([e.t for e in Aedat2Reader(path).chunks(records=2)]).tolist() == t.tolist()
+
+
+def test_pins_are_no_pixels(tmp_path):
+    path = put(tmp_path / "e.aedat", header() + records([1 << 10 | 511 << 22, 5 << 12, 1 << 10 | 1 << 11], [1, 2, 3]))
+    assert len(open_events(path).read()) == 1
+    assert Aedat2Reader(path).counts() == {"events": 1, "pins": 2, "samples": 0, "imu": 0}
+
+
+def test_a_record_that_begins_like_a_line_of_the_header(tmp_path):
+    """y = 140 from the bottom is the byte '#': the header ends where its lines end, or where it says so."""
+    for end in (True, False):
+        given = events(50, t0=0)
+        given.y[:] = H - 1 - 140
+        data = records(event_addresses(given), given.t)
+        assert data[:1] == b"#"
+        assert same(open_events(put(tmp_path / "e.aedat", header(end=end) + data)).read(), given), end
+
+
+# ---- frames and IMU --------------------------------------------------------------------------------------------------
+
+
+def pictures(count=3, seed=1, height=H, width=W) -> list[tuple[np.ndarray, np.ndarray]]:
+    rng = np.random.default_rng(seed)
+    reset = rng.integers(600, 1024, (count, height, width))
+    return [(r, np.clip(r - rng.integers(-20, 500, r.shape), 0, 1023)) for r in reset]
+
+
+def global_frames(frames, t0=1000, exposure=5000, period=40_000) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(addresses, times): the resets are read from t0 on, for 1 ms, the signals ``exposure`` later."""
+    parts = []
+    for k, (reset, signal) in enumerate(frames):
+        for read, is_signal, begin in ((reset, False, 0), (signal, True, 1000 + exposure)):
+            address = frame_addresses(read, is_signal)
+            t = t0 + k * period + begin + np.arange(len(address)) * 1000 // len(address)
+            parts.append((address, t))
+    return parts
+
+
+def file_of(*parts) -> bytes:
+    address, t = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
+    order = np.argsort(t, kind="stable")
+    return records(address[order], t[order])
+
+
+def test_frames_are_reset_minus_signal(tmp_path):
+    shown, given = pictures(), events(t0=0)
+    path = put(tmp_path / "f.aedat", header() + file_of((event_addresses(given), given.t), *global_frames(shown)))
+    file = open_events(path)
+    assert same(file.read(), given)
+    found = list(file.frames())
+    assert len(found) == 3
+    for k, (frame, (reset, signal)) in enumerate(zip(found, shown)):
+        assert frame.image.dtype == np.uint16
+        np.testing.assert_array_equal(frame.image, np.maximum(reset - signal, 0))
+        assert (frame.begin_us, frame.end_us) == (1000 + 40_000 * k + 999, 1000 + 40_000 * k + 6000)
+        assert frame.t_us == (frame.begin_us + frame.end_us) // 2
+    small = list(Aedat2Reader(path).frames(records=1000))
+    assert [f.begin_us for f in small] == [f.begin_us for f in found]
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(small, found))
+
+
+def test_a_rolling_shutter(tmp_path):
+    """Columns are reset one after the other and read 3 ms later, when others are still being reset."""
+    reset, signal = pictures(1)[0]
+    parts = [
+        (frame_addresses(read, is_signal), begin + np.arange(H * W) // H * 25)
+        for read, is_signal, begin in ((reset, False, 100), (signal, True, 3100))
+    ]
+    (frame,) = open_events(put(tmp_path / "f.aedat", header() + file_of(*parts))).frames()
+    np.testing.assert_array_equal(frame.image, np.maximum(reset - signal, 0))
+    assert (frame.begin_us, frame.end_us) == (100, 3100)
+
+
+def test_frames_that_are_cut_are_left_out_and_counted(tmp_path):
+    shown = pictures(3)
+    address, t = (np.concatenate([p[i] for p in global_frames(shown)]) for i in (0, 1))
+    reader = Aedat2Reader(put(tmp_path / "f.aedat", header() + records(address[100:-50], t[100:-50])))
+    (frame,) = reader.frames()
+    np.testing.assert_array_equal(frame.image, np.maximum(shown[1][0] - shown[1][1], 0))
+    assert reader.frames_cut == 2
+
+
+def test_a_part_of_the_sensor(tmp_path):
+    (reset, signal), mask = pictures(1)[0], np.zeros((H, W), bool)
+    mask[20:50, 30:90] = True
+    parts = [
+        (frame_addresses(read, s)[frame_addresses(mask, s) & 1 == 1], t)
+        for read, s, t in ((reset, 0, 10), (signal, 1, 90))
+    ]
+    parts = [(address, np.full(len(address), t)) for address, t in parts]
+    (frame,) = open_events(put(tmp_path / "f.aedat", header() + file_of(*parts))).frames()
+    np.testing.assert_array_equal(frame.image, np.where(mask, np.maximum(reset - signal, 0), 0))
+
+
+def test_frames_go_through_the_door_of_frames(tmp_path):
+    path = put(tmp_path / "f.aedat", header() + file_of(*global_frames(pictures(3))))
+    source = open_frames(path)
+    assert (source.height, source.width, source.count) == (H, W, None)
+    assert [t for _, t, _ in source] == [1000 * (1000 + 40_000 * k + 3499) for k in range(3)]
+    assert [t for _, t, _ in open_frames(path, fps=100)] == [0, 10**7, 2 * 10**7]
+    with pytest.raises(EventDataError, match=r"events need at least two frames \(got '0 frames'\)"):
+        open_frames(put(tmp_path / "e.aedat", header() + records([0], [1])))
+
+
+def test_the_inertial_unit(tmp_path):
+    values = np.array([[4096, -8192, 0, -1828, 328, -3280, 32767]] * 3 + [[-32768, 1, 2, 3, 4, 5, 6]])
+    t = np.repeat([10, 20, 30, 40], 7)
+    given = events(500, t0=0)
+    imu = (imu_addresses(values), t)
+    path = put(tmp_path / "i.aedat", header() + file_of(imu, (event_addresses(given), given.t)))
+    found = open_events(path).imu()
+    assert len(found) == 4 and found.t.tolist() == [10, 20, 30, 40]
+    # jAER's usual full scales: 8 g and 1000 degrees/s over 15 bits.
+    np.testing.assert_allclose(found.acceleration[0], np.array([1, -2, 0]) * 9.80665)
+    np.testing.assert_allclose(found.rate[0], np.radians(np.array([328, -3280, 32767]) * 1000 / 32768))
+    np.testing.assert_allclose(found.temperature[0], 35 - 1828 / 340)
+    np.testing.assert_allclose(found.acceleration[3, 0], -8 * 9.80665)
+    said = header(
+        CHIP,
+        '#<entry key="ImuGyroScale" value="GyroFullScaleDegPerSec250"/>',
+        '#<entry key="ImuAccelScale" value="ImuAccelScaleG2"/>',
+    )
+    other = open_events(put(tmp_path / "j.aedat", said + file_of(imu))).imu()
+    np.testing.assert_allclose(other.acceleration, found.acceleration / 4)
+    np.testing.assert_allclose(other.rate, found.rate / 4)
+
+
+def test_samples_of_the_inertial_unit_that_are_not_whole(tmp_path):
+    """A file begins within a sample, loses a value, and ends within another."""
+    address, t = imu_addresses(np.arange(35).reshape(5, 7)), np.repeat([10, 20, 30, 40, 50], 7)
+    keep = np.ones(35, bool)
+    keep[[0, 1, 17, 33, 34]] = False
+    found = open_events(put(tmp_path / "i.aedat", header() + records(address[keep], t[keep]))).imu()
+    assert found.t.tolist() == [20, 40]
+    assert len(open_events(put(tmp_path / "e.aedat", header() + records([0], [1]))).imu()) == 0
+
+
+# ---- a real recording ------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_of_a_davis240c(tmp_path):
+    """What is known of it: 162,771 events, IMU at about 2.33 kHz, a camera that stands upright under gravity."""
+    path = shared("data/events/rueckauer2016/IMU_translBoxes.aedat")
+    file = open_events(path)
+    assert (file.height, file.width) == (180, 240)
+    found = file.read()
+    assert len(found) == 162_771
+    assert int(found.t[-1] - found.t[0]) == 2_072_651 and (found.x.max(), found.y.max()) == (239, 179)
+    assert Aedat2Reader(path).counts() == {"events": 162_771, "pins": 0, "samples": 0, "imu": 33_837}
+    imu = file.imu()
+    assert len(imu) == 4833
+    assert (len(imu) - 1) / (imu.t[-1] - imu.t[0]) * 1e6 == pytest.approx(2332, abs=1)
+    assert np.linalg.norm(imu.acceleration.mean(0)) == pytest.approx(9.9, abs=0.1)
+    assert 20 < imu.temperature.mean() < 40
+    assert list(file.frames()) == [] and convert(path, tmp_path / "e.npz")[1] == 162_771
+    assert same(open_events(tmp_path / "e.npz").read(), found)
+
+
+def test_the_commands_read_it(tmp_path, capsys):
+    given = events()
+    path = put(tmp_path / "e.aedat", header() + file_of((event_addresses(given), given.t), *global_frames(pictures(4))))
+    assert run(["convert", str(path), str(tmp_path / "e.csv")]) == 0
+    assert same(open_events(tmp_path / "e.csv").read(), given)
+    assert run(["compare", str(path), "--frames", str(path)]) == 0
+    assert "correlation" in capsys.readouterr().out
+    assert run(["simulate", str(path), "--out", str(tmp_path / "s.h5"), "--quiet"]) == 0
+    assert len(open_events(tmp_path / "s.h5").read()) > 1000
+
+
+# ---- bad input -------------------------------------------------------------------------------------------------------
+
+START = len(header())
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (b"#!AER-DAT4.0\r\n" + b"\0" * 16, r"another version of AEDAT \(got '4.0'\); expected 2.0"),
+        (b"#!AER-DAT3.1\r\n", r"another version of AEDAT \(got '3.1'\)"),
+        (b"\x89PNG", r"not an AEDAT file: wrong magic \(got b'\\x89PNG'\)"),
+        (b"", r"not an AEDAT file: wrong magic"),
+        (header(None) + records([0], [1]), r"no camera named in the header"),
+        (header("ch.unizh.ini.jaer.chip.retina.DVS128"), r"a camera whose addresses are not known \(got 'DVS128'\)"),
+    ],
+)
+def test_files_that_are_not_opened(tmp_path, data, message):
+    with pytest.raises(AssetError, match=message):
+        open_events(put(tmp_path / "e.aedat", data))
+
+
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (records([0] * 3, [1, 2, 3])[:-3], rf"truncated: 5 stray bytes after record 1, at byte {START + 16}"),
+        (
+            records([0, 0, 240 << 12], [1, 2, 3]),
+            rf"outside the sensor: record 2, at byte {START + 16} \(got 'x 240, y 0 .address 0x000f0000.'\)",
+        ),
+        (records([180 << 22], [1]), rf"outside the sensor: record 0, at byte {START} \(got 'x 0, y 180"),
+        (records([0, 1 << 31 | 200 << 22], [1, 2]), rf"outside the sensor: record 1, at byte {START + 8}"),
+        (
+            records([0] * 4, [100, 200, 150, 300]),
+            rf"times run backwards: record 2, at byte {START + 16} \(got 150\); expected at least 200 µs, or a wrap",
+        ),
+        (records([0] * 2, [2**32 - 1, 2**31 + 10]), rf"times run backwards: record 1, at byte {START + 8}"),
+    ],
+)
+def test_damage_is_refused_by_its_place(tmp_path, data, message):
+    path = put(tmp_path / "e.aedat", header() + data)
+    for read in (lambda f: f.read(), lambda f: list(f.frames()), lambda f: f.imu()):
+        with pytest.raises(AssetError, match=message):
+            read(open_events(path))
+    with pytest.raises(AssetError, match=message.split(":")[0]):
+        list(Aedat2Reader(path).chunks(records=2))
+
+
+def test_kinds_may_be_out_of_order_among_each_other(tmp_path):
+    """Values of the inertial unit come late: only within a kind do times have to keep their order."""
+    values = imu_addresses(np.zeros((1, 7)))
+    path = put(tmp_path / "e.aedat", header() + records([0, *values, 0], [100, *[90] * 7, 110]))
+    file = open_events(path)
+    assert file.read().t.tolist() == [100, 110] and file.imu().t.tolist() == [90]
+
+
+def test_it_is_not_written(tmp_path):
+    given = put(tmp_path / "e.aedat", header() + records([0], [1]))
+    with pytest.raises(OutputError, match=r"unknown event file ending \(got '.aedat'\); expected .h5, .hdf5, .raw"):
+        convert(given, tmp_path / "out.aedat")
+
+
+def test_a_header_without_an_end(tmp_path):
+    with pytest.raises(AssetError, match=rf"a header without an end, at byte {START}"):
+        open_events(put(tmp_path / "e.aedat", header() + b"#" + b"x" * 200_000))
+
+
+def test_files_of_events_alone(tmp_path):
+    given = put(tmp_path / "e.aedat", header() + records([0], [1]))
+    convert(given, tmp_path / "e.csv")
+    for name in ("frames", "imu"):
+        with pytest.raises(AssetError, match=r"csv files hold events alone; expected an .aedat4 or .aedat recording"):
+            getattr(open_events(tmp_path / "e.csv"), name)()

@@ -1,0 +1,129 @@
+"""AEDAT4's frames and inertial unit, of recordings of which is known what they hold."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError, EventDataError
+from blinkgl.io import aedat4_decode
+from blinkgl.io.aedat4 import Aedat4Reader
+from blinkgl.io.formats import open_events
+from blinkgl.io.frames import open_frames
+from blinkgl.recordings.comparison import compare
+from tests.shared_data import shared
+
+CRADLE = "data/events/cuke_davis346/demo-01.aedat4"
+STILL = "data/events/aedat4/davis346_events_frames_imu.aedat4"
+
+
+def opened(name: str):
+    path = shared(name)
+    pytest.importorskip("dv_processing", reason="AEDAT4 needs the optional package dv-processing")
+    return open_events(path)
+
+
+@pytest.mark.parametrize("name, count, exposure_us", [(CRADLE, 13, 20_000), (STILL, 4, 500)])
+def test_frames(name, count, exposure_us):
+    """25 Hz of 346x260."""
+    file = opened(name)
+    frames = list(file.frames())
+    assert len(frames) == count and {f.image.shape for f in frames} == {(260, 346)}
+    assert {f.image.dtype for f in frames} == {np.dtype(np.uint8)} and frames[0].image.std() > 5
+    assert {f.end_us - f.begin_us for f in frames} == {exposure_us}
+    assert {b.begin_us - a.begin_us for a, b in itertools.pairwise(frames)} == {40_000}
+    source = open_frames(file.path)
+    assert [t for _, t, _ in source] == [1000 * (f.begin_us + exposure_us // 2) for f in frames]
+
+
+def test_frames_and_events_are_on_one_clock():
+    """The change of ln(frame + 10) from middle to middle of the exposures is what the events say; half an exposure off,
+    it is not."""
+    path = opened(CRADLE).path
+    right, early = (
+        float(
+            np.mean(
+                compare(str(path), frames=str(path), gamma="linear", frame_delay_ms=ms).to_dict()["a"][
+                    "frame_correlation"
+                ]
+            )
+        )
+        for ms in (0.0, -20.0)
+    )
+    assert right > 0.88 and early < right - 0.2
+
+
+@pytest.mark.parametrize(
+    "name, count, hertz, gravity",
+    [
+        (STILL, 160, 1001, 10.1),
+        ("data/events/aermanager/head_turn.aedat4", 1176, 805, 10.5),
+        (CRADLE, 510, 999, 0.0),
+    ],
+)
+def test_the_inertial_unit(name, count, hertz, gravity):
+    """(The cradle's camera had its accelerometer off.)"""
+    imu = opened(name).imu()
+    assert len(imu) == count and imu.acceleration.shape == imu.rate.shape == (count, 3)
+    assert (count - 1) / (imu.t[-1] - imu.t[0]) * 1e6 == pytest.approx(hertz, abs=1)
+    assert np.linalg.norm(imu.acceleration.mean(0)) == pytest.approx(gravity, abs=0.1)
+    assert np.abs(imu.rate.mean(0)).max() < 0.05 and 25 < imu.temperature.mean() < 40
+
+
+def test_what_a_recording_does_not_hold():
+    file = opened("data/events/noise/dvxplorer_constant_light.aedat4")
+    with pytest.raises(AssetError, match=r"constant_light.aedat4: no frames in the recording$"):
+        list(file.frames())
+    with pytest.raises(AssetError, match=r"no samples of an inertial unit in the recording$"):
+        file.imu()
+    with pytest.raises(AssetError, match="no frames in the recording"):
+        open_frames(file.path)
+
+
+def test_a_recording_that_is_cut(tmp_path):
+    path = tmp_path / "e.aedat4"
+    path.write_bytes(opened(STILL).path.read_bytes()[:200_000])
+    for read in (lambda f: list(f.frames()), lambda f: f.imu()):
+        try:
+            read(open_events(path))
+        except AssetError as error:
+            assert "AEDAT4" in str(error) or "in the recording" in str(error)
+
+
+class Decoder:
+    """In place of the process: says what it is told to."""
+
+    def __init__(self, rows, images=()):
+        self.rows, self.images = rows, images
+
+    def __iter__(self):
+        return iter([self.rows])
+
+    def pictures(self):
+        return iter(list(zip(self.rows, self.images)))
+
+    def close(self):
+        pass
+
+
+def reader(monkeypatch, decoder):
+    monkeypatch.setattr("blinkgl.io.aedat4._Decoder", lambda path, stream="events": decoder)
+    made = object.__new__(Aedat4Reader)
+    made.path = "e.aedat4"
+    return made
+
+
+@pytest.mark.parametrize("times", [[(10, 20), (10, 20)], [(10, 5)], [(30, 40), (20, 50)]])
+def test_frames_whose_times_do_not_increase(monkeypatch, times):
+    rows = np.array([(begin, end, 2, 2, 1, 1) for begin, end in times], aedat4_decode.FRAME)
+    with pytest.raises(EventDataError, match=rf"times of frame {len(times) - 1} do not increase"):
+        list(reader(monkeypatch, Decoder(rows, [np.zeros((2, 2), np.uint8)] * len(times))).frames())
+
+
+def test_samples_whose_times_run_backwards(monkeypatch):
+    rows = np.zeros(3, aedat4_decode.IMU)
+    rows["t"] = (5, 9, 8)
+    with pytest.raises(EventDataError, match=r"times run backwards at sample 2 of the inertial unit \(got \(9, 8\)\)"):
+        reader(monkeypatch, Decoder(rows)).imu()

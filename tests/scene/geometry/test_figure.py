@@ -105,7 +105,8 @@ def test_a_shape_made_larger_and_turned_is_the_larger_and_turned_shape(build, ke
     assert moved.deformer.speed == pytest.approx(1.7 * mesh.deformer.speed)
     assert moved.deformer.goes == mesh.deformer.goes
     (unit,) = normalise((mesh,))
-    assert unit.radius == pytest.approx(1)
+    lengths = [np.linalg.norm(unit.deformer.positions(unit, t), axis=1).max() for t in range(0, 1000 * MS, 50 * MS)]
+    assert 0.9 < max(lengths) <= 1  # at no time does it leave the sphere that collisions know
 
 
 @pytest.mark.parametrize("kind", ["figure", "flag", "fish"])

@@ -97,7 +97,8 @@ FILLED_IN_LATER = set(
 def records():
     """Every dataclass of the package, by where it is."""
     for module in pkgutil.walk_packages(blinkgl.__path__, "blinkgl."):
-        if not re.search(r"\.(tools|shaders|configs|cli|__main__)\b", module.name):
+        # (What lies `inside` Blender runs in a process of Blender's alone, and needs its modules.)
+        if not re.search(r"\.(tools|shaders|configs|cli|__main__|inside)\b", module.name):
             for thing in vars(importlib.import_module(module.name)).values():
                 if inspect.isclass(thing) and dataclasses.is_dataclass(thing) and thing.__module__ == module.name:
                     yield thing

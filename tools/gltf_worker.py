@@ -43,6 +43,8 @@ def main(folder: Path) -> int:
     # Shapes that stand for bones are hidden, and no part of the file.
     meshes = [o for o in scene.objects if o.type == "MESH" and not o.hide_get() and o.users_collection]
     meshes = [o for o in meshes if not any(c.name.startswith("glTF_not_exported") for c in o.users_collection)]
+    for thing in scene.objects:
+        thing.hide_render = thing.type == "MESH" and thing not in meshes
     if job["camera"] is not None:
         look(bpy, scene, job["camera"])
     found: dict[str, list[np.ndarray]] = {f"mesh:{o.name}": [] for o in meshes}
@@ -75,7 +77,7 @@ def look(bpy, scene, camera: dict) -> None:
     lens.clip_start, lens.clip_end = camera["near"], 1e6
     eye = bpy.data.objects.new("eye", lens)
     scene.collection.objects.link(eye)
-    eye.matrix_world = [list(row) for row in np.array(camera["pose"])]
+    eye.matrix_world = np.array(camera["pose"]).T  # columns first
     scene.camera = eye
     render = scene.render
     render.resolution_x, render.resolution_y = camera["size"]

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from blinkgl.show.terminal import plain_column, plain_console, say
 
+_SHAPES = ("meshes", "curves, texts, metaballs", "instances", "collection instances")
 _LONGER_SIDE = 640  # px: an event camera's, not a film's
 
 
@@ -59,6 +60,8 @@ def run(source: str, target: str, *, as_json: bool = False, quiet: bool = False,
 
 def _recipe(target: str, came: Any) -> str:
     """The YAML that plays what was imported, as far as the file decides it."""
+    if not any(row.came for row in came.rows if row.kind in _SHAPES):
+        return f"scene.objects: {{mesh: …, animation: {{file: {target}}}}}    (a clip, for a figure with these joints)"
     scene: dict[str, Any] = {"kind": "file", "path": target}
     if came.cameras:
         scene |= {"camera": came.camera or came.cameras[0], "intrinsics": "file"}

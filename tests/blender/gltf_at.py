@@ -4,6 +4,7 @@ judge of what Blender exported and of what BlinkGL draws, independent of both.""
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from blinkgl.scene.importing import gltf
 
@@ -57,10 +58,20 @@ class Played:
         """(4, 4) of a node, y up."""
         T, step = np.eye(4), node
         while step is not None:
-            rest = self.document.nodes[step]
-            given = {path: self.value(step, path, t) for path in ("translation", "rotation", "scale")}
-            T = rest.local(**given) @ T
-            step = rest.parent
+            T = self.local(step, t) @ T
+            step = self.document.nodes[step].parent
+        return T
+
+    def local(self, node: int, t: float) -> np.ndarray:
+        raw, T = self.tree["nodes"][node], np.eye(4)
+        if "matrix" in raw:
+            return np.array(raw["matrix"], float).reshape(4, 4).T
+        place, turn, size = (
+            raw.get(path, rest) if (found := self.value(node, path, t)) is None else found
+            for path, rest in (("translation", (0, 0, 0)), ("rotation", (0, 0, 0, 1)), ("scale", (1, 1, 1)))
+        )
+        T[:3, :3] = Rotation.from_quat(turn).as_matrix() * size
+        T[:3, 3] = place
         return T
 
     def node(self, name: str) -> int:

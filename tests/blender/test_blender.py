@@ -17,7 +17,9 @@ from blinkgl import cli
 from blinkgl.blender import process
 from blinkgl.blender.importing import Imported, import_scene
 from blinkgl.camera import PinHole
+from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import BlinkGLError
+from blinkgl.scene.importing.mesh_files import load_asset
 from blinkgl.scene.worlds.from_file import from_gltf
 from gltf_at import Played
 
@@ -144,7 +146,6 @@ def test_more_keys_are_exact_between_frames(imported):
     assert max(apart) < 1e-5
 
 
-@pytest.mark.xfail(strict=True, reason="skins and morph targets of glTF files are not read yet")
 @pytest.mark.parametrize("name", ["dancer.blend", "mixamo.fbx", "formats.abc"])
 def test_our_importer_plays_it(imported, name):
     """Skins, morph targets and their animations by BlinkGL's importer, against Blender at every frame."""
@@ -193,6 +194,21 @@ def test_a_character_of_mixamo(imported):
     assert max(np.abs(played.positions("Column", t) - first).max() for t in (0.3, 0.6)) > 0.2 * 0.02, "it moves"
     names = {node.name for node in played.document.nodes.values()}
     assert {"mixamorig:lower", "mixamorig:upper"} <= names and came.report.fps == 30
+
+
+def test_a_clip_without_skin(imported):
+    """Mixamo's "Without Skin": joints alone, whose clip moves the figure of another file."""
+    figure, clip = imported("mixamo.fbx"), imported("mixamo_clip.fbx")
+    assert not [row for row in clip.report.rows if row.kind == "meshes"] and clip.row("animations").came == 1
+    animation = AnimationConfig(file=str(clip.path), loop=False)
+    parts = load_asset(figure.path, animation=animation, base=clip.path.parent).parts
+
+    def at(t: float) -> np.ndarray:
+        return np.concatenate([p.mesh.deformer.positions(p.mesh, round(t * NS)) for p in parts])
+
+    assert same_points(at, clip, "Column") < 1e-5 * 0.02
+    own = cKDTree(figure.truth["Column@20"]).query(at(19 / 30))[0].max()
+    assert own > 0.1 * 0.02, "not the figure's own clip"
 
 
 def drawn_with_a_pose(came: Came):

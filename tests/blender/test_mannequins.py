@@ -23,7 +23,6 @@ from gltf_at import Played
 pytestmark = pytest.mark.skipif(bool(process.available()), reason=process.available() or "there")
 NS = 1_000_000_000
 FIGURES = ["running", "cheering", "push_ups"]
-NOT_YET = pytest.mark.xfail(strict=True, reason="skins of glTF files are not read yet")
 CAMERA = PinHole.centred(160, 120, 150.0)
 POSE = np.eye(4)
 POSE[:3, 3] = (3.0, -4.0, 1.6)
@@ -80,7 +79,7 @@ def judged(path: Path, times: np.ndarray) -> np.ndarray:
     return np.stack([np.concatenate([played.of(i, t) for i in nodes]) for t in times])
 
 
-@pytest.mark.parametrize("who", [judged, pytest.param(drawn, marks=NOT_YET)])
+@pytest.mark.parametrize("who", [judged, drawn])
 @pytest.mark.parametrize("figure", FIGURES)
 def test_vertices_are_where_blender_has_them(theirs, figure, who):
     path, times, blender = theirs(figure)
@@ -92,7 +91,6 @@ def test_vertices_are_where_blender_has_them(theirs, figure, who):
     assert np.ptp(true, axis=0).max() > 0.3 * height, "it moves"
 
 
-@NOT_YET
 def test_silhouettes_are_cycles(theirs, gl):
     """Pixels in which the figure is seen: those that differ touch its outline."""
     path, times, _ = theirs("running")
@@ -105,4 +103,4 @@ def test_silhouettes_are_cycles(theirs, gl):
             inside = mask & np.roll(mask, 1, 0) & np.roll(mask, -1, 0) & np.roll(mask, 1, 1) & np.roll(mask, -1, 1)
             outside = ~(mask | np.roll(mask, 1, 0) | np.roll(mask, -1, 0) | np.roll(mask, 1, 1) | np.roll(mask, -1, 1))
             assert ours[inside].all() and not ours[outside].any()
-            assert (ours != mask).mean() < 2e-3
+            assert (ours != mask).sum() <= 3, "of some 1,600 pixels"

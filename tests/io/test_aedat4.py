@@ -101,7 +101,7 @@ def test_a_decoder_that_ends_too_early(recording, counts, read):
     assert sum(found) == read
     with pytest.raises(AssetError, match="damaged AEDAT4 file: packet is odd"):
         list(Aedat4Reader(recording(2, 98)).chunks())
-    with pytest.raises(AssetError, match="damaged AEDAT4 file: recording without an event stream"):
+    with pytest.raises(AssetError, match="e.aedat4: no events in the recording"):
         Aedat4Reader(recording(0))
 
 

@@ -55,6 +55,19 @@ def test_a_constant_translation_hides_what_leaves_and_uncovers_what_enters(u, v)
     assert artefacts.uncovered(constant(u, v), YES) == pytest.approx(entered, abs=1e-6)
 
 
+@pytest.mark.parametrize("u, v", [(0.4, 0.4), (0.25, 0.75), (0.6, 0.1), (0.3, 2.9), (1.7, 0.2), (5.45, 7.3)])
+def test_pixels_are_covered_by_what_of_others_comes_to_them(u, v):
+    """Bilinear shares are products: of a constant flow, of one along the row and one along the column."""
+
+    def along(length: int, px: float) -> np.ndarray:
+        whole, part = int(px), px - int(px)
+        return np.concatenate([np.zeros(whole), [1 - part], np.ones(length - whole - 1)])
+
+    covered = np.outer(along(H, v), along(W, u)) >= 0.5
+    assert artefacts.uncovered(constant(u, v), YES) == pytest.approx(1 - covered.mean(), abs=1e-9)
+    assert artefacts.uncovered(constant(-u, -v), YES) == pytest.approx(1 - covered.mean(), abs=1e-9)
+
+
 @pytest.mark.parametrize("u, v", [(0, 0), (4, 0), (2.5, -1.25)])
 def test_a_constant_translation_leaves_no_residual(u, v):
     x, y = GRID
@@ -182,6 +195,24 @@ def test_slopes_are_not_fine():
 def test_edges_are_gradients_of_the_log():
     slopes = artefacts.edges(ramp(*GRID))[2:-2, 2:-2]
     np.testing.assert_allclose(slopes, np.hypot(0.02, 0.01), rtol=1e-3)
+
+
+def test_all_that_a_given_flow_says():
+    x, y = GRID
+    a, b, flow = ramp(x, y), ramp(x - 3, y), constant(3, 0)
+    plain = artefacts.of_given_flow(a, b, flow, YES)
+    assert list(plain) == ["displacement", "uncovered", "thin", "residual"]
+    assert plain == pytest.approx({"displacement": 3, "uncovered": 3 / W, "thin": 0, "residual": 0}, abs=2e-4)
+    gone = x < W / 4
+    b[:, : W // 4 + 3] *= 3  # where it goes is not seen, so it does not count
+    known = artefacts.of_given_flow(a, b, flow, YES, gone=gone, own=constant(5, 0))
+    assert known["hidden"] == 0.25 and known["residual"] < 2e-4 and known["astray"] == pytest.approx(1)
+    assert artefacts.of_given_flow(a, b, flow, YES)["residual"] > 0.2
+    half = x >= W / 2
+    assert artefacts.of_given_flow(a, b, flow, half, gone=gone)["hidden"] == 0, "of the valid pixels"
+    flat = np.full((H, W), 0.5, np.float32)
+    assert "astray" not in artefacts.of_given_flow(flat, flat, flow, YES, own=flow), "no edges to be followed"
+    assert "residual" not in artefacts.of_given_flow(a, b, flow, YES, gone=YES), "nothing is seen"
 
 
 @pytest.mark.parametrize(

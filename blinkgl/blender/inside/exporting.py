@@ -98,15 +98,17 @@ def count(tree: dict, table: Table) -> None:
     """What glTF counts, into ``came``."""
     nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
     shown = [n for n in nodes if "mesh" in n]
-    if not shown:
+    if not shown and not (table["armatures"].found and tree.get("animations")):
         raise Refused("the scene shows no surface", accepted="a scene with a mesh that has faces and is rendered")
     others = table["curves, texts, metaballs"].came + table["instances"].came
     table["meshes"].came = max(len(shown) - others, 0)
     faces = {k: _triangles(mesh, tree) for k, mesh in enumerate(meshes)}
-    table["meshes"].notes.append(f"{sum(faces[n['mesh']] for n in shown):,} triangles")
+    if shown:
+        table["meshes"].notes.append(f"{sum(faces[n['mesh']] for n in shown):,} triangles")
     table["cameras"].came = sum("camera" in n for n in nodes)
     table["lights"].came = sum("KHR_lights_punctual" in n.get("extensions", {}) for n in nodes)
-    table["armatures"].came = len({s.get("skeleton", k) for k, s in enumerate(tree.get("skins", []))})
+    skins = {s.get("skeleton", k) for k, s in enumerate(tree.get("skins", []))}
+    table["armatures"].came = len(skins) if shown else table["armatures"].found
     baked = table["vertex animations"].came
     targets = [len(p.get("targets", ())) for mesh in meshes for p in mesh["primitives"][:1]]
     table["shape keys"].came = min(sum(targets), table["shape keys"].found) if not baked else table["shape keys"].came

@@ -27,7 +27,9 @@ def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:
     things = kept.in_picture(view_layer)
     everything = things + [o for o in kept.instanced(things) if o not in things]
     survey.survey(scene, things, everything, table)
-    if not any(o.type in kept.MESH_LIKE or o.is_instancer for o in everything):
+    # Armatures alone are a clip for a figure of another file, as Mixamo sends them without skin.
+    clip = any(o.type == "ARMATURE" for o in everything) and bool(bpy.data.actions)
+    if not clip and not any(o.type in kept.MESH_LIKE or o.is_instancer for o in everything):
         raise Refused("the scene shows no shape", accepted="a scene with a mesh that is rendered")
     kept.make_visible(view_layer, things)
 

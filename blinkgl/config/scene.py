@@ -511,7 +511,9 @@ class ExplicitSceneConfig(Config):
     materials: dict[str, MaterialConfig] = Field({}, description="by name")
     objects: tuple[ObjectConfig, ...] = Field(min_length=1, description="at least one")
     collisions: bool = Field(
-        False, description="true: find collisions along the trajectories and stop what collides there"
+        False,
+        description="true: find collisions along the trajectories and stop what collides there (what falls is not "
+        "looked at: see physics)",
     )
     camera: KeyedMotionConfig = Field(description="pose or key frames; OpenCV axes: x right, y down, z forward")
     physics: PhysicsConfig | None = Field(

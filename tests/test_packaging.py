@@ -107,7 +107,7 @@ def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
     run(
         python,
         "-c",
-        f"from blinkgl.gl import expand\nassert '#include' not in expand({name!r}, 'vertex').text",
+        f"import blinkgl.render.resources\nfrom blinkgl.gl import expand\nassert '#include' not in expand({name!r}, 'vertex').text",
         cwd=elsewhere,
     )
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ sub-pixel shifts are not what it asks about."""
 
 
 @dataclass(eq=False)
-class Side:
+class RecordingSide:
     """One recording inside the compared time span. Maps are (H, W), times µs."""
 
     name: str
@@ -72,8 +72,8 @@ class Comparison:
     pixel is None where the two differ in size."""
 
     edges_us: np.ndarray
-    a: Side
-    b: Side | None
+    a: RecordingSide
+    b: RecordingSide | None
     pixel_correlation: float | None = None
     """Pearson correlation over the pixels of the event counts of a and b"""
     polarity_correlation: np.ndarray | None = None
@@ -132,7 +132,7 @@ class Comparison:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists (maps left out), for JSON."""
 
-        def side(s: Side) -> dict:
+        def side(s: RecordingSide) -> dict:
             return {k: _plain(v) for k, v in asdict(s).items() if k != "counts"} | {
                 "size": s.size,
                 "on_off_ratio": _plain(s.on_off_ratio),
@@ -215,7 +215,7 @@ def _accumulate(
     shapes, intervals = [(f.height, f.width) for f in files], len(edges) - 1
     same = len(files) == 2 and shapes[0] == shapes[1]
     sides = [
-        Side(
+        RecordingSide(
             str(f.path),
             counts=np.zeros(shape, np.int64),
             rate_hz=np.zeros(intervals),
@@ -294,7 +294,7 @@ def _windows(file: EventFile, edges: np.ndarray, shift: int) -> Iterator[Events]
 
 def _joined(parts: list[Events], shift: int) -> Events:
     events = Events.concatenate(parts)
-    return Events(events.x, events.y, events.t - shift, events.p) if shift else events
+    return replace(events, t=events.t - shift) if shift else events
 
 
 def _span(file: EventFile) -> tuple[int, int]:

@@ -175,12 +175,12 @@ class _World:
     # ---- the model ---------------------------------------------------------------------------------------------------
 
     def _compile(self) -> None:
-        """Once with unit density, to know volumes and centres of mass; then with those as the bodies' origins, so that
+        """Once with any density, to know volumes and centres of mass; then with those as the bodies' origins, so that
         a body in flight is on a parabola."""
         model = self._model(weighed=False)
         for body in self.moving:
             at = body.at + 1  # behind the world
-            body.centre, body.volume = model.body_ipos[at].copy(), float(model.body_mass[at])
+            body.centre, body.volume = model.body_ipos[at].copy(), float(model.body_mass[at]) * body.radius**5
         self.model = self._model(weighed=True)
         self.data = self.mujoco.MjData(self.model)
 
@@ -195,11 +195,15 @@ class _World:
         option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
         option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # an explosion has to be seen
         heaviest = max((body.mass for body in self.dynamic), default=1.0)
+        # MuJoCo takes no inertia below 1e-15 kg m², a ball of a millimetre; in another unit of mass nothing moves
+        # otherwise.
+        least = min((body.mass * body.radius**2 for body in self.dynamic), default=1.0)
+        unit = max(1.0, 1e-9 / least) if weighed else 1.0
         for k, side in enumerate(self.sides):
             self._geometry(spec, spec.worldbody, f"side {k}", _plane(side), IN_THE_WAY, 0.0, False, 1.0)
         for number, body in enumerate(self.bodies):
             T = body.path.pose(self.t0_ns)
-            holder, density = spec.worldbody, 1.0
+            holder, density = spec.worldbody, body.radius**-5
             if body.role != "fixed":
                 holder = spec.worldbody.add_body(
                     pos=T[:3, :3] @ body.centre + T[:3, 3],
@@ -209,7 +213,7 @@ class _World:
                 )
                 holder.add_freejoint()
                 if weighed:
-                    density = (_HEAVY * heaviest if body.role == "pusher" else body.mass) / body.volume
+                    density = unit * (_HEAVY * heaviest if body.role == "pusher" else body.mass) / body.volume
             frame = T if body.role == "fixed" else _shifted(-body.centre)
             for k, shape in enumerate(body.shapes):
                 name, dynamic = f"{number} {k}", body.role == "dynamic"
@@ -508,8 +512,8 @@ def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
         parts = [np.concatenate(parts)]
     if obj.category == "ground" and config.shape == "auto" and config.kind == "fixed" and len(parts) == 1:
         mesh = next(part.mesh for part in obj.parts if len(part.mesh.faces))
-        if (plane := _flat(parts[0])) is not None:
-            centre, axes, _ = plane
+        centre, axes, extent = _framed(parts[0])
+        if extent[2] < 1e-6 * extent[0]:
             up = axes[:, 2] * (1.0 if float(mesh.normals.mean(axis=0) @ axes[:, 2]) >= 0 else -1.0)
             return [_plane(Side(tuple(up), float(up @ centre)))]
     return [_solid(points, config) for points in parts]
@@ -519,8 +523,8 @@ def _solid(points: np.ndarray, config: BodyConfig) -> Shape:
     low, high = points.min(axis=0), points.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
     radii = np.linalg.norm(points - centre, axis=1)
-    if (plane := _flat(points)) is not None and config.shape in ("auto", "hull"):
-        middle, axes, extent = plane
+    middle, axes, extent = _framed(points)
+    if extent[2] < 0.005 * extent[0] and config.shape in ("auto", "hull"):
         return Shape("BOX", np.maximum(extent, 0.01 * extent.max()), middle, axes)
     if config.shape == "sphere":
         return Shape("SPHERE", (float(radii.max()), 0, 0), centre)
@@ -545,13 +549,12 @@ def _hull(points: np.ndarray) -> tuple[np.ndarray, float]:
     return points[hull.vertices], float(hull.volume)
 
 
-def _flat(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """(centre (3,), axes (3, 3) as columns, the last across, half extents (3,)) of points in a plane; else None."""
+def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(centre (3,), axes (3, 3) as columns, a right-handed frame, half extents (3,) along them) of a box round the
+    points, along their principal axes, longest first."""
     mean = points.mean(axis=0)
-    _, sizes, rows = np.linalg.svd(points - mean, full_matrices=False)
-    if len(points) > 2 and sizes[2] > 1e-6 * sizes[0]:
-        return None
-    axes = rows.T * np.sign(np.linalg.det(rows))
+    _, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+    axes = axes[:, ::-1] * np.sign(np.linalg.det(axes[:, ::-1]))
     along = (points - mean) @ axes
     low, high = along.min(axis=0), along.max(axis=0)
     return mean + axes @ (0.5 * (low + high)), axes, 0.5 * (high - low)

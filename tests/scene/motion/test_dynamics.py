@@ -253,6 +253,16 @@ def test_a_ball_comes_to_rest_on_a_shelf():
     assert paths["ball"].pose(3 * S // 2)[2, 3] == pytest.approx(0.6 + 0.01 * 0.5, abs=1e-3)
 
 
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("flatness", [1.0, 1e-3, 1e-7])
+def test_any_size_and_any_flatness_falls(size, flatness):
+    """Grains, houses, sheets of paper: MuJoCo itself refuses what weighs less than nothing or has no volume."""
+    mesh = transform_mesh(cone(radius=0.5, height=1.0), np.diag([size, size, size * flatness]))
+    made = body("it", mesh, (0, 0, 2 * size))
+    paths, _ = run([made, FLOOR], {"it": BodyConfig(spin=(9.0, 0, 0))}, 0.02, rate=2000)
+    assert paths["it"].pose(S // 100)[2, 3] == pytest.approx(2 * size - 0.5 * G * 1e-4, abs=2e-3 * size)
+
+
 @pytest.mark.parametrize("e", [0.0, 0.3, 0.7, 0.95])
 def test_the_damping_is_that_of_a_spring_let_go(e):
     """The continuous spring with a damper that does not pull: what so many steps come to."""

@@ -707,8 +707,8 @@ class ByName:
             return 1 if of_all or (mentions and mentions.search(self.texts[file])) else 2 if inside else 3
 
         ranks = {file: rank(file) for file in self.texts if not self._peer(file)}
-        looking = [test for test in LOOKERS if _on_import(mutant)]
-        return [*looking, *sorted((f for f in ranks if ranks[f] < 9), key=ranks.get)]
+        looking = [LOOKERS[0].split("::")[0]] if _on_import(mutant) else []
+        return [*looking, *sorted((f for f in ranks if ranks[f] < 9 and f not in looking), key=ranks.get)]
 
     def _peer(self, file: str) -> bool:
         return file.startswith(self.PEERS)

@@ -288,3 +288,18 @@ def test_two_renderers_need_not_agree_but_in_what_is_measured():
     free = {name for name, label in LABELS.items() if not name.startswith("flow") and label.agrees(zero, one)}
     assert free == set(LABELS) - {"depth", "flow_forward", "flow_backward"}
     assert LABELS["depth"].agrees(one, one) and not LABELS["depth"].agrees(one, one[:, :3])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(
+    "off, share, agrees", [(2 / 128, 1.0, True), (2.01 / 128, 0.05, True), (2.01 / 128, 0.06, False)]
+)
+def test_flow_of_two_renderers_agrees_to_two_quanta_in_nearly_all_pixels(axis, off, share, agrees):
+    one, other = (Flow(np.zeros((10, 20, 2), np.float32), np.ones((10, 20), bool)) for _ in range(2))
+    other.flow.reshape(-1, 2)[: round(200 * share), axis] = -off
+    label = LABELS["flow_backward"]
+    assert label.agrees(one, other) is agrees is label.agrees(other, one)
+    other.flow[...] = 0
+    other.valid.flat[: round(200 * share)] = False
+    assert label.agrees(one, other) is (share < 0.06)
+    assert not label.agrees(one, Flow(one.flow[:5], one.valid[:5]))

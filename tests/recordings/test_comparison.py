@@ -231,7 +231,7 @@ def test_the_picture_shows_the_figures(tmp_path, monkeypatch):
     """What is drawn is read back from the axes: seconds, millions, milliseconds, and only what there is."""
     from matplotlib.figure import Figure
 
-    a, b = (poisson(rate, 0.7, seconds=1.0, seed=seed) for rate, seed in ((20, 0), (40, 1)))
+    a, b = (poisson(rate, 0.7, seconds=1.0, seed=seed) for rate, seed in ((10, 0), (20, 1)))
     write_events(tmp_path / "a.npz", a, H, W)
     write_events(tmp_path / "b.npz", b, H, W)
     shown = []
@@ -257,6 +257,7 @@ def test_the_picture_shows_the_figures(tmp_path, monkeypatch):
     assert correlation.get_ylim()[0] <= 0 and correlation.get_ylim()[1] == 1
     seen = np.asarray(joint.images[0].get_array())
     limit = int(top) + 1
+    assert limit < 50 and seen.shape == (limit + 1, limit + 1), "a cell for each count"
     assert (10 ** seen[both.b.counts[0, 0], both.a.counts[0, 0]] - 1).round() >= 1, "A to the right, B upwards"
     assert (10**seen - 1).sum() == pytest.approx(H * W) and joint.images[0].get_extent() == [0, limit + 1] * 2
     for ax in (rate, intervals, correlation):

@@ -15,11 +15,22 @@ from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.machine.extras import EXTRAS, install
 from blinkgl.machine.interrupts import interruptible
 from blinkgl.show.terminal import never_fail_to_print
+from eflow.methods.table import METHODS, make_method
 
 app = typer.Typer(name="eflow", add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 Precision = Annotated[str, typer.Option(help="fp32, or bf16 (autocast with fp32 islands).")]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
+Answer = Annotated[
+    str,
+    typer.Argument(
+        help="Run folder, checkpoint folder or .safetensors file; or a method that needs no training: "
+        f"{', '.join(METHODS)}."
+    ),
+]
+Focal = Annotated[
+    float | None, typer.Option(min=1e-3, help="Focal length in px: contrast-rotation needs it.", show_default=False)
+]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="a.b=c", help="Override a value; may be repeated.")
 ]
@@ -64,7 +75,7 @@ def train(
 
 @app.command()
 def evaluate(
-    checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
+    checkpoint: Answer,
     dataset: Annotated[str, typer.Argument(help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences.")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
@@ -74,17 +85,20 @@ def evaluate(
     empty: Annotated[str, typer.Option(help="Windows without events: error or skip.")] = "error",
     limit: Annotated[int | None, typer.Option(min=1, help="Score only so many samples, evenly spaced.")] = None,
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
+    focal: Focal = None,
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
-    """Score a network on a data set, beside zero flow and constant flow."""
+    """Score a network or a method on a data set, beside zero flow and what knows the global motion."""
     from blinkgl.show.terminal import plain_console
     from eflow.data.sources import open_source
     from eflow.evaluate import evaluate as score, show
 
     _one_of("--empty", empty, ("error", "skip"))
-    model = _model(checkpoint, device, raw, precision, iterations)
-    precision = _precision(model, precision)
+    model = _method(checkpoint, focal, iterations=iterations, raw=raw)
+    if model is None:
+        model = _model(checkpoint, device, raw, precision, iterations)
+        precision = _precision(model, precision)
     source = open_source(dataset, _format(format), dt=dt)
     console = plain_console(stderr=True)
     with console.status("evaluating") as status:
@@ -105,7 +119,7 @@ def evaluate(
 
 @app.command()
 def predict(
-    checkpoint: Annotated[str, typer.Argument(help="Run folder, checkpoint folder or .safetensors file.")],
+    checkpoint: Answer,
     events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
     window_ms: Annotated[
@@ -127,18 +141,22 @@ def predict(
     empty: Annotated[str, typer.Option(help="Windows without events: error, or zero flow.")] = "error",
     raw: Annotated[bool, typer.Option("--raw", help="The last weights instead of the averaged ones.")] = False,
     iterations: Annotated[int | None, typer.Option(min=1, help="GRU iterations, where the network has them.")] = None,
+    focal: Focal = None,
     precision: Precision = "fp32",
     device: Device = "auto",
 ) -> None:
-    """Flow from any event file."""
+    """Flow from any event file, by a network or by a method that needs no training.
+
+    FWL is how much sharper the new window's events are when the flow takes them back to its start: above 1 it helps."""
     import numpy as np
 
     from eflow import infer
+    from eflow.methods.iwe import flow_warp_loss
     from eflow.metrics import frame_metrics
 
     _one_of("--empty", empty, ("error", "zero"))
-    model = _model(checkpoint, device, raw, precision, iterations)
-    precision = _precision(model, precision)
+    method = _method(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
+    model = None if method is not None else _model(checkpoint, device, raw, precision, iterations)
     file = infer.open_sized(events, _size(size))
     if whole:
         window, factor = infer.whole_file(file)
@@ -151,7 +169,17 @@ def predict(
         span, factor = round(window_ms * 1000), 1.0
         stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
-    predictor = infer.Predictor(model, file.height, file.width, warm_start=warm_start, precision=precision, empty=empty)
+    if method is not None:
+        predictor = infer.MethodPredictor(method, file.height, file.width, empty=empty)
+    else:
+        predictor = infer.Predictor(
+            model,
+            file.height,
+            file.width,
+            warm_start=warm_start,
+            precision=_precision(model, precision),
+            empty=empty,
+        )
     writer = infer.FlowWriter(out, npy=npy) if out else None
     count = 0
     if writer:
@@ -159,11 +187,12 @@ def predict(
     try:
         for window in stream:
             flow, tensor = predictor(window)
+            sharper = flow_warp_loss(window.new, flow)
             flow = flow * np.float32(factor)
             count += 1
             line = (
                 f"t {window.t_us} us  {len(window.old) + len(window.new)} events  mean speed "
-                f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px"
+                f"{np.hypot(*np.moveaxis(flow, -1, 0)).mean():.3f} px  FWL {sharper:.3f}"
             )
             if gt is not None:
                 valid = np.isfinite(gt).all(-1)
@@ -288,6 +317,18 @@ def bench(
     plain_console().print(table)
     if json_out:
         write_json(Path(json_out), {"rows": rows})
+
+
+def _method(name: str, focal: float | None, **network: object):
+    """The method of that name, unless a file has it; None: a network's. network : options that only those have."""
+    if name not in METHODS or Path(name).exists():
+        if focal is not None:
+            raise ConfigError("only a method takes it", where="--focal", value=focal, accepted=", ".join(METHODS))
+        return None
+    for option, value in network.items():
+        if value:
+            raise ConfigError(f"{name} is no network", where="--" + option.replace("_", "-"), value=value)
+    return make_method(name, focal)
 
 
 def _model(checkpoint: str, device: str, raw: bool, precision: str, iterations: int | None = None):

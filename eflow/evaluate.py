@@ -20,20 +20,21 @@ from blinkgl.io.sequence_dir import refuse_existing
 from blinkgl.show.terminal import plain_console
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
-from eflow.infer import predict
+from eflow.infer import PICTURED, predict
+from eflow.methods import Method
 from eflow.metrics import NAMES, Tally, frame_metrics
 from eflow.models import FlowModel, parameters_of
 from eflow.pictures import comparison, events_of, write_picture
 
 MEDIAN_FRAMES = 64
-BASELINES = ("zero flow", "median of the set", "median of the frame")
+BASELINES = ("zero flow", "median of the set", "median of the frame", "affine of the frame")
 """Zero; one constant flow, the component-wise median of the set's own ground truth; and, frame by frame, the median of
-that frame's ground truth: the best a network could say that saw only the global motion. The
-medians know the answer, so they are no methods."""
+that frame's ground truth and the affine field nearest to it: the best an answer could be that saw only the global
+motion. But for zero they know the truth, so they are no methods."""
 
 
 def evaluate(
-    model: FlowModel,
+    model: FlowModel | Method,
     source: Source,
     out: str | os.PathLike | None = None,
     *,
@@ -43,7 +44,7 @@ def evaluate(
     limit: int | None = None,
     progress: Callable[[int, int, float], None] | None = None,
 ) -> dict[str, Any]:
-    """Scores ``model`` on every labelled sample of ``source``.
+    """Scores ``model``, or a method that needs no training, on every labelled sample of ``source``.
 
     out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
     map); None: nothing is written. limit : score only so many samples, evenly spaced.
@@ -56,7 +57,9 @@ def evaluate(
     if out is not None:
         refuse_existing(out)
     out = Path(out) if out is not None else None
-    dataset = FlowDataset([source], model.representation, empty=empty)
+    method = None if isinstance(model, FlowModel) else model
+    representation = model.representation if method is None else PICTURED
+    dataset = FlowDataset([source], representation, empty=empty, raw=method is not None)
     indices = [int(i) for i in np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round()]
     shown = (
         {indices[int(i)] for i in np.linspace(0, len(indices) - 1, min(pictures, len(indices))).round()}
@@ -69,7 +72,11 @@ def evaluate(
     for done, i in enumerate(indices, 1):
         batch = collate([dataset[i]])
         began = time.perf_counter()
-        flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
+        if method is None:
+            flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
+        else:
+            raw = batch["raw"][0]
+            flow = method(raw.old, raw.new, raw.height, raw.width)
         spent += time.perf_counter() - began
         truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
         scene = batch["scene"][0]
@@ -77,7 +84,7 @@ def evaluate(
         tallies["network"].add(scene, metrics)
         for name, constant in zip(
             BASELINES,
-            (np.zeros(2), median, np.median(truth[valid], axis=0) if valid.any() else np.zeros(2)),
+            (np.zeros(2), median, *_from_truth(truth, valid)),
             strict=True,
         ):
             tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
@@ -93,17 +100,27 @@ def evaluate(
     if not scored:
         raise AssetError("no sample has a valid ground-truth pixel", accepted="a labelled data set")
     result = {
-        "model": json.loads(model.config.model_dump_json()),
-        "parameters": parameters_of(model),
+        "model": json.loads(model.config.model_dump_json()) if method is None else {"name": method.name},
+        "parameters": parameters_of(model) if method is None else 0,
         "samples": len(indices),
         "skipped": tallies["network"].skipped,
         "ms": 1000 * spent / len(indices),
-        "device": _device_name(model),
+        "device": _device_name(model) if method is None else "cpu",
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
     }
     if out is not None:
         write_json(out / "results.json", result)
     return result
+
+
+def _from_truth(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Median (2,), and the affine field (H, W, 2) nearest to the truth in the mean square; 0 where nothing is valid."""
+    if not valid.any():
+        return np.zeros(2), np.zeros_like(truth)
+    y, x = np.indices(valid.shape) / max(valid.shape)
+    ground = np.stack([np.ones_like(x), x, y], axis=-1)
+    affine = np.linalg.lstsq(ground[valid], truth[valid].astype(np.float64), rcond=None)[0]
+    return np.median(truth[valid], axis=0), ground @ affine
 
 
 def _set_median(dataset: FlowDataset, indices: list[int]) -> np.ndarray:

@@ -19,10 +19,15 @@ from blinkgl.io.flow_png import write_flow_png
 from blinkgl.io.formats import EventFile, open_events
 from blinkgl.io.images import encode_npy
 from blinkgl.io.sequence_dir import refuse_existing
+from eflow.data.representation import VoxelGrid
 from eflow.data.window import Window
+from eflow.methods import Method
 from eflow.models import FlowModel, FlowPrediction
 from eflow.ops.warp import forward_warp
 from eflow.pictures import comparison, events_of, write_picture
+
+PICTURED = VoxelGrid(bins=2, normalise="none")
+"""Of a method's windows: it sees the events themselves."""
 
 
 def pad_batch(batch: dict, divisor: int) -> dict:
@@ -111,6 +116,29 @@ def _pair(events: Events, t: int, span: int) -> StreamWindow:
     return StreamWindow(
         t, Window(old.x, old.y, old.t, old.p, t - span, t), Window(new.x, new.y, new.t, new.p, t, t + span)
     )
+
+
+class MethodPredictor:
+    """A method without training over a stream of windows, as :class:`Predictor` takes them.
+    empty : "error", or "zero" flow for a pair of windows in which it finds nothing to go by."""
+
+    def __init__(self, method: Method, height: int, width: int, *, empty: str = "error"):
+        self.method, self.height, self.width, self.empty = method, height, width, empty
+
+    def __call__(self, window: StreamWindow) -> tuple[np.ndarray, np.ndarray]:
+        """flow (H, W, 2) float32 px t -> t + Δ, and the new window's events (2, H, W) for a picture."""
+        seen = PICTURED(window.new, self.height, self.width)
+        try:
+            return self.method(window.old, window.new, self.height, self.width), seen
+        except EventDataError as error:
+            if self.empty == "zero":
+                return np.zeros((self.height, self.width, 2), np.float32), seen
+            raise EventDataError(
+                error.problem,
+                where=error.where,
+                value=error.value,
+                accepted=f"{error.accepted}, or --empty zero to write zero flow there",
+            ) from None
 
 
 class Predictor:

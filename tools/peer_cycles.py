@@ -43,6 +43,7 @@ from blinkgl.blender.process import Blender, how_it_ended, interpreter
 from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render.colour import LUMA, linear_image
+from blinkgl.scene.shapes.deformer import all_rigid
 from blinkgl.scene.types import Material, Scene
 
 WORKER = Path(__file__).with_name("cycles_worker.py")
@@ -164,6 +165,7 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     float32 with uv_scale in them and v growing upwards, faces{k} (F, 3) int32; texture{k} (h, w, 3) float32 linear, row
     0 at the top; poses (bodies, N, 4, 4) and camera_poses (N, 4, 4) float64, the camera's in Blender's camera axes.
     """
+    all_rigid(scene, "the path tracer")
     times_ns = np.array(list(times_ns), np.int64)
     camera, arrays = scene.camera, {}
     meshes, materials, textures = _Numbered(), _Numbered(), _Numbered()

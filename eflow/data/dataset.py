@@ -87,6 +87,7 @@ class FlowDataset(Dataset):
     Gives a dict: old, new (C, H, W) float32; flow (2, H, W) float32 px, valid (H, W) bool (finite, |flow| < 400), mask
     (H, W) bool, name, scene; without ground truth flow and valid are left out.
 
+    raw : the RawSample itself besides, as "raw".
     empty : "error" refuses a sample without an event in either window; "skip" takes the next sample that has some.
     """
 
@@ -99,8 +100,9 @@ class FlowDataset(Dataset):
         augment: AugmentConfig | None = None,
         crop: tuple[int, int] | None = None,
         empty: str = "error",
+        raw: bool = False,
     ):
-        self.sources, self.representation, self.seed = sources, representation, seed
+        self.sources, self.representation, self.seed, self.raw = sources, representation, seed, raw
         self.augment, self.crop, self.empty = augment, crop, empty
         self._starts = np.cumsum([0, *(len(s) for s in sources)])
         if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
@@ -160,7 +162,7 @@ class FlowDataset(Dataset):
                 out = scaled(out, float(np.exp2(rng.uniform(*self.augment.scale))), least=self.crop)
             if self.crop is not None:
                 out = cropped(out, self.crop, rng, s.name)
-        return {**out, "name": s.name, "scene": s.scene}
+        return {**out, "name": s.name, "scene": s.scene} | ({"raw": s} if self.raw else {})
 
 
 def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> RawSample:

@@ -49,7 +49,7 @@ def test_evaluate_writes_table_json_and_pictures(network, data, tmp_path, capsys
     out = tmp_path / "scores"
     assert run(["evaluate", network, str(data), "--out", str(out), "--pictures", "2"]) == 0
     text = capsys.readouterr().out
-    assert "network" in text and "zero flow" in text and "median of the frame" in text and "AEE px" in text
+    assert "network" in text and "zero flow" in text and "median of" in text and "AEE px" in text
     result = json.loads((out / "results.json").read_text())
     zero = result["methods"]["zero flow"]
     # two sequences of constant flow (4, -2) and (5, -2): zero flow errs by their lengths, the frame's median not at all
@@ -167,6 +167,62 @@ def test_predict_on_real_events(refined, burst, capsys):
         == 0
     )
     assert "cosine" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("burst", "limit"), [("boxes_rotation", 0.15), ("shapes_rotation", 0.1)])
+def test_a_rotating_camera_by_contrast(burst, limit, capsys):
+    """On recordings, without a network: what trained ones have to come near."""
+    folder = shared(f"data/events/ecd_rotation/{burst}")
+    focal = (folder / "calib.txt").read_text().split()[0]
+    command = ["predict", "contrast-rotation", str(folder / "events.txt"), "--size", "240x180", "--whole"]
+    assert run([*command, "--focal", focal, "--truth", str(folder / "flow.npy")]) == 0
+    aee, cosine, zero = map(
+        float,
+        re.search(r"all pixels: AEE (\S+) px, cosine (\S+); zero flow AEE (\S+) px", capsys.readouterr().out).groups(),
+    )
+    assert aee < limit * zero and cosine > 0.99
+
+
+def test_methods_stand_where_a_checkpoint_does(data, tmp_path, capsys):
+    out = tmp_path / "scores"
+    assert (
+        run(["evaluate", "contrast-translation", str(data), "--out", str(out), "--pictures", "1", "--limit", "2"]) == 0
+    )
+    text = capsys.readouterr().out
+    assert "contrast-translation: 2 samples" in text and "affine of" in text
+    result = json.loads((out / "results.json").read_text())
+    assert result["model"] == {"name": "contrast-translation"} and result["parameters"] == 0
+    assert result["methods"]["network"]["total"]["AEE"] < 0.5, "points carried along at one velocity"
+    assert result["methods"]["affine of the frame"]["total"]["AEE"] < 1e-5
+    assert len(list((out / "pictures").glob("*.png"))) == 1
+    write_events(tmp_path / "e.h5", moving_events(128, 144, 0, 3 * SPAN), 128, 144)
+    assert run(["predict", "planes", str(tmp_path / "e.h5"), "--out", str(tmp_path / "flow"), "--npy"]) == 0
+    assert "FWL" in capsys.readouterr().out
+    assert np.load(tmp_path / "flow/npy/000000.npy").shape == (128, 144, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (
+            ["contrast-rotation", "E"],
+            "error: --focal: a rotation's flow depends on the lens; expected its focal length",
+        ),
+        (["planes", "E", "--iterations", "3"], "error: --iterations: planes is no network (got 3)"),
+        (["planes", "E", "--warm-start"], "error: --warm-start: planes is no network (got True)"),
+        (["NETWORK", "E", "--focal", "200"], "error: --focal: only a method takes it (got 200.0); expected contrast-"),
+        (
+            ["contrast-affine", "FEW"],
+            "too few events for contrast maximisation (got 5); expected at least 50, or --empty",
+        ),
+    ],
+)
+def test_methods_refuse_what_they_cannot(network, arguments, says, tmp_path, capsys):
+    write_events(tmp_path / "e.h5", moving_events(128, 144, 0, 3 * SPAN), 128, 144)
+    write_events(tmp_path / "few.h5", moving_events(128, 144, 0, 3 * SPAN, n=12), 128, 144)
+    files = {"E": str(tmp_path / "e.h5"), "FEW": str(tmp_path / "few.h5"), "NETWORK": network}
+    assert run(["predict", *(files.get(a, a) for a in arguments), "--window-ms", "80", "--end-ms", "200"]) == 2
+    assert says in " ".join(capsys.readouterr().err.split())
 
 
 def test_submit_dsec(network, tmp_path, monkeypatch, capsys):

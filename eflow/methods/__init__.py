@@ -1,0 +1,12 @@
+"""Flow by optimisation: methods that were never trained, under the same commands as the networks.
+
+In:    the events of two windows.
+Out:   flow.
+Start: table.py; contrast.py is contrast maximisation, planes.py plane fitting.
+"""
+
+from __future__ import annotations
+
+from eflow.methods.table import METHODS, Method, make_method
+
+__all__ = ["METHODS", "Method", "make_method"]

@@ -1,0 +1,316 @@
+"""Contrast maximisation: the flow whose images of warped events are sharpest.
+
+Gallego, Rebecq and Scaramuzza (CVPR 2018); the objective is the squared gradient of the image (Gallego, Gehrig and
+Scaramuzza, CVPR 2019), taken at the first, the middle and the last time and divided by its value at zero flow (Shiba,
+Aoki and Gallego, ECCV 2022), which keeps a field that pulls all events into a point at one of the times from winning.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, optimize, sparse
+
+from blinkgl.errors import EventDataError
+from eflow.data.window import Window
+from eflow.methods.iwe import slope_at, vote
+
+LEAST_EVENTS = 50
+MOST_EVENTS = 60_000
+"""Of more, every n-th is taken: sharpness does not gain by them, time does."""
+HOT = 10.0
+"""A pixel with more than so many times the mean of those that fired is hot: it shines wherever nothing moves."""
+BLURS_PX = (4.0, 2.0, 1.0)
+"""Gaussians the image is seen through, one optimisation after the other: the coarse ones have few false maxima."""
+TIMES = ((0.0, 0.25), (0.5, 0.5), (1.0, 0.25))
+"""(time that events are carried to, as a share of the span; weight)."""
+_FINEST_PX = 1.5
+"""Blur at which an image's pixels are those of the sensor, or finer."""
+MARGIN = 0.15
+"""Of the larger side, round the image: events must not win by leaving it."""
+FARTHEST = 0.4
+"""Largest translation over both windows, as a share of the larger side."""
+MOST_GROWTH = 0.7
+"""Largest change of the flow per px over both windows. A field that grows by 2 carries all events of the last time into
+one point, the sharpest image that there is and no motion (event collapse)."""
+TILES = ((4, 3), (8, 6), (16, 12))
+"""Nodes of the tiled field across and down, coarse to fine."""
+SMOOTHNESS = 0.03
+"""Price of the mean squared difference (px², nodes 16 px apart) of neighbouring nodes' flow, less that of the field for
+the whole image: what turns or grows evenly is free."""
+
+
+@dataclass
+class _Cloud:
+    """Events as float64, at most :data:`MOST_EVENTS`. s : time as a share of the span, 0 to 1."""
+
+    x: np.ndarray
+    y: np.ndarray
+    s: np.ndarray
+    height: int
+    width: int
+
+    @classmethod
+    def of(cls, windows: list[Window], height: int, width: int) -> _Cloud:
+        t0, t1 = windows[0].t0, windows[-1].t1
+        x, y = (np.concatenate([getattr(w, k).astype(np.float64) for w in windows]) for k in "xy")
+        s = np.concatenate([w.t - t0 for w in windows]) / (t1 - t0)
+        if len(x) < LEAST_EVENTS:
+            raise EventDataError(
+                "too few events for contrast maximisation",
+                where=f"window [{t0}, {t1}) µs",
+                value=len(x),
+                accepted=f"at least {LEAST_EVENTS}",
+            )
+        pixel = np.rint(y).astype(np.intp) * width + np.rint(x).astype(np.intp)
+        counts = np.bincount(pixel - pixel.min())
+        cold = counts[pixel - pixel.min()] <= HOT * counts[counts > 0].mean()
+        x, y, s = x[cold], y[cold], s[cold]
+        every = -(-len(x) // MOST_EVENTS)
+        return cls(x[::every], y[::every], s[::every], height, width)
+
+
+class _Field:
+    """A flow field that is linear in its parameters.
+
+    basis : two (N, k) matrices, dense or sparse: flow of N points in px over the span is basis[0] @ p, basis[1] @ p.
+    limits : (k,) largest absolute value of each parameter, None: any."""
+
+    def __init__(self, basis: tuple, limits: np.ndarray | None = None):
+        self.basis, self.limits = basis, limits
+
+    def at(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self.basis[0] @ p, self.basis[1] @ p
+
+    def first(self, count: int) -> _Field:
+        """Of the first parameters alone."""
+        return _Field(tuple(b[:, :count] for b in self.basis), self.limits[:count])
+
+    def pulled(self, slope: np.ndarray) -> np.ndarray:
+        """(k,) derivative by the parameters, given (N, 2) by the points' flow."""
+        return self.basis[0].T @ slope[:, 0] + self.basis[1].T @ slope[:, 1]
+
+
+def _centred(x: np.ndarray, y: np.ndarray, height: int, width: int, unit: float) -> tuple[np.ndarray, np.ndarray]:
+    return (x - (width - 1) / 2) / unit, (y - (height - 1) / 2) / unit
+
+
+def affine_field(x: np.ndarray, y: np.ndarray, height: int, width: int) -> _Field:
+    """Six parameters, px at the border: a translation, then what grows with x, then with y. The first two alone: a
+    translation."""
+    u, v = _centred(x, y, height, width, max(height, width) / 2)
+    one, none = np.ones_like(u), np.zeros_like(u)
+    most, growth = FARTHEST * max(height, width), MOST_GROWTH * max(height, width) / 2
+    return _Field(
+        (np.stack([one, none, u, none, v, none], axis=1), np.stack([none, one, none, u, none, v], axis=1)),
+        np.array([most, most, growth, growth, growth, growth]),
+    )
+
+
+def rotation_field(x: np.ndarray, y: np.ndarray, height: int, width: int, focal: float) -> _Field:
+    """Three parameters, radians times the focal length: rotation of a pin-hole camera about its axes (Longuet-Higgins
+    and Prazdny 1980, the part that knows no depth)."""
+    u, v = _centred(x, y, height, width, focal)
+    most = FARTHEST * max(height, width)
+    return _Field(
+        (np.stack([u * v, -(1 + u * u), v], axis=1), np.stack([1 + v * v, -u * v, -u], axis=1)),
+        np.array([most, most, MOST_GROWTH * focal]),
+    )
+
+
+def tile_field(x: np.ndarray, y: np.ndarray, height: int, width: int, nodes: tuple[int, int]) -> _Field:
+    """Flow at nodes over the image, bilinear between them. Parameters: (rows, columns, 2), flattened."""
+    columns, rows = nodes
+    at = np.clip(x / (width - 1), 0, 1) * (columns - 1), np.clip(y / (height - 1), 0, 1) * (rows - 1)
+    c, r = np.minimum(at[0].astype(int), columns - 2), np.minimum(at[1].astype(int), rows - 2)
+    a, b = at[0] - c, at[1] - r
+    corner = lambda dr, dc: (r + dr) * columns + c + dc
+    index = np.stack([corner(0, 0), corner(0, 1), corner(1, 0), corner(1, 1)], axis=1)
+    weight = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)
+    n = len(x)
+    ends = np.arange(0, 4 * n + 1, 4)
+    matrix = lambda component: sparse.csr_matrix(
+        (weight.ravel(), (2 * index + component).ravel(), ends), shape=(n, 2 * rows * columns)
+    )
+    return _Field((matrix(0), matrix(1)))
+
+
+def sharpness(cloud: _Cloud, flow: tuple[np.ndarray, np.ndarray], blur: float) -> tuple[float, np.ndarray]:
+    """Mean squared gradient of the images of warped events over :data:`TIMES`, and its (N, 2) derivative by each
+    event's flow. flow : px over the span."""
+    unit = max(1.0, blur / _FINEST_PX)  # what is blurred needs no finer pixels
+    blur, edge = blur / unit, MARGIN * max(cloud.height, cloud.width) / unit
+    shape = (math.ceil(cloud.height / unit + 2 * edge), math.ceil(cloud.width / unit + 2 * edge))
+    total, slope, point = 0.0, np.zeros((len(cloud.x), 2)), np.empty((len(cloud.x), 2))
+    for time, weight in TIMES:
+        share = cloud.s - time
+        x, y = (cloud.x - share * flow[0]) / unit + edge, (cloud.y - share * flow[1]) / unit + edge
+        votes = np.zeros(shape)
+        vote(x, y, votes)
+        image = ndimage.gaussian_filter(votes, blur, mode="constant", truncate=3)
+        down, right = np.diff(image, axis=0), np.diff(image, axis=1)
+        total += weight * ((down**2).sum() + (right**2).sum())
+        back = np.zeros(shape)  # the derivative by the blurred image, then by the votes: a Gaussian is its own adjoint
+        back[1:] += down
+        back[:-1] -= down
+        back[:, 1:] += right
+        back[:, :-1] -= right
+        slope_at(x, y, ndimage.gaussian_filter(2 * back, blur, mode="constant", truncate=3), point)
+        slope -= (weight / unit) * share[:, None] * point
+    return total, slope
+
+
+def _climb(
+    cloud: _Cloud,
+    field: _Field,
+    start: np.ndarray,
+    blur: float,
+    steps: int,
+    price: sparse.spmatrix | None = None,
+    free: np.ndarray | None = None,
+) -> tuple[np.ndarray, float]:
+    """(parameters, relative sharpness less the price) at the top reached from ``start``.
+    price : quadratic form of what the parameters are beyond ``free``."""
+    none = (np.zeros_like(cloud.x),) * 2
+    scale = sharpness(cloud, none, blur)[0] or 1.0
+
+    def loss(p: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = sharpness(cloud, field.at(p), blur)
+        value, slope = -value / scale, -field.pulled(slope) / scale
+        if price is not None:
+            beyond = price @ (p - free)
+            value, slope = value + (p - free) @ beyond, slope + 2 * beyond
+        return value, slope
+
+    bounds = None
+    if field.limits is not None:
+        bounds = list(zip(-field.limits, field.limits, strict=True))
+        start = np.clip(start, -field.limits, field.limits)
+    found = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps})
+    return found.x, -float(found.fun)
+
+
+def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarray:
+    """(2,) px over the span: the best of a fan of translations up to ``most``, by the variance of an image of pixels
+    four times as coarse."""
+    coarse = 4.0
+    x, y, s = cloud.x[keep] / coarse, cloud.y[keep] / coarse, cloud.s[keep] - 0.5
+    shape = (math.ceil(cloud.height / coarse) + 2, math.ceil(cloud.width / coarse) + 2)
+    reach = most / coarse
+    lengths = np.concatenate([[0.0], np.geomspace(0.5, max(reach, 0.6), max(2, math.ceil(3 * math.log2(2 + reach))))])
+    best, top = np.zeros(2), -1.0
+    for length in lengths:
+        for angle in np.arange(max(1, math.ceil(2 * math.pi * min(length, 4) * 2))):
+            turn = 2 * math.pi * angle / max(1, math.ceil(2 * math.pi * min(length, 4) * 2))
+            shift = length * np.array([math.cos(turn), math.sin(turn)])
+            image = np.zeros(shape)
+            vote(x - s * shift[0] + 1, y - s * shift[1] + 1, image)
+            value = (image**2).sum()
+            if value > top:
+                best, top = shift * coarse, value
+    return best
+
+
+def _smooth(nodes: tuple[int, int]) -> sparse.spmatrix:
+    """Quadratic form of the squared differences between neighbouring nodes, their mean."""
+    columns, rows = nodes
+    number = np.arange(rows * columns).reshape(rows, columns)
+    pairs = np.concatenate(
+        [
+            np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()], 1),
+            np.stack([number[1:].ravel(), number[:-1].ravel()], 1),
+        ]
+    )
+    n, rows_of = len(pairs), np.arange(len(pairs))
+    difference = sparse.csr_matrix(
+        (np.tile([1.0, -1.0], n), (np.repeat(rows_of, 2), pairs.ravel())), shape=(n, rows * columns)
+    )
+    return sparse.kron(difference.T @ difference, sparse.identity(2), format="csr") / n
+
+
+class ContrastMaximisation:
+    """field : "translation" | "affine" | "rotation" | "tiles".   focal : px, for rotation.
+
+    The field stands still over both windows, so a motion that changes within them is averaged."""
+
+    def __init__(self, field: str, focal: float | None = None):
+        self.field, self.focal = field, focal
+        self.name, self.about = f"contrast-{field}", f"contrast maximisation, {field}"
+
+    def __call__(self, old: Window, new: Window, height: int, width: int) -> np.ndarray:
+        """As :class:`eflow.methods.Method`."""
+        cloud = _Cloud.of([old, new], height, width)
+        span = 2.0  # windows: the search is over the flow of both, the answer over the new one
+        make = self._family(height, width)
+        field = make(cloud.x, cloud.y)
+        found = [self._from(cloud, field, start) for start in self._starts(cloud, field)]
+        # What is best through a blur may be worse than no motion at all without it.
+        found.append(_climb(cloud, field, np.zeros(field.basis[0].shape[1]), BLURS_PX[-1], 30))
+        p = max(found, key=lambda one: one[1])[0]
+        grid = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
+        rows, columns = grid
+        flow = np.stack(make(columns, rows).at(p), axis=1)
+        if self.field == "tiles":
+            flow = self._tiled(cloud, flow.reshape(height, width, 2))
+        return (flow.reshape(height, width, 2) / span).astype(np.float32)
+
+    def _family(self, height: int, width: int):
+        if self.field == "rotation":
+            return lambda x, y: rotation_field(x, y, height, width, self.focal)
+        if self.field == "translation":
+            return lambda x, y: affine_field(x, y, height, width).first(2)
+        return lambda x, y: affine_field(x, y, height, width)
+
+    def _starts(self, cloud: _Cloud, field: _Field) -> list[np.ndarray]:
+        """Parameters to climb from: no motion, the best translation, and the field that fits the best translations of
+        nine parts of the image."""
+        most = FARTHEST * max(cloud.height, cloud.width)
+        everywhere = np.ones(len(cloud.x), bool)
+        whole = _best_translation(cloud, everywhere, most)
+        wanted = np.broadcast_to(whole, (len(cloud.x), 2)).copy()
+        starts = [np.zeros(field.basis[0].shape[1]), self._fit(field, wanted, everywhere)]
+        if self.field != "translation":
+            column = np.minimum((cloud.x * 3 / cloud.width).astype(int), 2)
+            row = np.minimum((cloud.y * 3 / cloud.height).astype(int), 2)
+            used = np.zeros(len(cloud.x), bool)
+            for part in range(9):
+                keep = row * 3 + column == part
+                if keep.sum() >= LEAST_EVENTS:
+                    wanted[keep], used = _best_translation(cloud, keep, most), used | keep
+            if used.any():
+                starts.append(self._fit(field, wanted, used))
+        return starts
+
+    @staticmethod
+    def _fit(field: _Field, flow: np.ndarray, keep: np.ndarray) -> np.ndarray:
+        basis = np.concatenate([field.basis[0][keep], field.basis[1][keep]])
+        return np.linalg.lstsq(basis, np.concatenate([flow[keep, 0], flow[keep, 1]]), rcond=None)[0]
+
+    @staticmethod
+    def _from(cloud: _Cloud, field: _Field, start: np.ndarray) -> tuple[np.ndarray, float]:
+        p, value = start, -math.inf
+        for blur in BLURS_PX:
+            p, value = _climb(cloud, field, p, blur, 30)
+        return p, value
+
+    @staticmethod
+    def _tiled(cloud: _Cloud, flow: np.ndarray) -> np.ndarray:
+        """(H, W, 2) px over the span: refined node by node from a field for the whole image."""
+        height, width = cloud.height, cloud.width
+        rows, columns = np.mgrid[:height, :width].reshape(2, -1).astype(np.float64)
+        whole = flow
+        for nodes, blur in zip(TILES, BLURS_PX, strict=True):
+            field = tile_field(cloud.x, cloud.y, height, width, nodes)
+            at = np.linspace(0, height - 1, nodes[1]), np.linspace(0, width - 1, nodes[0])
+            places = np.meshgrid(*at, indexing="ij")
+            start, free = (
+                np.stack([ndimage.map_coordinates(f[..., k], places, order=1) for k in (0, 1)], axis=-1).ravel()
+                for f in (flow, whole)
+            )
+            spacing = width / (nodes[0] - 1)
+            price = SMOOTHNESS * (16 / spacing) ** 2 * _smooth(nodes)
+            p, _ = _climb(cloud, field, start, blur, 40, price, free)
+            flow = np.stack(tile_field(columns, rows, height, width, nodes).at(p), axis=1).reshape(height, width, 2)
+        return flow

@@ -1,0 +1,67 @@
+"""Images of warped events: where the events of a window fall when each is carried along a flow to one time.
+
+Events of one edge then fall on one line, so that a right flow makes the image sharp (Gallego, Rebecq and Scaramuzza,
+CVPR 2018; Stoffregen et al., ECCV 2020).
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from eflow.data.window import Window
+
+
+@numba.njit(cache=True, nogil=True)
+def vote(x: np.ndarray, y: np.ndarray, image: np.ndarray) -> None:
+    """Adds 1 for every point (x, y), float64 px, to the four pixels round it, bilinearly; what is outside is lost."""
+    height, width = image.shape
+    for i in range(len(x)):
+        fx, fy = np.floor(x[i]), np.floor(y[i])
+        if not (fx >= 0 and fy >= 0 and fx < width - 1 and fy < height - 1):
+            continue
+        column, row = int(fx), int(fy)
+        a, b = x[i] - fx, y[i] - fy
+        image[row, column] += (1 - a) * (1 - b)
+        image[row, column + 1] += a * (1 - b)
+        image[row + 1, column] += (1 - a) * b
+        image[row + 1, column + 1] += a * b
+
+
+@numba.njit(cache=True, nogil=True)
+def slope_at(x: np.ndarray, y: np.ndarray, image: np.ndarray, out: np.ndarray) -> None:
+    """out (N, 2): derivative of sum(image * votes) by each point's x and y; the adjoint of :func:`vote`."""
+    height, width = image.shape
+    for i in range(len(x)):
+        fx, fy = np.floor(x[i]), np.floor(y[i])
+        if not (fx >= 0 and fy >= 0 and fx < width - 1 and fy < height - 1):
+            out[i, 0] = out[i, 1] = 0.0
+            continue
+        column, row = int(fx), int(fy)
+        a, b = x[i] - fx, y[i] - fy
+        p, q = image[row, column], image[row, column + 1]
+        r, s = image[row + 1, column], image[row + 1, column + 1]
+        out[i, 0] = (q - p) * (1 - b) + (s - r) * b
+        out[i, 1] = (r - p) * (1 - a) + (s - q) * a
+
+
+def warped(window: Window, flow: np.ndarray, span_us: int | None = None) -> np.ndarray:
+    """(H, W) float64 image of the window's events carried back along ``flow`` to its first time.
+
+    flow : (H, W, 2) px per ``span_us`` (default: the window's length), read at each event's pixel."""
+    height, width = flow.shape[:2]
+    image = np.zeros((height, width))
+    column, row = (np.rint(np.asarray(c)).astype(np.intp) for c in (window.x, window.y))
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    share = (window.t[inside] - window.t0) / (span_us or window.t1 - window.t0)
+    moved = flow[row[inside], column[inside]] * share[:, None]
+    vote(window.x[inside] - moved[:, 0].astype(np.float64), window.y[inside] - moved[:, 1].astype(np.float64), image)
+    return image
+
+
+def flow_warp_loss(window: Window, flow: np.ndarray) -> float:
+    """FWL of Stoffregen et al. (ECCV 2020), eq. 6: variance of the image of the events warped by the flow over that of
+    the events as they are. Above 1 the flow sharpens; 1 is zero flow's; NaN without events. flow : (H, W, 2) px over
+    the window."""
+    before = warped(window, np.zeros_like(flow)).var()
+    return float(warped(window, flow).var() / before) if before > 0 else float("nan")

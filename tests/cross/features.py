@@ -88,12 +88,14 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
                 "photoreceptor_noise": True,
                 "cutoff_hz": 200,
                 "hot_pixel_fraction": 0.01,
+                "causes": True,
+                "start": "balanced",
             }
         },
-        "v2e, causes": {"events": {"emulator": "v2e", "causes": True, "start": "balanced", "leak_rate_hz": 50}},
         "voltmeter": {"events": {"emulator": "voltmeter"}},
-        "voltmeter, 240, causes": {"events": {"emulator": "voltmeter", "preset": "DVS240", "causes": True}},
-        "voltmeter, authors": {"events": {"emulator": "voltmeter", "compat": "authors", "k4": 1e-4}},
+        "voltmeter, 240": {
+            "events": {"emulator": "voltmeter", "preset": "DVS240", "causes": True, "compat": "authors", "k4": 1e-4}
+        },
     },
     "timeline": {
         "uniform": {"timeline": {"kind": "uniform", "fps": 400}},

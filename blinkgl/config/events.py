@@ -26,6 +26,11 @@ _MAX_EVENTS = Field(
     "is cut to the same number; levels still move, the cut events are counted in `emulator.saturated`. "
     "2^25 events need about 1 GB while they are sorted.",
 )
+_CAUSES = Field(
+    False,
+    description="Mark every event by what caused it (`Events.cause`; `events/cause` in HDF5, `cause` in .npz): "
+    "0 signal, 1 leak, 2 shot noise, 3 hot pixel. The events are the same.",
+)
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
@@ -105,6 +110,7 @@ class EsimConfig(EmulatorConfig):
         description="Dead time of a pixel after an event, microseconds; a level passed in it is lost, as in rpg_esim.",
     )
     max_events_per_step: int = _MAX_EVENTS
+    causes: bool = _CAUSES
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
@@ -129,7 +135,7 @@ V2E_PRESETS = {
         leak_jitter=0.1,
         leak_cov_decades=0.1,
         shot_noise_rate_hz=5.0,
-        refractory_us=500.0,
+        refractory_us=0.0,
     ),
 }
 
@@ -191,9 +197,18 @@ class V2eConfig(EmulatorConfig):
         "at the rate shot_noise_rate_hz, instead of drawing events; needs cutoff_hz > 0.",
     )
     refractory_us: float = Field(500.0, ge=0, le=1e9, description="Dead time after an event, microseconds (v2e: 500).")
+    start: Literal["stationary", "balanced", "zero"] = Field(
+        "stationary",
+        description="Where a pixel stands between its levels at the first frame. `stationary`: as in a still scene "
+        "that was watched for long, which leak has brought nearer to ON (each pixel to another place): short clips "
+        "then have more ON events than a scene that has been moving. `balanced`: as after a signal that went up as "
+        "often as down. `zero`: every pixel has just fired, as v2e starts. Without leak the first and the last are "
+        "the same.",
+    )
     hot_pixel_fraction: float = Field(0.0, ge=0, le=1, description="Share of pixels that fire by themselves.")
     hot_pixel_rate_hz: float = Field(100.0, ge=0, le=1e5, description="Mean rate of a hot pixel, Hz, ON.")
     max_events_per_step: int = _MAX_EVENTS
+    causes: bool = _CAUSES
 
     @rule("photoreceptor_noise", "cutoff_hz")
     def _noise_needs_bandwidth(noise, cutoff_hz):
@@ -243,7 +258,18 @@ class VoltmeterConfig(EmulatorConfig):
     refractory_us: float = Field(
         0.0, ge=0, le=1e9, description="Dead time after an event, microseconds (the paper has none)."
     )
+    start: Literal["stationary", "zero"] = Field(
+        "stationary",
+        description="V at the first frame: as of a scene that has stood still for long, or 0 everywhere (as in the "
+        "authors' program: the first leak events of a flat image then come together).",
+    )
+    compat: Literal["none", "authors"] = Field(
+        "none",
+        description="`authors`: draw as their program does, where numbers made with it have to be made again. V then "
+        "starts at 0, and its noise depends on the frame rate.",
+    )
     max_events_per_step: int = _MAX_EVENTS
+    causes: bool = _CAUSES
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:

@@ -22,6 +22,8 @@ PRIMITIVE_KINDS = ("cuboid", "cylinder", "sphere", "icosphere", "cone", "torus",
 TEXTURE_KINDS = ("value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks")
 
 PrimitiveKind = Literal["cuboid", "cylinder", "sphere", "icosphere", "cone", "torus", "capsule", "prism", "pyramid"]
+LIVING_KINDS = ("figure", "flag", "fish")
+LivingKind = Literal["figure", "flag", "fish"]
 TextureKind = Literal["value", "perlin", "fbm", "stripes", "checks", "glyphs", "dots", "gradient", "bricks"]
 
 
@@ -71,6 +73,16 @@ def _number_or_three(value: Any) -> Any:
     return value
 
 
+def _parameter(value: Any) -> Any:
+    """A word is not looked at before the primitive sees it; YAML 1.1 reads 1e-1 as text, too."""
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return _number_or_three(value)
+
+
 def _greater_than_zero(value: Any) -> Any:
     values = value if isinstance(value, tuple) else (value,)
     if min(values) <= 0 or max(values) > 1e9:
@@ -113,8 +125,12 @@ class ObjectsConfig(Config):
 class PoolConfig(Config):
     """Where the random world's objects come from."""
 
-    primitives: Annotated[Literal["all"] | tuple[PrimitiveKind, ...], _one_of(("all",), PRIMITIVE_KINDS)] = Field(
-        "all", description="'all' or a list of kinds; [] for none"
+    primitives: Annotated[
+        Literal["all"] | tuple[PrimitiveKind | LivingKind, ...], _one_of(("all",), PRIMITIVE_KINDS + LIVING_KINDS)
+    ] = Field(
+        "all",
+        description="'all', which are the rigid ones, or a list of kinds; [] for none. A figure walks, runs, dances or "
+        "waves, a fish swims, a flag flies",
     )
     variants: int = Field(24, ge=1, le=10_000, description="shapes of each primitive kind (aspect ratios, sides)")
     folders: Paths = Field((), description="folders searched recursively for obj, ply, stl, glb, gltf")
@@ -339,12 +355,35 @@ class KeyedMotionConfig(PoseConfig):
                 )
 
 
+class WayConfig(Config):
+    """A curve that a body follows at one speed, its x axis ahead; beyond an open end it goes straight on."""
+
+    points: tuple[Position, ...] = Field(description="two or more places, m; the curve is smooth and passes them all")
+    speed: float | None = Field(
+        None,
+        gt=0,
+        le=1e4,
+        description="m/s; null: as fast as a figure's steps or a fish's strokes take it, so that feet do not slide; "
+        "1 for other bodies",
+    )
+    closed: bool = Field(False, description="from the last point back to the first, and on")
+    level: bool = Field(True, description="its z axis stays up; false: its x axis goes up and down with the way")
+    start: Fraction = Field(0.0, description="share of the way that lies behind it at time 0")
+
+    @rule("#points", "closed")
+    def _a_way(points, closed):
+        least = 3 if closed else 2
+        if len(points) < least:
+            raise Refused(f"a way needs {least} points or more", where="points", value=len(points))
+
+
 class MeshConfig(Config):
     """A primitive with its parameters, or a file."""
 
-    primitive: Literal[PrimitiveKind, "grid", "die"] | None = Field(None, description="kind of primitive")
-    parameters: dict[str, Annotated[int | float | Vector3, BeforeValidator(_number_or_three)]] = Field(
-        {}, description="the primitive's sizes and numbers of faces: see [primitives](#primitives)"
+    primitive: Literal[PrimitiveKind, "grid", "die", LivingKind] | None = Field(None, description="kind of primitive")
+    parameters: dict[str, Annotated[int | float | Vector3 | str, BeforeValidator(_parameter)]] = Field(
+        {},
+        description="the primitive's sizes, numbers of faces, and what it does: see [primitives](#primitives)",
     )
     file: str | None = Field(None, description="obj, ply, stl, glb or gltf file")
     up: Literal["auto", "y", "z"] = Field(
@@ -419,8 +458,16 @@ class ObjectConfig(KeyedMotionConfig):
         "or moves",
     )
     deform: DeformConfig | None = Field(
-        None, description="how its shape changes with time, by formula; null: it is rigid"
+        None,
+        description="how its shape changes with time, by formula, whatever it does by itself; null: it is rigid, but "
+        "for figure, flag, fish",
     )
+    way: WayConfig | None = Field(None, description="a curve that it follows, in place of a pose or key frames")
+
+    @rule("?way", "#keyframes", "position", "quaternion", "euler", "look_at")
+    def _one_motion(way, keyframes, position, *orientation):
+        if way and (keyframes or any(position) or any(o is not None for o in orientation)):
+            raise Refused("give a way, a fixed pose or keyframes, not several of them")
 
     @rule("physics.kind", "#keyframes")
     def _the_engine_or_key_frames(kind, keyframes):

@@ -16,15 +16,18 @@ from pathlib import Path
 from typing import Any, overload
 
 from blinkgl.config.base import validate
+from blinkgl.config.corners import sites
+from blinkgl.config.draw import is_distribution, options
 from blinkgl.config.reader import to_yaml
 from blinkgl.config.recipe import Group, all_groups
-from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
+from blinkgl.config.scene import LIVING_KINDS, ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig
 from blinkgl.config.sequence import OutputConfig, RunTemplate, SequenceConfig
 from blinkgl.errors import AssetError, ConfigError, OutputError
 from blinkgl.scene.build import check_assets
 from blinkgl.scene.importing.mesh_files import dependencies
 from blinkgl.scene.motion.dynamics import engine_version
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash
+from blinkgl.scene.worlds.explicit import check_primitive
 from blinkgl.scene.worlds.pool import files_below, resolve
 from blinkgl.scene.worlds.random_world import pools
 from blinkgl.sequence.folders import matching_folders, used_images
@@ -190,18 +193,7 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
     base = group.template.base
     if _falls(group.template.tree):
         engine_version()
-    # What check_assets looks at, and which folders there are.
-    for config in group.template.corners_of(
-        "frames",
-        "scene.kind",
-        "scene.pool",
-        "scene.textures",
-        "scene.sky",
-        "scene.objects.count",
-        "scene.meshes",
-        "scene.materials",
-        "scene.path",
-    ):
+    for config in _asset_corners(group.template):
         if config.frames is not None:
             folders = matching_folders(config.frames, base)
             last = group.first + count - 1
@@ -224,6 +216,32 @@ def _check_group(group: Group, count: int, hashes: dict[str, str]) -> None:
             continue
         check_assets(config.scene, base, config.output.split)
         _hash_scene_files(config.scene, base, hashes)
+
+
+def _asset_corners(template: RunTemplate) -> Iterator[SequenceConfig]:
+    """Configurations with all that check_assets looks at, and all folders there are: meshes and materials one by one,
+    of figures, flags and fish (which are checked here) one parameter after the other."""
+    world = ("frames", "scene.kind", "scene.pool", "scene.textures", "scene.sky", "scene.objects.count", "scene.path")
+    scene = template.tree.get("scene")
+    tables = [scene.get(table) if isinstance(scene, dict) else None for table in ("meshes", "materials")]
+    if not all(isinstance(table, dict) and not is_distribution(table) for table in tables):
+        yield from template.corners_of(*world, "scene.meshes", "scene.materials")
+        return
+    meshes, materials = tables
+    yield from template.corners_of(*world)
+    for name, mesh in meshes.items():
+        kind, given = (mesh.get(key) if isinstance(mesh, dict) else None for key in ("primitive", "parameters"))
+        if isinstance(kind, str) and kind in LIVING_KINDS and isinstance(given, dict) and not is_distribution(given):
+            for key, value in given.items():
+                path = ("scene", "meshes", name, "parameters", key)
+                for one in options(path, value) if is_distribution(value) else ():
+                    if not is_distribution(one):
+                        check_primitive(kind, {key: one}, name)
+        elif sites(mesh):
+            yield from template.corners_of(f"scene.meshes.{name}")
+    for name, material in materials.items():
+        if sites(material):
+            yield from template.corners_of(f"scene.materials.{name}")
 
 
 def _falls(tree: Any) -> bool:

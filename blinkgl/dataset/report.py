@@ -37,6 +37,8 @@ class SequenceReport:
     """without ``compile_s``"""
     compile_s: float = 0.0
     """compiling kernels; 0 but for a machine's first sequence of a kind"""
+    causes: dict[str, int] = field(default_factory=dict)
+    """events by what caused them; empty unless ``events.causes`` asks for it"""
     timeline: dict = field(default_factory=dict)
     """what an adaptive timeline says it achieved"""
     omissions: tuple[str, ...] = ()
@@ -50,6 +52,7 @@ class SequenceReport:
             sequence.labels,
             sequence.seconds,
         )
+        self.causes = sequence.causes
 
 
 def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
@@ -71,6 +74,7 @@ class Totals:
     frames: int = 0
     events: int = 0
     labels: int = 0
+    causes: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     total_s: float = 0.0
     compile_s: float = 0.0
@@ -87,6 +91,8 @@ class Totals:
         self.labels += report.labels
         self.total_s += report.total_s
         self.compile_s = max(self.compile_s, report.compile_s)  # workers compile at once
+        for cause, events in report.causes.items():
+            self.causes[cause] = self.causes.get(cause, 0) + events
         for stage, seconds in report.seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
         return self

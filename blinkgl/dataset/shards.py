@@ -114,5 +114,5 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
 
 def _npz(events: Events) -> bytes:
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, x=events.x, y=events.y, t=events.t, p=events.p)
+    np.savez_compressed(buffer, **{k: getattr(events, k) for k in events.columns})
     return buffer.getvalue()

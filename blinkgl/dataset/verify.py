@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
@@ -25,6 +26,7 @@ from blinkgl.dataset.plan import Plan, sequence_name
 from blinkgl.dataset.run_folder import RunFolder
 from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
+from blinkgl.events.types import Cause
 from blinkgl.gl import GLContext, create_context
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
@@ -194,6 +196,9 @@ def _bound(name: str, manifest: dict[str, Any], config: SequenceConfig) -> list[
             ("duration_us", t1 - t0),
             ("labels", config.time.label_count),
         ]
+    told = bool(getattr(config.events, "causes", False))
+    if ("events_by_cause" in manifest) != told:
+        said.append(("events_by_cause", "that there are some" if told else None))
     problems = [
         f"{MANIFEST}: {key} is {shown(manifest.get(key))}, config.yaml says {value}"
         for key, value in said
@@ -238,6 +243,7 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
         table = dataset(file, "ms_to_idx", path, shape=(None,))
         if not needed <= len(table) <= needed + 1:
             return [*problems, f"events.h5: ms_to_idx has {len(table)} entries, {needed} are needed"]
+        problems += _check_causes(file, path, manifest)
         ms_to_idx = table[()].astype(np.int64)
         expected = np.zeros(len(ms_to_idx), np.int64)
         marks = np.arange(len(ms_to_idx), dtype=np.int64) * 1000
@@ -264,6 +270,23 @@ def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
                     f"events.h5: ms_to_idx[{wrong[0]}] is {ms_to_idx[wrong[0]]}, expected {expected[wrong[0]]}"
                 )
     return problems
+
+
+def _check_causes(file: h5py.File, path: Path, manifest: dict[str, Any]) -> list[str]:
+    """As many events of each cause as the manifest says."""
+    there, wanted = "events/cause" in file, manifest.get("events_by_cause")
+    if wanted is None or (not there and manifest["events"] == 0):
+        return ["events.h5: 'events/cause', which the manifest does not know"] if there and wanted is None else []
+    column = dataset(file, "events/cause", path, shape=(None,), kinds="iu")
+    if len(column) != manifest["events"]:
+        return [f"events.h5: causes of {len(column)} events, manifest says {manifest['events']}"]
+    counts = np.zeros(256, np.int64)
+    for begin in range(0, len(column), _BLOCK):
+        counts += np.bincount(column[begin : begin + _BLOCK].astype(np.uint8), minlength=256)
+    found = {cause.name.lower(): int(counts[cause]) for cause in Cause}
+    if found == wanted and counts.sum() == sum(found.values()):
+        return []
+    return [f"events.h5: causes are {found}, manifest says {wanted}"]
 
 
 def _check_labels(folder: Path, manifest: dict[str, Any]) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.arith import LOG_MAX_INPUT
-from blinkgl.events.packing import MAX_INTERVAL_NS, PackedBuffer
+from blinkgl.events.packing import MAX_CAUSE_ROWS, MAX_INTERVAL_NS, PackedBuffer
 from blinkgl.events.response import Response
 from blinkgl.events.threads import run, thread_count
 from blinkgl.events.types import Events
@@ -124,6 +124,11 @@ class Emulator(ABC):
         pass
 
     @property
+    def causes(self) -> bool:
+        """Whether events say what caused them, ``config.causes``."""
+        return bool(getattr(self.config, "causes", False))
+
+    @property
     def needs_rate(self) -> bool:
         """Whether ``step`` wants dI/dt beside every frame."""
         return self.reconstruction == "hermite"
@@ -151,6 +156,13 @@ class Emulator(ABC):
         ``hermite`` looks at it; a value that is not finite counts as 0."""
         frame = self._checked_frame(luminance)
         t_ns = self._checked_time(t_ns)
+        if self.t_ns is None and self.causes and self.height > MAX_CAUSE_ROWS:
+            raise EventDataError(
+                "causes are for sensors of fewer rows",
+                where="events.causes",
+                value=self.height,
+                accepted=f"at most {MAX_CAUSE_ROWS} rows, or events without causes",
+            )
         rate = self._checked_rate(rate) if self.needs_rate else None
         whole = (0, self.height)
         here = whole if rows is None or self.t_ns is None else (max(0, rows[0]), min(self.height, rows[1]))
@@ -277,7 +289,7 @@ class Emulator(ABC):
             # No block emits more than its share or, at one event each, its pixels; so this ends, and is bounded.
             self._buffer.grow(bands, 2 * packed.shape[1] + 8 * BLOCK, progress[:, 1])
         self.saturated += int(progress[:, 2].sum())
-        return self._buffer.to_events(progress[:, 1].copy(), base_us, span_us, threads)
+        return self._buffer.to_events(progress[:, 1].copy(), base_us, span_us, threads, self.causes)
 
     # -- state ----------------------------------------------------------------------------------------------
     def state_dict(self) -> dict[str, np.ndarray]:

@@ -4,17 +4,23 @@ Layout: ``(t_us - base_us) << 33 | y << 17 | x << 1 | p``. Kernels emit pixel by
 sort is a stable radix sort on the time alone, so events of one microsecond come out in raster order, those of one
 pixel in the order they fired: no tie depends on how the frame was cut into bands for the threads. Moving one
 8-byte word per event is several times cheaper than moving four columns.
+
+Causes, where they are asked for, take the two uppermost bits of y: a sensor then has at most 2^14 rows.
 """
 
 from __future__ import annotations
 
 import numba
 import numpy as np
+from numba.extending import register_jitable
 
 from blinkgl.events.threads import run, take_part
-from blinkgl.events.types import Events
+from blinkgl.events.types import Cause, Events
 
 T_SHIFT = 33
+CAUSE_SHIFT = 31
+MAX_CAUSE_ROWS = 2**14
+_SIGNAL, _LEAK, _SHOT = int(Cause.SIGNAL), int(Cause.LEAK), int(Cause.SHOT)
 MAX_INTERVAL_NS = (2**30 - 1) * 1000
 """Longest interval between two frames: 30 bits of microseconds (the word stays positive), 17 minutes."""
 _SINGLE_PASS_BITS, _DIGIT_BITS = 14, 11
@@ -22,6 +28,14 @@ _EVENTS_PER_THREAD, _PARTS_PER_THREAD = 2**15, 2
 """Fewer events than that are sorted in the time another thread takes to wake up."""
 
 JIT = dict(nogil=True, cache=True, error_model="numpy", boundscheck=False)
+
+
+@register_jitable
+def cause_of(light: float, leak: float, noise: float) -> int:
+    """The :class:`~blinkgl.events.types.Cause` of a crossing: the largest part, all in its direction."""
+    if light >= leak and light >= noise:
+        return _SIGNAL
+    return _LEAK if leak >= noise else _SHOT
 
 
 # A radix sort from the lowest digit of the time up (Knuth, TAOCP 3, 5.2.5). Every pass keeps the order of equal digits,
@@ -63,6 +77,14 @@ def _unpack(packed, start, stop, base_us, x, y, t, p):
         ps[i] = np.uint8(word[i] & 1)
 
 
+@numba.njit(**JIT)
+def _unpack_causes(packed, start, stop, y, cause):
+    word, ys, causes = packed[start:stop], y[start:stop], cause[start:stop]
+    for i in range(word.size):
+        ys[i] = np.uint16((word[i] >> 17) & 0x3FFF)
+        causes[i] = np.uint8((word[i] >> CAUSE_SHIFT) & 3)
+
+
 # The three below work through parts of the events, each taken by the next thread that is free.
 
 
@@ -86,10 +108,12 @@ def _scatter_parts(taken, start, packed, starts, counts, first_row, shift, mask,
 
 
 @numba.njit(**JIT)
-def _unpack_parts(taken, start, packed, edges, base_us, x, y, t, p):
+def _unpack_parts(taken, start, packed, edges, base_us, x, y, t, p, cause):
     part = take_part(taken, start)
     while part >= 0:
         _unpack(packed, edges[part], edges[part + 1], base_us, x, y, t, p)
+        if cause.size:
+            _unpack_causes(packed, edges[part], edges[part + 1], y, cause)
         part = take_part(taken, start)
 
 
@@ -113,12 +137,15 @@ class PackedBuffer:
         for band in range(bands):
             self._rows[band, : filled[band]] = old[band, : filled[band]]
 
-    def to_events(self, counts: np.ndarray, base_us: int, span_us: int, threads: int = 1) -> Events:
+    def to_events(
+        self, counts: np.ndarray, base_us: int, span_us: int, threads: int = 1, causes: bool = False
+    ) -> Events:
         """The events of ``rows[b, : counts[b]]``, sorted.
 
         counts : (B,) int64, events per row, rows in raster order.
         base_us, span_us : time of offset 0, and the largest offset that can occur.
         threads : at most so many; few events are sorted by the calling one alone.
+        causes : whether the words hold them.
         """
         total = int(counts.sum())
         if total == 0:
@@ -151,8 +178,9 @@ class PackedBuffer:
             source, starts, counts, first_row = (target, edges[:-1], np.diff(edges), np.arange(parts + 1))
         x, y = np.empty(total, np.uint16), np.empty(total, np.uint16)
         t, p = np.empty(total, np.int64), np.empty(total, np.uint8)
-        run(_unpack_parts, parts, (source, edges, base_us, x, y, t, p), threads)
-        return Events(x, y, t, p)
+        cause = np.empty(total if causes else 0, np.uint8)
+        run(_unpack_parts, parts, (source, edges, base_us, x, y, t, p, cause), threads)
+        return Events(x, y, t, p, cause if causes else None)
 
 
 def _even_split(counts: np.ndarray, parts: int) -> np.ndarray:

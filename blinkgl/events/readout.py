@@ -12,6 +12,8 @@ event that left by T; those still on the bus then are no part of it, and are cou
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 
@@ -78,8 +80,8 @@ class Readout:
         if self.late:
             sent = Events.concatenate([self._on_bus, sent])
         count = len(sent) if until_us is None else int(np.searchsorted(sent.t, until_us, side="right"))
-        self._on_bus = Events(*(getattr(sent, k)[count:].copy() for k in "xytp"))
-        return Events(*(getattr(sent, k)[:count] for k in "xytp"))
+        self._on_bus = sent.part(slice(count, None)).copy()
+        return sent.part(slice(count))
 
     def _serve(self, events: Events) -> Events:
         """Those that find a place, with the times at which they leave."""
@@ -91,18 +93,18 @@ class Readout:
         kept = _serve(events.t, events.y, self._event_ps, self._row_ps, self._waiting, self._state, keep, out_us)
         self.dropped += len(events) - kept
         keep = keep[:kept]
-        return Events(events.x[keep], events.y[keep], out_us[:kept].copy(), events.p[keep])
+        return replace(events.part(keep), t=out_us[:kept].copy())
 
     def state_dict(self) -> dict[str, np.ndarray]:
         return {
             "waiting": self._waiting.copy(),
             "state": self._state.copy(),
             "dropped": np.array([self.dropped], np.int64),
-            **{f"on_bus_{k}": getattr(self._on_bus, k).copy() for k in "xytp"},
+            **{f"on_bus_{k}": getattr(self._on_bus, k).copy() for k in self._on_bus.columns},
         }
 
     def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
-        columns = [f"on_bus_{k}" for k in "xytp"]
+        columns = [f"on_bus_{k}" for k in ("x", "y", "t", "p", *(["cause"] if "on_bus_cause" in state else []))]
         if set(state) != {"waiting", "state", "dropped", *columns} or state["waiting"].shape != self._waiting.shape:
             raise EventDataError("saved state is of another read-out", value=sorted(state))
         self._waiting[...], self._state[...], self.dropped = state["waiting"], state["state"], int(state["dropped"][0])

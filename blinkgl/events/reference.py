@@ -16,15 +16,30 @@ from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import v2e_model as v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
 from blinkgl.events.noise import noise_table
-from blinkgl.events.philox import Stream, normal2, normal_and_uniform, pixel_counters, rough_normal, uniform2
+from blinkgl.events.philox import (
+    Stream,
+    normal2,
+    normal2_and_uniform,
+    normal_and_uniform,
+    pixel_counters,
+    rough_normal,
+    uniform2,
+)
 from blinkgl.events.types import Events
 
 
-def sorted_events(rows: list[tuple[int, int, int, int]]) -> Events:
-    """Events from (t_us, y, x, p) rows given pixel by pixel in raster order: sorted by time, ties in that order."""
+def sorted_events(rows: list[tuple[int, int, int, int, int]], causes: bool) -> Events:
+    """Events from (t_us, y, x, p, cause) rows given pixel by pixel in raster order: sorted by time, ties in that
+    order."""
     rows = sorted(rows, key=lambda r: r[0])
-    t, y, x, p = np.array(rows, np.int64).reshape(-1, 4).T
-    return Events(x.astype(np.uint16), y.astype(np.uint16), np.ascontiguousarray(t), p.astype(np.uint8))
+    t, y, x, p, cause = np.array(rows, np.int64).reshape(-1, 5).T
+    return Events(
+        x.astype(np.uint16),
+        y.astype(np.uint16),
+        np.ascontiguousarray(t),
+        p.astype(np.uint8),
+        cause.astype(np.uint8) if causes else None,
+    )
 
 
 def as_luminance(frame: np.ndarray) -> np.ndarray:
@@ -100,7 +115,7 @@ class ReferenceEsim:
                     self.levels[self.passed][i],
                     *self.times[self.passed - 1 : self.passed + 1],
                 )
-        return sorted_events(rows)
+        return sorted_events(rows, self.config.causes)
 
     def end_slopes(self, i: int) -> tuple[float, float]:
         """(alpha, beta) of pixel i in the interval that is being passed, unlimited, in units of its secant."""
@@ -150,7 +165,7 @@ class ReferenceEsim:
             self.next[i] = self.next_thresholds(i)
             if self.last_ns[i] is None or t - self.last_ns[i] >= round(self.config.refractory_us * 1000):
                 self.last_ns[i] = t
-                rows.append((t // 1000, y, x, p))
+                rows.append((t // 1000, y, x, p, 0))
 
 
 class ReferenceV2e:
@@ -196,20 +211,23 @@ class ReferenceV2e:
         rows = []
         if self.t_ns is None:
             self.t_ns = self.epoch = t_ns
-            phase = uniform2(self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0))[
-                0
-            ]
-            reference = x - phase.astype(np.float32) * self.on if self.leaks else x
-            self.upper, self.lower = reference + self.on, reference - self.off
-            lag = np.zeros(self.pixels, np.float32)
+            self.hum = np.zeros(0, np.float32)
             if self.hums:
-                start = v2e.draw_start_noise(intensity, self.config, self.seed)
-                self.hum = start
-                reference = x + start
-                if self.leaks:
-                    reference = reference - phase.astype(np.float32) * self.on
-                self.upper, self.lower = reference + self.on, reference - self.off
-            elif self.config.shot_noise_rate_hz:
+                self.hum = v2e.draw_start_noise(intensity, self.config, self.seed)
+            leak = self.leak if self.leaks else self.leak[:0]
+            start = v2e.draw_start(self.config, intensity, self.on, self.off, leak, self.hum, self.seed)
+            if self.leaks:
+                self.leak = start.leak
+            reference = (x + self.hum if self.hums else x) + start.offset
+            lag = np.zeros(self.pixels, np.float32)
+            self.upper, self.lower = reference + self.on, reference - self.off
+            self.release = [t_ns + int(left) if left else None for left in start.dead_ns] or self.release
+            self.since, self.noise_then = (
+                t_ns - start.age_ns,
+                start.by_noise + (self.hum if self.hums else np.float32(0)),
+            )
+            self.hot = v2e.draw_hot(self.height, self.width, self.config, self.seed)
+            if self.config.shot_noise_rate_hz and not self.hums:
                 self.clocks = [self.shot_times(b) for b in range(-(-self.pixels // v2e.BLOCK))]
                 self.pending = [next(clock) for clock in self.clocks]
         else:
@@ -228,7 +246,7 @@ class ReferenceV2e:
         if t_ns - self.epoch >= self.rebase_ns:
             gone = self.leak * np.float32((t_ns - self.epoch) * 1e-9)
             self.upper, self.lower, self.epoch = self.upper - gone, self.lower - gone, t_ns
-        return sorted_events(rows)
+        return sorted_events(rows, self.config.causes)
 
     def noise(self, intensity: np.ndarray, t_ns: int) -> list[list[tuple[int, int]]]:
         """Accepted shot noise of the interval, per pixel: (ns from its start, polarity) in time order."""
@@ -258,9 +276,13 @@ class ReferenceV2e:
         )
         normals = np.stack(pairs, axis=1).ravel()[: self.pixels].astype(f)
         k = kappa * (f(0.5) * (self.intensity + intensity) + f(20))
-        sizes = noise_table(c.shot_noise_rate_hz, dt_s, c.contrast_threshold)
+        sizes = noise_table(c.shot_noise_rate_hz, dt_s, v2e.noise_threshold(c))
         below, part = v2e.noise_place(k)
         return v2e.next_noise(self.hum, k, sizes[below] + part * (sizes[below + 1] - sizes[below]), normals)
+
+    def hum_at(self, i: int, s: float, change: float) -> float:
+        """Photoreceptor noise at the fraction s of the interval."""
+        return np.float64(self.hum[i]) + change * s if self.hums else np.float64(0)
 
     def pixel(
         self, i: int, x: int, lag: float, intensity: float, kappa: float, t_ns: int, noise: float, hum: float
@@ -289,13 +311,14 @@ class ReferenceV2e:
         if self.config.cutoff_hz:
             end = end + f(lag[i])
         on, off, up, down = f(self.on[i]), f(self.off[i]), f(self.upper[i]), f(self.lower[i])
-        s, after, rows = f(0), 0, []
+        s, after, rows, then = f(0), 0, [], f(self.noise_then[i])
         if waiting:
             if self.release[i] > t_ns:
                 return []
             after = max(self.release[i] - self.t_ns, 0)
             s, self.release[i] = f(after / dt_ns), None
             up, down = z(s) + on, z(s) - off
+            self.since[i], then = self.t_ns + after, self.hum_at(i, s, change_of_hum)
         while True:
             noise = [n for n in noise if n[0] >= after]
             p = 1 if end >= up else 0 if end <= down else None
@@ -310,7 +333,11 @@ class ReferenceV2e:
             if event is None:
                 break
             after, p, s, reference = event
-            rows.append(((self.t_ns + after) // 1000, y, column, p))
+            sign, size = (1.0, on) if p else (-1.0, off)
+            by_leak = sign * leak * ((self.t_ns + after - self.since[i]) * 1e-9)
+            by_noise = sign * (self.hum_at(i, s, change_of_hum) - then)
+            cause = 2 if reference is None else int(np.argmax([size - by_leak - by_noise, by_leak, by_noise]))
+            rows.append(((self.t_ns + after) // 1000, y, column, p, 3 if cause == 1 and self.hot[i] else cause))
             if self.leaks and self.config.leak_jitter:
                 n = rough_normal(self.seed, np.uint64(i), np.uint64(Stream.LEAK_JITTER), np.uint64(self.t_ns + after))
                 self.leak[i] = np.float32(self.mean_leak[i] / max(0.1, 1.0 + self.config.leak_jitter * n))
@@ -328,17 +355,21 @@ class ReferenceV2e:
             if reference is None:
                 reference = z(s)
             up, down = reference + on, reference - off
+            self.since[i], then = self.t_ns + after, self.hum_at(i, s, change_of_hum)
+        self.noise_then[i] = then
         self.upper[i], self.lower[i] = np.float32(up), np.float32(down)
         return rows
 
 
 class ReferenceVoltmeter:
-    """Lin et al. 2022, sections 3 and 4."""
+    """Lin et al. 2022, sections 3 and 4, as the docstring of :mod:`blinkgl.events.voltmeter` says it."""
 
     def __init__(self, height: int, width: int, config: VoltmeterConfig, seed: int = 0):
         self.width, self.config, self.seed = width, config, np.uint64(seed)
-        self.v = np.zeros(height * width, np.int32)
+        self.v, self.unspent = np.zeros(height * width, np.int32), np.zeros(height * width, np.float32)
         self.release: list[int | None] = [None] * (height * width)
+        self.parts = np.zeros((height * width, 2), np.float32)
+        """What light and leak have moved V by since it was 0."""
         self.t_ns: int | None = None
         self.frame = 0
 
@@ -346,6 +377,11 @@ class ReferenceVoltmeter:
         c, f = self.config, np.float32
         intensity = (as_luminance(luminance) * f(c.full_scale)).ravel()
         rows = []
+        if self.t_ns is None and c.start == "stationary" and c.compat == "none":
+            self.v, left_us = voltmeter.start_voltage(intensity, c, self.seed)
+            self.release = [t_ns + int(us * 1e3) if us else None for us in left_us]
+            v = np.where([r is None for r in self.release], self.v, voltmeter.IN_DEAD_TIME)
+            self.parts[:, 1] = voltmeter.start_by_leak(v, intensity, c)
         if self.t_ns is not None:
             dt = (t_ns - self.t_ns) * 1e-3
             drift, noise = voltmeter.drift_and_noise(
@@ -359,42 +395,121 @@ class ReferenceVoltmeter:
                 f(c.k6),
                 f(np.sqrt(dt)),
             )
-            v_end = voltmeter.move(self.v, drift)
-            near = voltmeter.near_threshold(self.v, v_end, noise)
+            v_end, unspent = voltmeter.move(self.v, drift), self.unspent + noise * noise
+            near = voltmeter.near_threshold(self.v, v_end, unspent, noise * noise)
+            mean = f(0.5) * (self.intensity + intensity)
+            by_light = self.parts[:, 0] + f(c.k1) * (intensity - self.intensity) / (mean + f(c.k2))
+            after = np.stack([by_light, self.parts[:, 1] + (f(c.k4 * dt) + f(c.k5 * dt) * mean)], axis=1)
             for i in range(len(self.v)):
-                if near[i] or self.release[i] is not None:
-                    v_end[i] = self.pixel(i, np.float64(intensity[i]), dt, t_ns, rows)
-            self.v = v_end
+                if c.compat == "authors":
+                    v_end[i] = self.pixel_of_authors(i, np.float64(intensity[i]), dt, t_ns, rows)
+                elif near[i] or self.release[i] is not None:
+                    v_end[i], unspent[i] = self.pixel(i, np.float64(intensity[i]), dt, t_ns, rows)
+                else:
+                    continue
+                after[i] = self.moved if v_end[i] != voltmeter.IN_DEAD_TIME else 0
+            self.v, self.unspent, self.parts = v_end, unspent, after
         self.intensity, self.t_ns, self.frame = intensity, t_ns, self.frame + 1
-        return sorted_events(rows)
+        return sorted_events(rows, self.config.causes)
 
-    def pixel(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> int:
-        """Draw the interval of one pixel; returns its voltage at the end."""
-        c, before, (y, x) = self.config, np.float64(self.intensity[i]), divmod(i, self.width)
+    def rates(self, i: int, after: np.float64, dt: float, t: float) -> tuple[float, float]:
+        """(mu, sigma) of one pixel, per us, that goes on at t."""
+        c, before = self.config, np.float64(self.intensity[i])
         mean = 0.5 * (before + after)
-        mu = c.k1 * (after - before) / dt / (mean + c.k2) + c.k4 + c.k5 * mean
-        sigma = c.k3 * np.sqrt(mean) / (mean + c.k2) + c.k6
-        v, t, refractory = np.float64(self.v[i] / voltmeter.V_ONE), 0.0, round(c.refractory_us * 1000)
+        leak = c.k4 + c.k5 * mean
+        mu = c.k1 * (after - before) / dt / (mean + c.k2) + leak
+        self.since, self.part, self.part_rates = t, self.parts[i].astype(np.float64), np.array([mu - leak, leak])
+        self.moved = self.part + self.part_rates * (dt - t)
+        return mu, c.k3 * np.sqrt(mean) / (mean + c.k2) + c.k6
+
+    def fire(self, i: int, up: bool, t: float, t_ns: int, rows: list) -> float | None:
+        """Notes an event; returns when the pixel goes on (us from the interval's start), None after its end."""
+        light, leak = (1 if up else -1) * (self.part + self.part_rates * (t - self.since))
+        cause = int(np.argmax([light, leak, 1 - light - leak]))
+        after_us = self._fire(i, up, t, t_ns, rows, cause)
+        if after_us is not None:
+            self.since, self.part = after_us, np.zeros(2)
+            self.moved = self.part_rates * ((t_ns - self.t_ns) * 1e-3 - after_us)
+        return after_us
+
+    def _fire(self, i: int, up: bool, t: float, t_ns: int, rows: list, cause: int) -> float | None:
+        refractory, dt_ns = round(self.config.refractory_us * 1000), t_ns - self.t_ns
+        after_ns = min(int(t * 1e3), dt_ns)
+        y, x = divmod(i, self.width)
+        rows.append(((self.t_ns + after_ns) // 1000, y, x, int(up), cause))
+        if not refractory:
+            return t
+        if after_ns + refractory > dt_ns:
+            self.release[i] = self.t_ns + after_ns + refractory
+            return None
+        return (after_ns + refractory) * 1e-3
+
+    def pixel(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> tuple[int, float]:
+        """Draw the interval of one pixel; returns its voltage at the end and the variance that is unspent."""
+        v, variance, t = np.float64(self.v[i] / voltmeter.V_ONE), np.float64(self.unspent[i]), 0.0
+        if self.release[i] is not None:
+            if self.release[i] > t_ns:
+                return voltmeter.IN_DEAD_TIME, 0.0
+            v, variance, t, self.release[i] = np.float64(0), 0.0, max(self.release[i] - self.t_ns, 0) * 1e-3, None
+        mu, sigma = self.rates(i, after, dt, t)
+        held = lambda voltage: np.clip(voltage, -voltmeter.NEAREST, voltmeter.NEAREST)
+        draws = (
+            normal2_and_uniform(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64((self.frame << 20) + k))
+            for k in range(voltmeter.MAX_DRAWS)
+        )
+        first, normal, uniform = next(draws)
+        drawn = True
+        if variance > 0:
+            v, variance = held(v + np.sqrt(variance) * first), 0.0
+        while t < dt:
+            part, side = voltmeter.reach_of_part(v, mu, sigma, dt - t)
+            if side == 0 and part == dt - t:
+                v, variance = v + mu * part, sigma * sigma * part
+                break
+            if not drawn:
+                _, normal, uniform = next(draws)
+            drawn, distance, hit = False, 1.0 - side * v, np.inf
+            chance = voltmeter.reached(distance, side * mu, sigma) if side else 0.0
+            if uniform < chance:
+                hit = voltmeter.hitting_time(distance, side * mu, sigma, normal, uniform / chance)
+            if hit <= part:
+                resumed = self.fire(i, side > 0, t + hit, t_ns, rows)
+                if resumed is None:
+                    return voltmeter.IN_DEAD_TIME, 0.0
+                v, t = np.float64(0), resumed
+                continue
+            noise = sigma * np.sqrt(part)
+            for _ in range(voltmeter.TRIES):
+                normal, _, uniform = next(draws)
+                end = v + mu * part + noise * normal
+                if not side or uniform >= voltmeter.crosses(distance, 1.0 - side * end, noise):
+                    break
+            v, whole, t = held(end), part == dt - t, t + part
+            if whole:
+                break
+        return int(v * voltmeter.V_ONE), np.float32(variance)
+
+    def pixel_of_authors(self, i: int, after: np.float64, dt: float, t_ns: int, rows: list) -> int:
+        """:meth:`pixel` of ``compat: authors``."""
+        v, t = np.float64(self.v[i] / voltmeter.V_ONE), 0.0
         if self.release[i] is not None:
             if self.release[i] > t_ns:
                 return voltmeter.IN_DEAD_TIME
             v, t, self.release[i] = np.float64(0), max(self.release[i] - self.t_ns, 0) * 1e-3, None
+        mu, sigma = self.rates(i, after, dt, t)
         draw = self.frame << 20
         while True:
-            if not voltmeter.in_reach(v, mu * (dt - t), sigma * np.sqrt(dt - t)):
-                return int((v + mu * (dt - t)) * voltmeter.V_ONE)
             normal, which = normal_and_uniform(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw))
             side, _ = uniform2(self.seed, np.uint64(i), np.uint64(Stream.DIFFUSION), np.uint64(draw + 1))
             draw += 2
-            p = int(side < voltmeter.on_first(1.0 - v, 1.0 + v, mu, sigma))
-            hit = t + voltmeter.hitting_time(1.0 - v if p else 1.0 + v, mu, sigma, normal, which)
-            if not hit <= dt:
-                return int(np.clip(v + mu * (dt - t), -voltmeter.NEAREST, voltmeter.NEAREST) * voltmeter.V_ONE)
-            v, t = np.float64(0), hit
-            after_ns = min(int(hit * 1e3), t_ns - self.t_ns)
-            rows.append(((self.t_ns + after_ns) // 1000, y, x, p))
-            if refractory:
-                if after_ns + refractory > t_ns - self.t_ns:
-                    self.release[i] = self.t_ns + after_ns + refractory
-                    return voltmeter.IN_DEAD_TIME
-                t = (after_ns + refractory) * 1e-3
+            up = side < voltmeter.on_first(1.0 - v, 1.0 + v, mu, sigma)
+            distance = 1.0 - v if up else 1.0 + v
+            hit = voltmeter.hitting_time(distance, mu, sigma, normal, which)
+            if not hit < dt - t:
+                moved = distance * (dt - t) / hit
+                v = v + moved if up else v - moved
+                return int(np.clip(v, -voltmeter.NEAREST, voltmeter.NEAREST) * voltmeter.V_ONE)
+            resumed = self.fire(i, up, t + hit, t_ns, rows)
+            if resumed is None:
+                return voltmeter.IN_DEAD_TIME
+            v, t = np.float64(0), resumed

@@ -1,12 +1,27 @@
-"""The one event container of the project."""
+"""The one event container of the project, and what an event is caused by."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
 from blinkgl.errors import EventDataError
+
+
+class Cause(IntEnum):
+    """What moved a pixel to the threshold that it fired at. Of the parts that its signal has moved by since its last
+    event (or the end of the dead time after it), in the direction of the crossing, the largest is the cause; the light
+    where two are alike. An event that an emulator draws by itself, V2E's shot noise, is its own.
+
+    So every event has one cause, the parts add up to the threshold, and an event is a noise event where the light alone
+    would have brought the pixel less than its noise did. The numbers are part of the file format."""
+
+    SIGNAL = 0  # the light changed
+    LEAK = 1  # V2E: leak; DVS-Voltmeter: k4 and k5
+    SHOT = 2  # V2E: shot or photoreceptor noise; DVS-Voltmeter: diffusion
+    HOT = 3  # V2E: leak of a hot pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,6 +31,7 @@ class Events:
     x, y : (N,) uint16 pixel column and row, (0, 0) the top-left pixel.
     t    : (N,) int64 microseconds, non-decreasing inside a chunk and across the chunks of one emulator.
     p    : (N,) uint8, 1 brighter (ON), 0 darker (OFF).
+    cause : (N,) uint8 of :class:`Cause`, or None where nobody asked for it (``events.causes``) or knows.
 
     Raises EventDataError: a column of another type or length.
     """
@@ -24,10 +40,13 @@ class Events:
     y: np.ndarray
     t: np.ndarray
     p: np.ndarray
+    cause: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.uint8)):
+        for name, dtype in (("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.uint8), ("cause", np.uint8)):
             column = getattr(self, name)
+            if name == "cause" and column is None:
+                continue
             if (
                 not isinstance(column, np.ndarray)
                 or column.dtype != dtype
@@ -50,22 +69,46 @@ class Events:
     def empty() -> Events:
         return Events(np.empty(0, np.uint16), np.empty(0, np.uint16), np.empty(0, np.int64), np.empty(0, np.uint8))
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of those there are: "x", "y", "t", "p" and perhaps "cause"."""
+        return ("x", "y", "t", "p") if self.cause is None else ("x", "y", "t", "p", "cause")
+
+    def part(self, which: slice | np.ndarray) -> Events:
+        """Those of a slice (views) or of an index array or mask (copies), which must keep the order of time."""
+        return Events(*(getattr(self, k)[which] for k in self.columns))
+
+    def copy(self) -> Events:
+        """With memory of its own."""
+        return Events(*(getattr(self, k).copy() for k in self.columns))
+
     @staticmethod
     def concatenate(chunks: list[Events] | tuple[Events, ...]) -> Events:
-        """Chunks joined in the given order (they must already be in time order)."""
-        if not chunks:
+        """Chunks joined in the given order (they must already be in time order); with causes where all that are not
+        empty have them."""
+        full = [c for c in chunks if len(c)] or list(chunks[:1])
+        if not full:
             return Events.empty()
-        return Events(*(np.concatenate([getattr(c, k) for c in chunks]) for k in "xytp"))
+        known = "xytp" if any(c.cause is None for c in full) else full[0].columns
+        return Events(*(np.concatenate([getattr(c, k) for c in full]) for k in known))
 
     def window(self, t0_us: int, t1_us: int) -> Events:
         """Events of the half-open window [t0_us, t1_us); views, no copy."""
         i, j = np.searchsorted(self.t, (t0_us, t1_us), side="left")
-        return Events(self.x[i:j], self.y[i:j], self.t[i:j], self.p[i:j])
+        return self.part(slice(i, j))
 
     def split(self, t_us: int) -> tuple[Events, Events]:
         """Those before t_us, and the rest; views, no copy."""
         cut = int(np.searchsorted(self.t, t_us, side="left"))
-        return (
-            Events(self.x[:cut], self.y[:cut], self.t[:cut], self.p[:cut]),
-            Events(self.x[cut:], self.y[cut:], self.t[cut:], self.p[cut:]),
-        )
+        return self.part(slice(cut)), self.part(slice(cut, None))
+
+
+def named_causes(counts: np.ndarray) -> dict[str, int]:
+    """Of :func:`count_causes`: {"signal": n, "leak": n, "shot": n, "hot": n}."""
+    return {cause.name.lower(): int(counts[cause]) for cause in Cause}
+
+
+def count_causes(events: Events) -> np.ndarray:
+    """(4,) int64, events by :class:`Cause`; zeros without causes."""
+    counts = np.zeros(len(Cause), np.int64)
+    return counts if events.cause is None else counts + np.bincount(events.cause, minlength=len(Cause))[: len(Cause)]

@@ -32,21 +32,24 @@ from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
 from blinkgl.events.esim import draw_thresholds
 from blinkgl.events.noise import noise_table
-from blinkgl.events.packing import JIT, T_SHIFT
-from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
+from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
+from blinkgl.events.philox import Stream, normal2, rough_normal, uniform2
 from blinkgl.events.response import Response, smallest_threshold
 from blinkgl.events.threads import take_part
-from blinkgl.events.types import Events
+from blinkgl.events.types import Cause, Events
 from blinkgl.events.v2e_model import (
     DARKEST,
     REBASE,
     crossing_fraction,
     curve_of,
+    draw_hot,
     draw_leaks,
+    draw_start,
     draw_start_noise,
     lin_log,
     next_noise,
     noise_place,
+    noise_threshold,
     relax,
     relax_gently,
     shot_draw,
@@ -60,6 +63,7 @@ _ZERO, _ONE, _HALF, _JOINT, _INF = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.inf)
 _SHOT, _LEAK_JITTER, _NOISE = np.uint64(Stream.SHOT), np.uint64(Stream.LEAK_JITTER), np.uint64(Stream.NOISE)
 _U2, _U1, _U1000, _MASK41 = np.uint64(2), np.uint64(1), np.uint64(1000), 2**41 - 1
 _INSERTION_LIMIT = 32
+_CAUSE_LEAK, _CAUSE_SHOT, _CAUSE_HOT = int(Cause.LEAK), int(Cause.SHOT), int(Cause.HOT)
 _FARTHEST, _FAR_BELOW = _F(1e6), np.int32(-(2**31))
 
 
@@ -79,6 +83,9 @@ class Pixels(NamedTuple):
     clock_ns: np.ndarray  # (blocks,) int64 time of the next shot-noise candidate; []
     clock_index: np.ndarray  # (blocks,) int64 its number
     shot_table: np.ndarray  # (blocks, 2048) float32, see shot_tables
+    since_ns: np.ndarray  # int64: when the reference was taken; [] unless causes are asked for
+    noise_then: np.ndarray  # float32: the photoreceptor noise in it; []
+    hot: np.ndarray  # uint8: whether leak is that of a hot pixel; []
 
 
 class Interval(NamedTuple):
@@ -245,6 +252,9 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
         up, down = np.float64(p.upper[i]), np.float64(p.lower[i])
         on, off = np.float64(constants[j, 0]), np.float64(constants[j, 1])
         s, now_ns, dead = 0.0, np.int64(0), False
+        since_ns, noise_then = np.int64(0), 0.0
+        if p.since_ns.size:
+            since_ns, noise_then = p.since_ns[i] - v.t0_ns, np.float64(p.noise_then[i])
         # In its dead time, which ends where the comparator takes its new reference.
         if p.release.size and up == -np.inf:
             if p.release[i] > end_ns:
@@ -254,6 +264,9 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
                 s = now_ns / dt_ns
                 reference = signal_at(s, c, rise, fall, k)
                 up, down = reference + on, reference - off
+                since_ns = now_ns
+                if p.noise.size:
+                    noise_then = np.float64(p.noise[i]) + shift * s
         while noise < noise_end and (keys[noise] >> 42) < o:  # left by pixels that died before them
             noise += 1
         emitted = 0
@@ -281,7 +294,20 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
             if not fires:
                 break
             if emitted < cap:
-                packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | pixel | polarity
+                word = pixel | polarity
+                if p.since_ns.size:
+                    if from_noise:
+                        word |= _CAUSE_SHOT << CAUSE_SHIFT
+                    else:
+                        sign, size = (1.0, on) if polarity else (-1.0, off)
+                        by_leak, by_noise = sign * leak * ((event_ns - since_ns) * 1e-9), 0.0
+                        if p.noise.size:
+                            by_noise = sign * (np.float64(p.noise[i]) + shift * event_s - noise_then)
+                        cause = cause_of(size - by_leak - by_noise, by_leak, by_noise)
+                        if cause == _CAUSE_LEAK and p.hot[i]:
+                            cause = _CAUSE_HOT
+                        word |= cause << CAUSE_SHIFT
+                packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
                 out += 1
                 emitted += 1
             else:
@@ -307,6 +333,11 @@ def _emit_block(active, count, first, now, constants, keys, noise_end, p, v, cap
             if from_noise or p.release.size:
                 reference = signal_at(s, c, rise, fall, k)
             up, down = reference + on, reference - off
+            since_ns = now_ns
+            if p.noise.size:
+                noise_then = np.float64(p.noise[i]) + shift * s
+        if p.since_ns.size:
+            p.since_ns[i], p.noise_then[i] = v.t0_ns + since_ns, np.float32(noise_then)
         if dead:  # both levels are passed, whatever comes: the pixel is looked at until it is released
             p.upper[i], p.lower[i] = -_INF, _INF
         else:
@@ -451,7 +482,8 @@ class V2e(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
     State: 12 bytes per pixel; 4 more each with the low-pass, leak, photoreceptor noise, and intensity where the first
-    or shot noise asks for it, 8 with the dead time. Constants: 16 bytes per pixel, 8 more with shot noise."""
+    or shot noise asks for it, 8 with the dead time, 12 with causes. Constants: 16 bytes per pixel, 8 more with shot
+    noise."""
 
     Config = V2eConfig
     _state = (
@@ -467,6 +499,8 @@ class V2e(Emulator):
         "_clock_index",
         "_epoch_ns",
         "_brightest",
+        "_since_ns",
+        "_noise_then",
     )
 
     @classmethod
@@ -522,6 +556,9 @@ class V2e(Emulator):
         self._shot_table = shot_tables(self._on, self._off, on, off) if shot else np.empty((0, 0), np.float32)
         self._inverse_threshold = 1.0 / float(min(self._on.min(), self._off.min()))
         self._scale = np.float32(config.full_scale)
+        told = pixels if config.causes else 0
+        self._since_ns, self._noise_then = np.zeros(told, np.int64), frame(config.causes)
+        self._hot = draw_hot(height, width, config, self.seed) if told else np.empty(0, np.uint8)
         self._tables_changed()
 
     def _tables_changed(self) -> None:
@@ -537,12 +574,17 @@ class V2e(Emulator):
         if self._noise.size:
             self._noise[...] = draw_start_noise(intensity, self.config, self.seed)
             reference = reference + self._noise
-        if self._leak.size:  # else every pixel's first leak event would come at the same time
-            phase, _ = uniform2(
-                self.seed, pixel_counters(self.height, self.width), np.uint64(Stream.START), np.uint64(0)
-            )
-            reference = reference - phase.astype(np.float32) * self._on
+        start = draw_start(self.config, intensity, self._on, self._off, self._leak, self._noise, self.seed)
+        reference = reference + start.offset
         self._upper[...], self._lower[...] = reference + self._on, reference - self._off
+        self._leak[...] = start.leak
+        dead = np.flatnonzero(start.dead_ns)
+        self._upper[dead], self._lower[dead] = -np.inf, np.inf
+        self._release[dead] = t_ns + start.dead_ns[dead]
+        if self.causes:
+            self._since_ns[...] = t_ns - start.age_ns
+            if self._noise.size:
+                self._noise_then[...] = self._noise + start.by_noise
         for block in range(len(self._clock_ns)):
             rate = self._shot_unit * float(self._shot_table[block, -1])
             gap, _ = shot_draw(self.seed, np.uint64(block), np.uint64(2**62), rate)
@@ -560,7 +602,7 @@ class V2e(Emulator):
                 accepted="a shorter interval or a lower shot_noise_rate_hz",
             )
         if self._noise.size and dt_ns != self._sizes_dt_ns:
-            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, config.contrast_threshold)
+            self._noise_sizes = noise_table(config.shot_noise_rate_hz, dt_ns * 1e-9, noise_threshold(config))
             self._sizes_dt_ns = dt_ns
         pixels = Pixels(
             self._intensity,
@@ -576,6 +618,9 @@ class V2e(Emulator):
             self._clock_ns,
             self._clock_index,
             self._shot_table,
+            self._since_ns,
+            self._noise_then,
+            self._hot,
         )
         base_us, epoch = self.t_ns // 1000, int(self._epoch_ns[0])
         kappa = 2 * np.pi * config.cutoff_hz * dt_ns * 1e-9 / 275.0

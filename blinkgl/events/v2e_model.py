@@ -6,14 +6,16 @@ kernel and arrays from Python.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba.extending import register_jitable
 
 from blinkgl.config.events import V2eConfig
 from blinkgl.events.arith import exp_f32, exp_f64, fall_f64, log_f32, log_f64, select
 from blinkgl.events.emulator import BLOCK
-from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_sizes
-from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
+from blinkgl.events.noise import TABLE_LOW, TABLE_SIZE, TABLE_STEP, start_places, start_sizes
+from blinkgl.events.philox import Stream, normal2, pixel_counters, rough_normal, uniform2
 
 _F = np.float32
 _ZERO, _ONE, _HALF, _JOINT, _SLOPE = _F(0), _F(1), _F(0.5), _F(20.0), _F(np.log(20.0) / 20.0)
@@ -192,16 +194,137 @@ def noise_place(k: float) -> tuple[int, float]:
     return below, _F(np.minimum(place, _TABLE_LAST) - _F(below))
 
 
+def noise_threshold(config: V2eConfig) -> float:
+    """The threshold that the size of the noise is made for: the mean of ON and OFF, as v2e does."""
+    return 0.5 * (config.contrast_threshold + (config.contrast_threshold_off or config.contrast_threshold))
+
+
 # --- what is drawn once ------------------------------------------------------------------------------------
 def draw_start_noise(intensity: np.ndarray, config: V2eConfig, seed: np.uint64) -> np.ndarray:
     """Photoreceptor noise at the first frame, already stationary, (H*W,) float32 ln units."""
     corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
     _, normal = normal2(seed, np.arange(len(intensity), dtype=np.uint64), np.uint64(Stream.START), np.uint64(1))
-    return (start_sizes(config.shot_noise_rate_hz, corner, config.contrast_threshold) * normal).astype(np.float32)
+    return (start_sizes(config.shot_noise_rate_hz, corner, noise_threshold(config)) * normal).astype(np.float32)
+
+
+class Start(NamedTuple):
+    """Where the comparators stand at the first frame, flat."""
+
+    offset: np.ndarray  # float32: reference less signal, ln units
+    leak: np.ndarray  # float32, of the interval that is under way; [] without leak
+    dead_ns: np.ndarray  # int64: what is left of the dead time; [] without one, 0 for most
+    age_ns: np.ndarray  # int64: how long leak has been moving the pixel
+    by_noise: np.ndarray  # float32: what of the offset is the photoreceptor noise's doing
+
+
+_JITTER_TURN, _TURNS, _MOST_ROUGH = 1000, 200, 3.5
+
+
+def draw_start(
+    config: V2eConfig,
+    intensity: np.ndarray,
+    on: np.ndarray,
+    off: np.ndarray,
+    leak: np.ndarray,
+    noise: np.ndarray,
+    seed: np.uint64,
+) -> Start:
+    """The state of pixels at the first frame, see ``V2eConfig.start``.
+
+    intensity : (H*W,) DN.   on, off : thresholds.   leak : mean drift, ln units per second; [].
+    noise : the photoreceptor noise; [].
+
+    ``stationary``: a still scene, watched for long. Leak takes a time T from one event to the next, and shot noise of
+    rate R begins it anew: the T under way has the weight (1 - e^-RT)/R (of a long one more is seen), its age a the
+    density e^-Ra up to T."""
+    pixels = np.arange(len(on), dtype=np.uint64)
+    offset, dead_ns = np.zeros(len(on), np.float32), np.zeros(len(on) if config.refractory_us else 0, np.int64)
+    age_ns, by_noise = np.zeros(len(on), np.int64), np.zeros(len(on), np.float32)
+    first, second = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(0))
+    if config.start == "balanced":
+        place = first - second  # triangular: where a Brownian motion that is put back to 0 at -1 and 1 is found
+        offset = (-place * np.where(place > 0, on, off)).astype(np.float32)
+    if config.start != "stationary" or not (leak.size or config.shot_noise_rate_hz):
+        return Start(offset, leak, dead_ns, age_ns, by_noise)
+    nominal_off = config.contrast_threshold_off or config.contrast_threshold
+    shot = np.zeros(len(on))
+    if config.shot_noise_rate_hz and not config.photoreceptor_noise:
+        level = np.minimum((intensity.astype(np.float64) + 20.0) / 275.0, 1.0)
+        each = config.contrast_threshold / on.astype(np.float64) + nominal_off / off.astype(np.float64)
+        shot = 0.5 * config.shot_noise_rate_hz * (1.0 - 0.75 * level) * each
+    moving = np.flatnonzero(leak > 0) if leak.size else np.empty(0, np.int64)
+    between = np.where(shot > 0, 1.0 / np.maximum(shot, 1e-300), np.inf)  # mean time from one event to the next
+    leak = leak.copy()
+    if moving.size:
+        rate, mean = shot[moving], on[moving].astype(np.float64) / leak[moving]
+        weight = lambda time: time * _one_minus_exp_over(rate * time)
+        between[moving] = weight(mean)  # exact without jitter, and to its square with
+        time = mean * _length_of_interval(config.leak_jitter, rate * mean, pixels[moving], seed)
+        age = _age(first[moving], rate * time) * time
+        offset[moving] = -(age / time * on[moving]).astype(np.float32)
+        leak[moving] = (on[moving] / time).astype(np.float32)
+        age_ns[moving] = np.minimum(age * 1e9, 2.0**61).astype(np.int64)
+    if dead_ns.size:
+        u, v = uniform2(seed, pixels, np.uint64(Stream.START), np.uint64(_TURNS))
+        dead_s = config.refractory_us * 1e-6
+        dead_ns = np.where(u * (dead_s + between) < dead_s, np.ceil(v * dead_s * 1e9), 0.0).astype(np.int64)
+    if noise.size:
+        # Where noise fires more often than leak: the rung next to its mean, or the last one that the noise has passed.
+        often = np.ones(len(on), bool)
+        often[moving] = mean * config.shot_noise_rate_hz > 1.0 if moving.size else False
+        corner = config.cutoff_hz * (intensity.astype(np.float64) + 20.0) / 275.0
+        place = start_places(config.shot_noise_rate_hz, corner, first) * np.where(first > 0.5, on, off)
+        up, down = np.floor((noise - place) / on), np.floor((place - noise) / off)
+        rung = place + np.maximum(up, 0.0) * on - np.maximum(down, 0.0) * off
+        by_noise = np.where(often, rung - noise, 0.0).astype(np.float32)
+        offset = np.where(often, by_noise, offset)
+        age_ns[often] = 0
+    return Start(offset, leak, dead_ns, age_ns, by_noise)
+
+
+def _one_minus_exp_over(q: np.ndarray) -> np.ndarray:
+    """(1 - e^-q)/q for q >= 0."""
+    small = q < 1e-4
+    safe = np.where(small, 1.0, q)
+    return np.where(small, 1.0 - q * (0.5 - q / 6.0), (1.0 - exp_f64(-safe)) / safe)
+
+
+def _age(uniform: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Of density e^-qa in (0, 1), by the inverse of its cumulative law."""
+    small = q < 1e-6
+    safe = np.where(small, 1.0, q)
+    return np.where(small, uniform, np.minimum(-log_f64(1.0 - uniform * (1.0 - exp_f64(-safe))) / safe, 1.0))
+
+
+def _length_of_interval(jitter: float, q: np.ndarray, pixels: np.ndarray, seed: np.uint64) -> np.ndarray:
+    """Leak intervals under way at one moment, in mean intervals; q: shot noise events in a mean one."""
+    length = np.ones(len(q))
+    if jitter == 0:
+        return length
+    longest = 1.0 + jitter * _MOST_ROUGH
+    most = longest * _one_minus_exp_over(q * longest)
+    wanted = np.arange(len(q))
+    for turn in range(_TURNS):  # by rejection: two of three are kept at the largest jitter
+        if not wanted.size:
+            break
+        index = np.uint64(_JITTER_TURN + turn)
+        normal = rough_normal(seed, pixels[wanted], np.uint64(Stream.START), np.uint64(index + _U2 * np.uint64(_TURNS)))
+        tried = np.maximum(0.1, 1.0 + jitter * normal)
+        u, _ = uniform2(seed, pixels[wanted], np.uint64(Stream.START), index)
+        kept = u * most[wanted] < tried * _one_minus_exp_over(q[wanted] * tried)
+        length[wanted[kept]] = tried[kept]
+        wanted = wanted[~kept]
+    return length
 
 
 MAX_LEAK_HZ = 1e6
 """One event per microsecond, the resolution of event times."""
+
+
+def draw_hot(height: int, width: int, config: V2eConfig, seed: np.uint64) -> np.ndarray:
+    """Which pixels are hot, (H*W,) uint8."""
+    u, _ = uniform2(seed, pixel_counters(height, width), np.uint64(Stream.HOT), np.uint64(0))
+    return (u < config.hot_pixel_fraction).astype(np.uint8)
 
 
 def draw_leaks(height: int, width: int, config: V2eConfig, on: np.ndarray, seed: np.uint64) -> np.ndarray:

@@ -6,13 +6,29 @@ sections 3 and 4. In an interval with intensities L0 -> L1 (digital numbers) and
     mu    = k1 (L1 - L0)/dt / (L + k2) + k4 + k5 L        drift: signal, temperature, parasitic photocurrent
     sigma = k3 sqrt(L) / (L + k2) + k6                    photon shot noise, circuit
 
-dV = mu dt + sigma dW from V in (-1, 1); at +1 an ON event, at -1 an OFF event, V back to 0. Which threshold comes
-first has the closed form :func:`on_first`; the time to it is inverse Gaussian with mean a/|mu| and shape
-a^2/sigma^2 (the law against the drift, given that it is reached, is the same; without drift it is Levy's). A time
-beyond the frame's end is discarded, and V carries its drift into the next interval.
+dV = mu dt + sigma dW from V in (-1, 1); at +1 an ON event, at -1 an OFF event, V back to 0.
 
-Far from both thresholds (more than 6.5 sigma sqrt(dt) at both ends of the drift; probability 1e-10) nothing is
-drawn. V is kept in 2^-29, fine enough for a leak of one event an hour at any frame rate.
+That equation is followed exactly, so that noise is the same at any frame rate:
+
+* A pixel far from both thresholds is not drawn. What it keeps is the mean of V and the *unspent variance*, the sum of
+  sigma^2 dt since V was last known. Where the mean path comes within 6.5 standard deviations of a threshold the pixel
+  is looked at: V is drawn at the interval's start, and the variance is spent. A path is missed that has crossed and
+  come back while nobody looked: with probability below 1.6e-10 an interval (4 Q(6.5), both sides).
+* A pixel that is looked at draws the time at which it meets the threshold that is in reach: inverse Gaussian with mean
+  a/|mu| and shape a^2/sigma^2 for a distance a (the law against the drift, met with probability exp(-2 |mu| a/sigma^2),
+  is the same; without drift it is Levy's). Where that is beyond the interval's end V at the end is drawn, given that it
+  was not met: normal, kept with the probability 1 - exp(-2 a b/sigma^2 dt) that a Brownian bridge to the distance b has
+  not met it. Where both thresholds can be reached the interval is taken in parts, short enough that one of them
+  cannot (again to 1.6e-10).
+* V starts at the stationary law of a still scene (:func:`start_voltage`), not at 0 everywhere, where all pixels of a
+  flat image would have their first leak event together.
+
+``compat: authors`` is the published program instead: V starts at 0; every pixel draws, in every interval, which
+threshold comes first (:func:`on_first`) and the inverse Gaussian time to it as if there were no other; where that is
+beyond the interval's end the pixel moves towards that threshold by the share of the time that has passed. The
+variance of such a move is of the order of dt^2 instead of dt: noise then falls with the frame rate.
+
+V is kept in 2^-29, fine enough for a leak of one event an hour at any frame rate.
 """
 
 from __future__ import annotations
@@ -27,25 +43,30 @@ from blinkgl.config.events import EsimConfig, VoltmeterConfig
 from blinkgl.events.arith import exp_f64, select
 from blinkgl.events.blocks import compact_flags, copy_block, lookup_block, scale_block
 from blinkgl.events.emulator import BLOCK, NEVER_NS, NO_CODES, NO_FRAME, Emulator
-from blinkgl.events.packing import JIT, T_SHIFT
-from blinkgl.events.philox import Stream, normal_and_uniform, uniform2
+from blinkgl.events.packing import CAUSE_SHIFT, JIT, T_SHIFT, cause_of
+from blinkgl.events.philox import Stream, normal2_and_uniform, normal_and_uniform, uniform2
 from blinkgl.events.response import Response
 from blinkgl.events.threads import take_part
 from blinkgl.events.types import Events
 
 _F = np.float32
-_HALF, _ONE, _I0 = _F(0.5), _F(1.0), np.int32(0)
+_ZERO, _HALF, _ONE, _I0 = _F(0.0), _F(0.5), _F(1.0), np.int32(0)
 V_ONE = 2**29
 _V_SCALE, _V_UNIT, _DRIFT_LIMIT = _F(V_ONE), _F(1.0 / V_ONE), _F(2.25)
-_DIFFUSION = np.uint64(Stream.DIFFUSION)
-_U1000, _U20, _U1, _MAX_BOUND = np.uint64(1000), np.uint64(20), np.uint64(1), np.float32(1e7)
+_DIFFUSION, _START = np.uint64(Stream.DIFFUSION), np.uint64(Stream.START)
+_U1000, _U20, _U1, _U2, _MAX_BOUND = np.uint64(1000), np.uint64(20), np.uint64(1), np.uint64(2), np.float32(1e7)
 _FAR_64 = 6.5
-FAR = np.float32(6.5)
+_FAR_SQUARED = np.float32(6.5**2)
+MOST_STEPS = np.float32(2.0**16)
+"""So many intervals' variance is summed before it is spent: beyond, float32 would round away what is added."""
 NEAREST = 1.0 - 1e-6
 """|V| carried over never exceeds this: a threshold that the drift has passed is then reached at once."""
 IN_DEAD_TIME = np.int32(2 * V_ONE - 1)
 """Voltage of a pixel in its dead time: never far from a threshold, so that the pixel is looked at."""
 MAX_DRAWS = 2**19
+TRIES = 500
+"""At an end that is drawn until it fits: it does at once, or the time before it was a rounding error's."""
+_MAX_DRAWS, _TRIES = np.uint64(MAX_DRAWS), np.uint64(TRIES)
 
 
 @register_jitable
@@ -54,8 +75,8 @@ def drift_and_noise(
 ) -> tuple[float, float]:
     """(mu dt, sigma sqrt(dt)) of an interval, elementwise; k4_dt = k4 dt, root_dt = sqrt(dt), dt in us."""
     mean = _HALF * (before + now)
-    room = mean + k2  # (L + k2): the gain of the logarithm
-    return k1 * (now - before) / room + k4_dt + k5_dt * mean, (k3 * np.sqrt(mean) / room + k6) * root_dt
+    gain = _ONE / (mean + k2)  # of the logarithm
+    return k1 * (now - before) * gain + k4_dt + k5_dt * mean, (k3 * np.sqrt(mean) * gain + k6) * root_dt
 
 
 @register_jitable
@@ -66,11 +87,15 @@ def move(v: float, drift: float) -> float:
 
 
 @register_jitable
-def near_threshold(v: float, v_end: float, noise: float) -> bool:
-    """Whether a threshold may be reached: 6.5 sigma sqrt(dt) around the path's extremes."""
+def near_threshold(v: float, v_end: float, variance: float, here: float) -> bool:
+    """Whether a pixel has to be looked at: 6.5 standard deviations around the mean path's extremes reach a threshold.
+
+    v, v_end : mean voltage at both ends, int32, 2^-29.   variance : unspent at the end, float32.   here : of it, this
+    interval's."""
     high, low = select(v > v_end, v, v_end), select(v > v_end, v_end, v)
-    reach = FAR * noise
-    return (_F(high) * _V_UNIT + reach >= _ONE) | (_F(low) * _V_UNIT - reach <= -_ONE)
+    above, below = _ONE - _F(high) * _V_UNIT, _ONE + _F(low) * _V_UNIT
+    room = select(above < below, above, below)  # negative where the mean path crosses
+    return (room * abs(room) <= _FAR_SQUARED * variance) | (variance > MOST_STEPS * here)
 
 
 @register_jitable
@@ -83,7 +108,7 @@ def in_reach(v: float, drift: float, noise: float) -> bool:
 @register_jitable
 def one_minus_exp(x: float) -> float:
     """1 - e^-x for x >= 0, to 1e-11 relative."""
-    return x * (1.0 - x * (0.5 - x * (1.0 / 6.0))) if x < 1e-4 else 1.0 - exp_f64(-x)
+    return select(x < 1e-4, x * (1.0 - x * (0.5 - x * (1.0 / 6.0))), 1.0 - exp_f64(-x))
 
 
 @register_jitable
@@ -128,12 +153,101 @@ def hitting_time(distance: float, mu: float, sigma: float, normal: float, unifor
     return distance / (speed * ratio)
 
 
+@register_jitable
+def reach_of_part(v: float, mu: float, sigma: float, left: float) -> tuple[float, int]:
+    """(us of the next part, the threshold that it may reach: 1, -1, or 0 where neither can be and the part is all).
+
+    ``left`` is halved until at most one threshold is in reach of 6.5 sigma sqrt(part)."""
+    part, rate = left, _FAR_64 * _FAR_64 * sigma * sigma
+    while True:
+        drift, squared = mu * part, rate * part
+        above, below = 1.0 - max(v, v + drift), 1.0 + min(v, v + drift)  # negative where the mean path crosses
+        up, down = above * abs(above) <= squared, below * abs(below) <= squared
+        if not (up and down):
+            return part, 1 if up else (-1 if down else 0)
+        part *= 0.5
+
+
+@register_jitable
+def reached(distance: float, toward: float, sigma: float) -> float:
+    """Probability that a threshold is ever met; ``toward`` is the drift towards it."""
+    if toward >= 0.0:
+        return 1.0
+    return exp_f64(2.0 * toward * distance / (sigma * sigma)) if sigma > 0.0 else 0.0
+
+
+@register_jitable
+def crosses(before: float, after: float, noise: float) -> float:
+    """Probability that a Brownian motion between two known ends meets a threshold: ``before`` > 0 and ``after`` are the
+    distances there, ``noise`` is sigma sqrt(dt)."""
+    if after <= 0.0:
+        return 1.0
+    variance = noise * noise
+    return exp_f64(-2.0 * before * after / variance) if variance > 0.0 else 0.0
+
+
+def start_voltage(intensity: np.ndarray, config: VoltmeterConfig, seed: np.uint64) -> tuple[np.ndarray, np.ndarray]:
+    """V of a scene that has stood still for long, int32 (2^-29), and µs left of the dead time, 0 for most.
+
+    intensity : (H*W,) DN.   Where there is neither drift nor noise nothing moves, and V is 0.
+
+    Between events V has the density 1 - e^{-r(1-v)} above 0 and e^{rv} - e^{-r} below, r = 2 mu/sigma^2 >= 0 (the
+    Fokker-Planck equation with a source at 0; for r < 0 its mirror image); drawn by rejection, half are kept at any r.
+    """
+    c = config
+    level = intensity.astype(np.float64)
+    mu = c.k4 + c.k5 * level
+    sigma = c.k3 * np.sqrt(level) / (level + c.k2) + c.k6
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = np.minimum(2.0 * np.abs(mu) / sigma**2, 1e12)  # infinite without noise, NaN where nothing moves
+        # Mean time between events, for the share of the dead time: tanh(r/2)/mu, 1/sigma^2 without drift.
+        between = np.where(r > 1e-9, one_minus_exp(r) / (2.0 - one_minus_exp(r)) / np.abs(mu), 1 / sigma**2)
+    v = np.zeros(level.size)
+    wanted = np.flatnonzero(np.isfinite(r))
+    for turn in range(200):
+        if not wanted.size:
+            break
+        a, b = uniform2(seed, wanted.astype(np.uint64), _START, np.uint64(turn))
+        place, rate = 2.0 * a - 1.0, r[wanted]
+        # 1 - e^-r(1-v) and e^rv - e^-r, both over 1 - e^-r, their value at 0; a triangle for small r.
+        flat = rate < 1e-9
+        rate = np.where(flat, 1.0, rate)
+        shape = one_minus_exp(rate * (1.0 - np.abs(place))) / one_minus_exp(rate)
+        density = np.where(place > 0, shape, shape * exp_f64(rate * np.minimum(place, 0.0)))
+        kept = b < np.where(flat, 1.0 - np.abs(place), density)
+        v[wanted[kept]] = place[kept]
+        wanted = wanted[~kept]
+    v = np.where(mu < 0, -v, v)
+    left = np.zeros(level.size)
+    if c.refractory_us:
+        a, b = uniform2(seed, np.arange(level.size, dtype=np.uint64), _START, np.uint64(1000))
+        dead = np.isfinite(r) & (a * (c.refractory_us + between) < c.refractory_us)
+        left[dead] = b[dead] * c.refractory_us
+    return (np.clip(v, -NEAREST, NEAREST) * V_ONE).astype(np.int32), left
+
+
+def start_by_leak(v: np.ndarray, intensity: np.ndarray, config: VoltmeterConfig) -> np.ndarray:
+    """What of the V of :func:`start_voltage` is leak's doing, float32: the share tanh(r/2) that drift has of the way
+    from event to event in the mean, where V lies on the drift's side."""
+    level = intensity.astype(np.float64)
+    mu = config.k4 + config.k5 * level
+    sigma = config.k3 * np.sqrt(level) / (level + config.k2) + config.k6
+    with np.errstate(divide="ignore", invalid="ignore"):
+        e = exp_f64(-np.minimum(2.0 * np.abs(mu) / sigma**2, 700.0))
+    share = np.where(mu == 0, 0.0, (1.0 - e) / (1.0 + e))
+    held = np.where(np.abs(v) < V_ONE, v / V_ONE, 0.0)
+    return np.where(held * mu > 0, held * share, 0.0).astype(np.float32)
+
+
 class Pixels(NamedTuple):
     """Per-pixel arrays, flat."""
 
     intensity: np.ndarray  # float32 DN of the frame before
-    v: np.ndarray  # int32 voltage, 2^-29 thresholds
+    v: np.ndarray  # int32 mean voltage, 2^-29 thresholds
+    unspent: np.ndarray  # float32 variance of the voltage around it, thresholds^2; 0 where V is known
     release: np.ndarray  # int64 ns, end of the dead time or NEVER; [] without dead time
+    by_light: np.ndarray  # float32: what light and leak have moved V by since it was 0; [] unless causes are asked for
+    by_leak: np.ndarray
 
 
 class Interval(NamedTuple):
@@ -154,11 +268,13 @@ class Interval(NamedTuple):
     step: int
     refractory_ns: int
     bound_per_pixel: int
+    authors: bool
 
 
 @numba.njit(**JIT)
-def _sense_block(before, now, v, interval, v_end, flags):
-    """V at the end into ``v_end``, flags of pixels that may fire; returns the largest mean number of events."""
+def _sense_block(before, now, v, unspent, interval, v_end, unspent_end, flags):
+    """Mean and variance of V at the end into ``v_end`` and ``unspent_end``, flags of pixels to look at; returns the
+    largest mean number of events."""
     dt_us = interval.dt_ns * 1e-3
     k1, k2, k3, k6 = _F(interval.k1), _F(interval.k2), _F(interval.k3), _F(interval.k6)
     k4_dt, k5_dt, root_dt = _F(interval.k4 * dt_us), _F(interval.k5 * dt_us), _F(np.sqrt(dt_us))
@@ -166,17 +282,47 @@ def _sense_block(before, now, v, interval, v_end, flags):
     for i in range(now.size):
         drift, noise = drift_and_noise(before[i], now[i], k1, k2, k3, k4_dt, k5_dt, k6, root_dt)
         end = move(v[i], drift)
+        here = _F(noise * noise)
+        variance = _F(unspent[i] + here)
         v_end[i] = end
-        flags[i] = np.uint8(near_threshold(v[i], end, noise))
+        unspent_end[i] = variance
+        flags[i] = np.uint8(near_threshold(v[i], end, variance, here))
         # Mean number of events between thresholds at +-1: |mu| dt of the drift alone, sigma^2 dt of the diffusion
         # alone.
-        mean_events = _F(abs(drift) + noise * noise)
+        mean_events = _F(abs(drift) + here)
         most = max(most, mean_events.view(np.int32))  # floats >= 0 are ordered as their bits; this loop vectorises
     return np.int32(most).view(np.float32)
 
 
 @numba.njit(**JIT)
-def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
+def _share_block(before, now, by_light, by_leak, interval, light_end, leak_end):
+    """What light and leak will have moved V by at the interval's end, if nothing fires."""
+    dt_us = interval.dt_ns * 1e-3
+    k1, k2, k4_dt, k5_dt = _F(interval.k1), _F(interval.k2), _F(interval.k4 * dt_us), _F(interval.k5 * dt_us)
+    for i in range(now.size):
+        mean = _HALF * (before[i] + now[i])
+        light_end[i] = by_light[i] + k1 * (now[i] - before[i]) / (mean + k2)
+        leak_end[i] = by_leak[i] + (k4_dt + k5_dt * mean)
+
+
+@register_jitable
+def rates(before: float, after: float, dt_us: float, v: Interval) -> tuple[float, float, float]:
+    """(mu, what of it is leak, sigma) per us: :func:`drift_and_noise` in double precision, since a pixel may fire at
+    any time."""
+    mean = 0.5 * (before + after)
+    leak = v.k4 + v.k5 * mean
+    return v.k1 * (after - before) / dt_us / (mean + v.k2) + leak, leak, v.k3 * np.sqrt(mean) / (mean + v.k2) + v.k6
+
+
+@register_jitable
+def cause_at(side: int, since_us: float, light: float, leak: float, mu: float, leak_rate: float) -> int:
+    """Of an event at the threshold ``side`` (1, -1), ``since_us`` after V's parts were ``light`` and ``leak``."""
+    by_light, by_leak = light + (mu - leak_rate) * since_us, leak + leak_rate * since_us
+    return cause_of(side * by_light, side * by_leak, 1.0 - side * (by_light + by_leak))
+
+
+@numba.njit(**JIT)
+def _emit_block(active, count, first, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, begin):
     """Events of the listed pixels of one block into ``packed[begin:]``, in raster order; moves their voltages.
 
     Returns (end of the events, events cut)."""
@@ -191,47 +337,141 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
             y += 1
             row_end += v.width
         pixel = (y << 17) | ((i - row_end + v.width) << 1)
-        before, after = np.float64(p.intensity[i]), np.float64(now[i - first])
-        mean = 0.5 * (before + after)
-        # drift_and_noise, once more in double precision and per us: a pixel may fire at any time of the interval.
-        mu = v.k1 * (after - before) / dt_us / (mean + v.k2) + v.k4 + v.k5 * mean
-        sigma = v.k3 * np.sqrt(mean) / (mean + v.k2) + v.k6
-        voltage = p.v[i] / V_ONE
+        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
+        voltage, variance = p.v[i] / V_ONE, np.float64(p.unspent[i])
         t_us = 0.0
         if p.release.size and p.release[i] != NEVER_NS:
             if p.release[i] > v.t0_ns + v.dt_ns:
+                v_end[i - first], unspent_end[i - first] = IN_DEAD_TIME, _ZERO
+                if p.by_light.size:
+                    light_end[i - first] = leak_end[i - first] = _ZERO
+                continue
+            t_us, voltage, variance = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0, 0.0
+            p.release[i] = NEVER_NS
+        since_us, light, leak = t_us, 0.0, 0.0
+        if p.by_light.size:
+            light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
+        emitted, dead = 0, False
+        # The first block of random numbers: V at the interval's start, the time of the first event, which of its two
+        # roots. One more for each event that follows, and for each end that is drawn.
+        draw = np.uint64(v.step) << _U20
+        last = draw + _MAX_DRAWS
+        past, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+        unused = True
+        if variance > 0.0:
+            voltage = max(min(voltage + np.sqrt(variance) * past, NEAREST), -NEAREST)
+            variance = 0.0
+        # One turn per part of the interval, at most one event in each, until no threshold is in reach.
+        while t_us < dt_us:
+            left_us = dt_us - t_us
+            part_us, side = reach_of_part(voltage, mu, sigma, left_us)
+            if side == 0 and part_us == left_us:
+                voltage += mu * left_us
+                variance = sigma * sigma * left_us
+                break
+            if not unused:
+                draw += _U1
+                _, normal, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+            unused = False
+            distance, toward, fires = 1.0 - side * voltage, side * mu, False
+            chance = reached(distance, toward, sigma) if side else 0.0
+            if uniform < chance:
+                which = uniform if chance == 1.0 else uniform / chance
+                after_us = hitting_time(distance, toward, sigma, normal, which)
+                fires = after_us <= part_us
+            if fires:
+                t_us += after_us
+                event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
+                voltage = 0.0
+                if emitted == cap or draw >= last:  # too many to draw them all: count what is to be expected
+                    cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
+                    break
+                word = pixel | np.int64(side > 0)
+                if p.by_light.size:
+                    word |= cause_at(side, t_us - since_us, light, leak, mu, leak_rate) << CAUSE_SHIFT
+                packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
+                out += 1
+                emitted += 1
+                if p.release.size:
+                    release_ns = event_ns + v.refractory_ns
+                    if release_ns > v.dt_ns:
+                        p.release[i] = v.t0_ns + release_ns
+                        dead = True
+                        break
+                    t_us = release_ns * 1e-3
+                since_us, light, leak = t_us, 0.0, 0.0
+            else:
+                noise, stop = sigma * np.sqrt(part_us), draw + _TRIES
+                while True:
+                    draw += _U1
+                    normal, _, uniform = normal2_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+                    end = voltage + mu * part_us + noise * normal
+                    if side == 0 or draw >= stop or uniform >= crosses(distance, 1.0 - side * end, noise):
+                        break
+                voltage, t_us = max(min(end, NEAREST), -NEAREST), t_us + part_us
+                if part_us == left_us or draw >= last:
+                    break
+        v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)
+        if p.by_light.size:
+            rest_us = 0.0 if dead else dt_us - since_us
+            light_end[i - first] = np.float32(0.0 if dead else light + (mu - leak_rate) * rest_us)
+            leak_end[i - first] = np.float32(0.0 if dead else leak + leak_rate * rest_us)
+        unspent_end[i - first] = _ZERO if dead else np.float32(variance)
+    return out, cut
+
+
+@numba.njit(**JIT)
+def _emit_block_authors(active, count, first, now, v_end, light_end, leak_end, p, v, cap, packed, begin):
+    """:func:`_emit_block` of ``compat: authors``; every pixel is listed."""
+    out, cut = begin, 0
+    dt_us = v.dt_ns * 1e-3
+    start_ns = v.t0_ns - 1000 * v.base_us
+    y = first // v.width
+    row_end = (y + 1) * v.width
+    for j in range(count):
+        i = np.int64(active[j])
+        while i >= row_end:
+            y += 1
+            row_end += v.width
+        pixel = (y << 17) | ((i - row_end + v.width) << 1)
+        mu, leak_rate, sigma = rates(np.float64(p.intensity[i]), np.float64(now[i - first]), dt_us, v)
+        voltage, t_us = p.v[i] / V_ONE, 0.0
+        if p.release.size and p.release[i] != NEVER_NS:
+            if p.release[i] > v.t0_ns + v.dt_ns:
                 v_end[i - first] = IN_DEAD_TIME
+                if p.by_light.size:
+                    light_end[i - first] = leak_end[i - first] = _ZERO
                 continue
             t_us, voltage = max(p.release[i] - v.t0_ns, 0) * 1e-3, 0.0
             p.release[i] = NEVER_NS
-        emitted, draw, dead = 0, 0, False
-        # One turn per event, after which V is 0 again, until no threshold is reached before the frame's end.
+        since_us, light, leak = t_us, 0.0, 0.0
+        if p.by_light.size:
+            light, leak = np.float64(p.by_light[i]), np.float64(p.by_leak[i])
+        emitted, dead = 0, False
+        draw = np.uint64(v.step) << _U20
+        last = draw + _MAX_DRAWS
         while True:
+            normal, which = normal_and_uniform(v.seed, np.uint64(i), _DIFFUSION, draw)
+            side, _ = uniform2(v.seed, np.uint64(i), _DIFFUSION, draw + _U1)
+            draw += _U2
             left_us = dt_us - t_us
-            if not in_reach(voltage, mu * left_us, sigma * np.sqrt(left_us)):
-                voltage += mu * left_us
+            up = side < on_first(1.0 - voltage, 1.0 + voltage, mu, sigma)
+            distance = 1.0 - voltage if up else 1.0 + voltage
+            after_us = hitting_time(distance, mu, sigma, normal, which)
+            if not after_us < left_us:
+                share = distance * left_us / after_us  # 0 where it is never reached
+                voltage = max(min(voltage + (share if up else -share), NEAREST), -NEAREST)
                 break
-            # Two blocks a draw: (normal, uniform), then the side.
-            index = (np.uint64(v.step) << _U20) | np.uint64(2 * draw)
-            normal, which = normal_and_uniform(v.seed, np.uint64(i), _DIFFUSION, index)
-            chance = on_first(1.0 - voltage, 1.0 + voltage, mu, sigma)
-            polarity = np.int64(chance)  # where it is certain, no number is drawn
-            if 0.0 < chance < 1.0:
-                side, _ = uniform2(v.seed, np.uint64(i), _DIFFUSION, index + _U1)
-                polarity = np.int64(side < chance)
-            distance = 1.0 - voltage if polarity else 1.0 + voltage
-            hit_us = t_us + hitting_time(distance, mu, sigma, normal, which)
-            # Too late, or never (inf): no event, and V takes its drift along, as in the paper's algorithm.
-            if not hit_us <= dt_us:
-                voltage = max(min(voltage + mu * left_us, NEAREST), -NEAREST)
-                break
-            draw += 1
-            voltage, t_us = 0.0, hit_us
-            event_ns = min(np.int64(hit_us * 1e3), v.dt_ns)
-            if emitted == cap or draw == MAX_DRAWS:  # too many to draw them all: count what is to be expected
+            t_us += after_us
+            voltage = 0.0
+            event_ns = min(np.int64(t_us * 1e3), v.dt_ns)
+            if emitted == cap or draw >= last:
                 cut += 1 + np.int64((dt_us - t_us) * max(abs(mu), sigma * sigma))
                 break
-            packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | pixel | polarity
+            word = pixel | np.int64(up)
+            if p.by_light.size:
+                word |= cause_at(1 if up else -1, t_us - since_us, light, leak, mu, leak_rate) << CAUSE_SHIFT
+            packed[out] = (np.int64(np.uint64(start_ns + event_ns) // _U1000) << T_SHIFT) | word
             out += 1
             emitted += 1
             if p.release.size:
@@ -241,7 +481,12 @@ def _emit_block(active, count, first, now, v_end, p, v, cap, packed, begin):
                     dead = True
                     break
                 t_us = release_ns * 1e-3
+            since_us, light, leak = t_us, 0.0, 0.0
         v_end[i - first] = IN_DEAD_TIME if dead else np.int32(voltage * V_ONE)
+        if p.by_light.size:
+            rest_us = 0.0 if dead else dt_us - since_us
+            light_end[i - first] = np.float32(0.0 if dead else light + (mu - leak_rate) * rest_us)
+            leak_end[i - first] = np.float32(0.0 if dead else leak + leak_rate * rest_us)
     return out, cut
 
 
@@ -250,7 +495,9 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
     """Band kernel, see :meth:`Emulator._run`."""
     cut, pixels = 0, p.v.size
     flags, scratch, active = np.zeros(BLOCK, np.uint8), np.empty(BLOCK // 8, np.int64), np.empty(BLOCK + 8, np.int32)
-    now, v_end = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
+    now, v_end, unspent_end = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.float32)
+    shares = BLOCK if p.by_light.size else 0
+    light_end, leak_end = np.empty(shares, np.float32), np.empty(shares, np.float32)
     for block in range(first_block, stop_block):
         s = block * BLOCK
         e = min(s + BLOCK, pixels)
@@ -261,7 +508,11 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
             lookup_block(codes[s:e], table, now[:n])
         else:
             scale_block(frame[s:e], v.scale, now[:n])
-        most = _sense_block(p.intensity[s:e], now[:n], p.v[s:e], v, v_end, flags)
+        most = _sense_block(p.intensity[s:e], now[:n], p.v[s:e], p.unspent[s:e], v, v_end, unspent_end, flags)
+        if v.authors:
+            flags[:n] = 1
+        if p.by_light.size:
+            _share_block(p.intensity[s:e], now[:n], p.by_light[s:e], p.by_leak[s:e], v, light_end[:n], leak_end[:n])
         most = np.float64(min(most, _MAX_BOUND))
         count = compact_flags(flags, scratch, s, active)
         if count:
@@ -271,10 +522,22 @@ def _band(first_block, stop_block, share, packed, filled, frame, codes, table, p
                 cap = max(1, share // count)
             if filled + count * cap > packed.size:
                 return block, filled, cut
-            filled, cut_here = _emit_block(active, count, s, now, v_end, p, v, cap, packed, filled)
+            if v.authors:
+                filled, cut_here = _emit_block_authors(
+                    active, count, s, now, v_end, light_end, leak_end, p, v, cap, packed, filled
+                )
+            else:
+                filled, cut_here = _emit_block(
+                    active, count, s, now, v_end, unspent_end, light_end, leak_end, p, v, cap, packed, filled
+                )
             cut += cut_here
         copy_block(now[:n], p.intensity[s:e])
         copy_block(v_end[:n], p.v[s:e])
+        if not v.authors:
+            copy_block(unspent_end[:n], p.unspent[s:e])
+        if p.by_light.size:
+            copy_block(light_end[:n], p.by_light[s:e])
+            copy_block(leak_end[:n], p.by_leak[s:e])
     return stop_block, filled, cut
 
 
@@ -293,11 +556,11 @@ def _bands(taken, start, edges, progress, share, packed, frame, codes, table, p,
 class DvsVoltmeter(Emulator):
     """See the module and :class:`~blinkgl.events.emulator.Emulator`. Luminance 1.0 is ``config.full_scale`` DN.
 
-    State: 8 bytes per pixel, 8 more with a dead time. V starts at 0. ``saturated`` counts the expected number of
+    State: 12 bytes per pixel, 8 more with a dead time, 8 more with causes. ``saturated`` counts the expected number of
     the events that were not drawn."""
 
     Config = VoltmeterConfig
-    _state = ("_intensity", "_v", "_release")
+    _state = ("_intensity", "_v", "_unspent", "_release", "_by_light", "_by_leak")
 
     @classmethod
     def response(cls, config: VoltmeterConfig) -> Response:
@@ -319,6 +582,9 @@ class DvsVoltmeter(Emulator):
         self.config = config = config or VoltmeterConfig()
         pixels = self.height * self.width
         self._intensity, self._v = np.zeros(pixels, np.float32), np.zeros(pixels, np.int32)
+        self._unspent = np.zeros(pixels, np.float32)
+        self._authors = config.compat == "authors"
+        self._by_light, self._by_leak = (np.zeros(pixels if config.causes else 0, np.float32) for _ in range(2))
         self._refractory_ns = round(config.refractory_us * 1000)
         self._release = np.full(pixels if self._refractory_ns else 0, NEVER_NS, np.int64)
         self._scale = np.float32(config.full_scale)
@@ -329,11 +595,18 @@ class DvsVoltmeter(Emulator):
 
     def _start(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         self._intensity[...] = self._table[frame] if frame.dtype == np.uint8 else frame * self._scale
+        if self.config.start == "stationary" and not self._authors:
+            self._v[...], left_us = start_voltage(self._intensity, self.config, self.seed)
+            dead = np.flatnonzero(left_us)
+            self._v[dead] = IN_DEAD_TIME
+            self._release[dead] = t_ns + (left_us[dead] * 1e3).astype(np.int64)
+            if self.causes:
+                self._by_leak[...] = start_by_leak(self._v, self._intensity, self.config)
         return Events.empty()
 
     def _advance(self, frame: np.ndarray, t_ns: int, rate: np.ndarray | None) -> Events:
         c, dt_ns, base_us = self.config, t_ns - self.t_ns, self.t_ns // 1000
-        pixels = Pixels(self._intensity, self._v, self._release)
+        pixels = Pixels(self._intensity, self._v, self._unspent, self._release, self._by_light, self._by_leak)
         interval = Interval(
             self.t_ns,
             dt_ns,
@@ -350,6 +623,7 @@ class DvsVoltmeter(Emulator):
             self.frames,
             self._refractory_ns,
             dt_ns // self._refractory_ns + 2 if self._refractory_ns else 2**31,
+            self._authors,
         )
         source = (NO_FRAME, frame) if frame.dtype == np.uint8 else (frame, NO_CODES)
         return self._run(_bands, (*source, self._table, pixels, interval), base_us, t_ns // 1000 - base_us)

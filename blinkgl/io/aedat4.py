@@ -20,7 +20,7 @@ from blinkgl.errors import AssetError, BlinkGLError, EventDataError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io import aedat4_decode
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size, events_of
+from blinkgl.io.columns import check_events, check_size, events_of, refuse_causes
 from blinkgl.io.davis import CameraFrame, ImuSamples
 from blinkgl.machine.extras import install
 
@@ -201,6 +201,7 @@ class Aedat4Writer:
                 raise OutputError(f"cannot write: {' '.join(str(error).split())}", where=str(path)) from error
 
     def append(self, events: Events) -> None:
+        refuse_causes(events, "AEDAT4", str(self.path))
         if not len(events):
             return
         self._last = check_events(

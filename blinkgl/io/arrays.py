@@ -1,4 +1,4 @@
-"""Events as NumPy files: .npz with x, y, t, p, or .npy with a structured array. Whole
+"""Events as NumPy files: .npz with x, y, t, p (and cause, where known), or .npy with a structured array. Whole
 recordings in memory, unlike the others."""
 
 from __future__ import annotations
@@ -46,11 +46,12 @@ class ArrayReader:
         t = columns["t"]
         if t.dtype.kind == "f" and t.ndim == 1:
             columns["t"] = microseconds(t, str(path))
-        self._events = events_of(*(columns[k] for k in "xytp"), str(path), signed=True)
+        self._events = events_of(*(columns[k] for k in "xytp"), str(path), cause=columns.get("cause"), signed=True)
+        self.causes = self._events.cause is not None
 
     def chunks(self, size: int = 1 << 20) -> Iterator[Events]:
         for i in range(0, len(self._events), size):
-            yield Events(*(getattr(self._events, k)[i : i + size] for k in "xytp"))
+            yield self._events.part(slice(i, i + size))
 
 
 class ArrayWriter:
@@ -65,16 +66,17 @@ class ArrayWriter:
             events, str(self.path), self._count, height=self._size[0], width=self._size[1], after=self._last
         )
         self._count += len(events)
-        self._chunks.append(Events(*(getattr(events, k).copy() for k in "xytp")))
+        self._chunks.append(events.copy())
 
     def close(self, t_end_us: int | None = None) -> None:
         e = Events.concatenate(self._chunks)
         with output_errors(self.path), open(self.path, "wb") as file:
             if self.path.suffix == ".npz":
-                np.savez_compressed(file, x=e.x, y=e.y, t=e.t, p=e.p, height=self._size[0], width=self._size[1])
+                columns = {k: getattr(e, k) for k in e.columns}
+                np.savez_compressed(file, **columns, height=self._size[0], width=self._size[1])
             else:
-                table = np.empty(len(e), DTYPE)
-                for k in DTYPE.names:
+                table = np.empty(len(e), DTYPE if e.cause is None else [*DTYPE.descr, ("cause", "u1")])
+                for k in table.dtype.names:
                     table[k] = getattr(e, k)
                 np.save(file, table, allow_pickle=False)
 
@@ -85,6 +87,8 @@ class ArrayWriter:
 def _named(names: Iterable[str], path) -> dict[str, str]:
     """Column -> its name in the file; AssetError when one is missing."""
     found = {k: next((n for n in options if n in names), None) for k, options in _NAMES.items()}
+    if "cause" in names:
+        found["cause"] = "cause"
     if missing := [k for k, name in found.items() if name is None]:
         raise AssetError(
             f"no column '{missing[0]}'",

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from blinkgl.errors import AssetError, EventDataError
-from blinkgl.events.types import Events
+from blinkgl.errors import AssetError, EventDataError, OutputError
+from blinkgl.events.types import Cause, Events
 
 MAX_SIDE = 65536
 _MAX_TIME = 1 << 62
@@ -25,24 +25,30 @@ def events_of(
     where: str,
     first: int = 0,
     *,
+    cause: np.ndarray | None = None,
     offset: int = 0,
     signed: bool = False,
 ) -> Events:
     """Columns of any integer, boolean or float type as :class:`Events`; ``offset`` (µs) is added to the times.
 
-    t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. first : index of the
+    t : µs. p : 0 or 1, with ``signed`` also -1, which becomes 0. cause : 0 to 3, see
+    :class:`~blinkgl.events.types.Cause`, where the file has them. first : index of the
     first of these events in the file.
     Raises EventDataError, naming event and value, for what Events cannot hold: coordinates outside uint16 or between
     pixels, NaN, times beyond int64, another polarity. AssetError: a column that is no 1-D array of
     numbers, or columns of different lengths."""
     columns = {"x": np.asarray(x), "y": np.asarray(y), "t": np.asarray(t), "p": np.asarray(p)}
+    if cause is not None:
+        columns["cause"] = np.asarray(cause)
     if any(c.ndim != 1 for c in columns.values()) or len({len(c) for c in columns.values()}) != 1:
         raise AssetError("event columns differ in length", where=where, value={k: c.shape for k, c in columns.items()})
     x = _whole(columns["x"], "x", np.uint16, 0, MAX_SIDE - 1, where, first)
     y = _whole(columns["y"], "y", np.uint16, 0, MAX_SIDE - 1, where, first)
     t = _whole(columns["t"], "t", np.int64, -_MAX_TIME - min(offset, 0), _MAX_TIME - max(offset, 0), where, first)
     p = _whole(columns["p"], "p", np.int8, -1 if signed else 0, 1, where, first)
-    return Events(x, y, t + offset if offset else t, (p > 0).view(np.uint8) if signed else p.view(np.uint8))
+    if cause is not None:
+        cause = _whole(columns["cause"], "cause", np.uint8, 0, max(Cause), where, first)
+    return Events(x, y, t + offset if offset else t, (p > 0).view(np.uint8) if signed else p.view(np.uint8), cause)
 
 
 def microseconds(seconds: np.ndarray, where: str, first: int = 0) -> np.ndarray:
@@ -89,10 +95,25 @@ def check_events(
                 value=(int(events.x[i]), int(events.y[i])),
                 accepted=", ".join(f"{k} < {n}" for k, n in (("x", width), ("y", height)) if n is not None),
             )
+    if events.cause is not None and events.cause.max() > max(Cause):
+        i = int(np.argmax(events.cause > max(Cause)))
+        raise EventDataError(
+            f"cause of event {first + i}", where=where, value=int(events.cause[i]), accepted=f"0 to {int(max(Cause))}"
+        )
     if events.p.max() > 1:
         i = int(np.argmax(events.p > 1))
         raise EventDataError(f"polarity of event {first + i}", where=where, value=int(events.p[i]), accepted="0 or 1")
     return int(t[-1])
+
+
+def refuse_causes(events: Events, kind: str, where: str) -> None:
+    """OutputError for events with causes, for a format that has no place for them."""
+    if events.cause is not None:
+        raise OutputError(
+            f"{kind} cannot hold the causes of events",
+            where=where,
+            accepted=".h5, .npz or .npy, or events without causes",
+        )
 
 
 def check_size(height: int | None, width: int | None, where: str) -> None:

@@ -2,7 +2,8 @@
 
 Layout: ``events/{x,y}`` u2, ``events/p`` u1, ``events/t`` u4 µs relative to the scalar ``t_offset`` (i8 µs on the
 image clock), ``ms_to_idx`` u8 with ``ms_to_idx[ms]`` = smallest index whose t >= 1000·ms. Blosc-zstd with bit
-shuffle, as the published files.
+shuffle, as the published files. ``events/cause`` u1 besides, of :class:`~blinkgl.events.types.Cause`, where events have
+causes; readers of DSEC's files do not look at it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import contextlib
 import os
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NoReturn
 
@@ -68,7 +69,7 @@ class DsecEventWriter:
         self._next_ms = 0
         self._written = 0
         self._fill = 0
-        self._block = _new_block()
+        self._block = _new_block(_COLUMNS)
         self._error: BaseException | None = None
         self._closed = False
         with output_errors(path):
@@ -95,19 +96,21 @@ class DsecEventWriter:
             not 0 or 1. OutputError : the disk refused an earlier block.
         """
         self._check(events)
+        if len(events):
+            self._check_causes(events)
         self.count += len(events)
         start = 0
         while start < len(events):
             stop = min(len(events), start + BLOCK - self._fill)
             into = slice(self._fill, self._fill + stop - start)
-            for name in "xyp":
+            for name in (name for name in self._columns if name != "t"):
                 self._block[name][into] = getattr(events, name)[start:stop]
             np.subtract(events.t[start:stop], self.t_offset_us, out=self._block["t"][into], casting="unsafe")
             self._fill += stop - start
             start = stop
             if self._fill == BLOCK:
                 self._submit(self._block)
-                self._block, self._fill = _new_block(), 0
+                self._block, self._fill = _new_block(self._columns), 0
         self._raise_pending()
 
     def close(self, t_end_us: int | None = None) -> None:
@@ -175,6 +178,15 @@ class DsecEventWriter:
             )
         self._last_t = check_events(events, where, self.count, height=self.height, width=self.width, after=self._last_t)
 
+    def _check_causes(self, events: Events) -> None:
+        """The first events say whether there are causes."""
+        if self.count == 0 and events.cause is not None:
+            with output_errors(self.path):
+                self._columns["cause"] = blosc_dataset(self._file, "events/cause", (0,), np.uint8, (BLOCK,))
+            self._block = _new_block(self._columns)
+        if (events.cause is not None) != ("cause" in self._columns):
+            raise EventDataError("some events have causes and some do not", where=str(self.path))
+
     def _submit(self, block: dict[str, np.ndarray] | None) -> None:
         if self._queue is not None:
             self._queue.put(block)
@@ -215,8 +227,8 @@ class DsecEventWriter:
             self._next_ms += len(entries)
 
 
-def _new_block() -> dict[str, np.ndarray]:
-    return {name: np.empty(BLOCK, dtype) for name, dtype in _COLUMNS.items()}
+def _new_block(names: Iterable[str]) -> dict[str, np.ndarray]:
+    return {name: np.empty(BLOCK, _COLUMNS.get(name, np.uint8)) for name in names}
 
 
 class DsecEventReader:
@@ -244,6 +256,9 @@ class DsecEventReader:
             self._columns = {
                 k: dataset(self._file, f"events/{k}", self.path, shape=(None,), kinds="iub") for k in "xytp"
             }
+            self.causes = "events/cause" in self._file
+            if self.causes:
+                self._columns["cause"] = dataset(self._file, "events/cause", self.path, shape=(None,), kinds="iu")
             lengths = {len(c) for c in self._columns.values()}
             if len(lengths) != 1:
                 raise AssetError("event columns differ in length", where=str(path), value=sorted(lengths))
@@ -308,8 +323,8 @@ class DsecEventReader:
 
     def _read(self, start: int, stop: int) -> Events:
         with hdf5_errors(self.path):
-            x, y, t, p = (self._columns[k][start:stop] for k in "xytp")
-        return events_of(x, y, t, p, str(self.path), start, offset=self.t_offset_us)
+            columns = {k: column[start:stop] for k, column in self._columns.items()}
+        return events_of(**columns, where=str(self.path), first=start, offset=self.t_offset_us)
 
     def close(self) -> None:
         self._file.close()

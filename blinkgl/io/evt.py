@@ -20,7 +20,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size
+from blinkgl.io.columns import check_events, check_size, refuse_causes
 
 _WORD = {"evt2": np.dtype("<u4"), "evt3": np.dtype("<u2")}
 _MAX_SIDE = 2048
@@ -57,6 +57,7 @@ class EvtWriter:
             self._file.write(header.encode())
 
     def append(self, events: Events) -> None:
+        refuse_causes(events, self.version.upper(), str(self.path))
         if not len(events):
             return
         t = events.t

@@ -39,6 +39,8 @@ ENDINGS = {
     ".npz": "npz",
     ".npy": "npy",
 }
+WITH_CAUSES = ("dsec", "npz", "npy")
+"""Formats with a place for what caused each event; the others refuse events that have causes."""
 WRITABLE = ("dsec", "evt3", "evt2", "aedat4", "text", "csv", "npz", "npy")
 SENSORS = ((180, 240), (240, 304), (260, 346), (320, 320), (480, 640), (720, 1280), (1080, 1920))
 """(height, width) of event cameras, smallest first: the guess for files that do not say."""
@@ -67,6 +69,11 @@ class EventFile:
     width: int | None
     t_offset_us: int = 0
     _reader: Any = field(default=None, repr=False)
+
+    @property
+    def causes(self) -> bool:
+        """Whether its events have causes."""
+        return getattr(self._reader, "causes", False)
 
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning, in pieces, memory flat (npz, npy: held whole).
@@ -267,9 +274,10 @@ def convert(
     size : (height, width) for sources that do not say (default: guessed, see :meth:`EventFile.sized`).
     time_unit : of text and CSV, "s" or "us". zero_time : shift times so that the first event is at 0, for formats that
     count from the start (EVT2, EVT3).
+    Causes of events are left out where the format cannot hold them.
     Returns the source with its size, and the number of events written.
     """
-    output_format(target, format)
+    kind = output_format(target, format)
     with open_events(source) as file:
         if size is not None:
             file = replace(file, height=size[0], width=size[1])
@@ -279,6 +287,8 @@ def convert(
         # DSEC's t is u4 relative to t_offset: keep the source's own, else put it at the first event's second.
         offset = 0 if zero_time else file.t_offset_us or first // 1_000_000 * 1_000_000
         shifted = (replace(e, t=e.t - shift) for e in file.chunks()) if shift else file.chunks()
+        if file.causes and kind not in WITH_CAUSES:
+            shifted = (replace(e, cause=None) for e in shifted)
         count = write_events(
             target,
             shifted,

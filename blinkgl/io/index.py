@@ -58,6 +58,10 @@ def sequence_folders(root: str | Path) -> Iterator[Path]:
                 yield manifest.parent
 
 
+_SOMETIMES = ("events_by_cause",)
+"""Keys of manifests that only some have."""
+
+
 def entry(root: Path, folder: Path) -> dict[str, Any]:
     """A sequence's line. Raises AssetError for a damaged manifest."""
     manifest = read_manifest(folder)
@@ -65,6 +69,7 @@ def entry(root: Path, folder: Path) -> dict[str, Any]:
         "path": folder.relative_to(root).as_posix(),
         "name": folder.name,
         **{key: manifest.get(key) for key in _KEYS},
+        **{key: manifest[key] for key in _SOMETIMES if key in manifest},
         "bytes": sum(file["bytes"] for file in manifest["files"].values()),
     }
 

@@ -53,6 +53,7 @@ class PreviewWriter:
     ):
         self._counts = np.zeros((2, height, width), np.uint16)
         self._pending = 0
+        self._noise: int | None = None  # of the pending; None: nobody knows
         factor = min(1.0, _MAX_PANEL_HEIGHT / height)
         if height < 200:
             factor = 2.0
@@ -75,6 +76,8 @@ class PreviewWriter:
         """Collected until the next frame."""
         count_events(events.x, events.y, events.p, self._counts)
         self._pending += len(events)
+        if events.cause is not None:
+            self._noise = (self._noise or 0) + int(np.count_nonzero(events.cause))
 
     def set_flow(self, flow: np.ndarray, valid: np.ndarray | None = None) -> None:
         """(H, W, 2) px and its valid mask. Full saturation follows the 95th percentile of speed: up at once, down
@@ -105,9 +108,10 @@ class PreviewWriter:
         self._panel_view(0)[:] = small[..., None] if small.ndim == 2 else small
         self._panel_view(1)[:] = self._fit(event_colour(self._counts))
         self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms   slowed {self._slow:g}x")
-        self._caption(1, f"ON blue, OFF red   {self._pending:,}")
+        share = "" if self._noise is None else f"   {100 * self._noise / max(self._pending, 1):.0f} % noise"
+        self._caption(1, f"ON blue, OFF red   {self._pending:,}{share}")
         self._counts[:] = 0
-        self._pending = 0
+        self._pending, self._noise = 0, None if self._noise is None else 0
         for _ in range(self._ticks.passed(t_us)):
             self._video.write(self._canvas)
 

@@ -20,7 +20,7 @@ import numpy as np
 from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import output_errors
-from blinkgl.io.columns import check_events, check_size
+from blinkgl.io.columns import check_events, check_size, refuse_causes
 
 _LONGEST_LINE = 1 << 16
 _ACCEPTED = "t x y p"
@@ -139,6 +139,7 @@ class TextWriter:
                 self._file.write(f"t,x@{width},y@{height},on\n".encode() if self._micro else b"t,x,y,p\n")
 
     def append(self, events: Events) -> None:
+        refuse_causes(events, "text", str(self.path))
         if len(events) and events.t[0] < 0:
             raise EventDataError("negative time", where=str(self.path), value=int(events.t[0]), accepted=">= 0 µs")
         self._last = check_events(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -294,7 +294,7 @@ def _windows(file: EventFile, edges: np.ndarray, shift: int) -> Iterator[Events]
 
 def _joined(parts: list[Events], shift: int) -> Events:
     events = Events.concatenate(parts)
-    return Events(events.x, events.y, events.t - shift, events.p) if shift else events
+    return replace(events, t=events.t - shift) if shift else events
 
 
 def _span(file: EventFile) -> tuple[int, int]:

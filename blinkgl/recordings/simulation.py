@@ -14,7 +14,7 @@ import contextlib
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
-from blinkgl.events.types import Events
+from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.io.frames import open_frames
 from blinkgl.srgb import linear_from_srgb
 from blinkgl.timeline import interpolate as between
@@ -55,6 +55,8 @@ class SimulationReport:
     """events that found the queue of the sensor's read-out full"""
     late: int = 0
     """events that were still on the read-out's bus when the last frame came"""
+    causes: dict[str, int] = field(default_factory=dict)
+    """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
     """for interpolate="motion" """
 
@@ -210,6 +212,7 @@ def stepped(
             seen[0] = luminance
             yield EventFrame(t_ns, luminance)
 
+    by_cause = count_causes(Events.empty())
     for t_ns, events in emulate(shown(), camera):
         report.first_ns = t_ns if report.steps == 0 else report.first_ns
         report.steps += 1
@@ -217,6 +220,9 @@ def stepped(
         report.events += len(events)
         report.on += int(np.count_nonzero(events.p))
         report.saturated, report.lost, report.late = camera.saturated, camera.dropped, camera.late
+        if camera.emulator.causes:
+            by_cause += count_causes(events)
+            report.causes = named_causes(by_cause)
         yield Step(t_ns, events, seen[0])
 
 
@@ -237,10 +243,17 @@ def file_to_events(
     preview : video of frames and events. progress : called with (report so far, fraction done or None) per given frame.
     """
     from blinkgl.io.atomic import atomic_file
-    from blinkgl.io.formats import event_writer, output_format
+    from blinkgl.io.formats import WITH_CAUSES, event_writer, output_format
     from blinkgl.io.preview import PreviewWriter
 
     kind = output_format(target)
+    if getattr(emulator_config(options.get("emulator", EmulatorConfig.members.default)), "causes", False):
+        if kind not in WITH_CAUSES:
+            raise OutputError(
+                f"{kind} cannot hold the causes of events",
+                where=str(target),
+                accepted=".h5, .npz or .npy, or an emulator without causes",
+            )
     if preview is not None and Path(preview).resolve() == Path(target).resolve():
         raise OutputError("preview and events in the same file", where=str(preview))
     frames = open_frames(source, fps=fps, timestamps=timestamps)

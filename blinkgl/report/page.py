@@ -45,6 +45,7 @@ def build_report(found: Collected) -> str:
             (f"{len(sequences):,}", "sequences"),
             (f"{seconds:,.4g} s", "simulated"),
             (number(sum(x["events"] or 0 for x in sequences)), "events"),
+            *_causes(sequences),
             (f"{sum(x['labels'] or 0 for x in sequences):,}", "flow labels"),
             (size(sum(x["bytes"] for x in sequences)), "on disk"),
         ],
@@ -60,6 +61,16 @@ def build_report(found: Collected) -> str:
         failures=[*sorted(found.failed.items()), *(("", line) for line in found.unreadable)],
         retried=[c for c in costs if c["attempts"] > 1],
     )
+
+
+def _causes(sequences: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Tiles: rates per pixel by what caused the events, over the sequences that know."""
+    known = [x for x in sequences if x.get("events_by_cause") and x["duration_us"]]
+    pixel_seconds = sum(x["duration_us"] * 1e-6 * x["width"] * x["height"] for x in known)
+    counts: Counter[str] = Counter()
+    for x in known:
+        counts.update(x["events_by_cause"])
+    return [(f"{n / pixel_seconds:.3g} Hz/px", f"{cause} events") for cause, n in counts.items()]
 
 
 def _groups(found: Collected) -> list[tuple[str, int, int]]:

@@ -9,7 +9,7 @@ from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSce
 from blinkgl.config.sequence import CameraConfig, SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.types import Scene
-from blinkgl.scene.worlds.explicit import explicit_scene, primitive_mesh
+from blinkgl.scene.worlds.explicit import check_primitive, explicit_scene
 from blinkgl.scene.worlds.from_file import scene_from_file
 from blinkgl.scene.worlds.pool import SPLITS, resolve
 from blinkgl.scene.worlds.random_world import pools, random_world
@@ -82,7 +82,7 @@ def check_assets(config: SceneConfig, base: Path | str = ".", split: str = "trai
         for name, mesh in config.meshes.items():
             _exists(mesh.file, base, f"scene.meshes.{name}.file", "a mesh file")
             if mesh.primitive is not None:
-                primitive_mesh(mesh, name)
+                check_primitive(mesh.primitive, mesh.parameters, name)
         for name, material in config.materials.items():
             _exists(material.texture, base, f"scene.materials.{name}.texture", "an image file")
     else:

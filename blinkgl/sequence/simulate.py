@@ -26,7 +26,7 @@ import numpy as np
 from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
-from blinkgl.events.types import Events
+from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.gl import GLContext
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
@@ -121,6 +121,7 @@ class Simulation(ABC):
         self.config, self.index, self.clock, self.camera = config, index, clock, camera
         (self.height, self.width), (self.t0_ns, self.t1_ns) = size, span_ns
         self.pictures_hz, self.events, self.labels = pictures_hz, 0, 0
+        self._by_cause = count_causes(Events.empty())
         self._labels, self._stack, self._begun = labels, stack or ExitStack(), False
 
     def __enter__(self) -> Simulation:
@@ -156,6 +157,8 @@ class Simulation(ABC):
         ticks = None if self.pictures_hz is None else Ticks(self.t0_ns // 1000, self.pictures_hz)
         for t_ns, events in self._event_pass() if self.camera is not None else ():
             self.events += len(events)
+            if events.cause is not None:
+                self._by_cause += count_causes(events)
             while label_ns is not None and label_ns <= t_ns:
                 before, events = events.split(label_ns // 1000)
                 yield EventChunk(label_ns, before)
@@ -183,6 +186,12 @@ class Simulation(ABC):
         """Events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's
         queue full, and that are on its bus still."""
         return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
+
+    @property
+    def causes(self) -> dict[str, int]:
+        """Events so far by what caused them; empty unless ``events.causes`` asks for it."""
+        asked = self.camera is not None and self.camera.emulator.causes
+        return named_causes(self._by_cause) if asked else {}
 
     @property
     def seconds(self) -> dict[str, float]:

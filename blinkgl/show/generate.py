@@ -18,7 +18,7 @@ from blinkgl.dataset.report import STAGES, SequenceReport, Totals
 from blinkgl.dataset.run import Outcome, run_dataset
 from blinkgl.dataset.work import Message, report_of
 from blinkgl.machine.compiling import compiling_line
-from blinkgl.show.terminal import plain_column, plain_console, say
+from blinkgl.show.terminal import causes_line, plain_column, plain_console, say
 
 MAX_NOTES = 20
 """Files of which it is said what is not drawn; beyond, that there are more."""
@@ -221,6 +221,8 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     )
     table.add_row("event frames", f"{s['frames']:,}")
     table.add_row("events", f"{s['events'] / 1e6:.2f} M")
+    if made.causes:
+        table.add_row("by cause", causes_line(made.causes, made.simulated_s).removeprefix("by cause: "))
     table.add_row("labels", f"{s['labels']:,}")
     if elapsed_s is not None and len(made) > 1:
         table.add_row("elapsed", f"{elapsed_s:.1f} s  ({s['total_s'] / elapsed_s:.2f} sequences at a time)")

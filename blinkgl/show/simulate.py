@@ -10,7 +10,7 @@ from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingC
 
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.errors import ConfigError
-from blinkgl.show.terminal import plain_column, plain_console, say
+from blinkgl.show.terminal import causes_line, plain_column, plain_console, say
 
 
 def emulator_options(
@@ -90,6 +90,8 @@ def run(
         say(console, f"{report.steps - report.frames} of the frames were interpolated, not recorded")
     if line := compiling_line(compiled_s()):
         say(console, line)
+    if report.causes:
+        say(console, causes_line(report.causes, report.duration_s))
     if report.lost:
         say(console, f"{report.lost:,} events were lost in the sensor's read-out")
     if report.late:

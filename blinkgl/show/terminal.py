@@ -68,3 +68,10 @@ def never_fail_to_print() -> None:
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # not what tests and notebooks put there
             stream.reconfigure(errors="blinkgl-plainly")
+
+
+def causes_line(causes: dict[str, int], seconds: float) -> str:
+    """Events by cause, in words: how many a second, and the share of all."""
+    whole = max(sum(causes.values()), 1)
+    parts = (f"{name} {n / max(seconds, 1e-9):,.4g}/s ({100 * n / whole:.1f} %)" for name, n in causes.items())
+    return "by cause: " + ", ".join(parts)

@@ -126,7 +126,7 @@ def _vote(x, y, t, p, t0, t1, grid):
 def masked(events: Events, mask: np.ndarray) -> Events:
     """The events of the pixels where ``mask`` (H, W) is True."""
     keep = mask[events.y, events.x]
-    return Events(events.x[keep], events.y[keep], events.t[keep], events.p[keep])
+    return events.part(keep)
 
 
 def _spread(values: np.ndarray) -> tuple[float, float]:

@@ -179,7 +179,7 @@ def test_every_error_of_every_key_is_plain(monkeypatch):
                 "percentile, reconstruction, sample_every; it is a key of kind: uniform"
             ),
         ),
-        ("events: {k1: 3}", "events.k1: unknown key; expected one of: contrast_threshold"),
+        ("events: {k1: 3}", "events.k1: unknown key; expected one of: causes, contrast_threshold"),
         (
             "timeline: {kind: regular}",
             (

@@ -18,6 +18,7 @@ from blinkgl.dataset.explain import Explanation
 from blinkgl.dataset.report import SequenceReport
 from blinkgl.dataset.shards import export_shards
 from blinkgl.dataset.verify import verify_dataset
+from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png
@@ -100,6 +101,13 @@ def of_sequence(folder: Path, manifest: dict[str, Any]) -> Findings:
             all((c.t >= manifest["t_offset_us"]).all() and (c.t <= end).all() for c in chunks),
             "events outside the recording",
         )
+    told = all(c.cause is not None for c in chunks)
+    found.same(
+        "causes", asked=getattr(config.events, "causes", False), file=told, manifest="events_by_cause" in manifest
+    )
+    if told:
+        by_cause = named_causes(count_causes(Events.concatenate(chunks)))
+        found.same("events by cause", file=by_cause, manifest=manifest["events_by_cause"])
     lost = manifest["events_lost_in_readout"] + manifest["events_late_in_readout"]
     if config.readout is None or config.readout.events_per_second >= 1e6:
         found.expect(lost == 0, f"{lost} events lost without a limit")

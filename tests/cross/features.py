@@ -90,8 +90,10 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
                 "hot_pixel_fraction": 0.01,
             }
         },
+        "v2e, causes": {"events": {"emulator": "v2e", "causes": True, "start": "balanced", "leak_rate_hz": 50}},
         "voltmeter": {"events": {"emulator": "voltmeter"}},
-        "voltmeter, 240": {"events": {"emulator": "voltmeter", "preset": "DVS240"}},
+        "voltmeter, 240, causes": {"events": {"emulator": "voltmeter", "preset": "DVS240", "causes": True}},
+        "voltmeter, authors": {"events": {"emulator": "voltmeter", "compat": "authors"}},
     },
     "timeline": {
         "uniform": {"timeline": {"kind": "uniform", "fps": 400}},

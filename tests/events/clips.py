@@ -37,5 +37,6 @@ def run_cubic(emulator, clip, times, rates) -> Events:
 
 def assert_same(a: Events, b: Events) -> None:
     assert len(a) == len(b)
-    for name in "tyxp":
+    assert a.columns == b.columns
+    for name in a.columns:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -27,6 +29,8 @@ VARIANTS = {
     ),
     "photoreceptor noise": dict(shot_noise_rate_hz=20.0, photoreceptor_noise=True, leak_rate_hz=0.0, cutoff_hz=30.0),
     "photoreceptor noise, leak": dict(preset="noisy", shot_noise_rate_hz=30.0, photoreceptor_noise=True),
+    "balanced": dict(start="balanced", leak_rate_hz=5.0, shot_noise_rate_hz=20.0),
+    "starting at 0": dict(start="zero", leak_rate_hz=5.0, refractory_us=0.0),
     "noise without dead time": dict(
         shot_noise_rate_hz=80.0, leak_rate_hz=2.0, refractory_us=0.0, contrast_threshold_off=0.3
     ),
@@ -37,10 +41,12 @@ VARIANTS = {
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_equals_slow_twin(variant, dtype, threads):  # noqa: F811
     clip, times = random_clip(1, frames=5, dtype=dtype)
-    config = V2eConfig(**VARIANTS[variant])
+    config = V2eConfig(**VARIANTS[variant], causes=True)
     fast = run(V2e(37, 45, config, seed=9), clip, times)
     assert len(fast) > 1500
     assert_same(fast, run(ReferenceV2e(37, 45, config, seed=9), clip, times))
+    untold = run(V2e(37, 45, V2eConfig(**VARIANTS[variant]), seed=9), clip, times)
+    assert_same(replace(fast, cause=None), untold)
 
 
 def test_resumes_bit_identically():

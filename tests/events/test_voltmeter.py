@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mpmath
 import numba
 import numpy as np
@@ -12,7 +14,8 @@ from blinkgl.config.events import VoltmeterConfig
 from blinkgl.events import DvsVoltmeter, Events
 from blinkgl.events.philox import normal_and_uniform
 from blinkgl.events.reference import ReferenceVoltmeter
-from blinkgl.events.voltmeter import hitting_time, on_first, one_minus_exp
+from blinkgl.events.voltmeter import crosses, hitting_time, on_first, one_minus_exp, reached, start_voltage
+from blinkgl.tools.noise_laws import exit_survival
 from tests.events.clips import assert_same, random_clip, run
 from tests.events.test_esim import threads  # noqa: F401  (fixture)
 
@@ -24,6 +27,9 @@ VARIANTS = {
     "very noisy": dict(k3=0.01, k6=0.002),
     "noiseless": dict(k3=0.0, k6=0.0),
     "leaky": dict(k4=2e-4, refractory_us=100.0),
+    "starting at 0": dict(start="zero", k6=1e-3),
+    "authors": dict(compat="authors", k6=1e-3),
+    "authors, dead time": dict(compat="authors", refractory_us=3000.0),
 }
 
 
@@ -31,10 +37,12 @@ VARIANTS = {
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_equals_slow_twin(variant, dtype, threads):  # noqa: F811
     clip, times = random_clip(1, frames=5, dtype=dtype)
-    config = VoltmeterConfig(**VARIANTS[variant])
+    config = VoltmeterConfig(**VARIANTS[variant], causes=True)
     fast = run(DvsVoltmeter(37, 45, config, seed=9), clip, times)
     assert len(fast) > 1000
     assert_same(fast, run(ReferenceVoltmeter(37, 45, config, seed=9), clip, times))
+    untold = run(DvsVoltmeter(37, 45, VoltmeterConfig(**VARIANTS[variant]), seed=9), clip, times)
+    assert_same(replace(fast, cause=None), untold)
 
 
 def test_resumes_bit_identically():
@@ -100,10 +108,11 @@ def test_hitting_times_without_drift_are_levy():
     assert stats.kstest(_hitting_times(N, distance, 1e-14, sigma), law.cdf).pvalue > 1e-3  # and continuous in the drift
 
 
-def test_kernel_event_times_are_inverse_gaussian():
-    """Straight from the emulator: the first event of 10^5 pixels under one long ramp step."""
+def test_kernel_event_times_are_first_exits():
+    """Straight from the emulator: the first event of 10^5 pixels in one long step, in which both thresholds are in
+    reach, against the first exit from between them; and which of the two it is."""
     h, w = 250, 400
-    config = VoltmeterConfig(k1=5.0, k2=20.0, k3=0.0, k4=0.0, k5=0.0, k6=4e-3)
+    config = VoltmeterConfig(k1=5.0, k2=20.0, k3=0.0, k4=0.0, k5=0.0, k6=4e-3, start="zero")
     emulator = DvsVoltmeter(h, w, config, seed=8)
     emulator.step(np.full((h, w), 100 / 255, np.float32), 0)
     dt = 200_000  # us
@@ -111,13 +120,62 @@ def test_kernel_event_times_are_inverse_gaussian():
     mu, sigma = 5.0 * 100 / dt / 170, 4e-3
     _, first = np.unique(events.y.astype(int) * w + events.x, return_index=True)
     t = events.t[first] + 0.5
-    mean, shape = 1 / mu, sigma**-2
-    law = stats.invgauss(mu=mean / shape, scale=shape)
+    survival = exit_survival(mu * 1e6, sigma * 1e3)
     on = events.p[first] == 1
     expected_on = on_first(1.0, 1.0, mu, sigma)
-    assert abs(len(first) / (h * w) - law.cdf(dt)) < 5e-3
-    assert abs(on.mean() - expected_on) < 5 * np.sqrt(expected_on * (1 - expected_on) / len(on)) + 1e-3
-    assert stats.kstest(t, lambda x: law.cdf(x) / law.cdf(dt)).pvalue > 1e-3
+    left = float(survival(np.array([dt * 1e-6]))[0])
+    assert abs(1 - len(first) / (h * w) - left) < 5 * np.sqrt(left / (h * w))
+    assert abs(on.mean() - expected_on) < 5 * np.sqrt(expected_on * (1 - expected_on) / len(on))
+    assert stats.kstest(t, lambda x: (1 - survival(x * 1e-6)) / (1 - left)).pvalue > 1e-3
+
+
+def test_crossings_of_bridges_and_thresholds_that_may_never_be_met():
+    """By simulation in 20,000 small steps; and where there is no noise."""
+    rng, noise = np.random.default_rng(0), 0.6
+    steps = rng.normal(0, noise / 100, (2000, 10_000)).cumsum(axis=1)
+    bridge = steps - np.linspace(0, 1, 10_000) * (steps[:, -1:] + 0.1)  # ends 0.1 lower
+    assert abs((bridge.max(axis=1) > 0.4 - 0.58 * noise / 100).mean() - crosses(0.4, 0.5, noise)) < 0.04
+    assert crosses(0.5, 0.5, 0.0) == 0.0 and crosses(0.5, -0.1, 0.0) == 1.0 and crosses(0.5, 0.0, 1.0) == 1.0
+    away = (steps - np.linspace(0, 0.5, 10_000)).max(axis=1) > 0.3  # until t = 1; most never do later
+    assert abs(away.mean() - reached(0.3, -0.5, noise)) < 0.08
+    assert reached(0.3, 0.0, 0.0) == reached(0.3, 1.0, 0.0) == 1.0 and reached(0.3, -1e-9, 0.0) == 0.0
+
+
+@pytest.mark.parametrize("r", [0.0, 1e-3, 1.0, 30.0, 5e3, np.inf])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_start_is_the_stationary_law(r, sign):
+    """Against the density of the Fokker-Planck equation, and the share of pixels in their dead time."""
+    sigma = 0.0 if r == np.inf else 2e-3
+    mu = 1e-5 if r == np.inf else r * sigma**2 / 2
+    config = VoltmeterConfig(k3=0.0, k4=sign * mu, k5=0.0, k6=sigma, refractory_us=3e4)
+    v, left = start_voltage(np.full(60_000, 100.0, np.float32), config, np.uint64(4))
+    grid = np.linspace(-1, 1, 20_001)
+    with np.errstate(over="ignore", invalid="ignore"):
+        up = -np.expm1(-r * (1 - grid)) if 0 < r < np.inf else (np.ones_like(grid) if r else 1 - grid)
+        down = np.exp(r * grid) * -np.expm1(-r * (1 + grid)) if 0 < r < np.inf else (0 * grid if r else 1 + grid)
+    density = np.where(grid >= 0, up, down)
+    law = np.cumsum(density) / density.sum()
+    assert stats.kstest(sign * v / 2**29, lambda x: np.interp(x, grid, law)).pvalue > 1e-3
+    between = 1 / mu if r == np.inf else (np.tanh(r / 2) / mu if r else sigma**-2)
+    share = 3e4 / (3e4 + between)
+    assert abs((left > 0).mean() - share) < 4 * np.sqrt(share / 60_000)
+
+
+def test_nothing_moves_where_there_is_neither_drift_nor_noise():
+    v, left = start_voltage(np.array([0, 50], np.float32), VoltmeterConfig(k3=0, k4=0, k5=0, k6=0), np.uint64(1))
+    assert not v.any() and not left.any()
+
+
+def test_a_look_comes_before_float32_forgets():
+    """A million frames a second: the variance of one is lost beside the sum of many, unless that is spent in time."""
+    config = VoltmeterConfig(k1=1.0, k3=0.0, k4=0.0, k5=0.0, k6=1e-4, start="zero")
+    emulator = DvsVoltmeter(8, 128, config, seed=1)
+    frame, steps = np.full((8, 128), 0.4, np.float32), 70_000
+    for k in range(steps + 1):
+        emulator.step(frame, k * 1000)
+    assert emulator._unspent.max() < 2**16 * 1.01e-8
+    total = (emulator._v / 2**29).var() + emulator._unspent.mean()
+    assert abs(total / (steps * 1e-8) - 1) < 5 * np.sqrt(2 / 1024)
 
 
 @pytest.mark.parametrize("frame_ms", [1, 100])
@@ -135,7 +193,7 @@ def test_leak_rate_by_temperature_and_photocurrent(frame_ms):
 
 def test_effective_threshold():
     """About k1 events per unit of ln(L + k2)."""
-    emulator = DvsVoltmeter(20, 20, VoltmeterConfig(k4=0, k5=0), seed=1)
+    emulator = DvsVoltmeter(20, 20, VoltmeterConfig(k4=0, k5=0, start="zero"), seed=1)
     ramp = np.linspace(20, 200, 400)
     events = run(emulator, [np.full((20, 20), v / 255, np.float32) for v in ramp], np.arange(400) * MS)
     assert abs(len(events) / 400 - np.floor(5.265 * np.log(220 / 40))) < 0.2

@@ -16,6 +16,7 @@ from blinkgl.labels import LabelRequest
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry.meshes import transform_mesh
+from blinkgl.scene.geometry.primitives import figure as figure_of
 from blinkgl.scene.shapes.skeleton import Locals, Skeleton
 from blinkgl.scene.shapes.skin import Morphs, Skin
 from blinkgl.scene.shapes.table import deformer_of
@@ -179,7 +180,14 @@ def morphing(mesh):
     return replace(mesh, deformer=Skin(*given, morphs, after=skin.after, before=skin.before))
 
 
-FIGURES = {"skin": bar, "skin and morphs": lambda: morphing(bar())}
+def person():
+    """One that runs, its head up in the picture."""
+    return transform_mesh(
+        figure_of(clip="run", height=2.2), np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, -1.2], [0, 0, 0, 1]])
+    )
+
+
+FIGURES = {"skin": bar, "skin and morphs": lambda: morphing(bar()), "a person": person}
 
 
 @pytest.mark.parametrize("figure", FIGURES)

@@ -1,4 +1,5 @@
-"""Primitive solids with analytic normals and proper texture coordinates, centred on the origin, z up.
+"""Primitive bodies with analytic normals and proper texture coordinates, z up: solids, centred on the origin, and
+bodies that move by themselves.
 
 All but :func:`grid` are closed. Every function takes keyword parameters in the user's units and returns a
 :class:`~blinkgl.scene.types.Mesh` whose ``source_hash`` is a hash of the parameters. Texture coordinates run once round
@@ -19,21 +20,41 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from blinkgl.config.scene import PRIMITIVE_KINDS
+from blinkgl.config.deform import FlagConfig
+from blinkgl.config.scene import LIVING_KINDS, PRIMITIVE_KINDS
 from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.figure import body_of
 from blinkgl.scene.geometry.meshes import closedness, make_mesh, transform_mesh, weld
+from blinkgl.scene.shapes.closed_forms import Beat, Flag, Waves
+from blinkgl.scene.shapes.deformer import Deformer
+from blinkgl.scene.shapes.gait import CLIPS, PARENTS, Proportions, clip_of
+from blinkgl.scene.shapes.skeleton import Skeleton
+from blinkgl.scene.shapes.skin import Skin
 from blinkgl.scene.types import Mesh
 
 PARAMETERS = {
     "size": "edge length, m",
     "rounding": "radius of the rounded edges, parts of size, at most 0.5",
     "extents": "edge lengths in x, y, z, m",
-    "width": "edge in x, m",
+    "width": "edge in x, m; flag: from the pole to the free end",
     "depth": "edge in y, m",
     "radius": "m; prism, pyramid: of the circle through the polygon's corners; torus: from the axis to the "
     "middle of the tube",
     "tube": "radius of the tube, m, less than radius",
-    "height": "along z, m; capsule: of the cylinder between the two half spheres",
+    "height": "along z, m; capsule: of the cylinder between the two half spheres; figure: from the soles to the crown",
+    "length": "fish: from the nose to the end of the tail, m",
+    "deep": "fish: height of its body, parts of an average fish's",
+    "build": "figure: how thick it is, parts of an average body's, 0.7 to 1.4",
+    "legs": "figure: how long they are, parts of an average body's of this height, 0.7 to 1.4; likewise arms, head",
+    "arms": "figure: see legs",
+    "head": "figure: see legs",
+    "clip": "figure: what it does, one of " + ", ".join(CLIPS),
+    "variant": "figure: which of many dances, and how it walks, runs, stands, waves; 0 is the plain one",
+    "tempo": "1 is the natural one of a body of this size, 0.1 to 4; a figure that walks or runs, and a fish, also go "
+    "on faster",
+    "phase": "0 to 1, of a round, where it is at time 0",
+    "wind": "flag: 1 is a breeze, up to 4; more of it lifts the cloth higher, and faster",
+    "coat": "figure, flag, fish: which colours they wear where the object names no material",
     "segments": "faces round the z axis",
     "tube_segments": "faces round the tube",
     "rings": "rows of faces along z; cylinder, cone: rows of vertices",
@@ -43,8 +64,13 @@ PARAMETERS = {
 }
 """What the builders' parameters mean, for the documentation. Metres are world units, before the object's scale."""
 
-_LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1}
+_LEAST = {"segments": 3, "sides": 3, "tube_segments": 3, "rings": 2, "subdivisions": 1, "variant": 0, "coat": 0}
 _MAX_SEGMENTS = 4096
+_MOST = {"variant": 10**9, "coat": 10**9}
+_WORDS = {"clip": tuple(CLIPS)}
+_PART = (0.7, 1.4)
+_RANGES = {"figure.build": _PART, "figure.legs": _PART, "figure.arms": _PART, "figure.head": _PART, "fish.deep": _PART}
+_RANGES |= {"phase": (0.0, 1.0), "tempo": (0.1, 4.0), "wind": (0.1, 4.0)}
 
 
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -56,12 +82,11 @@ def parameter_hash(*parts: object) -> str:
     return hashlib.blake2b(repr(parts).encode(), digest_size=16).hexdigest()
 
 
-def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
+def _primitive(build: Callable[..., Surface | tuple[Surface, Deformer]]) -> Callable[..., Mesh]:
     """Checks the parameters, builds, and stamps name, hash and closedness."""
     signature = inspect.signature(build)
 
-    @wraps(build)
-    def made(**parameters: Any) -> Mesh:
+    def checked(**parameters: Any) -> inspect.BoundArguments:
         where = build.__name__
         unknown = set(parameters) - set(signature.parameters)
         if unknown:
@@ -75,9 +100,25 @@ def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
         bound.apply_defaults()
         for key, value in bound.arguments.items():
             default = signature.parameters[key].default
-            if isinstance(default, int):
-                low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MAX_SEGMENTS)
-                if float(value) != int(value) or not low <= value <= high:
+            within = _RANGES.get(f"{where}.{key}", _RANGES.get(key))
+            if isinstance(default, str):
+                if value not in _WORDS[key]:
+                    raise AssetError(
+                        f"no such {key}",
+                        where=f"{where}.{key}",
+                        value=value,
+                        accepted="one of " + ", ".join(_WORDS[key]),
+                    )
+            elif isinstance(value, str):
+                raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted="a number")
+            elif within is not None:
+                if np.shape(value) or not within[0] <= value <= within[1]:
+                    accepted = f"a number from {within[0]:g} to {within[1]:g}"
+                    raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
+                bound.arguments[key] = float(value)
+            elif isinstance(default, int):
+                low, high = (0, 7) if where == "icosphere" else (_LEAST[key], _MOST.get(key, _MAX_SEGMENTS))
+                if np.shape(value) or not low <= value <= high or float(value) != int(value):
                     raise AssetError(
                         "bad parameter",
                         where=f"{where}.{key}",
@@ -90,7 +131,13 @@ def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
                 raise AssetError("bad parameter", where=f"{where}.{key}", value=value, accepted=accepted)
             else:
                 bound.arguments[key] = tuple(map(float, value)) if np.shape(default) else float(value)
-        positions, normals, uvs, faces = build(**bound.arguments)
+        return bound
+
+    @wraps(build)
+    def made(**parameters: Any) -> Mesh:
+        where, bound = build.__name__, checked(**parameters)
+        built = build(**bound.arguments)
+        (positions, normals, uvs, faces), deformer = built if len(built) == 2 else (built, None)
         return Mesh(
             vertices=np.ascontiguousarray(positions, np.float64),
             faces=np.ascontiguousarray(faces, np.int32),
@@ -99,8 +146,10 @@ def _primitive(build: Callable[..., Surface]) -> Callable[..., Mesh]:
             closed=closedness(*weld(positions, faces))[0],
             name=where,
             source_hash=parameter_hash("primitive", 1, where, tuple(bound.arguments.items())),
+            deformer=deformer,
         )
 
+    made.checked = checked  # type: ignore[attr-defined]
     return made
 
 
@@ -375,12 +424,123 @@ def pyramid(sides: int = 4, radius: float = 0.5, height: float = 1.0) -> Surface
     return _join([*walls, _disc(radius, -height / 2, False, sides)])
 
 
+@_primitive
+def figure(
+    height: float = 1.75,
+    build: float = 1.0,
+    legs: float = 1.0,
+    arms: float = 1.0,
+    head: float = 1.0,
+    clip: str = "stand",
+    variant: int = 0,
+    tempo: float = 1.0,
+    phase: float = 0.0,
+    coat: int = 0,
+) -> tuple[Surface, Deformer]:
+    """A person on z = 0, looking along x: walks, runs, dances, waves or stands, on the spot (an object's `way` takes it
+    along). The texture is an atlas in which each part of the body has its place, in one scale all over."""
+    if height > 1000:
+        raise AssetError("bad parameter", where="figure.height", value=height, accepted="a number up to 1000")
+    proportions = Proportions(height, build, legs, arms, head)
+    body = body_of(proportions)
+    skeleton = Skeleton(PARENTS, clip_of(clip, proportions, tempo, phase, variant), where="figure")
+    skin = Skin(skeleton, range(len(PARENTS)), body.inverse_bind, body.joints, body.weights, where="figure")
+    return (body.vertices, body.normals, body.uvs, body.faces), skin
+
+
+@_primitive
+def flag(
+    width: float = 1.5,
+    height: float = 1.0,
+    wind: float = 1.0,
+    phase: float = 0.0,
+    subdivisions: int = 40,
+    coat: int = 0,
+) -> tuple[Surface, Deformer]:
+    """Cloth in wind, from its held edge at x = 0 along x, from z = 0 up, waving in y; the texture once on each side,
+    seen through from the other."""
+    thick = 0.004 * min(width, height)
+    rows = max(round(subdivisions * height / width), 1)
+    front = square((0, -thick, 0), (width, 0, 0), (0, 0, height), subdivisions, rows)
+    back = square((width, thick, 0), (-width, 0, 0), (0, 0, height), subdivisions, rows)
+    back[2][:, 0] = 1 - back[2][:, 0]
+    rim = [
+        square((0, thick, 0), (0, -2 * thick, 0), (0, 0, height), 1, rows),
+        square((width, -thick, 0), (0, 2 * thick, 0), (0, 0, height), 1, rows),
+        square((0, thick, 0), (width, 0, 0), (0, -2 * thick, 0), subdivisions, 1),
+        square((0, -thick, height), (width, 0, 0), (0, 2 * thick, 0), subdivisions, 1),
+    ]
+    beat = Beat(0.75 / wind**0.7, -2 * math.pi * phase)
+    config = FlagConfig(amplitude=0.1 * wind**0.3, period=beat.period, phase=360 * phase)
+    low, high = np.array([0, -thick, 0]), np.array([width, thick, height])
+    cloth = Flag.of(config, low, high)
+    cloth.goes = "level"
+    return _join([front, back, *rim]), cloth
+
+
+@_primitive
+def fish(
+    length: float = 0.3, deep: float = 1.0, tempo: float = 1.0, phase: float = 0.0, coat: int = 0
+) -> tuple[Surface, Deformer]:
+    """A fish that swims along x, its nose at x = length / 2: a wave runs down its body, larger towards the tail."""
+    rings, segments = 48, 28
+    s = (1 - np.cos(math.pi * np.arange(rings + 1) / rings)) / 2  # 0 the nose, 1 the end of the tail; finer at both
+    body = np.sqrt(np.clip(s / 0.78, 0, 1)) * np.clip(1 - (s / 0.80) ** 2.2, 0, 1) ** 0.8
+    tail = np.exp(-(((s - 0.97) / 0.085) ** 2)) * (s < 1)
+    fin = np.exp(-(((s - 0.40) / 0.13) ** 4))
+    stalk = 0.022 * (np.sin(math.pi * np.clip(s, 0, 1)) ** 0.3)
+    up = length * deep * (0.235 * body + 0.17 * tail + 0.07 * fin + stalk)
+    under = length * deep * (0.215 * body + 0.17 * tail + 0.05 * np.exp(-(((s - 0.55) / 0.06) ** 2)) + stalk)
+    wide = length * (0.105 * body + 0.010 * np.sin(math.pi * s) ** 0.5)
+    angle = 2 * math.pi * np.arange(segments + 1) / segments
+    # Fins are thin: what is higher than the body itself tapers off.
+    z = np.where(np.cos(angle) > 0, up[:, None], under[:, None]) * np.cos(angle)
+    core = length * deep * (0.225 * body + stalk)[:, None]
+    thin = np.clip((1 - np.clip(np.abs(z) / (core + 1e-9) - 0.25, 0, 1) ** 2), 0.06, 1)
+    y = -wide[:, None] * np.sin(angle) * thin
+    y[:, [0, segments // 2, -1]] = 0
+    notch = 0.10 * length * tail[:, None] * (np.abs(z) / (0.17 * length * deep) - 0.55)
+    x = length * (0.5 - s)[:, None] - notch
+    positions = np.stack([x, y, z], axis=2)
+    positions[[0, -1]] = positions[[0, -1]].mean(axis=1, keepdims=True)
+    faces = _lattice(segments, rings)[:, ::-1]  # rows go to the tail
+    flat = positions.reshape(-1, 3)
+    corners = flat[faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces, area = (a[np.linalg.norm(area, axis=1) > 1e-12 * length**2] for a in (faces, area))
+    uvs = np.stack(np.broadcast_arrays(angle / (2 * math.pi), s[:, None]), axis=2).reshape(-1, 2)
+    wave = -2 * math.pi / (0.95 * length) * np.array([1.0, 0, 0])
+    frequency = 1.9 * tempo * math.sqrt(0.3 / length)
+    beat = Beat(1 / frequency, -2 * math.pi * phase)
+    swim = Waves(
+        np.array([0, 1.0, 0]),
+        (np.array([-0.9 / length, 0, 0]), 0.55),
+        ((wave, 0.0), (np.zeros(3), 0.0)),
+        (0.085 * length, 0.0),
+        (beat, beat),
+    )
+    swim.goes, swim.speed = "level", 0.7 * 0.95 * length / (beat.period_ns * 1e-9)
+    return (flat, _smooth_normals(flat, faces, area), uvs, faces), swim
+
+
+def _smooth_normals(positions: np.ndarray, faces: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """(V, 3) means of the faces round each point, across seams of the texture, too."""
+    points, welded = weld(positions, faces)
+    total = np.zeros_like(points)
+    np.add.at(total, welded, area[:, None])
+    out = np.zeros_like(positions)
+    out[faces] = total[welded]
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.where(length > 0, out / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
+
+
 BUILDERS = {
-    f.__name__: f for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid, die)
+    f.__name__: f
+    for f in (cuboid, cylinder, sphere, icosphere, cone, torus, capsule, prism, pyramid, grid, die, figure, flag, fish)
 }
 
 
-def parameters(kind: str) -> dict[str, float | int | tuple[float, ...]]:
+def parameters(kind: str) -> dict[str, float | int | str | tuple[float, ...]]:
     """Names and defaults of a builder's parameters."""
     return {name: parameter.default for name, parameter in inspect.signature(BUILDERS[kind]).parameters.items()}
 
@@ -388,7 +548,7 @@ def parameters(kind: str) -> dict[str, float | int | tuple[float, ...]]:
 def random_primitive(kind: str, index: int) -> Mesh:
     """The ``index``-th body of a kind, about one unit large. No two have the same proportions, so that bodies of
     different indices may be told apart by a train/test split; ``source_hash`` is of (kind, index)."""
-    rng = np.random.default_rng([PRIMITIVE_KINDS.index(kind), index])
+    rng = np.random.default_rng([(PRIMITIVE_KINDS + LIVING_KINDS).index(kind), index])
 
     def between(low: float, high: float) -> float:
         # Log-uniform, and rounded: the last bit of exp differs between platforms.
@@ -410,6 +570,25 @@ def random_primitive(kind: str, index: int) -> Mesh:
         mesh = capsule(height=between(0.1, 1.2))
     elif kind == "prism":
         mesh = prism(sides=int(rng.integers(3, 9)), height=between(0.3, 3))
+    elif kind == "figure":
+        does = ("walk", "dance", "run", "dance", "walk", "wave")[index % 6]
+        grown, parts = between(1.2, 1.95), [between(0.9, 1.1) for _ in range(3)]
+        mesh = figure(
+            height=grown,
+            build=between(0.8, 1.3),
+            legs=parts[0],
+            arms=parts[1],
+            head=parts[2] * (1.75 / grown) ** 0.5,
+            clip=does,
+            variant=index,
+            tempo=between(0.85, 1.2),
+            phase=round(rng.uniform(), 6),
+            coat=index,
+        )
+    elif kind == "flag":
+        mesh = flag(height=between(0.5, 1.5), wind=between(0.5, 2), phase=round(rng.uniform(), 6), coat=index)
+    elif kind == "fish":
+        mesh = fish(deep=between(0.65, 1.5), tempo=between(0.7, 1.6), phase=round(rng.uniform(), 6), coat=index)
     else:
         mesh = pyramid(sides=int(rng.integers(3, 7)), height=between(0.5, 1.6))
     return replace(mesh, source_hash=random_primitive_hash(kind, index), name=f"{kind}-{index}")

@@ -269,7 +269,8 @@ class _Search:
             return False
         heights = _heights(b.planes, a, Ta)
         k = int(np.argmax(heights))
-        if not -self.rest_margin * a.radius <= heights[k] <= self._tol(a, b):
+        # What is padded for want of times that were looked at was put down without its padding.
+        if not -self.rest_margin * a.radius - a.pad <= heights[k] <= self._tol(a, b):
             return False
         self.resting[i, j] = b.planes[k : k + 1], min(float(heights[k]), 0.0)
         return True

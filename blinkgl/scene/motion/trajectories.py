@@ -124,7 +124,7 @@ def random_path(
     speed, rate = rng.uniform(*config.speed), math.radians(rng.uniform(*config.rotation_rate))
     if config.kind == "static" or still or (speed == 0 and rate == 0):
         return StaticPath(start, t0_ns, t1_ns)
-    times, positions = _waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=on_ground)
+    times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=on_ground)
     times, positions = _refined(times, positions, rate)
     turns = _random_turns(rng, config, rate, times, start[:3, :3].T[:, 2] if on_ground else None)
     return SplinePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
@@ -165,7 +165,7 @@ def random_camera_path(
     speed, rate = rng.uniform(*config.speed), math.radians(rng.uniform(*config.rotation_rate))
     if config.kind == "static" or (speed == 0 and rate == 0 and config.shake == 0):
         return StaticPath(start, t0_ns, t1_ns)
-    times, positions = _waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=False)
+    times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=False)
     times, positions = _refined(times, positions, rate)
     aims = np.array([look_at(int(t)) for t in times]) - positions
     turns = _camera_turns(rng, config, rate, times, start[:3, :3], aims)
@@ -211,7 +211,17 @@ def _turned(rng, config: MotionConfig, last: np.ndarray | None, flat: bool) -> n
     return v / n if n > 1e-9 else np.array([1.0, 0.0, 0.0])
 
 
-def _waypoints(rng, t0_ns, t1_ns, config, space, radius, start, speed, flat):
+def waypoints(
+    rng: np.random.Generator,
+    t0_ns: int,
+    t1_ns: int,
+    config: MotionConfig,
+    space: FreeSpace,
+    radius: float,
+    start: np.ndarray,
+    speed: float,
+    flat: bool,
+) -> tuple[np.ndarray, np.ndarray]:
     """Times (K,) int64 and positions (K, 3), K >= 2, of a walk whose mean speed over [t0, t1] is ``speed``."""
     duration = (t1_ns - t0_ns) * 1e-9
     if duration <= 0:

@@ -58,8 +58,9 @@ def _dot(points: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 class Waves(Deformer):
-    """Two plane waves along one direction. direction : (3,).   envelope : ((3,), float): e(p) = e . p + e0.
-    numbers : ((3,) rad per unit, phase rad) of both waves.   amplitudes : units."""
+    """Two plane waves along one direction. direction : (3,) where amplitudes of 1 lead.
+    envelope : ((3,), float): e(p) = e . p + e0.   numbers : ((3,) rad per unit, phase rad) of both waves.
+    amplitudes : units."""
 
     glsl = "waves"
     rows = 5  # type: ignore[assignment]
@@ -94,7 +95,9 @@ class Waves(Deformer):
             return vector @ inverse, constant - float(vector @ inverse @ shift)
 
         first, second = (form(*wave) for wave in self.waves)
-        return type(self)(linear @ self.direction, form(*self.envelope), (first, second), self.amplitudes, self.beats)
+        out = type(self)(linear @ self.direction, form(*self.envelope), (first, second), self.amplitudes, self.beats)
+        out.goes, out.speed = self.goes, self.speed * float(np.linalg.norm(linear[:, 0]))
+        return out
 
     def _terms(self, mesh: Mesh, t_ns: int):
         """(amplitude, wave vector, angles (V,), rate) of both waves."""

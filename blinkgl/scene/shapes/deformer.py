@@ -16,7 +16,7 @@ Everything here is pure data in float64; what the vertex stage computes from the
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -51,6 +51,9 @@ class Deformer(ABC):
 
     examples : ``sizes`` of the variants that ``blinkgl shader check`` compiles.
 
+    goes : which way up a body is, and which way it goes: "anyhow"; "upright" on the ground, "level" above it, both
+    along its x axis.   speed : units/s that the shape goes with, as steps do; 0: it may stay where it is.
+
     Config : the model of ``deform:`` that asks for it; None: none does.   period_ns : after which the shape repeats;
     None: it does not.   span_ns : from time 0 on after so long nothing new comes."""
 
@@ -63,6 +66,8 @@ class Deformer(ABC):
     sizes: Mapping[str, int] = {}
     period_ns: int | None = None
     span_ns: int = 0
+    goes: str = "anyhow"
+    speed: float = 0.0
     examples: ClassVar[tuple[Mapping[str, int], ...]] = ({},)
 
     @classmethod
@@ -231,3 +236,11 @@ def all_rigid(scene: Scene, who: str) -> None:
 def normals_at(mesh: Mesh, t_ns: int) -> np.ndarray:
     """(V, 3) normals at t, object frame; of a mesh that deforms not normalised."""
     return mesh.normals if mesh.deformer is None else mesh.deformer.normals(mesh, t_ns)
+
+
+def gait(meshes: Iterable[Mesh]) -> tuple[str, float]:
+    """(which way they go, units/s that they go with) of the meshes of one object: that of the first that says any."""
+    for mesh in meshes:
+        if mesh.deformer is not None and mesh.deformer.goes != "anyhow":
+            return mesh.deformer.goes, mesh.deformer.speed
+    return "anyhow", 0.0

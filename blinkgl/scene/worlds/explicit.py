@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.camera import CameraModel
 from blinkgl.config.deform import AnimationConfig, animation_of
 from blinkgl.config.scene import (
+    LIVING_KINDS,
     ExplicitSceneConfig,
     KeyedMotionConfig,
     MaterialConfig,
@@ -28,8 +31,11 @@ from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.motion.trajectories import look_rotation
+from blinkgl.scene.motion.ways import way_path
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
+from blinkgl.scene.shapes.deformer import gait
+from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
@@ -94,9 +100,14 @@ def explicit_scene(
                     "an object deforms by one thing", where=f"{where}.deform", accepted="deform or animation"
                 )
             parts = list(deforming(parts, item.deform))
-        objects.append(
-            SceneObject(names[k], k + 1, tuple(parts), motion_path(item, t0_ns, t1_ns, where), item.category)
-        )
+        way = item.way
+        if way is None:
+            path = motion_path(item, t0_ns, t1_ns, where)
+        else:
+            speed = way.speed or gait(part.mesh for part in parts)[1] or 1.0
+            form = {"closed": way.closed, "level": way.level, "start": way.start}
+            path = way_path(way.points, speed, t0_ns, t1_ns, **form, where=f"{where}.way")
+        objects.append(SceneObject(names[k], k + 1, tuple(parts), path, item.category))
     path = motion_path(config.camera, t0_ns, t1_ns, "scene.camera", camera=True)
     bodies = {name: item.physics for name, item in zip(names, config.objects) if item.physics is not None}
     if config.collisions:
@@ -165,8 +176,21 @@ def pose_matrix(config: PoseConfig, camera: bool = False) -> np.ndarray:
 
 def primitive_mesh(config: MeshConfig, name: str) -> Mesh:
     """The primitive that ``scene.meshes.name`` asks for. Raises ConfigError for a bad parameter."""
-    try:
+    with _parameters_of(name):
         return BUILDERS[config.primitive](**config.parameters)
+
+
+def check_primitive(kind: str, parameters: Mapping[str, Any], name: str) -> None:
+    """Raises ConfigError for what :func:`primitive_mesh` would refuse; of living things, whose parameters have nothing
+    to do with each other, without making one."""
+    with _parameters_of(name):
+        (BUILDERS[kind].checked if kind in LIVING_KINDS else BUILDERS[kind])(**parameters)
+
+
+@contextmanager
+def _parameters_of(name: str) -> Iterator[None]:
+    try:
+        yield
     except AssetError as error:
         key = (error.where or "").partition(".")[2]
         raise ConfigError(
@@ -193,7 +217,9 @@ def _asset(
         )
     if name in memory or config.primitive is not None:
         mesh = memory[name] if name in memory else primitive_mesh(config, name)
-        return Asset(name, mesh.source_hash, (Part(mesh, Material()),))
+        wears = own_materials and name not in memory and config.primitive in COATS
+        material = Material(coat(config.primitive, config.parameters.get("coat", 0))) if wears else Material()
+        return Asset(name, mesh.source_hash, (Part(mesh, material),))
     where = f"scene.meshes.{name}"
     path = resolve(config.file, base)
     if not path.is_file():

@@ -21,6 +21,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.primitives import random_primitive, random_primitive_hash
 from blinkgl.scene.importing.mesh_files import MESH_SUFFIXES, Asset, dependencies, load_asset
 from blinkgl.scene.reading import MAX_BYTES, contents
+from blinkgl.scene.surfaces.coats import COATS, coat
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, content_hash, decode_image, photographs
 from blinkgl.scene.surfaces.textures import procedural_hash, procedural_texture
 from blinkgl.scene.types import Material, Part, Texture
@@ -161,9 +162,10 @@ def object_pool(config: PoolConfig, base: Path, where: str = "scene.pool", max_t
 
     def load(entry: Entry) -> Asset:
         if entry.file is None:
-            return Asset(
-                entry.name, entry.source_hash, (Part(random_primitive(entry.kind, entry.index), Material()),)
-            ).normalised()
+            wears = config.keep_materials and entry.kind in COATS
+            material = Material(coat(entry.kind, entry.index)) if wears else Material()
+            part = Part(random_primitive(entry.kind, entry.index), material)
+            return Asset(entry.name, entry.source_hash, (part,), wears).normalised()
         asset = load_asset(
             entry.file,
             max_faces=config.max_faces,

@@ -7,6 +7,7 @@ joined by splines; whoever collides stops. The world is z up, in metres, ground 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -27,12 +28,13 @@ from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
 from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.motion.collision import resolve_collisions
-from blinkgl.scene.motion.dynamics import Exploded, Side, simulate
+from blinkgl.scene.motion.dynamics import Barrier, Exploded, simulate
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
+from blinkgl.scene.motion.ways import random_way
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
-from blinkgl.scene.shapes.deformer import filled
+from blinkgl.scene.shapes.deformer import filled, gait
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
 from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
@@ -97,7 +99,9 @@ def random_world(
     low, high = np.array([-half, -half, floor]), np.array([half, half, floor + config.region.height])
     ground_z = floor if config.ground else None
 
-    bodies = _bodies(config.physics, [name for name, *_ in placed], generator(seed, sequence, Role.PHYSICS))
+    # What goes by itself is not thrown.
+    lifeless = [name for name, parts, *_ in placed if _gait(parts)[0] == "anyhow"]
+    bodies = _bodies(config.physics, lifeless, generator(seed, sequence, Role.PHYSICS))
     items = list(backdrop)
     for k, (name, parts, T, radius, resting) in enumerate(placed):
         if name in bodies:
@@ -111,7 +115,14 @@ def random_world(
             np.vstack([centres[others], T_cam[:3, 3]]),
             np.append(radii[others], clearance + _STAND_OFF),
         )
-        path = random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=resting)
+        goes, speed = _gait(parts)
+        if goes == "anyhow" or (goes == "level" and speed == 0):
+            turns = resting or goes == "level"
+            path = random_path(rng_motion, t0_ns, t1_ns, config.object_motion, space, radius, T, on_ground=turns)
+        elif speed == 0 or config.object_motion.kind == "static":
+            path = StaticPath(T, t0_ns, t1_ns)
+        else:
+            path = random_way(rng_motion, t0_ns, t1_ns, space, radius, T, speed, flat=goes == "upright")
         items.append((name, "object", parts, path))
     scene_objects = tuple(
         SceneObject(name, k + 1, parts, motion, category) for k, (name, category, parts, motion) in enumerate(items)
@@ -198,7 +209,12 @@ def _place(config, camera, objects: Pool, textures: Pool, dice, split, T_cam, cl
         asset, said = _playing(objects.draw(rng, split, log), config, rng_shape)
         radius = 0.5 * _log_uniform(rng, (settings.size[0], min(settings.size[1], region.height)))
         resting = config.ground is not None and rng.random() >= settings.flying
-        rotation = _rotation(rng, resting)
+        goes, _ = _gait(asset.parts)
+        if goes == "anyhow":
+            rotation = _rotation(rng, resting)
+        else:
+            resting = goes == "upright" and config.ground is not None
+            rotation = Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * math.pi)]).as_matrix()
         changed, word = _changing(asset, settings.deform, rng_shape)
         parts = _dress(config, changed, radius, textures, rng_texture, split, log)
         lowest = min(_lowest(p.mesh, rotation[2]) for p in parts)
@@ -262,7 +278,8 @@ def _lowest(mesh: Mesh, up: np.ndarray) -> float:
     if mesh.deformer is None:
         return float((mesh.vertices @ up).min())
     points, margin = filled(mesh)
-    return float((points @ up).min()) - margin
+    # A figure's feet are on the ground, and not as far above it as they might be below between two times.
+    return float((points @ up).min()) - (0.0 if mesh.deformer.goes == "upright" else margin)
 
 
 def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarray:
@@ -276,6 +293,10 @@ def _candidate(config, camera, rng, T_cam, floor, in_view, resting) -> np.ndarra
     if resting:
         ray[2] = 0.0
     return T_cam[:3, 3] + ray / np.linalg.norm(ray) * _log_uniform(rng, config.objects.distance)
+
+
+def _gait(parts: Iterable[Part]) -> tuple[str, float]:
+    return gait(part.mesh for part in parts)
 
 
 def _rotation(rng, resting: bool) -> np.ndarray:
@@ -333,14 +354,14 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
     return found
 
 
-def _sides(config: RandomSceneConfig, floor: float) -> list[Side]:
+def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
     """Of the region, as far out as walls stand, so that no object is in one; its floor where there is no ground."""
     reach = 0.5 * config.objects.size[1] + _GAP
     out = config.region.width / 2 + reach
-    sides = [Side((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
-    sides.append(Side((0.0, 0.0, -1.0), -(floor + config.region.height + reach)))
+    sides = [Barrier((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
+    sides.append(Barrier((0.0, 0.0, -1.0), -(floor + config.region.height + reach)))
     if config.ground is None:
-        sides.append(Side((0.0, 0.0, 1.0), floor - reach))
+        sides.append(Barrier((0.0, 0.0, 1.0), floor - reach))
     return sides
 
 

@@ -241,7 +241,7 @@ def message(make):
             {"pool": {"primitives": ["cube"]}},
             (
                 "scene.pool.primitives: must be all or a list of cuboid, cylinder, sphere, icosphere, cone, torus, "
-                "capsule, prism, pyramid (got ['cube'])"
+                "capsule, prism, pyramid, figure, flag, fish (got ['cube'])"
             ),
         ),
         ({"pool": {"urdfs": "maybe"}}, "scene.pool.urdfs: must be auto, true, false (got 'maybe')"),

@@ -1,0 +1,286 @@
+"""The body of a figure: one watertight skin round a skeleton's capsules, with weights and texture coordinates.
+
+Each bone has capsules; where they meet they are blended, and a vertex follows the bones it is near, so that joints
+bend smoothly. Texture coordinates are an atlas: each part of the body lies in a rectangle of its own
+(:data:`CHARTS`), once round it from left to right, from its upper end down, in one scale all over, so that any pattern
+looks as cloth; the seams are behind, under the soles and at the palms.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_matrix
+
+from blinkgl.scene.geometry.isosurface import isosurface
+from blinkgl.scene.shapes.gait import JOINTS, PARENTS, J, Proportions
+from blinkgl.scene.shapes.skeleton import Locals, Skeleton, Still
+
+ATLAS = 1.5
+"""m of an average body that the texture covers in either direction."""
+
+
+class Chart(NamedTuple):
+    """A part of the body in the texture, in m of the atlas: left and upper edge, once round, length."""
+
+    left: float
+    top: float
+    around: float
+    length: float
+
+
+CHARTS = {
+    "torso": Chart(0.0, 0.0, 0.95, 0.66),
+    "upper_arm": Chart(1.0, 0.0, 0.34, 0.33),
+    "forearm": Chart(1.0, 0.35, 0.27, 0.31),
+    "thigh": Chart(0.0, 0.68, 0.54, 0.48),
+    "shank": Chart(0.56, 0.68, 0.40, 0.48),
+    "hand": Chart(1.0, 0.68, 0.23, 0.20),
+    "head": Chart(0.0, 1.18, 0.60, 0.32),
+    "foot": Chart(0.64, 1.18, 0.30, 0.30),
+}
+_MARGIN = 0.03  # m above and below each chart that belong to it
+_CHART_OF = {
+    "pelvis": "torso", "spine": "torso", "chest": "torso", "clavicle": "torso", "neck": "head", "head": "head",
+    "arm": "upper_arm", "forearm": "forearm", "hand": "hand", "thigh": "thigh", "shank": "shank", "foot": "foot",
+    "toes": "foot",
+}  # fmt: skip
+_STEP = 0.026  # m of an average body: about 4,000 vertices
+_BLEND = 0.014
+_SOFT = 0.022  # m over which the weights of neighbouring bones change
+_BIND = {"arm_l": 42.0, "arm_r": -42.0, "thigh_l": 4.0, "thigh_r": -4.0, "foot_l": -4.0, "foot_r": 4.0}
+"""Degrees about x in which limbs are bound: away from each other."""
+
+
+class Body(NamedTuple):
+    """vertices, normals : (V, 3).   faces : (F, 3).   uvs : (V, 2).   joints, weights : (V, 4).
+    inverse_bind : (21, 4, 4)."""
+
+    vertices: np.ndarray
+    normals: np.ndarray
+    uvs: np.ndarray
+    faces: np.ndarray
+    joints: np.ndarray
+    weights: np.ndarray
+    inverse_bind: np.ndarray
+
+
+class _Piece(NamedTuple):
+    """A capsule from a to b with radii at both ends, ``flat`` times as thick along x and y of the body."""
+
+    bone: int
+    a: np.ndarray
+    b: np.ndarray
+    radii: tuple[float, float]
+    flat: tuple[float, float]
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        scale = 1 / np.array([*self.flat, 1.0])
+        along, p = (self.b - self.a) * scale, (points - self.a) * scale
+        t = np.clip(p @ along / max(along @ along, 1e-12), 0, 1)
+        radius = self.radii[0] + (self.radii[1] - self.radii[0]) * t
+        return (np.linalg.norm(p - t[:, None] * along, axis=1) - radius) * min(*self.flat, 1.0)
+
+
+@lru_cache(maxsize=64)
+def body_of(body: Proportions) -> Body:
+    """The skin of a body, bound with its limbs apart, its soles on z = 0: the average one, each bone made longer and
+    thicker. Not to be written to."""
+    points, normals, faces, uvs, joints, weights = _average()
+    bind, shape = _bind(body), _shape(body)
+    turns = bind[:, :3, :3]
+    shape = turns * shape[:, None] @ turns.transpose(0, 2, 1)
+    local = points[:, None] - _bind(Proportions())[joints, :3, 3]
+    placed = (shape[joints] @ local[..., None])[..., 0] + bind[joints, :3, 3]
+    vertices = (weights[..., None] * placed).sum(axis=1)
+    outward = (weights[..., None] * (np.linalg.inv(shape)[joints] @ normals[:, None, :, None])[..., 0]).sum(axis=1)
+    floor = bind[J["foot_l"], 2, 3] - body.ankle
+    vertices[:, 2] -= floor
+    bind[:, 2, 3] -= floor
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    made = Body(vertices, outward, uvs, faces, joints, weights, np.linalg.inv(bind))
+    for array in made:
+        array.setflags(write=False)
+    return made
+
+
+def _shape(body: Proportions) -> np.ndarray:
+    """(21, 3): how many times an average body's size each bone is, in its own frame: z along it, but for the feet."""
+    out = np.full((len(JOINTS), 3), body.unit)
+    for number, name in enumerate(JOINTS):
+        bone = name.partition("_")[0]
+        if bone == "head":
+            out[number] *= body.head
+        elif bone == "neck":
+            out[number] *= [0.8 + 0.2 * body.build] * 2 + [body.head]
+        elif bone in ("foot", "toes", "hand"):
+            out[number, 2] *= body.arms if bone == "hand" else body.legs
+        else:
+            length = body.arms if "arm" in bone else body.legs if bone in ("thigh", "shank") else 1.0
+            out[number] *= [body.build, body.build, length]
+    return out
+
+
+@lru_cache(maxsize=1)
+def _average() -> tuple[np.ndarray, ...]:
+    """Of an average body, as bound, the pelvis where its joints say: (V, 3) points, (V, 3) normals, (F, 3) faces,
+    (V, 2) texture coordinates, (V, 4) joints and their weights. Vertices are split where the texture has a seam."""
+    body = Proportions()
+    bind = _bind(body)
+    pieces = _pieces(body, bind)
+    floor = bind[J["foot_l"], 2, 3] - body.ankle
+
+    def distance(points: np.ndarray) -> np.ndarray:
+        """Of the blend of all, cut off below the soles."""
+        near = np.stack([p.distance(points) for p in pieces])
+        least = near.min(axis=0)
+        blend = least - _BLEND * np.log(np.exp(-np.maximum(near - least, 0) / _BLEND).sum(axis=0))
+        return np.maximum(blend, floor - points[:, 2])
+
+    ends = np.concatenate([[p.a, p.b] for p in pieces])
+    low, high = ends.min(axis=0) - 0.2, ends.max(axis=0) + 0.2
+    low[2] = floor - 2.4 * _STEP
+    points, faces, normals = isosurface(distance, low, high, _STEP)
+    weights = _weights(points, faces, pieces)
+    uvs = _unwrapped(points, faces, normals, weights, bind)
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    four = np.take_along_axis(weights, order, 1)
+    corners = np.concatenate([faces.reshape(-1, 1), np.round(uvs.reshape(-1, 2) * 1e6).astype(np.int64)], axis=1)
+    _, first, index = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+    old = faces.reshape(-1)[first]
+    return (
+        points[old],
+        normals[old],
+        index.reshape(-1, 3).astype(np.int32),
+        uvs.reshape(-1, 2)[first],
+        order[old],
+        (four / four.sum(axis=1, keepdims=True))[old],
+    )
+
+
+def _bind(body: Proportions) -> np.ndarray:
+    """(21, 4, 4) of the joints as they are bound."""
+    rest = Locals.rest(len(JOINTS))
+    rest.translation[:] = body.offsets
+    for name, degrees in _BIND.items():
+        half = math.radians(degrees) / 2
+        rest.rotation[J[name]] = [math.sin(half), 0, 0, math.cos(half)]
+    return Skeleton(PARENTS, Still(rest)).at(0)[0]
+
+
+def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
+    """The capsules of an average body's bones. Places are m in the joint's frame."""
+    made = []
+
+    def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0)) -> None:
+        T = bind[J[joint]]
+        made.append(_Piece(J[joint], *(T[:3, :3] @ np.array(p) + T[:3, 3] for p in (a, b)), (r0, r1), flat))
+
+    add("pelvis", (-0.005, 0, -0.055), (0, 0, 0.04), 0.118, 0.112, (0.92, 1.30))
+    add("pelvis", (-0.045, 0.06, -0.06), (-0.045, -0.06, -0.06), 0.083, 0.083)
+    add("spine", (0.0, 0, 0), (0.002, 0, 0.12), 0.106, 0.112, (0.88, 1.22))
+    add("chest", (0.0, 0, 0.02), (-0.005, 0, 0.15), 0.120, 0.108, (0.90, 1.40))
+    add("neck", (-0.005, 0, -0.02), (0.01, 0, 0.09), 0.056, 0.052)
+    add("head", (0.012, 0, 0.085), (0.002, 0, 0.115), 0.082, 0.095, (1.08, 0.84))
+    add("head", (0.035, 0, 0.012), (0.03, 0, 0.07), 0.048, 0.062, (1.0, 0.92))
+    add("head", (0.10, 0, 0.055), (0.09, 0, 0.085), 0.014, 0.008)  # a nose
+    for side, sign in (("l", 1.0), ("r", -1.0)):
+        sole = body.ankle
+        add("head", (0.0, sign * 0.078, 0.06), (-0.006, sign * 0.082, 0.085), 0.016, 0.018, (1, 0.6))
+        add(f"clavicle_{side}", (-0.005, 0, -0.035), (-0.005, sign * 0.12, -0.02), 0.066, 0.060)
+        add(f"arm_{side}", (-0.004, 0, -0.005), (0, 0, -0.27), 0.060, 0.043)
+        add(f"forearm_{side}", (0, 0, -0.005), (0, 0, -0.23), 0.042, 0.029)
+        add(f"hand_{side}", (0, 0, -0.02), (0.004, 0, -0.085), 0.029, 0.033, (1.25, 0.62))
+        add(f"hand_{side}", (0.006, 0, -0.09), (0.002, 0, -0.155), 0.030, 0.022, (1.2, 0.5))
+        add(f"hand_{side}", (0.02, 0, -0.03), (0.05, 0, -0.085), 0.015, 0.012)  # a thumb
+        add(f"thigh_{side}", (0.0, 0, -0.02), (0.004, 0, -0.40), 0.089, 0.057)
+        add(f"shank_{side}", (0.002, 0, 0), (0, 0, -0.38), 0.055, 0.037)
+        add(f"shank_{side}", (-0.018, 0, -0.09), (-0.014, 0, -0.18), 0.047, 0.040)  # a calf
+        add(f"foot_{side}", (-0.018, 0, 0.037 - sole), (0.07, 0, 0.039 - sole), 0.042, 0.043, (1, 0.92))
+        add(f"foot_{side}", (0, 0, -0.01), (0.03, 0, 0.042 - sole), 0.040, 0.043, (1, 0.92))
+        add(f"foot_{side}", (0.04, 0, 0.037 - sole), (0.125, 0, 0.028 - sole), 0.041, 0.034, (1, 1.15))
+        add(f"toes_{side}", (0.005, 0, 0.008), (0.045, 0, 0.004), 0.032, 0.027, (1, 1.35))
+    return made
+
+
+def _weights(points: np.ndarray, faces: np.ndarray, pieces: list[_Piece]) -> np.ndarray:
+    """(V, 21): the nearer a bone, the larger; of bones that are no further than two joints from the nearest one."""
+    far = np.full((len(points), len(JOINTS)), np.inf)
+    for piece in pieces:
+        far[:, piece.bone] = np.minimum(far[:, piece.bone], piece.distance(points))
+    near = np.zeros((len(JOINTS), len(JOINTS)), bool)
+    for joint, parent in enumerate(PARENTS):
+        near[joint, joint] = True
+        if parent >= 0:
+            near[joint, parent] = near[parent, joint] = True
+    near = near.astype(int) @ near.astype(int) > 0
+    least = far.argmin(axis=1)
+    weights = np.exp(-(far - far.min(axis=1, keepdims=True)) / _SOFT) * near[least]
+    weights[weights < 0.02] = 0
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    links = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(points),) * 2).tocsr()
+    links = links.multiply(1 / np.maximum(links.sum(axis=1), 1))
+    for _ in range(3):
+        weights = weights / weights.sum(axis=1, keepdims=True)
+        weights = 0.5 * weights + 0.5 * (links @ weights)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+_AXES = {  # chart: (joint, its upper and its lower end in m of an average body, what is in the middle of the chart)
+    "torso": ("spine", (0, 0, 0.42), (0, 0, -0.20), (1, 0, 0)),
+    "head": ("head", (0.01, 0, 0.21), (0.01, 0, -0.09), (1, 0, 0)),
+    "upper_arm": ("arm", (0, 0, 0.02), (0, 0, -0.29), (0, 1, 0)),
+    "forearm": ("forearm", (0, 0, 0.0), (0, 0, -0.25), (0, 1, 0)),
+    "hand": ("hand", (0, 0, 0.0), (0, 0, -0.17), (0, 1, 0)),
+    "thigh": ("thigh", (0, 0, 0.0), (0, 0, -0.43), (1, 0, 0)),
+    "shank": ("shank", (0, 0, 0.0), (0, 0, -0.41), (1, 0, 0)),
+    "foot": ("foot", (0.20, 0, -0.05), (-0.055, 0, -0.05), (0, 0, 1)),
+}
+
+
+def _unwrapped(
+    points: np.ndarray, faces: np.ndarray, normals: np.ndarray, weights: np.ndarray, bind: np.ndarray
+) -> np.ndarray:
+    """(F, 3, 2) texture coordinates of the corners of an average body's faces."""
+    names = list(CHARTS)
+    share = np.zeros((len(points), 2 * len(names)))  # left and right
+    for joint, name in enumerate(JOINTS):
+        bone, _, side = name.partition("_")
+        share[:, 2 * names.index(_CHART_OF[bone]) + (side == "r")] += weights[:, joint]
+    chart = share[faces].sum(axis=1).argmax(axis=1)
+    uvs = np.empty((len(faces), 3, 2))
+    for number, name in enumerate(names):
+        joint, top, bottom, middle = _AXES[name]
+        area = CHARTS[name]
+        for right in (0, 1):
+            here = chart == 2 * number + right
+            if not here.any():
+                continue
+            paired = f"{joint}_l" in J
+            T = bind[J[f"{joint}_{'lr'[right]}" if paired else joint]]
+            local = (points[faces[here]] - T[:3, 3]) @ T[:3, :3]
+            outward = normals[faces[here]] @ T[:3, :3]
+            top_, bottom_, ahead = (np.array(v, float) for v in (top, bottom, middle))
+            mirror = paired and right
+            if mirror:
+                local, outward, ahead = (v * [1, -1, 1] for v in (local, outward, ahead))
+                ahead = np.array(middle, float)
+            down = (bottom_ - top_) / np.linalg.norm(bottom_ - top_)
+            across = np.cross(down, ahead)
+            p = local - top_
+            # Caps: the direction of the surface says more of what is round than the place does.
+            q = p + 0.03 * outward
+            angle = np.arctan2(q @ across, q @ ahead) / (2 * math.pi)
+            first = angle[:, :1]
+            angle = first + (angle - first + 0.5) % 1.0 - 0.5
+            if mirror:
+                angle = -angle
+            length = np.linalg.norm(bottom_ - top_)
+            inner = area.length - 2 * _MARGIN
+            below = np.clip(p @ down / length * inner + _MARGIN, 0.0, area.length)
+            uvs[here, :, 0] = (area.left + area.around * (0.5 + angle)) / ATLAS
+            uvs[here, :, 1] = (area.top + below) / ATLAS
+    return uvs

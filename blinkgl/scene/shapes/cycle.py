@@ -1,0 +1,100 @@
+"""Motions that go round: every joint's angles, and the root's place, are sums of a few sines of one phase.
+
+    angle(t) = a_0 + sum_k a_k cos(k phi) + b_k sin(k phi),     phi(t) = 2 pi (t / period + phase)
+
+A loop has no seam and a rate of its own, exactly. What a figure does (:mod:`~blinkgl.scene.shapes.gait`) is made at
+some phases and put into this form once, by the fast Fourier transform.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from blinkgl.scene.shapes.skeleton import Locals
+
+HARMONICS = 12
+"""k of the fastest sine, per round."""
+
+
+class Cycle:
+    """A motion of n joints, of :class:`~blinkgl.scene.shapes.skeleton.Skeleton`.
+
+    offsets : (n, 3) of each joint in its parent's frame.   angles : (N, n, 3) rad at N equal steps of one round, about
+    x, then the turned y, then the twice turned z.   root : (N, 3) what the first joint is moved by, units.
+    period : s of one round.   phase : rounds at time 0.   speed : units/s of the body along its x axis that the motion
+    goes with, 0: it stays where it is.   N has to be more than twice ``HARMONICS``."""
+
+    is_static = False
+    goes = "upright"
+
+    def __init__(
+        self,
+        offsets: np.ndarray,
+        angles: np.ndarray,
+        root: np.ndarray,
+        period: float,
+        phase: float = 0.0,
+        speed: float = 0.0,
+    ):
+        self.period_ns = self.span_ns = max(round(period * 1e9), 1)
+        self.phase, self.speed = phase, speed
+        count = len(angles)
+        values = np.concatenate([root[:, None], angles], axis=1)  # the root's place is row 0
+        spectrum = np.fft.rfft(values, axis=0)[: HARMONICS + 1] / count
+        spectrum[1:] *= 2
+        self._cosines = np.ascontiguousarray(spectrum.real)
+        self._sines = np.ascontiguousarray(-spectrum.imag)
+        self._offsets = np.ascontiguousarray(offsets, np.float64)
+
+    def locals(self, t_ns: int) -> Locals:
+        out = Locals.rest(len(self._offsets))
+        rounds = (int(t_ns) % self.period_ns) / self.period_ns + self.phase
+        rate = 2e9 * np.pi / self.period_ns
+        _evaluate(2 * np.pi * rounds, rate, self._cosines, self._sines, self._offsets, out[0], out[1], out[3], out[4])
+        return out
+
+
+@njit(cache=True, nogil=True)
+def _evaluate(phi, rate, cosines, sines, offsets, T, R, dT, dR):
+    """Writes the joints' places and turns at a phase, and their rates, where phi grows by ``rate`` per second."""
+    rows = cosines.shape[1]
+    value, change = cosines[0].copy(), np.zeros((rows, 3))
+    for k in range(1, len(cosines)):
+        c, s = np.cos(k * phi), np.sin(k * phi)
+        for i in range(rows):
+            for j in range(3):
+                a, b = cosines[k, i, j], sines[k, i, j]
+                value[i, j] += a * c + b * s
+                change[i, j] += rate * k * (b * c - a * s)
+    for i in range(rows - 1):
+        for j in range(3):
+            T[i, j], dT[i, j] = offsets[i, j], 0.0
+    for j in range(3):
+        T[0, j] += value[0, j]
+        dT[0, j] = change[0, j]
+    q, d, turn, turning, p, e = np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4), np.zeros(4)
+    for i in range(1, rows):
+        q[:], d[:] = 0.0, 0.0
+        q[3] = 1.0
+        for axis in range(3):
+            half, half_rate = 0.5 * value[i, axis], 0.5 * change[i, axis]
+            turn[:], turning[:] = 0.0, 0.0
+            turn[axis], turn[3] = np.sin(half), np.cos(half)
+            turning[axis], turning[3] = half_rate * turn[3], -half_rate * turn[axis]
+            _product(q, turning, e)
+            _product(d, turn, p)
+            for k in range(4):
+                d[k] = e[k] + p[k]
+            _product(q, turn, p)
+            q[:] = p
+        R[i - 1], dR[i - 1] = q, d
+
+
+@njit(cache=True, nogil=True)
+def _product(a, b, out):
+    """Of quaternions x, y, z, w."""
+    out[0] = a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1]
+    out[1] = a[3] * b[1] - a[0] * b[2] + a[1] * b[3] + a[2] * b[0]
+    out[2] = a[3] * b[2] + a[0] * b[1] - a[1] * b[0] + a[2] * b[3]
+    out[3] = a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2]

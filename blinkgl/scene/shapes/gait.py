@@ -1,0 +1,401 @@
+"""What a figure does: stand, walk, run, dance, wave, as angles of its joints over one round.
+
+The pelvis and the feet are told where to be, the legs follow by the law of cosines; the rest is said in angles. In
+``walk`` and ``run`` a foot on the ground goes back, as seen from the body, exactly as fast as the body goes on, first
+on its heel, then flat, then on its ball: it does not slide but for what :mod:`~blinkgl.scene.shapes.cycle` leaves out
+of it. Angles: about x (to the side), y (positive: a leg or an arm goes back, a trunk leans on), z; all zero is a body
+that stands with its arms down. x is forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from blinkgl.scene.shapes.cycle import Cycle
+
+JOINTS = (
+    "pelvis", "spine", "chest", "neck", "head",
+    "clavicle_l", "arm_l", "forearm_l", "hand_l", "clavicle_r", "arm_r", "forearm_r", "hand_r",
+    "thigh_l", "shank_l", "foot_l", "toes_l", "thigh_r", "shank_r", "foot_r", "toes_r",
+)  # fmt: skip
+J = {name: number for number, name in enumerate(JOINTS)}
+PARENTS = (-1, 0, 1, 2, 3, 2, 5, 6, 7, 2, 9, 10, 11, 0, 13, 14, 15, 0, 17, 18, 19)
+STEPS = 256
+"""Phases at which a round is made."""
+_GRAVITY = 9.81
+_SIDES = (("l", 1.0, 0.0), ("r", -1.0, 0.5))
+
+
+@dataclass(frozen=True)
+class Proportions:
+    """Lengths of a body. height : m, from the soles to the crown.   build : thickness, 1: average.
+    legs, arms, head : lengths as parts of an average body's."""
+
+    height: float = 1.75
+    build: float = 1.0
+    legs: float = 1.0
+    arms: float = 1.0
+    head: float = 1.0
+
+    @cached_property
+    def unit(self) -> float:
+        """What a length of an average body of 1.75 m is multiplied by."""
+        trunk, leg, head = 0.045 + 0.10 + 0.16 + 0.24, 0.075 + 0.41 + 0.43, 0.08 + 0.21
+        return self.height / (trunk + leg * self.legs + head * self.head)
+
+    def __getattr__(self, name: str) -> float:
+        try:
+            length, part = _LENGTHS[name]
+        except KeyError:
+            raise AttributeError(name) from None
+        return length * self.unit * (getattr(self, part) if part else 1.0)
+
+    @property
+    def hip(self) -> float:
+        """Of the joints between pelvis and thighs, above the ground, legs straight."""
+        return self.ankle + self.shank + self.thigh
+
+    @cached_property
+    def offsets(self) -> np.ndarray:
+        """(21, 3) of each joint in its parent's frame; the pelvis above the ground, legs straight."""
+        out, u = np.zeros((len(JOINTS), 3)), self.unit
+        out[J["pelvis"]] = [0, 0, self.hip + 0.045 * u]
+        out[J["spine"]], out[J["chest"]], out[J["neck"]] = [0, 0, 0.10 * u], [0, 0, 0.16 * u], [-0.01 * u, 0, 0.24 * u]
+        out[J["head"]] = [0.01 * u, 0, 0.08 * u * self.head]
+        broad = 0.6 + 0.4 * self.build
+        for side, sign, _ in _SIDES:
+            out[J[f"clavicle_{side}"]] = [0, sign * 0.03 * u * broad, 0.19 * u]
+            out[J[f"arm_{side}"]] = [0, sign * 0.155 * u * broad, -0.005 * u]
+            out[J[f"forearm_{side}"]], out[J[f"hand_{side}"]] = [0, 0, -self.upper_arm], [0, 0, -self.forearm]
+            out[J[f"thigh_{side}"]] = [0, sign * self.hip_half, -0.045 * u]
+            out[J[f"shank_{side}"]], out[J[f"foot_{side}"]] = [0, 0, -self.thigh], [0, 0, -self.shank]
+            out[J[f"toes_{side}"]] = [self.ball, 0, self.ball_height - self.ankle]
+        return out
+
+
+_LENGTHS = {
+    "ankle": (0.075, "legs"), "shank": (0.41, "legs"), "thigh": (0.43, "legs"), "heel": (0.055, ""),
+    "ball": (0.125, ""), "ball_height": (0.018, ""), "toes": (0.07, ""), "hip_half": (0.09, ""),
+    "upper_arm": (0.29, "arms"), "forearm": (0.25, "arms"), "hand": (0.17, "arms"),
+}  # fmt: skip
+
+
+@dataclass
+class _Pose:
+    """A round being made. angles : (N, 21, 3) rad.   pelvis : (N, 3) m in the body's frame."""
+
+    body: Proportions
+
+    def __post_init__(self):
+        self.phi = np.arange(STEPS) / STEPS
+        self.angles = np.zeros((STEPS, len(JOINTS), 3))
+        self.pelvis = np.tile(self.body.offsets[0], (STEPS, 1))
+
+    def wave(self, times: float = 1, late: float = 0.0) -> np.ndarray:
+        """(N,) cosine that goes ``times`` round in a round, highest ``late`` of a round after its beginning."""
+        return np.cos(2 * math.pi * times * (self.phi - late))
+
+    def turn(self, joint: str, x=0.0, y=0.0, z=0.0) -> None:
+        """Adds degrees, numbers or (N,), to a joint's angles."""
+        for axis, value in enumerate((x, y, z)):
+            self.angles[:, J[joint], axis] += np.radians(value)
+
+    def turn_both(self, joint: str, x=0.0, y=0.0, z=0.0) -> None:
+        """The same on both sides, mirrored."""
+        self.turn(f"{joint}_l", x, y, z)
+        self.turn(f"{joint}_r", -np.asarray(x), y, -np.asarray(z))
+
+    def plant(self, feet: dict[str, tuple[np.ndarray, ...]], reach: float = 0.985) -> None:
+        """Turns legs and feet so that the ankles are where they should be, the knees in front, and lowers the pelvis,
+        as much at all phases, so far that they can. feet : by side ((N, 3) ankle, (N,) pitch, (N,) yaw, (N,) toes)."""
+        body = self.body
+        limit, turned = reach * (body.thigh + body.shank), Rotation.from_euler("XYZ", self.angles[:, 0])
+        hips = {side: turned.apply(body.offsets[J[f"thigh_{side}"]]) for side in feet}
+        room = [
+            foot[0][:, 2] + np.sqrt(np.maximum(limit**2 - ((foot[0] - self.pelvis - hips[side])[:, :2] ** 2).sum(1), 0))
+            for side, foot in feet.items()
+        ]
+        least = min(float((r - (self.pelvis + hips[side])[:, 2]).min()) for r, side in zip(room, feet))
+        self.pelvis[:, 2] += min(least, 0.0)
+        for side, (ankle, pitch, yaw, toes) in feet.items():
+            d = turned.inv().apply(ankle - self.pelvis - hips[side])
+            length = np.minimum(np.linalg.norm(d, axis=1), 0.9995 * (body.thigh + body.shank))
+            bent = (length**2 - body.thigh**2 - body.shank**2) / (2 * body.thigh * body.shank)
+            knee = np.arccos(np.clip(bent, -0.9, 1))
+            lag = np.arctan2(body.shank * np.sin(knee), body.thigh + body.shank * np.cos(knee))
+            angles = self.angles[:, J[f"thigh_{side}"]]
+            angles[:, 0] = np.arctan2(d[:, 1], -d[:, 2])
+            angles[:, 1] = np.arcsin(np.clip(-d[:, 0] / np.linalg.norm(d, axis=1), -1, 1)) - lag
+            self.angles[:, J[f"shank_{side}"], 1] = knee
+            leg = turned * Rotation.from_euler("XYZ", angles) * Rotation.from_euler("Y", knee[:, None])
+            flat = Rotation.from_euler("ZY", np.stack([yaw, pitch], axis=1))
+            self.angles[:, J[f"foot_{side}"]] = (leg.inv() * flat).as_euler("XYZ")
+            self.angles[:, J[f"toes_{side}"], 1] = toes
+
+    def cycle(self, period: float, phase: float, speed: float = 0.0) -> Cycle:
+        return Cycle(self.body.offsets, self.angles, self.pelvis - self.body.offsets[0], period, phase, speed)
+
+
+def _smooth(s: np.ndarray) -> np.ndarray:
+    """From 0 to 1 with two derivatives zero at both ends."""
+    s = np.clip(s, 0, 1)
+    return s**3 * (10 - 15 * s + 6 * s**2)
+
+
+def _between(s: np.ndarray, a: float, b: float, slope: float = 0.0) -> np.ndarray:
+    """From a to b, at both ends with this slope and no curvature."""
+    return a + slope * s + (b - a - slope) * _smooth(s)
+
+
+def _feet(pose: _Pose, stride: float, duty: float, strike: float, push: float, lift: float, apart: float) -> dict:
+    """Of a body that goes on: each foot is on the ground for ``duty`` of the round, while it goes back by
+    ``duty * stride``. strike, push : rad of the foot as it comes down and as it leaves.   lift : m, of the ankle in
+    between.   apart : m from the middle."""
+    body, feet = pose.body, {}
+    foot = np.array([body.ball, body.ball_height - body.ankle]), np.array([-body.heel, -body.ankle])
+
+    def at(s):
+        """((K, 2) ankle, (K,) pitch) on the ground, at s of ``duty``, 0 to 1."""
+        down, up = -strike * (1 - _smooth(s / 0.2)), push * _smooth((s - 0.5) / 0.5)
+        pitch = down + up
+        ball, heel = (
+            np.stack([np.cos(pitch) * o[0] + np.sin(pitch) * o[1], np.cos(pitch) * o[1] - np.sin(pitch) * o[0]], -1)
+            for o in foot
+        )
+        fixed = np.where((pitch < 0)[:, None], foot[1] - heel, foot[0] - ball)
+        x = stride * duty * (0.43 - s) + fixed[:, 0]
+        return np.stack([x, body.ankle + fixed[:, 1]], -1), pitch
+
+    (first, last), (came, left) = at(np.array([0.0, 1.0]))
+    for side, sign, late in _SIDES:
+        phi = (pose.phi - late) % 1.0
+        ground, s = phi < duty, (phi - duty) / (1 - duty)
+        ankle, pitch = at(np.minimum(phi / duty, 1.0))
+        back = -stride * (1 - duty)
+        swing = np.stack([_between(s, last[0], first[0], back), _between(s, last[1], first[1])], -1)
+        early = np.clip(s, 0, 1) ** 0.75  # before the toes, which hang, come forward
+        swing[:, 1] += lift * 64 * (early * (1 - early)) ** 3
+        turned = _between(s, left, came)
+        ankle, pitch = np.where(ground[:, None], ankle, swing), np.where(ground, pitch, turned)
+        toes = np.where(ground, -np.maximum(pitch, 0), -left * (1 - _smooth(s / 0.9)))
+        place = np.stack([ankle[:, 0], np.full(STEPS, sign * apart), ankle[:, 1]], -1)
+        feet[side] = place, pitch, np.zeros(STEPS), toes
+    return feet
+
+
+def _still_feet(pose: _Pose, apart: float, yaw: float = 0.2) -> dict:
+    """Both flat on the ground."""
+    zero = np.zeros(STEPS)
+    return {
+        side: (np.tile([0.0, sign * apart, pose.body.ankle], (STEPS, 1)), zero, zero + sign * yaw, zero)
+        for side, sign, _ in _SIDES
+    }
+
+
+def _round(body: Proportions, tempo: float, longest: float, stride: float, froude: float) -> tuple[float, float]:
+    """(m of two steps, s for them) of a gait that takes ``stride`` legs at tempo 1 and then goes at ``froude``
+    sqrt(g leg). Whoever is quicker takes longer steps, too, up to ``longest`` times as long ones."""
+    speed = froude * math.sqrt(_GRAVITY * body.hip)
+    length = stride * body.hip
+    return length * min(math.sqrt(tempo), longest), length / speed / tempo
+
+
+def _walk(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
+    pose, u = _Pose(body), body.unit
+    rng = np.random.default_rng([variant, 1])
+    sway, swing, lean = rng.uniform(0.8, 1.25, 3) if variant else np.ones(3)
+    stride, period = _round(body, tempo, 1.2, 1.36, 0.43)
+    pose.pelvis[:, 1] += 0.018 * u * sway * pose.wave(1, 0.3)
+    pose.pelvis[:, 2] -= 0.02 * u * pose.wave(2, 0.04)
+    yaw = -6 * pose.wave()
+    pose.turn("pelvis", 3 * sway * pose.wave(1, 0.3), 0, yaw)
+    pose.turn("spine", -2 * sway * pose.wave(1, 0.3), 3 * lean, -0.8 * yaw)
+    pose.turn("chest", -2 * sway * pose.wave(1, 0.3), 1, -1.1 * yaw)
+    pose.turn("neck", 0, -1, 0.5 * yaw)
+    pose.turn("head", 0, -2.5 * lean + 0.8 * pose.wave(2, 0.1), 0.4 * yaw)
+    for side, sign, late in _SIDES:
+        back = pose.wave(1, late - 0.02)
+        pose.turn(f"clavicle_{side}", 0, 0, -sign * 3 * back)
+        pose.turn(f"arm_{side}", sign * 7, -2 + 24 * swing * back, 0)
+        pose.turn(f"forearm_{side}", 0, -20 * swing + 13 * swing * back, 0)
+        pose.turn(f"hand_{side}", 0, -6 + 4 * back)
+    pose.plant(_feet(pose, stride, 0.61, math.radians(18), math.radians(50), 0.045 * u, 0.05 * u), 0.996)
+    return pose.cycle(period, phase, stride / (round(period * 1e9) * 1e-9))
+
+
+def _run(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
+    pose, u = _Pose(body), body.unit
+    rng = np.random.default_rng([variant, 2])
+    swing, lean, high = rng.uniform(0.8, 1.2, 3) if variant else np.ones(3)
+    stride, period = _round(body, tempo, 1.25, 2.2, 0.95)
+    duty = 0.31
+    pose.pelvis[:, 1] += 0.008 * u * pose.wave(1, duty / 2)
+    pose.pelvis[:, 2] -= 0.035 * u * pose.wave(2, duty / 2)
+    yaw = -9 * pose.wave(1, -0.05)
+    pose.turn("pelvis", 2 * pose.wave(1, duty / 2), 4, yaw)
+    pose.turn("spine", 0, 6 * lean, -0.9 * yaw)
+    pose.turn("chest", 0, 3, -1.3 * yaw)
+    pose.turn("neck", 0, -4, 0.6 * yaw)
+    pose.turn("head", 0, -6 * lean + 1.5 * pose.wave(2, 0.1), 0.6 * yaw)
+    for side, sign, late in _SIDES:
+        back = pose.wave(1, late - 0.06)
+        pose.turn(f"clavicle_{side}", 0, 0, -sign * 5 * back)
+        pose.turn(f"arm_{side}", sign * 12, 6 + 38 * swing * back, 0)
+        pose.turn(f"forearm_{side}", sign * 8, -88 + 18 * back, 0)
+    feet = _feet(pose, stride, duty, math.radians(8), math.radians(48), 0.24 * u * high, 0.03 * u)
+    pose.plant(feet, 0.985)
+    return pose.cycle(period, phase, stride / (round(period * 1e9) * 1e-9))
+
+
+def _stand(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
+    pose, u = _Pose(body), body.unit
+    rng = np.random.default_rng([variant, 3])
+    look, rest = rng.uniform(-14, 14, 2) if variant else np.zeros(2)
+    pose.pelvis[:, 1] += 0.012 * u * pose.wave()
+    pose.pelvis[:, 2] -= 0.004 * u * pose.wave(2)
+    pose.turn("pelvis", 0.8 * pose.wave(), 0, rest / 3)
+    pose.turn("spine", -0.8 * pose.wave(), 0.6 * pose.wave(3))
+    pose.turn("chest", 0, -0.8 * pose.wave(3), 1.5 * pose.wave(1, 0.2))
+    pose.turn("head", 0, 1.5 * pose.wave(2, 0.3), look + 4 * pose.wave(1, 0.4))
+    pose.turn_both("clavicle", -1.2 * pose.wave(3))
+    pose.turn_both("arm", 8 + 0.8 * pose.wave(3), 1 + 1.5 * pose.wave(1, 0.1))
+    pose.turn_both("forearm", 0, -12 + 1.5 * pose.wave(2))
+    pose.plant(_still_feet(pose, 0.1 * u))
+    return pose.cycle(4.0 / tempo, phase)
+
+
+def _wave(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
+    """Four to and fro of a hand; every second variant the left one."""
+    pose, u = _Pose(body), body.unit
+    rng = np.random.default_rng([variant, 4])
+    wide, high = rng.uniform(0.8, 1.2, 2) if variant else np.ones(2)
+    side, sign = ("l", 1.0) if variant % 2 else ("r", -1.0)
+    other = "r" if side == "l" else "l"
+    to = pose.wave(4)
+    pose.pelvis[:, 1] -= sign * (0.015 + 0.006 * pose.wave()) * u
+    pose.turn("pelvis", -1.5 * sign)
+    pose.turn("spine", -2 * sign + 0.6 * to)
+    pose.turn("chest", -2 * sign + 0.8 * to, 0, 4 * sign)
+    pose.turn("head", -4 * sign - 1.2 * to, 2 * pose.wave(1, 0.2), 4 * pose.wave(1, 0.6))
+    pose.turn(f"clavicle_{side}", 14 * sign + 1.5 * sign * to)
+    pose.turn(f"arm_{side}", sign * (100 * high + 5 * wide * to), -14)
+    pose.turn(f"forearm_{side}", sign * (58 - 26 * wide * pose.wave(4, 0.02)), -8)
+    pose.turn(f"hand_{side}", -sign * 16 * wide * pose.wave(4, 0.07))
+    pose.turn(f"arm_{other}", -sign * 9, 3 + 2 * pose.wave())
+    pose.turn(f"forearm_{other}", 0, -16)
+    pose.plant(_still_feet(pose, 0.11 * u))
+    return pose.cycle(3.0 / tempo, phase)
+
+
+def _dance(body: Proportions, tempo: float, phase: float, variant: int) -> Cycle:
+    """Four beats of a round, at 116 to the minute: steps, hips and arms are drawn from the variant."""
+    pose, u = _Pose(body), body.unit
+    rng = np.random.default_rng([variant, 5])
+    big, loose, late = rng.uniform(0.8, 1.2), rng.uniform(0.7, 1.3), rng.uniform(-0.03, 0.03)
+    step, arms = int(rng.integers(4)), int(rng.integers(5))
+    beat = pose.wave(4, late)
+    side = pose.wave(2, 0.125 + late)
+    apart = 0.15 * u
+    pose.pelvis[:, 2] -= (0.045 + 0.022 * big * (1 + beat)) * u
+    pose.pelvis[:, 1] += 0.045 * u * big * side
+    pose.turn("pelvis", -7 * loose * side, 3 * pose.wave(4, 0.1))
+    pose.turn("spine", 8 * loose * side, 4 + 2 * beat, 0)
+    pose.turn("chest", 5 * loose * pose.wave(2, 0.2 + late), -3 * pose.wave(4, 0.05))
+    pose.turn("neck", -3 * side, 3 * beat)
+    pose.turn("head", -5 * loose * pose.wave(2, 0.18), 5 * pose.wave(4, 0.03), 10 * pose.wave(1, 0.2))
+    feet = _still_feet(pose, apart, 0.25)
+    if step == 0:  # heels rise with the beat, knees go in and out
+        _tap(pose, feet, pitch=24, per_round=2)
+    elif step == 1:  # from side to side
+        shift = 0.13 * u * big * pose.wave(1, 0.25)
+        pose.pelvis[:, 1] += 0.9 * shift
+        for name, sign, _ in _SIDES:
+            ankle, pitch, yaw, toes = feet[name]
+            # A foot goes over while the other one carries: quickly, and rests in between.
+            slow = np.sin(2 * math.pi * pose.phi) + sign * 0.25 * np.cos(4 * math.pi * pose.phi)
+            ankle[:, 1] += 0.13 * u * big * np.tanh(2.2 * slow) / np.tanh(2.2)
+            moving = (1 - np.tanh(2.2 * slow) ** 2) ** 2
+            ankle[:, 2] += 0.06 * u * moving
+            feet[name] = ankle, pitch + 0.15 * moving, yaw, toes
+    elif step == 2:  # the twist
+        turn = 24 * big * pose.wave(2, 0.03)
+        pose.turn("pelvis", 0, 0, turn)
+        pose.turn("spine", 0, 0, -0.9 * turn)
+        pose.turn("chest", 0, 0, -0.7 * turn)
+        pose.turn("head", 0, 0, 0.6 * turn)
+        _tap(pose, feet, pitch=14, per_round=2)
+        for name in feet:
+            ankle, pitch, yaw, toes = feet[name]
+            feet[name] = ankle, pitch, yaw + np.radians(0.8 * turn), toes
+    else:  # marching on the spot, knees up
+        for name, _, first in _SIDES:
+            ankle, pitch, yaw, toes = feet[name]
+            up = np.maximum(np.sin(2 * math.pi * (2 * pose.phi - first - 0.05)), 0) ** 2
+            ankle[:, 2] += 0.17 * u * big * up
+            ankle[:, 0] += 0.05 * u * up
+            feet[name] = ankle, pitch + 0.5 * up, yaw, toes
+    if arms == 0:  # both up, swaying
+        pose.turn_both("clavicle", 16)
+        pose.turn("arm_l", 138 + 14 * side, -12)
+        pose.turn("arm_r", -138 + 14 * side, -12)
+        pose.turn("forearm_l", 18 + 14 * side, -18 + 10 * beat)
+        pose.turn("forearm_r", -18 + 14 * side, -18 + 10 * beat)
+    elif arms == 1:  # pumping before the chest
+        for name, sign, first in _SIDES:
+            pump = pose.wave(2, 0.5 * first + 0.05)
+            pose.turn(f"arm_{name}", sign * 24, -26 - 26 * loose * pump)
+            pose.turn(f"forearm_{name}", sign * 14, -95 + 22 * pump)
+    elif arms == 2:  # one hand points up and down aslant, the other on the hip
+        up = 0.5 + 0.5 * np.tanh(2 * pose.wave(2, 0.1)) / np.tanh(2)
+        pose.turn("clavicle_r", -14 * up)
+        pose.turn("arm_r", -30 - 112 * up, -30 + 16 * up)
+        pose.turn("forearm_r", -4, -35 * (1 - up) - 8)
+        pose.turn("arm_l", 42, 22)
+        pose.turn("forearm_l", -48, -78)
+    elif arms == 3:  # rolling forearms
+        for name, sign, first in _SIDES:
+            pose.turn(f"arm_{name}", sign * (18 + 8 * pose.wave(4, 0.5 * first)), -48 + 14 * pose.wave(4, 0.25 * first))
+            pose.turn(f"forearm_{name}", -sign * 30, -80 + 26 * pose.wave(4, 0.125 * first + 0.06), -sign * 10)
+    else:  # a wave that runs from one hand to the other
+        for name, sign, _ in _SIDES:
+            run = 0.06 * sign
+            pose.turn(f"clavicle_{name}", sign * (6 + 6 * pose.wave(2, 0.02 - run)))
+            pose.turn(f"arm_{name}", sign * (78 + 22 * loose * pose.wave(2, -run)), -8)
+            pose.turn(f"forearm_{name}", sign * 24 * pose.wave(2, 0.06 - run), -14)
+            pose.turn(f"hand_{name}", sign * 30 * pose.wave(2, 0.12 - run))
+    pose.plant(feet, 0.975)
+    return pose.cycle(4 * 60 / 116 / tempo, phase)
+
+
+def _tap(pose: _Pose, feet: dict, pitch: float, per_round: int) -> None:
+    """Heels that come off the ground in turn, the balls staying where they are."""
+    body = pose.body
+    for name, _, late in _SIDES:
+        ankle, _, yaw, _ = feet[name]
+        turned = math.radians(pitch) * (0.5 + 0.5 * pose.wave(per_round, late / per_round)) ** 2
+        ball = np.array([body.ball, body.ball_height - body.ankle])
+        x = ball[0] - (np.cos(turned) * ball[0] + np.sin(turned) * ball[1])
+        ankle[:, :2] += x[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], 1)
+        ankle[:, 2] += ball[1] - (np.cos(turned) * ball[1] - np.sin(turned) * ball[0])
+        feet[name] = ankle, turned, yaw, -turned
+
+
+CLIPS: dict[str, Callable[[Proportions, float, float, int], Cycle]] = {
+    "stand": _stand,
+    "walk": _walk,
+    "run": _run,
+    "dance": _dance,
+    "wave": _wave,
+}
+
+
+def clip_of(name: str, body: Proportions, tempo: float = 1.0, phase: float = 0.0, variant: int = 0) -> Cycle:
+    """What a body does. name : of CLIPS.   tempo : 1: as is natural at its size.   phase : rounds at time 0.
+    variant : which of many dances, and how one walks; 0 is the plain one."""
+    return CLIPS[name](body, tempo, phase, variant)

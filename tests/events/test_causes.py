@@ -1,0 +1,224 @@
+"""Causes of events: which they are, that they follow their events to the file and back, that they cost nothing off."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from blinkgl.cli import run as command
+from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
+from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.errors import EventDataError, OutputError
+from blinkgl.events import Events, make_emulator
+from blinkgl.events.camera import EventCamera, EventFrame
+from blinkgl.events.types import Cause, count_causes, named_causes
+from blinkgl.io.formats import WITH_CAUSES, WRITABLE, convert, event_writer, open_events, write_events
+from blinkgl.recordings.simulation import SimulationReport, frames_to_events
+from tests.events.clips import assert_same, random_clip, run
+
+MS = 10**6
+NOTHING = dict(preset="clean", threshold_sigma=0.0, leak_cov_decades=0.0, causes=True)
+STILL = dict(k3=0.0, k4=0.0, k5=0.0, k6=0.0, causes=True)
+
+
+def shares(config, seconds: float, slope: float = 0.0, side: int = 30) -> dict[str, float]:
+    """Of the events of an even scene that gets brighter by ``slope`` ln units a second."""
+    emulator = make_emulator(config, side, side, 1)
+    times = np.arange(0, seconds, 2e-3)
+    frames = (np.full((side, side), 0.2 * np.exp(slope * t), np.float32) for t in times)
+    counts = named_causes(count_causes(run(emulator, frames, np.round(times * 1e9))))
+    assert sum(counts.values()) > 500
+    return {name: n / sum(counts.values()) for name, n in counts.items()}
+
+
+@pytest.mark.parametrize(
+    "config, slope, cause",
+    [
+        (EsimConfig(threshold_jitter=0.05, causes=True), 4.0, "signal"),
+        (V2eConfig(**NOTHING), 4.0, "signal"),
+        (V2eConfig(**{**NOTHING, "cutoff_hz": 100.0}), 4.0, "signal"),
+        (V2eConfig(**{**NOTHING, "leak_rate_hz": 20.0}), 0.0, "leak"),
+        (V2eConfig(**{**NOTHING, "shot_noise_rate_hz": 20.0}), 0.0, "shot"),
+        (
+            V2eConfig(**{**NOTHING, "shot_noise_rate_hz": 20.0, "photoreceptor_noise": True, "cutoff_hz": 50.0}),
+            0,
+            "shot",
+        ),
+        (V2eConfig(**{**NOTHING, "hot_pixel_fraction": 1.0, "hot_pixel_rate_hz": 30.0}), 0.0, "hot"),
+        (VoltmeterConfig(**STILL), 4.0, "signal"),
+        (VoltmeterConfig(**{**STILL, "k4": 2e-5}), 0.0, "leak"),
+        (VoltmeterConfig(**{**STILL, "k5": 4e-7}), 0.0, "leak"),
+        (VoltmeterConfig(**{**STILL, "k6": 6e-3}), 0.0, "shot"),
+        (VoltmeterConfig(**{**STILL, "k4": 2e-5, "compat": "authors"}), 0.0, "leak"),
+    ],
+)
+def test_one_term_alone_is_the_cause(config, slope, cause):
+    found = shares(config, 0.4, slope)
+    assert found[cause] == 1.0, found
+
+
+@pytest.mark.parametrize("dead_us", [0.0, 900.0])
+@pytest.mark.parametrize("leak_share, cause", [(0.4, "signal"), (0.6, "leak")])
+def test_the_larger_part_of_the_way_is_the_cause(leak_share, cause, dead_us):
+    """Both the light and the leak push up, all the time: the one that pushes more."""
+    theta, whole = 0.2, 30.0  # thresholds per second
+    v2e = V2eConfig(
+        **{**NOTHING, "leak_rate_hz": whole * leak_share, "refractory_us": dead_us},
+        contrast_threshold=theta,
+        start="zero",
+    )
+    slope = whole * (1 - leak_share)
+    assert shares(v2e, 0.4, slope * theta)[cause] == 1.0
+    volt = VoltmeterConfig(
+        **{**STILL, "k4": whole * leak_share * 1e-6, "refractory_us": dead_us}, k2=1e-3, start="zero"
+    )
+    assert shares(volt, 0.4, slope / volt.k1)[cause] > 0.99
+
+
+def test_diffusion_is_the_cause_where_drift_is_the_lesser_half():
+    """Between two events drift moves V by mu t in time t: under a half of the way where t < 1/(2 mu)."""
+    config = VoltmeterConfig(**{**STILL, "k4": 2e-5, "k6": 6e-3}, start="zero")
+    emulator = make_emulator(config, 60, 60, 3)
+    events = run(emulator, [np.full((60, 60), 0.4, np.float32)] * 301, np.arange(301) * MS)
+    pixel = events.y.astype(int) * 60 + events.x
+    order = np.lexsort((events.t, pixel))
+    pixel, t, cause, p = pixel[order], events.t[order], events.cause[order], events.p[order]
+    gap = np.where(np.diff(pixel, prepend=-1) == 0, np.diff(t, prepend=0), t)
+    by_drift = (p == 1) & (2e-5 * gap > 0.5)
+    wrong = (cause == Cause.LEAK) != by_drift
+    assert not wrong[np.abs(2e-5 * gap - 0.5) > 1e-4].any()
+    assert 0.1 < by_drift.mean() < 0.9
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        V2eConfig(shot_noise_rate_hz=50.0, leak_rate_hz=30.0, refractory_us=9_000.0, causes=True),
+        V2eConfig(preset="noisy", photoreceptor_noise=True, hot_pixel_fraction=0.1, causes=True),
+        VoltmeterConfig(k6=2e-3, k4=3e-5, refractory_us=2_000.0, causes=True),
+        EsimConfig(causes=True),
+    ],
+)
+def test_causes_survive_saving_and_restoring(config):
+    clip, times = random_clip(2, frames=8)
+    whole = run(make_emulator(config, 37, 45, 3), clip, times)
+    first, second = (make_emulator(config, 37, 45, 3) for _ in range(2))
+    head = run(first, clip[:3], times[:3])
+    second.load_state_dict(first.state_dict())
+    assert_same(whole, Events.concatenate([head, run(second, clip[3:], times[3:])]))
+    assert whole.cause is not None
+
+
+def test_causes_follow_their_events_through_the_read_out():
+    config = V2eConfig(shot_noise_rate_hz=200.0, leak_rate_hz=100.0, causes=True)
+    clip, times = random_clip(1, frames=6)
+    free = EventCamera(config, None, 37, 45, 1)
+    slow = EventCamera(config, ReadoutConfig(events_per_second=1e5, queue_events=64), 37, 45, 1)
+    frames = [EventFrame(int(t), f) for f, t in zip(clip, times)]
+    made = Events.concatenate([free.step(f) for f in frames])
+    sent = Events.concatenate([slow.step(f) for f in frames])
+    assert 0 < len(sent) < len(made) and set(np.unique(sent.cause)) == {0, 1, 2}
+    k = 0  # what is sent is what was made, some left out, each a little later: the first that fits is it
+    for x, y, p, cause in zip(sent.x, sent.y, sent.p, sent.cause):
+        while (made.x[k], made.y[k], made.p[k], made.cause[k]) != (x, y, p, cause):
+            k += 1
+        k += 1
+    assert k <= len(made)
+
+
+def events_with_causes() -> Events:
+    clip, times = random_clip(3, frames=6)
+    return run(
+        make_emulator(V2eConfig(shot_noise_rate_hz=100.0, leak_rate_hz=90.0, causes=True), 37, 45, 1), clip, times
+    )
+
+
+@pytest.mark.parametrize("name", ["a.h5", "a.npz", "a.npy"])
+def test_files_keep_causes(tmp_path, name):
+    events = events_with_causes()
+    pieces = [events.part(slice(i, i + 700)) for i in range(0, len(events), 700)]
+    write_events(tmp_path / name, [Events.empty(), *pieces, Events.empty()], 37, 45)
+    with open_events(tmp_path / name) as file:
+        assert file.causes
+        assert_same(file.read(), events)
+    write_events(tmp_path / f"plain-{name}", replace(events, cause=None), 37, 45)
+    with open_events(tmp_path / f"plain-{name}") as file:
+        assert not file.causes
+        assert_same(file.read(), replace(events, cause=None))
+
+
+@pytest.mark.parametrize("kind", sorted(set(WRITABLE) - set(WITH_CAUSES) - {"aedat4"}))
+def test_other_formats_say_that_they_cannot(tmp_path, kind, capsys):
+    events = events_with_causes()
+    ending = {"text": "txt", "csv": "csv", "evt2": "raw", "evt3": "raw"}[kind]
+    target = tmp_path / f"b.{ending}"
+    with (
+        pytest.raises(OutputError, match="cannot hold the causes of events"),
+        event_writer(target, 37, 45, format=kind) as out,
+    ):
+        out.append(events)
+    assert not target.exists()
+    write_events(tmp_path / "a.h5", events, 37, 45)
+    _, count = convert(tmp_path / "a.h5", target, format=kind)
+    assert count == len(events)
+    with open_events(target) as file:
+        assert not file.causes
+    assert command(["convert", str(tmp_path / "a.h5"), str(tmp_path / "c.csv")]) == 0
+    assert "causes of the events are left out" in capsys.readouterr().out
+
+
+def test_bad_causes_in_files_are_named(tmp_path):
+    events = events_with_causes()
+    with pytest.raises(EventDataError, match="some events have causes and some do not"):
+        write_events(
+            tmp_path / "a.h5",
+            [
+                events,
+                replace(events.window(2**40, 2**41), cause=None),
+                replace(events.part(slice(len(events) - 1, None)), cause=None),
+            ],
+            37,
+            45,
+        )
+    write_events(tmp_path / "a.h5", events, 37, 45)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["events/cause"][17] = 9
+    with open_events(tmp_path / "a.h5") as file, pytest.raises(EventDataError, match="cause of event 17.*9"):
+        file.read()
+
+
+def test_too_many_rows(tmp_path):
+    emulator = make_emulator(EsimConfig(causes=True), 2**14 + 1, 2)
+    with pytest.raises(EventDataError, match="events.causes.*16384"):
+        emulator.step(np.ones((2**14 + 1, 2), np.float32), 0)
+    assert len(make_emulator(EsimConfig(causes=True), 2**14, 2).step(np.ones((2**14, 2), np.float32), 0)) == 0
+
+
+def test_the_last_row_keeps_its_number():
+    emulator = make_emulator(EsimConfig(threshold_sigma=0.0, causes=True), 2**14, 1)
+    frame = np.ones((2**14, 1), np.float32)
+    emulator.step(frame, 0)
+    events = emulator.step(frame * 1.3, MS)
+    assert events.y.tolist() == list(range(2**14)) and not events.cause.any()
+
+
+def test_simulate_counts_by_cause(tmp_path, capsys):
+    frames = [np.full((20, 20), 0.4, np.float32)] * 30
+    report, config = SimulationReport(), V2eConfig(shot_noise_rate_hz=100.0, leak_rate_hz=90.0, causes=True)
+    events = Events.concatenate(list(frames_to_events(frames, fps=200, emulator=config, report=report)))
+    assert report.causes == named_causes(count_causes(events)) and sum(report.causes.values()) == len(events)
+    assert report.causes["shot"] > 100 < report.causes["leak"] and report.causes["hot"] == 0
+
+    rng = np.random.default_rng(0)
+    np.save(tmp_path / "clip.npy", rng.integers(0, 255, (6, 20, 24), np.uint8))
+    options = ["--fps", "100", "--emulator", "v2e", "--set", "causes=true", "--preview", str(tmp_path / "p.mp4")]
+    assert command(["simulate", str(tmp_path / "clip.npy"), "--out", str(tmp_path / "a.h5"), *options]) == 0
+    assert "by cause: signal " in capsys.readouterr().out
+    with open_events(tmp_path / "a.h5") as file:
+        assert file.causes
+    assert command(["simulate", str(tmp_path / "clip.npy"), "--out", str(tmp_path / "a.csv"), *options]) == 2
+    assert "csv cannot hold the causes of events" in capsys.readouterr().err
+    assert not (tmp_path / "a.csv").exists()

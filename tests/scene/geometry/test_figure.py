@@ -1,0 +1,168 @@
+"""The body of a figure: one watertight skin of the proportions that are asked for; flags and fish."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.geometry.figure import ATLAS, CHARTS
+from blinkgl.scene.geometry.isosurface import isosurface
+from blinkgl.scene.geometry.meshes import closedness, normalise, transform_mesh, uvs_degenerate, weld
+from blinkgl.scene.geometry.primitives import figure, fish, flag, random_primitive
+from blinkgl.scene.shapes.gait import CLIPS
+
+MS = 1_000_000
+PEOPLE = [
+    {},
+    {"height": 1.1, "head": 1.4, "build": 1.3, "clip": "run"},
+    {"height": 1.95, "legs": 1.2, "arms": 0.8, "build": 0.7, "clip": "dance", "variant": 3},
+]
+LIVING = [*((figure, keys) for keys in PEOPLE), (flag, {}), (fish, {}), (fish, {"deep": 0.7, "length": 2.0})]
+
+
+def volume(points, faces):
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return (a * np.cross(b, c)).sum() / 6
+
+
+@pytest.mark.parametrize(("build", "keys"), LIVING)
+def test_a_skin_is_watertight_and_its_normals_face_out(build, keys):
+    mesh = build(**keys)
+    assert mesh.closed and closedness(*weld(mesh.vertices, mesh.faces)) == (True, False)
+    for t in (0, 130 * MS, 700 * MS):
+        at, n = mesh.deformer.positions(mesh, t), mesh.deformer.normals(mesh, t)
+        a, b, c = (at[mesh.faces[:, k]] for k in range(3))
+        outward, size = np.cross(b - a, c - a), np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        agree = (n[mesh.faces].mean(axis=1) * outward).sum(axis=1)
+        assert size[agree <= 0].sum() < 0.01 * size.sum()
+        assert volume(at, mesh.faces) > 0
+        np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("keys", PEOPLE)
+def test_proportions_are_those_asked_for(keys):
+    mesh = figure(**keys)
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    assert abs(low[2]) < 0.004 and high[2] == pytest.approx(keys.get("height", 1.75), rel=0.01)
+    assert 2000 <= len(mesh.vertices) <= 6000
+    assert low[1] == pytest.approx(-high[1], rel=0.01)
+    weights = mesh.deformer.weights
+    np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+    assert (weights >= 0).all() and len(mesh.deformer.skeleton.parents) == 21
+    # Skin does not tear: neighbours follow much the same joints.
+    full = np.zeros((len(weights), 21))
+    np.add.at(full, (np.arange(len(weights))[:, None], mesh.deformer.joints), weights)
+    assert np.abs(full[mesh.faces] - full[np.roll(mesh.faces, 1, axis=1)]).sum(axis=2).max() < 1.2
+
+
+def test_parts_are_as_long_as_they_should():
+    plain, other = figure(), figure(legs=1.2, arms=0.8, build=1.3)
+    heights = [m.deformer.skeleton.at(0)[0] for m in (plain, other)]
+    knees = [T[14, 2, 3] for T in heights]
+    assert knees[1] > 1.05 * knees[0]  # of a body as high, most of whose height are legs
+    reach = [np.ptp(m.vertices[:, 1]) for m in (plain, other)]
+    assert reach[1] < reach[0]
+    assert volume(other.vertices, other.faces) > 1.15 * volume(plain.vertices, plain.faces)
+    # 75 kg or so
+    assert 0.05 < volume(plain.vertices, plain.faces) < 0.11
+
+
+def test_texture_coordinates_are_an_atlas_in_one_scale():
+    mesh = figure()
+    assert not uvs_degenerate(mesh.vertices, mesh.faces, mesh.uvs)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    u, v, w = (mesh.uvs[mesh.faces[:, k]].astype(float) * ATLAS for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    drawn = np.abs((v - u)[:, 0] * (w - u)[:, 1] - (v - u)[:, 1] * (w - u)[:, 0]) / 2
+    ratio = drawn / area
+    assert 0.4 < np.median(ratio) < 1.4
+    assert np.quantile(ratio, 0.1) > 0.15 and np.quantile(ratio, 0.9) < 3
+    # No face is drawn over more than a part of the body: no seam runs through one. (At the crown all of them meet.)
+    width = np.ptp(mesh.uvs[mesh.faces], axis=1).max(axis=1)
+    assert np.quantile(width, 0.99) < 0.06 and width.max() < 0.3
+    boxes = [(c.left, c.top, c.left + c.around, c.top + c.length) for c in CHARTS.values()]
+    for k, one in enumerate(boxes):
+        assert min(one) >= 0 and max(one) <= ATLAS
+        for other in boxes[k + 1 :]:
+            assert one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+
+
+@pytest.mark.parametrize(("build", "keys"), LIVING)
+def test_a_shape_made_larger_and_turned_is_the_larger_and_turned_shape(build, keys):
+    mesh, matrix = build(**keys), np.eye(4)
+    matrix[:3, :3] = 1.7 * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    matrix[:3, 3] = [1, 2, 3]
+    moved = transform_mesh(mesh, matrix)
+    for t in (0, 333 * MS):
+        true = mesh.deformer.positions(mesh, t) @ matrix[:3, :3].T + matrix[:3, 3]
+        np.testing.assert_allclose(moved.deformer.positions(moved, t), true, atol=1e-7)
+        rate = mesh.deformer.velocity(mesh, t) @ matrix[:3, :3].T
+        np.testing.assert_allclose(moved.deformer.velocity(moved, t), rate, atol=1e-6)
+        n, m = mesh.deformer.normals(mesh, t) @ matrix[:3, :3].T, moved.deformer.normals(moved, t)
+        cosine = (n * m).sum(axis=1) / np.linalg.norm(n, axis=1) / np.linalg.norm(m, axis=1)
+        assert cosine.min() > 0.99999
+    assert moved.deformer.speed == pytest.approx(1.7 * mesh.deformer.speed)
+    assert moved.deformer.goes == mesh.deformer.goes
+    (unit,) = normalise((mesh,))
+    lengths = [np.linalg.norm(unit.deformer.positions(unit, t), axis=1).max() for t in range(0, 1000 * MS, 50 * MS)]
+    assert 0.9 < max(lengths) <= 1  # at no time does it leave the sphere that collisions know
+
+
+@pytest.mark.parametrize("kind", ["figure", "flag", "fish"])
+def test_variants_differ_and_are_always_the_same(kind):
+    first, second = random_primitive(kind, 0), random_primitive(kind, 1)
+    again = random_primitive(kind, 0)
+    np.testing.assert_array_equal(first.vertices, again.vertices)
+    t = 77 * MS
+    np.testing.assert_array_equal(first.deformer.positions(first, t), again.deformer.positions(again, t))
+    assert first.source_hash == again.source_hash != second.source_hash
+    moved = [mesh.deformer.positions(mesh, t) for mesh in (first, second)]
+    assert moved[0].shape != moved[1].shape or not np.allclose(*moved)
+
+
+def test_all_clips_are_drawn_in_a_pool():
+    speeds = [random_primitive("figure", k).deformer.speed for k in range(6)]
+    assert sum(s > 0 for s in speeds) == 3 and sum(s == 0 for s in speeds) == 3
+
+
+@pytest.mark.parametrize(
+    ("where", "accepted", "build", "keys"),
+    [
+        ("figure.clip", ", ".join(CLIPS), figure, {"clip": "jog"}),
+        ("figure.tempo", "a number from 0.1 to 4", figure, {"tempo": 0}),
+        ("figure.tempo", "a number", figure, {"tempo": "fast"}),
+        ("figure.height", "a number greater than 0", figure, {"height": -1.7}),
+        ("figure.height", "a number up to 1000", figure, {"height": 1e4}),
+        ("figure.legs", "a number from 0.7 to 1.4", figure, {"legs": 9}),
+        ("figure.build", "a number from 0.7 to 1.4", figure, {"build": (1, 1, 1)}),
+        ("figure.coat", "a whole number", figure, {"coat": -1}),
+        ("figure.variant", "a whole number", figure, {"variant": 1.5}),
+        ("figure.phase", "a number from 0 to 1", figure, {"phase": float("nan")}),
+        ("flag.wind", "a number from 0.1 to 4", flag, {"wind": 0}),
+        ("fish.length", "a number greater than 0", fish, {"length": 0}),
+        ("fish", "one of length", fish, {"clip": "walk"}),
+    ],
+)
+def test_what_cannot_be_made_is_refused_in_one_line(where, accepted, build, keys):
+    with pytest.raises(AssetError) as error:
+        build(**keys)
+    said = str(error.value)
+    assert said.startswith(where) and accepted in said and "\n" not in said
+
+
+def test_a_surface_lies_where_the_function_is_zero():
+    def distance(points):
+        ring = np.hypot(np.linalg.norm(points[:, :2], axis=1) - 1, points[:, 2]) - 0.4
+        return np.minimum(ring, np.linalg.norm(points - [0, 0, 1.2], axis=1) - 0.3)
+
+    points, faces, normals = isosurface(distance, np.full(3, -1.7), np.full(3, 1.8), 0.08)
+    assert np.abs(distance(points)).max() < 1e-6
+    assert closedness(points, faces.astype(np.int64)) == (True, False)
+    true = 2 * np.pi**2 * 0.4**2 + 4 / 3 * np.pi * 0.3**3
+    assert volume(points, faces) == pytest.approx(true, rel=0.02)
+    ring = points[:, 2] < 0.6
+    ahead = points * [1, 1, 0] / np.linalg.norm(points[:, :2], axis=1)[:, None].clip(1e-9)
+    outward = points - ahead
+    outward /= np.linalg.norm(outward, axis=1)[:, None]
+    np.testing.assert_allclose(normals[ring], outward[ring], atol=1e-4)

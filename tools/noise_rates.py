@@ -1,0 +1,74 @@
+"""Rates of noise events of a comparator behind a low-pass: the table of :mod:`blinkgl.events.noise`.
+
+    python -m blinkgl.tools.noise_rates        # prints the tables, about five minutes of one core
+
+Gaussian noise of standard deviation s (in thresholds) with the correlation e^-k from frame to frame; levels one
+threshold apart, the one at which the last event came is the reference, an event for each other level that is passed.
+References stay on a ladder of levels, so that rungs and the place of the noise are a Markov chain; its stationary state
+is solved for on a grid whose cells end at the rungs, and no die is thrown.
+
+Where the ladder stands differs from pixel to pixel, and the rate with it: a ladder with a rung at the noise's mean is
+quiet. Unlike thresholds for ON and OFF, as every real pixel has them, move the ladder by their difference with every
+pair of events, so that pixels spend the more time with a ladder the quieter it is; the rate in the end is the harmonic
+mean over all places of the ladder. The second table is how much quieter: ln of the rates' ratio from a rung at half a
+threshold to one at the mean.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import ndtr
+
+from blinkgl.events.noise import RATE_K, RATE_SIZES
+
+
+def rate_per_step(size: float, k: float, place: float, cells: int) -> float:
+    """Events per frame of a ladder with a rung at ``place``; ``cells`` of the grid between two rungs."""
+    a, fresh = np.exp(-k), size * np.sqrt(-np.expm1(-2 * k))
+    rungs = int(np.ceil(5.5 * size)) + 1
+    below = np.repeat(np.arange(-rungs, rungs), cells)  # of each cell: the rung under it
+    n = place + (np.arange(2 * rungs * cells) + 0.5) / cells - rungs
+    edges = np.append(n - 0.5 / cells, n[-1] + 0.5 / cells)
+    edges[0], edges[-1] = -np.inf, np.inf
+    # From anywhere in a cell: the mean over the two points of Gauss's rule.
+    move = 0.5 * sum(
+        np.diff(ndtr((edges[None, :] - a * (n + d / cells)[:, None]) / fresh), axis=1)
+        for d in (-0.5 / 3**0.5, 0.5 / 3**0.5)
+    )
+    after, counts = np.zeros((2 * n.size, 2 * n.size)), np.zeros(2 * n.size)
+    for bit in (0, 1):  # the reference is the rung below, or the one above
+        reference = (below + bit)[:, None]
+        up, down = below[None, :] - reference, reference - 1 - below[None, :]
+        passed = np.maximum(np.maximum(up, down), 0)
+        new_bit = np.where(up > 0, 0, np.where(down > 0, 1, reference - below[None, :]))
+        rows = slice(bit * n.size, (bit + 1) * n.size)
+        after[rows, : n.size] = move * (new_bit == 0)
+        after[rows, n.size :] = move * (new_bit == 1)
+        counts[rows] = (move * passed).sum(1)
+    system = after.T - np.eye(2 * n.size)
+    system[-1] = 1.0
+    state = np.linalg.solve(system, np.eye(1, 2 * n.size, 2 * n.size - 1)[0])
+    return float(state @ counts)
+
+
+def rate_per_time_constant(size: float, k: float, ladders: int = 8) -> tuple[float, float]:
+    """(harmonic mean of the rates over where the ladder stands, ln of the largest over the smallest)."""
+    fresh = size * np.sqrt(-np.expm1(-2 * k))
+    cells = int(min(max(np.ceil(4.0 / fresh), 24), 200))
+    # Mirror images have the same rate: half of the places are enough.
+    rates = np.array([rate_per_step(size, k, (j + 0.5) / ladders / 2, cells) for j in range(ladders)])
+    ends = [rate_per_step(size, k, place, cells) for place in (1e-3, 0.499)]
+    return float(1 / np.mean(1 / rates)) / k, float(np.log(ends[1] / ends[0]))
+
+
+def main() -> None:
+    spans = []
+    for k in RATE_K:
+        row = [rate_per_time_constant(size, k) for size in RATE_SIZES]
+        spans.append([span for _, span in row])
+        print("        [" + ", ".join(f"{np.log(rate):.4f}" for rate, _ in row) + f"],  # k = {k:g}", flush=True)
+    print("[" + ", ".join(f"{span:.3f}" for span in spans[0]) + f"]  # span at k = {RATE_K[0]:g}")
+
+
+if __name__ == "__main__":
+    main()

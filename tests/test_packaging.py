@@ -107,7 +107,8 @@ def check_installation(bin_: Path, root: Path, elsewhere: Path) -> None:
     run(
         python,
         "-c",
-        f"import blinkgl.render.resources\nfrom blinkgl.gl import expand\nassert '#include' not in expand({name!r}, 'vertex').text",
+        "import blinkgl.render.resources\nfrom blinkgl.gl import expand\n"  # whose tables shaders include
+        f"assert '#include' not in expand({name!r}, 'vertex').text",
         cwd=elsewhere,
     )
 

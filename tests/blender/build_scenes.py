@@ -326,6 +326,34 @@ def left_out() -> None:
     source.unlink()
 
 
+def awkward() -> None:
+    """An armature in an excluded collection, before a subdivision; scales of zero, mirrored, sheared, with NaN."""
+    scene = fresh(12)
+    armature, column = rig()
+    skin(column, armature)
+    rigs = bpy.data.collections.new("Rigs")
+    scene.collection.children.link(rigs)
+    rigs.objects.link(armature)
+    scene.collection.objects.unlink(armature)
+    bpy.context.view_layer.layer_collection.children["Rigs"].exclude = True
+    cube("Flat").scale = (0, 1, 1)
+    keyed(cube("Pops", (3, 0, 0)), "scale", (0, 0, 0), (1, 1, 1), frames=(1, 12))
+    cube("Mirrored", (5, 0, 0)).scale = (-1, 1, 1)
+    stretch = linked(bpy.data.objects.new("Stretch", None))
+    stretch.scale = (1, 3, 1)
+    sheared = cube("Sheared", (7, 0, 0))
+    sheared.rotation_euler, sheared.parent = (0, 0, 0.7), stretch
+    cube("Broken", (9, 0, 0)).data.vertices[0].co = (float("nan"), 0, 0)
+    save("awkward")
+    bpy.context.view_layer.layer_collection.children["Rigs"].exclude = False
+    found = {}
+    for frame in (1, 6, 12):
+        scene.frame_set(frame)
+        shown = bpy.data.objects["Column"].evaluated_get(bpy.context.evaluated_depsgraph_get())
+        found[f"Column@{frame}"] = vertices(shown, shown.matrix_world)
+    np.savez(FOLDER / "awkward.npz", **found)
+
+
 def paints() -> None:
     """Materials of every kind, one per cube."""
     fresh()
@@ -436,5 +464,5 @@ def odd() -> None:
 
 
 if __name__ == "__main__":
-    for build in (dancer, mixamo, formats, world, left_out, paints, evil, odd):
+    for build in (dancer, mixamo, formats, world, left_out, awkward, paints, evil, odd):
         build()

@@ -305,6 +305,16 @@ def test_what_cannot_come_is_said(imported):
         assert words in said[kind]
 
 
+def test_awkward_scenes(imported):
+    """An armature that is excluded still moves its mesh; scales of zero are left out; NaN is no crash."""
+    came = imported("awkward.blend")
+    scene = drawn_with_a_pose(came)
+    assert same_points(lambda t: places(scene, "Column", t), came, "Column") < 1e-5
+    shown = {thing.name for thing in scene.objects}
+    assert {"Column", "Mirrored", "Sheared"} <= shown and not shown & {"Flat", "Pops"}
+    assert "hidden by a scale of 0, left out: 'Flat', 'Pops'" in came.row("meshes").notes
+
+
 def test_scripts_are_never_run(imported, scenes, capsys, tmp_path):
     """Neither by the import nor by what it reads back; both would run where they were allowed to (the control)."""
     assert (scenes / "control.txt").read_text() == "PWNED.text PWNED.driver"

@@ -21,6 +21,9 @@ def in_picture(view_layer: bpy.types.ViewLayer) -> list[bpy.types.Object]:
             o.name_full for o in layer.collection.objects if o.type in NEVER_SEEN or not (o.hide_render or hidden)
         }
         waiting += [(child, hidden) for child in layer.children]
+    for thing in bpy.context.scene.objects:  # an armature may be hidden away wherever it is
+        if thing.name_full in found:
+            found |= {m.object.name_full for m in thing.modifiers if m.type == "ARMATURE" and m.object is not None}
     return [thing for thing in bpy.context.scene.objects if thing.name_full in found]
 
 
@@ -37,6 +40,8 @@ def make_visible(view_layer: bpy.types.ViewLayer, kept: list[bpy.types.Object]) 
         waiting += layer.children
     for thing in kept:
         thing.hide_viewport = False
+        if thing.name_full not in view_layer.objects:  # its collection is excluded
+            bpy.context.scene.collection.objects.link(thing)
         thing.hide_set(False)
 
 

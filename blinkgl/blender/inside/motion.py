@@ -9,6 +9,7 @@ import bpy
 from said import Refused, Table, names
 
 _MOST_FRAMES = 100_000
+_NOTHING = 1e-9  # of a scale
 
 
 def choose_scene(name: str | None) -> bpy.types.Scene:
@@ -114,3 +115,18 @@ def _takers(action: bpy.types.Action, slot: bpy.types.ActionSlot) -> list[bpy.ty
         rigs = [o for o in bpy.data.objects if o.type == "ARMATURE"]
         return [o for o in rigs if bones & {b.name for b in o.data.bones}]
     return [o for o in bpy.data.objects if o.name == slot.name_display]
+
+
+def without_extent(things: list[bpy.types.Object], clock: Clock, table: Table) -> set[str]:
+    """Names of objects that a scale of zero hides, always or at times: BlinkGL draws no scale that changes, and a pose
+    without extent is none."""
+    gone: dict[str, None] = {}
+    for frame in clock.some(25):
+        bpy.context.scene.frame_set(frame)
+        graph = bpy.context.evaluated_depsgraph_get()
+        for thing in things:
+            if min(abs(s) for s in thing.evaluated_get(graph).matrix_world.to_scale()) < _NOTHING:
+                gone[thing.name_full] = None
+    if gone:
+        table["meshes"].notes.append(f"hidden by a scale of 0, left out: {names(gone)}")
+    return set(gone)

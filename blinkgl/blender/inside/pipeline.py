@@ -36,6 +36,7 @@ def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:
     doing("looking at its motion")
     shapes.stop_simulations(everything, table)
     clock = motion.set_clock(scene, job["frames"], job["keys_per_frame"])
+    gone = motion.without_extent([o for o in things if o.type in kept.MESH_LIKE], clock, table)
     scene.frame_set(clock.first)
 
     doing("making meshes")
@@ -60,7 +61,7 @@ def run(job: dict, out: Path, doing: Callable[[str], None]) -> dict:
     doing("writing the GLB")
     if job["clips"]:
         motion.offer_clips(table)
-    exporting.export(out, things, everything, made, unseen, job["clips"], table)
+    exporting.export(out, things, everything, made, unseen | gone, job["clips"], table)
     cameras = [o for o in things if o.type == "CAMERA"]
     return {
         "blender": bpy.app.version_string,

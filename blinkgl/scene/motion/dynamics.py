@@ -67,7 +67,7 @@ class Exploded(ConfigError):
 
 
 @dataclass(frozen=True)
-class Side:
+class Barrier:
     """A plane without end that nothing passes and nobody sees: points x with ``normal . x >= offset`` are inside."""
 
     normal: tuple[float, float, float]
@@ -112,7 +112,7 @@ def simulate(
     t1_ns: int,
     *,
     camera: tuple[PosePath, float] | None = None,
-    sides: Sequence[Side] = (),
+    sides: Sequence[Barrier] = (),
 ) -> tuple[tuple[SceneObject, ...], Dynamics]:
     """The objects, those that are dynamic on the paths they take over [t0, t1], and what
     is known of how those came about.
@@ -515,7 +515,7 @@ def shapes_of(obj: SceneObject, config: BodyConfig) -> list[Shape]:
         centre, axes, extent = _framed(parts[0])
         if extent[2] < 1e-6 * extent[0]:
             up = axes[:, 2] * (1.0 if float(mesh.normals.mean(axis=0) @ axes[:, 2]) >= 0 else -1.0)
-            return [_plane(Side(tuple(up), float(up @ centre)))]
+            return [_plane(Barrier(tuple(up), float(up @ centre)))]
     return [_solid(points, config) for points in parts]
 
 
@@ -560,7 +560,7 @@ def _framed(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return mean + axes @ (0.5 * (low + high)), axes, 0.5 * (high - low)
 
 
-def _plane(side: Side) -> Shape:
+def _plane(side: Barrier) -> Shape:
     """An endless one, its z axis the normal."""
     normal = np.asarray(side.normal, dtype=np.float64)
     rotation, _ = Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])

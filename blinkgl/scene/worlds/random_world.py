@@ -28,7 +28,7 @@ from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
 from blinkgl.scene.importing.mesh_files import Asset
 from blinkgl.scene.motion.collision import resolve_collisions
-from blinkgl.scene.motion.dynamics import Exploded, Side, simulate
+from blinkgl.scene.motion.dynamics import Barrier, Exploded, simulate
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from blinkgl.scene.motion.ways import random_way
@@ -354,14 +354,14 @@ def _bodies(config: RandomPhysicsConfig | None, names: list[str], rng) -> dict[s
     return found
 
 
-def _sides(config: RandomSceneConfig, floor: float) -> list[Side]:
+def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
     """Of the region, as far out as walls stand, so that no object is in one; its floor where there is no ground."""
     reach = 0.5 * config.objects.size[1] + _GAP
     out = config.region.width / 2 + reach
-    sides = [Side((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
-    sides.append(Side((0.0, 0.0, -1.0), -(floor + config.region.height + reach)))
+    sides = [Barrier((sx, sy, 0.0), -out) for sx, sy in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))]
+    sides.append(Barrier((0.0, 0.0, -1.0), -(floor + config.region.height + reach)))
     if config.ground is None:
-        sides.append(Side((0.0, 0.0, 1.0), floor - reach))
+        sides.append(Barrier((0.0, 0.0, 1.0), floor - reach))
     return sides
 
 

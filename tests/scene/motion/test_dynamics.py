@@ -13,7 +13,7 @@ from blinkgl.config.physics import BodyConfig, PhysicsConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.primitives import cone, cuboid, cylinder, grid, icosphere, sphere
-from blinkgl.scene.motion.dynamics import Side, damping_ratio, shapes_of, simulate
+from blinkgl.scene.motion.dynamics import Barrier, damping_ratio, shapes_of, simulate
 from blinkgl.scene.motion.paths import HermitePath, KeyframePath, StaticPath
 from blinkgl.scene.types import Material, Part, SceneObject
 
@@ -202,7 +202,7 @@ def test_nothing_enters_the_camera_nor_leaves_by_the_sides():
         0,
         2 * S,
         camera=(eye, 0.3),
-        sides=[Side((1.0, 0.0, 0.0), -1.5)],
+        sides=[Barrier((1.0, 0.0, 0.0), -1.5)],
     )
     p = thrown.path.poses(np.arange(0, 2 * S, 1_000_000))[:, :3, 3]
     assert np.linalg.norm(p, axis=1).min() > 0.4 - 0.003

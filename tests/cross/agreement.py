@@ -101,11 +101,10 @@ def of_sequence(folder: Path, manifest: dict[str, Any]) -> Findings:
             all((c.t >= manifest["t_offset_us"]).all() and (c.t <= end).all() for c in chunks),
             "events outside the recording",
         )
-    told = all(c.cause is not None for c in chunks)
-    found.same(
-        "causes", asked=getattr(config.events, "causes", False), file=told, manifest="events_by_cause" in manifest
-    )
-    if told:
+    asked = getattr(config.events, "causes", False)
+    found.same("causes", asked=asked, manifest="events_by_cause" in manifest)
+    found.expect(all((c.cause is not None) == asked for c in chunks), "causes in the file, or not, against the wish")
+    if asked and chunks:
         by_cause = named_causes(count_causes(Events.concatenate(chunks)))
         found.same("events by cause", file=by_cause, manifest=manifest["events_by_cause"])
     lost = manifest["events_lost_in_readout"] + manifest["events_late_in_readout"]

@@ -80,7 +80,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
             "events": {"emulator": "esim", "threshold_jitter": 0.05, "refractory_us": 50, "contrast_threshold_off": 0.3}
         },
         "v2e": {"events": {"emulator": "v2e"}},
-        "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean"}},
+        "v2e, clean": {"events": {"emulator": "v2e", "preset": "clean", "start": "zero"}},
         "v2e, noisy": {
             "events": {
                 "emulator": "v2e",
@@ -93,7 +93,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "v2e, causes": {"events": {"emulator": "v2e", "causes": True, "start": "balanced", "leak_rate_hz": 50}},
         "voltmeter": {"events": {"emulator": "voltmeter"}},
         "voltmeter, 240, causes": {"events": {"emulator": "voltmeter", "preset": "DVS240", "causes": True}},
-        "voltmeter, authors": {"events": {"emulator": "voltmeter", "compat": "authors"}},
+        "voltmeter, authors": {"events": {"emulator": "voltmeter", "compat": "authors", "k4": 1e-4}},
     },
     "timeline": {
         "uniform": {"timeline": {"kind": "uniform", "fps": 400}},

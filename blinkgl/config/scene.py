@@ -372,9 +372,9 @@ class WayConfig(Config):
 
     @rule("#points", "closed")
     def _a_way(points, closed):
-        least = 3 if closed else 2
-        if len(points) < least:
-            raise Refused(f"a way needs {least} points or more", where="points", value=len(points))
+        least, given = (3 if closed else 2), len([*points])
+        if given < least:
+            raise Refused(f"a way needs {least} points or more", where="points", value=given)
 
 
 class MeshConfig(Config):

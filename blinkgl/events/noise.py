@@ -79,7 +79,7 @@ _OVER_K = PchipInterpolator(
 )
 
 
-def noise_size(k: np.ndarray, events_per_time_constant: np.ndarray) -> np.ndarray:
+def noise_size(k: np.ndarray | float, events_per_time_constant: np.ndarray) -> np.ndarray:
     """Standard deviation of the noise, in thresholds, elementwise; at most 2.5.
 
     k : time constants per frame. Beyond 10 the samples are independent and the rate per *frame* is what counts.

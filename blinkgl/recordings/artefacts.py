@@ -197,4 +197,4 @@ def _outside(there: np.ndarray) -> np.ndarray:
 
 
 def _look(image: np.ndarray, there: np.ndarray) -> np.ndarray:
-    return cv2.remap(image, there, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(image, there[..., 0], there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -180,7 +180,7 @@ Given = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 
 def measure(
-    light: Sequence[np.ndarray], interpolate: str, given: Callable[[int], Given] | None = None
+    light: Sequence[np.ndarray] | _Light, interpolate: str, given: Callable[[int], Given] | None = None
 ) -> Iterator[dict[str, float]]:
     """The measures of every pair of frames, by name; those that can be had.
 
@@ -189,13 +189,13 @@ def measure(
     dense = DenseFlow() if interpolate == "motion" and _dense_fits(light[0].shape) else None
     guess = _halfway(dense)
     tried: float | None = None  # of the frame that the pair begins with
+    everywhere = np.ones(light[0].shape, bool)
     for k in range(len(light) - 1):
         a, b = light[k], light[k + 1]
         values = {"fine": artefacts.fine(a)}
         own = None
         if dense is not None:
             own, own_back = dense(dense.codes(a), dense.codes(b))
-            everywhere = np.ones(a.shape, bool)
             values["contradicted"] = float(artefacts.hidden(own, everywhere, own_back, everywhere).mean())
         if given is not None:
             flow, valid, gone = given(k)
@@ -241,7 +241,7 @@ def _halfway(dense: DenseFlow | None) -> Callable[[np.ndarray, np.ndarray], np.n
     return lambda a, b: np.maximum(np.sqrt((a + eps) * (b + eps)) - eps, np.float32(0))
 
 
-class _Light(Sequence[np.ndarray]):
+class _Light:
     """Frames as linear light, the last three kept. size : (H, W) of the first."""
 
     def __init__(self, frames: FramesConfig, files: list[Path]):

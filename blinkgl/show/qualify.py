@@ -80,8 +80,9 @@ def _folders(sources: Sequence[str], overrides: Sequence[str]) -> Iterator[tuple
     for source in sources:
         tree = apply_overrides({"frames": {"folders": [glob.escape(source)]}}, overrides)
         template = RunTemplate(tree, Path("."))
-        config = template.check()
-        yield source, config.frames, folder_of(config.frames, 0, template.base)
+        frames = template.check().frames
+        assert frames is not None, "they are what the tree holds"
+        yield source, frames, folder_of(frames, 0, template.base)
 
 
 def _of_run(template: RunTemplate, path: str) -> Iterator[tuple[str, FramesConfig, Path]]:
@@ -140,8 +141,9 @@ def _folders_in_rows(rows: Sequence[_Row]) -> Table:
         table.add_column(heading, overflow="fold")
     for row in rows:
         found, answer = row.verdict, "yes" if row.reason is None else "no"
-        nearest = None if found is None else found.nearest
-        cells = ("–",) * 3 if nearest is None else (nearest, *_value_and_limit(found, nearest))
+        cells = ("–",) * 3
+        if found is not None and found.nearest is not None:
+            cells = (found.nearest, *_value_and_limit(found, found.nearest))
         counts = ("–", "–") if found is None else (str(len(found.pairs)), str(found.refused))
         table.add_row(row.name, *counts, *cells, answer)
     return table
@@ -152,8 +154,11 @@ def _value_and_limit(found: Verdict, name: str) -> tuple[str, str]:
 
 
 def _show_pairs(row: _Row, console: Console) -> None:
-    for pair in row.verdict.pairs if row.verdict is not None else ():
-        limits = {name: getattr(row.verdict.limits, name) for name in pair.values}
+    found = row.verdict
+    if found is None:
+        return
+    for pair in found.pairs:
+        limits = {name: getattr(found.limits, name) for name in pair.values}
         said = [
             f"{name} {shown(name, value)}" + (" (!)" if limits[name] is not None and value > limits[name] else "")
             for name, value in pair.values.items()

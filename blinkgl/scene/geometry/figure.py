@@ -177,7 +177,8 @@ def _pieces(body: Proportions, bind: np.ndarray) -> list[_Piece]:
 
     def add(joint: str, a, b, r0: float, r1: float, flat=(1.0, 1.0)) -> None:
         T = bind[J[joint]]
-        made.append(_Piece(J[joint], *(T[:3, :3] @ np.array(p) + T[:3, 3] for p in (a, b)), (r0, r1), flat))
+        start, end = (T[:3, :3] @ np.array(p) + T[:3, 3] for p in (a, b))
+        made.append(_Piece(J[joint], start, end, (r0, r1), flat))
 
     add("pelvis", (-0.005, 0, -0.055), (0, 0, 0.04), 0.118, 0.112, (0.92, 1.30))
     add("pelvis", (-0.045, 0.06, -0.06), (-0.045, -0.06, -0.06), 0.083, 0.083)

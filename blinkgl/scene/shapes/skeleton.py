@@ -50,8 +50,11 @@ class Motion(Protocol):
     """What moves the joints of a skeleton. period_ns : after which it repeats; None: it does not.
     span_ns : from time 0 on after so long nothing new comes."""
 
-    period_ns: int | None
-    span_ns: int
+    @property
+    def period_ns(self) -> int | None: ...
+
+    @property
+    def span_ns(self) -> int: ...
 
     @property
     def is_static(self) -> bool: ...

@@ -17,6 +17,7 @@ convex in each value alone, as all of ours are.
 
 from __future__ import annotations
 
+import itertools
 import typing
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -129,31 +130,45 @@ def combinations(tree: Any, group: frozenset[Path], between: Path | None = None)
             value=f"{number} combinations",
             accepted=f"at most {MOST}; draw fewer of them",
         )
-    yield from _expand(tree, (), group, between)
+    yield from _Expansion(group, between).of(tree, ())
 
 
-def _expand(node: Any, path: Path, group: frozenset[Path], between: Path | None) -> Iterator[Any]:
-    if is_distribution(node):
-        given = options(path, node, between=path == between)
-        for option in given if path in group else given[:1]:
-            yield from _expand(option, path, group, between)
-        return
-    children = _children(node)
-    if not any(_holds(child) for _, child in children):
-        yield node
-        return
+class _Expansion:
+    """What does not vary is made once, and the trees share it: hundreds of them cost little beside reading them."""
 
-    def product(at: int) -> Iterator[list[Any]]:
-        if at == len(children):
-            yield []
+    def __init__(self, group: frozenset[Path], between: Path | None):
+        self.group, self.between = group, between
+        self.towards = {site[:depth] for site in group for depth in range(len(site) + 1)}
+        self.made: dict[int, tuple[Any, Any]] = {}  # identity of a node -> the node, which keeps it taken; what it is
+
+    def of(self, node: Any, path: Path) -> Iterator[Any]:
+        if path not in self.towards:
+            yield self.first(node, path)
             return
-        step, child = children[at]
-        for value in _expand(child, (*path, step), group, between):
-            for rest in product(at + 1):
-                yield [value, *rest]
+        if is_distribution(node):
+            given = options(path, node, between=path == self.between)
+            for option in given if path in self.group else given[:1]:
+                yield from self.of(option, path)
+            return
+        if not isinstance(node, (dict, list)):  # one choice of several, of which another holds a distribution
+            yield node
+            return
+        places = [tuple(self.of(child, (*path, step))) for step, child in _children(node)]
+        for values in itertools.product(*places):
+            yield dict(zip(node, values, strict=True)) if isinstance(node, dict) else list(values)
 
-    for values in product(0):
-        yield dict(zip(node, values, strict=True)) if isinstance(node, dict) else values
+    def first(self, node: Any, path: Path) -> Any:
+        """The node with every first option."""
+        if not isinstance(node, (dict, list)):
+            return node
+        if id(node) not in self.made:
+            if isinstance(node, dict) and is_distribution(node):
+                value = self.first(options(path, node)[0], path)
+            else:
+                values = [self.first(child, (*path, step)) for step, child in _children(node)]
+                value = dict(zip(node, values, strict=True)) if isinstance(node, dict) else values
+            self.made[id(node)] = node, value
+        return self.made[id(node)][1]
 
 
 def _count(node: Any, path: Path, group: frozenset[Path]) -> int:
@@ -164,10 +179,6 @@ def _count(node: Any, path: Path, group: frozenset[Path]) -> int:
     for step, child in _children(node):
         number *= _count(child, (*path, step), group)
     return number
-
-
-def _holds(node: Any) -> bool:
-    return is_distribution(node) or any(_holds(child) for _, child in _children(node))
 
 
 def _children(node: Any) -> list[tuple[str, Any]]:

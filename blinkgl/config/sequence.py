@@ -12,8 +12,9 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
 
@@ -33,6 +34,9 @@ from blinkgl.config.sensor import ReadoutConfig, drain_us, fill_sensor, known_se
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LABELS  # noqa: F401 - whose rows bring the keys of `labels:`
+
+if TYPE_CHECKING:
+    from blinkgl.config.recipe import Group
 
 NS_PER_S = 1_000_000_000
 MAX_LABELS = 1_000_000
@@ -334,10 +338,19 @@ class RunTemplate:
     def check(self) -> SequenceConfig:
         """Validates what stands for all that can be drawn, in every group; returns the first. Raises ConfigError before
         any work starts."""
-        if "groups" in self.tree:
-            from blinkgl.config.recipe import all_groups
+        return self._first
 
-            return [group.template.check() for group in all_groups(self)][0]
+    @cached_property
+    def groups(self) -> tuple[Group, ...]:
+        """As of :func:`blinkgl.config.recipe.all_groups`."""
+        from blinkgl.config.recipe import split
+
+        return split(self)
+
+    @cached_property
+    def _first(self) -> SequenceConfig:  # kept: a large recipe stands for thousands of configurations
+        if "groups" in self.tree:
+            return self.groups[0].template.check()
         if is_distribution(self.tree):
             raise ConfigError(
                 "the whole file cannot be drawn", where=next(iter(self.tree)), accepted="distributions of single keys"

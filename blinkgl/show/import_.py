@@ -7,11 +7,11 @@ import math
 import os
 from typing import Any
 
-import yaml
 from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+from blinkgl.config.reader import to_short_yaml
 from blinkgl.show.terminal import plain_column, plain_console, say
 
 _SHAPES = ("meshes", "curves, texts, metaballs", "instances", "collection instances")
@@ -75,4 +75,4 @@ def _recipe(target: str, came: Any) -> str:
     if came.cameras:
         less = max(max(came.size) / _LONGER_SIDE, 1)
         recipe = {"camera": {"width": round(came.size[0] / less), "height": round(came.size[1] / less)}, **recipe}
-    return yaml.safe_dump(recipe, sort_keys=False, default_flow_style=None, width=110)
+    return to_short_yaml(recipe)

@@ -86,13 +86,11 @@ _LENGTHS = {
 }  # fmt: skip
 
 
-@dataclass
 class _Pose:
     """A round being made. angles : (N, 21, 3) rad.   pelvis : (N, 3) m in the body's frame."""
 
-    body: Proportions
-
-    def __post_init__(self):
+    def __init__(self, body: Proportions):
+        self.body = body
         self.phi = np.arange(STEPS) / STEPS
         self.angles = np.zeros((STEPS, len(JOINTS), 3))
         self.pelvis = np.tile(self.body.offsets[0], (STEPS, 1))

@@ -41,8 +41,7 @@ import numpy as np
 from blinkgl.machine.extras import install
 
 if TYPE_CHECKING:
-    from blinkgl.scene.shapes.deformer import all_rigid
-from blinkgl.scene.types import Scene
+    from blinkgl.scene.types import Scene
 
 _GL_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along -z with y up
 
@@ -79,6 +78,8 @@ def measure(scene: Scene, times_ns, repeat: int = 3) -> dict:
 def export(scene: Scene, times_ns, near: float | None = None, double: bool = True, **more) -> dict[str, np.ndarray]:
     """The scene as plain arrays: geometry once, poses for each time. double : two faces for
     one of a two-sided surface."""
+    from blinkgl.scene.shapes.deformer import all_rigid  # not at the top: the worker's interpreter needs no BlinkGL
+
     all_rigid(scene, "pyrender")
     camera, arrays = scene.camera, {}
     parts = [(thing, part) for thing in scene.objects for part in thing.parts]

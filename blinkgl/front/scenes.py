@@ -321,6 +321,8 @@ class Primitive(_Object):
             primitive_mesh(validate(MeshConfig, self.mesh), "mesh")
         except ConfigError as error:
             _, said, key = (error.where or "").rpartition("parameters")
+            if said and not key and error.value in parameters:  # one that this kind does not have
+                key = f".{error.value}"
             raise ConfigError(
                 error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted
             ) from None

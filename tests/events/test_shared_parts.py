@@ -204,7 +204,7 @@ def test_the_size_of_noise_is_smooth_and_grows_with_the_rate():
         q = 1 / noise_size(np.full(len(rates), k), rates) ** 2
         inner = q > 1 / 2.5**2 + 1e-9
         steps = -np.diff(q[inner])
-        assert (steps > 0).all() and (steps[1:-1] / steps[:-2] > 0.4).all() and (steps[1:] / steps[:-1] < 1.06).all(), k
+        assert (steps > 0).all() and (steps[1:-1] / steps[:-2] > 0.4).all() and (steps[1:] / steps[:-1] < 1.2).all(), k
     for rate in (1e-4, 1e-2, 0.3):
         sizes = noise_size(np.exp(np.linspace(np.log(0.003), np.log(10.0), 200)), rate)
         growth = np.diff(np.log(sizes[sizes < 2.5]))
@@ -212,7 +212,9 @@ def test_the_size_of_noise_is_smooth_and_grows_with_the_rate():
 
 
 def test_beyond_the_table_of_noise():
-    assert noise_size(1e-5, 0.1) == noise_size(0.003, 0.1), "finer frames see nothing new"
+    few, fewer, none = (noise_size(k, 0.1) for k in (0.003, 1e-5, 0.0))
+    assert few > fewer > none > 0.97 * few, "finer frames see little new, down to a limit"
+    assert fewer == pytest.approx(none, rel=2e-3)
     assert noise_size(100.0, 0.01) == pytest.approx(noise_size(10.0, 0.1)), (
         "samples are independent: the rate per frame counts"
     )
@@ -227,7 +229,7 @@ def test_the_tables_of_an_interval_and_of_the_start():
     np.testing.assert_allclose(table[:255], 0.2 * noise_size(k, 5.0 * 1e-3 / k), rtol=1e-5)
     corners = np.random.default_rng(0).uniform(3, 300, 200)
     np.testing.assert_allclose(
-        start_sizes(5.0, corners, 0.2), 0.2 * noise_size(np.full(200, 0.003), 5.0 / (2 * np.pi * corners)), rtol=2e-3
+        start_sizes(5.0, corners, 0.2), 0.2 * noise_size(np.zeros(200), 5.0 / (2 * np.pi * corners)), rtol=2e-3
     )
 
 
@@ -257,7 +259,7 @@ def test_noise_at_the_first_frame():
     noise = v2e_model.draw_start_noise(light, config, np.uint64(3)).reshape(3, -1)
     for row, level in zip(noise, (0, 100, 255)):
         corner = 30.0 * (level + 20) / 275
-        assert row.std() == pytest.approx(0.2 * noise_size(0.003, 20.0 / (2 * np.pi * corner)), rel=0.02)
+        assert row.std() == pytest.approx(0.2 * noise_size(0.0, 20.0 / (2 * np.pi * corner)), rel=0.02)
         assert stats.kstest(row / row.std(), "norm").pvalue > 1e-3
 
 

@@ -12,6 +12,14 @@ import pytest
 from blinkgl.machine.interrupts import interruptible
 
 
+@pytest.fixture(autouse=True)
+def as_in_the_foreground():
+    """Where the suite itself runs in a shell's background SIGINT is ignored, by Python, too."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 class Dying:
     """Calls ``last`` where exceptions are dropped: in ``__del__``, or in a weak reference's callback."""
 

@@ -5,7 +5,7 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-KERNELS_ALONE = {"tools/bench_events.py", "tools/bench_load.py", "tools/draws.py"}
+KERNELS_ALONE = {"tools/bench_events.py", "tools/bench_load.py", "tools/draws.py", "tools/noise_laws.py"}
 THE_DOOR = {"blinkgl/front/sensors.py"}  # hands an emulator to a person who steps it
 OWN = {
     "make_emulator": {"blinkgl/events/camera.py", "blinkgl/events/table.py", "blinkgl/events/__init__.py"}

@@ -202,7 +202,7 @@ def test_without_a_map_tests_are_found_by_name():
     found = names.tests(of("blinkgl/timeline/budget.py", "return 0.0"))
     assert found[0] == "tests/timeline/test_budget.py" and "tests/timeline/test_strategy.py" in found
     found = names.tests(of("blinkgl/labels/table.py", "return keys"))
-    assert "tests/labels/test_labels.py" in found and "tests/test_seams.py" in found
+    assert "tests/labels/test_label_rows.py" in found and "tests/test_seams.py" in found
     assert not any(file.startswith(ByName.PEERS) for file in found) and len(set(found)) == len(found)
     shader = names.tests(Mutant("shaders/luminance.glsl", 1, 1, "a", "b", "x"))
     assert {Path(file).parts[1] for file in shader} == {"render", "extremes"}

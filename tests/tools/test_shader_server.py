@@ -373,7 +373,9 @@ def test_an_edit_that_drops_a_uniform_is_drawn(served):
     state = as_json(server, "/state")
     edit(
         label,
-        "return vec4(displacement(difference_forward, local, image_size), 1.0);",
+        "    vec3 d = difference_forward * vec4(local, 1.0); // d.z is the w row\n"
+        "#ifdef DEFORM\n    d += shape_forward;\n#endif\n"
+        "    return vec4(displacement(d, image_size), 1.0);",
         "return vec4(1.0, 2.0, 3.0, 1.0);",
     )
     now = next_version(server, state["version"])
@@ -391,6 +393,15 @@ def test_broken_from_the_start_is_one_error(shader, config, tmp_path):
     assert status == 2 and out == "" and err.startswith("error: luminance.glsl:")
 
 
+@pytest.fixture
+def interruptible_children():
+    """Where the suite itself runs in a shell's background SIGINT is ignored, and children would inherit that."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible_children")
 def test_the_command_says_where_and_ends_on_interrupt(config):
     child = subprocess.Popen(
         [sys.executable, "-X", "faulthandler", "-m", "blinkgl.cli", "shader", "serve", config, "--port", "0"],

@@ -20,6 +20,8 @@ from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
 from blinkgl.events.types import Events
 
+_NOTHING = nullcontext()
+
 
 class EventFrame(NamedTuple):
     """What an emulator is given of one moment; valid until the next one is asked for, so
@@ -102,7 +104,7 @@ class EventCamera:
 def emulate(
     frames: Iterable[EventFrame],
     camera: EventCamera,
-    clock: Callable[[str], AbstractContextManager] = lambda _: nullcontext(),
+    clock: Callable[[str], AbstractContextManager] = lambda _: _NOTHING,
 ) -> Iterator[tuple[int, Events]]:
     """(t_ns, events) frame by frame: all events before t_ns's microsecond that have not been given before.
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 import math
 import platform
 import time
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
+from blinkgl.scene.shapes.table import DEFORMERS
 from blinkgl.scene.types import Scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.folders import folder_of
@@ -146,6 +150,27 @@ def _verdict_in_words(found: Verdict | None) -> str:
     return f"yes; largest of {len(found.pairs)} pairs: {worst}" if refused is None else f"no: {refused}"
 
 
+def _variant(defines: Iterable[tuple[str, Any]]) -> str:
+    """What tells a shader's variants apart, in words; not which outputs it has, nor the sizes of a shape's numbers."""
+    sizes = {"DEFORM", "SHAPE_ROWS"}.union(*(sizes for shape in DEFORMERS.values() for sizes in shape.examples))
+    names = [name for name, _ in defines if name not in sizes and not name.startswith("OUT_")]
+    return "+".join(name.removeprefix("DEFORM_") for name in names) or "plain"
+
+
+def _living(scene: Scene) -> dict[str, str]:
+    """Rows of what changes its shape and of what falls, where there is any."""
+    kinds = Counter(type(p.mesh.deformer).__name__.lower() for o in scene.objects for p in o.parts if p.mesh.deformer)
+    rows = {}
+    if kinds:
+        rows["change shape"] = ", ".join(f"{n} by {kind}" for kind, n in sorted(kinds.items()))
+    if (falling := scene.dynamics) is not None:
+        rows["fall"] = (
+            f"{falling.bodies} by {falling.engine} {falling.version}, {falling.steps:,} steps, "
+            f"{len(falling.impacts_ns)} impacts"
+        )
+    return rows
+
+
 def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
     moving = sum(not o.is_static for o in scene.objects)
     parts = [p for o in scene.objects for p in o.parts]
@@ -158,6 +183,7 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
     return {
         "bodies": ", ".join(f"{n} {k}{'s' if n > 1 and k != 'sky' else ''}" for k, n in kinds.items() if n)
         + f"; {moving} move",
+        **_living(scene),
         "camera": f"{scene.camera.summary}, " + ("still" if scene.camera_path.is_static else "moving"),
         "triangles": f"{renderer.triangles:,}"
         + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
@@ -188,15 +214,7 @@ def _passes(
     labels = config.time.label_count
 
     def variants(name: str) -> tuple[str, ...]:
-        return tuple(
-            sorted(
-                {
-                    "+".join(d for d, _ in defines if not d.startswith("OUT_")) or "plain"
-                    for program, defines in gl.shaders.compiled
-                    if program == name
-                }
-            )
-        )
+        return tuple(sorted({_variant(defines) for program, defines in gl.shaders.compiled if program == name}))
 
     timeline, rejected = config.timeline, 1.0
     rates = timeline.reconstruction == "hermite"

@@ -12,6 +12,7 @@ the lower (part, triangle), so that the answer does not depend on the order of t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -41,8 +42,7 @@ class Tree:
     count: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Forest:
+class Forest(NamedTuple):
     """The trees of all parts, one after the other, as the kernels take them.
 
     root, first, size : (P,) int32 root node, first triangle and number of triangles of each part.
@@ -180,17 +180,7 @@ def _local_ray(axes, rx, ry, d):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_tree(
-    triangles: np.ndarray,
-    face: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    child: np.ndarray,
-    count: np.ndarray,
-    root: np.ndarray,
-    first: np.ndarray,
-    size: np.ndarray,
-    cull: np.ndarray,
-    extent: np.ndarray,
+    forest: Forest,
     origins: np.ndarray,
     axes: np.ndarray,
     rays: np.ndarray,
@@ -209,6 +199,7 @@ def nearest_tree(
     Output: hit (N, 3) int32 (part, face, 1 when seen from the front) or -1; bary (N, 3); depth (N,), inf when nothing
     is hit.
     """
+    triangles, face, lower, upper, child, count, root, _, size, cull, extent = forest
     o, d, inverse, o_lo, o_hi = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     stack, entry = np.empty(_STACK, np.int64), np.empty(_STACK)
     for i in range(rays.shape[0]):
@@ -271,17 +262,7 @@ def nearest_tree(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def nearest_exhaustive(
-    triangles: np.ndarray,
-    face: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    child: np.ndarray,
-    count: np.ndarray,
-    root: np.ndarray,
-    first: np.ndarray,
-    size: np.ndarray,
-    cull: np.ndarray,
-    extent: np.ndarray,
+    forest: Forest,
     origins: np.ndarray,
     axes: np.ndarray,
     rays: np.ndarray,
@@ -293,6 +274,7 @@ def nearest_exhaustive(
     depth: np.ndarray,
 ) -> None:
     """The slow twin of :func:`nearest_tree`: every triangle against every ray; the same arguments and answer."""
+    triangles, face, _, _, _, _, root, first, size, cull, _ = forest
     d = np.empty(3)
     for i in range(rays.shape[0]):
         depth[i] = np.inf

@@ -218,17 +218,7 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
     hit, bary, depth = np.empty((n, 3), np.int32), np.zeros((n, 3)), np.empty(n)
     kernel = nearest_exhaustive if exhaustive else nearest_tree
     kernel(
-        forest.triangles,
-        forest.face,
-        forest.lower,
-        forest.upper,
-        forest.child,
-        forest.count,
-        forest.root,
-        forest.first,
-        forest.size,
-        forest.cull,
-        forest.extent,
+        forest,
         origins,
         np.ascontiguousarray(axes),
         np.ascontiguousarray(rays),

@@ -202,8 +202,8 @@ def _best_translation(cloud: _Cloud, keep: np.ndarray, most: float) -> np.ndarra
     lengths = np.concatenate([[0.0], np.geomspace(0.5, max(reach, 0.6), max(2, math.ceil(3 * math.log2(2 + reach))))])
     best, top = np.zeros(2), -1.0
     for length in lengths:
-        for angle in np.arange(max(1, math.ceil(2 * math.pi * min(length, 4) * 2))):
-            turn = 2 * math.pi * angle / max(1, math.ceil(2 * math.pi * min(length, 4) * 2))
+        ways = max(1, math.ceil(4 * math.pi * min(length, 4)))  # half a coarse pixel apart, where they are near
+        for turn in 2 * math.pi * np.arange(ways) / ways:
             shift = length * np.array([math.cos(turn), math.sin(turn)])
             image = np.zeros(shape)
             vote(x - s * shift[0] + 1, y - s * shift[1] + 1, image)

@@ -64,6 +64,37 @@ def test_what_is_left_out_follows_the_configuration(tmp_path):
     assert more.frames == 26, "0.25 s at 100 frames/s, both ends included"
 
 
+def test_what_changes_its_shape_is_said(tmp_path):
+    scene = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}, "ann": {"primitive": "figure"}},
+        "objects": [
+            {"mesh": "box", "position": [4, 1, 0], "deform": {"kind": "twist"}},
+            {"mesh": "ann", "position": [4, -1, -1]},
+            {"mesh": "ann", "position": [5, 0, -1]},
+        ],
+        "camera": {"position": [0, 0, 0]},
+    }
+    told = explain(template(tmp_path, scene=scene))
+    assert told.scene["change shape"] == "2 by skin, 1 by twist" and "fall" not in told.scene
+    frames = next(p for p in told.passes if p.name == "event frames")
+    assert any("SKIN" in v.split("+") for v in frames.variants), "by its kind, without the sizes of its numbers"
+    assert not any("DEFORM" in v or "ROWS" in v for v in frames.variants)
+    assert "change shape" not in explain(template(tmp_path)).scene
+
+
+def test_what_falls_is_said(tmp_path):
+    pytest.importorskip("mujoco")
+    scene = {
+        "kind": "explicit",
+        "meshes": {"ball": {"primitive": "sphere", "parameters": {"radius": 0.2}}},
+        "objects": [{"mesh": "ball", "position": [4, 0, 0], "physics": {"mass": 1}}],
+        "physics": {},
+        "camera": {"position": [0, 0, 0]},
+    }
+    assert explain(template(tmp_path, scene=scene)).scene["fall"].startswith("1 by mujoco ")
+
+
 def test_an_unlit_world_needs_no_normals(tmp_path):
     scene = {**SMALL["scene"], "light": {"unlit": True}}
     told = explain(template(tmp_path, scene=scene))

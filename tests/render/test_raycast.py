@@ -22,17 +22,7 @@ def ask(kernel, forest, origins, axes, rays, near=0.0, far=None, skip=None):
     n = len(rays)
     hit, bary, depth = np.empty((n, 3), np.int32), np.zeros((n, 3)), np.empty(n)
     kernel(
-        forest.triangles,
-        forest.face,
-        forest.lower,
-        forest.upper,
-        forest.child,
-        forest.count,
-        forest.root,
-        forest.first,
-        forest.size,
-        forest.cull,
-        forest.extent,
+        forest,
         origins,
         axes,
         rays,
@@ -79,10 +69,7 @@ def forest_with_an_empty_part(parts, cull):
     """A part of no triangles has a root that nobody visits."""
     whole = forest_of([p for p in parts if len(p)], [c for p, c in zip(parts, cull) if len(p)])
     at = next(k for k, p in enumerate(parts) if not len(p))
-    from dataclasses import replace
-
-    return replace(
-        whole,
+    return whole._replace(
         root=np.insert(whole.root, at, 0).astype(np.int32),
         first=np.insert(whole.first, at, whole.first[at]).astype(np.int32),
         size=np.insert(whole.size, at, 0).astype(np.int32),

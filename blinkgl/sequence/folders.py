@@ -2,7 +2,8 @@
 
 A folder is expected to look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of frames in
 another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero: the point is
-hidden or outside the image in the next frame). All are taken in the order of their names. A third may hold the flow back, one file per pair of frames, too.
+hidden or outside the image in the next frame). All are taken in the order of their names. A third may hold the flow
+back, one file per pair of frames, too.
 """
 
 from __future__ import annotations

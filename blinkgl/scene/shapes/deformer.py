@@ -201,11 +201,11 @@ def _reach(points, halves, order, reach):
         for d in range(count):
             height = a * x[d] + b * y[d] + c * z[d]
             foremost[d] = number if height > ahead[d] else foremost[d]
-            ahead[d] = height if height > ahead[d] else ahead[d]
+            ahead[d] = max(ahead[d], height)
         for d in range(count):
             height = -(a * x[d] + b * y[d] + c * z[d])
             hindmost[d] = number if height > behind[d] else hindmost[d]
-            behind[d] = height if height > behind[d] else behind[d]
+            behind[d] = max(behind[d], height)
     heights, furthest = np.concatenate((ahead, behind)), np.concatenate((foremost, hindmost))
     mean = np.zeros(3)
     for d in range(len(order)):

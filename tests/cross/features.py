@@ -41,8 +41,13 @@ _RANDOM = {
     "camera_motion": _FAST,
     "object_motion": _FAST,
 }
-_KEYED = {"keyframes": [{"time": t, "position": [0, 20 * t, 0.1]} for t in (0, 4)], "interpolation": "linear"}
-_CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * t, 0], "look_at": [0, 14 * t, 0]} for t in (0, 2, 4)]}
+# To and fro about y = 0, once a second, so that things are in view at the late start, too.
+_TO_AND_FRO = [(k / 4, (0, 1, 0, -1)[k % 4]) for k in range(17)]
+_KEYED = {
+    "keyframes": [{"time": t, "position": [0, 5 * y, 0.1]} for t, y in _TO_AND_FRO],
+    "interpolation": "linear",
+}
+_CAMERA = {"keyframes": [{"time": t, "position": [-3, 2.2 * y, 0], "look_at": [0, 2.2 * y, 0]} for t, y in _TO_AND_FRO]}
 _EXPLICIT = {
     "kind": "explicit",
     "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},

@@ -172,6 +172,23 @@ def bodies() -> dict[str, Any]:
     }
 
 
+def living() -> dict[str, Any]:
+    """People, flags and fish as they are bound, and where they are at other times."""
+    keys = {
+        "figure": [{}, {"height": 1.1, "head": 1.4, "build": 1.3, "clip": "run"}, {"legs": 1.2, "clip": "dance"}],
+        "flag": [{}],
+        "fish": [{}, {"deep": 0.7}],
+    }
+    said = {}
+    for kind, several in keys.items():
+        for number, these in enumerate(several):
+            mesh = BUILDERS[kind](**these)
+            assert mesh.deformer is not None
+            at = np.stack([mesh.deformer.positions(mesh, int(t)) for t in TIMES_NS])
+            said[f"{kind} {number}"] = [*told_mesh(mesh), *told(at)]
+    return said
+
+
 def shapes() -> dict[str, Any]:
     """Primitives of other parameters than the usual ones; meshes whose normals and texture
     coordinates are made here."""
@@ -260,7 +277,7 @@ def events() -> dict[str, Any]:
     return said
 
 
-PARTS = (textures, coats, bodies, shapes, worlds, coarse, events)
+PARTS = (textures, coats, bodies, living, shapes, worlds, coarse, events)
 
 
 def drawn(parts=PARTS) -> dict[str, Any]:

@@ -305,7 +305,9 @@ def make(seed: int, what: str, number: int) -> Case:
     maker = Maker(rng, rng.choice([0.05, 0.15, 0.3, 0.6]), rng.choice([0.0, 0.1, 0.5]), rng.choice([0.0, 0.1, 0.3]))
     tree: dict[str, Any] = {}
     for name, info in SequenceConfig.model_fields.items():
-        if rng.random() < (0.15 if name in ("frames", "quality", "sensor", "readout", "gl", "output", "images") else 0.5):
+        if rng.random() < (
+            0.15 if name in ("frames", "quality", "sensor", "readout", "gl", "output", "images") else 0.5
+        ):
             models = [m for m in members(info.annotation) if is_model(m)]
             if name == "scene" and rng.random() < 0.7:
                 models = models[:1]

@@ -27,8 +27,10 @@ def read(tmp_path, **changes):
         ),
         (
             {"exposure_us": 40_000, "rate": 30},
-            "images.exposure_us: an exposure lasts into the next image's (got 40000.0); expected at most 33333.3, or a "
-            "lower rate",
+            (
+                "images.exposure_us: an exposure lasts into the next image's (got 40000.0); expected at most 33333.3, or a "
+                "lower rate"
+            ),
         ),
         ({"row_us": 200, "rate": 30}, "images.row_us: the rows are not read before the next image begins"),
         ({"row_us": 10_000, "rate": 0.1}, "images.exposure_us: no exposure fits into the sequence"),
@@ -50,8 +52,10 @@ def read(tmp_path, **changes):
         ({"exposure": 5}, "images.exposure: unknown key; expected 'exposure_us' (nearest)"),
         (
             {"auto_exposure": {"longest_us": 1000}},
-            "images.exposure_us: automatic exposure begins with an exposure outside its limits (got 5000.0); expected "
-            "from 20 to 1000 (auto_exposure)",
+            (
+                "images.exposure_us: automatic exposure begins with an exposure outside its limits (got 5000.0); expected "
+                "from 20 to 1000 (auto_exposure)"
+            ),
         ),
         (
             {"auto_exposure": {"longest_us": 40_000}},

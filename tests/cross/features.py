@@ -40,8 +40,13 @@ _RANDOM = {
     "camera_motion": _FAST,
     "object_motion": _FAST,
 }
-_KEYED = {"keyframes": [{"time": t, "position": [0, 20 * t, 0.1]} for t in (0, 4)], "interpolation": "linear"}
-_CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * t, 0], "look_at": [0, 14 * t, 0]} for t in (0, 2, 4)]}
+_AWAY = {0: 0, 1: 1, 2: 1, 3: 0, 4: -1}
+"""Something passes at 0 s and comes back at 3 s, so that a sequence that starts late sees it, too."""
+_KEYED = {
+    "keyframes": [{"time": t, "position": [0, 20 * y, 0.1]} for t, y in _AWAY.items()],
+    "interpolation": "linear",
+}
+_CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * y, 0], "look_at": [0, 14 * y, 0]} for t, y in _AWAY.items()]}
 _EXPLICIT = {
     "kind": "explicit",
     "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
@@ -125,8 +130,20 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "frame camera": {
         "none": NOTHING,
-        "plain": {"images": {"rate": 100, "max_instants": 4}},
-        "raw": {"images": {"preset": "raw", "rate": 50, "bayer": "bggr", "bits": 16, "max_instants": 2}},
+        "plain": {
+            "images": {"preset": "plain", "rate": 100, "max_instants": 4, "response": "srgb", "photon_noise": False}
+        },
+        "raw": {
+            "images": {
+                "preset": "raw",
+                "rate": 50,
+                "response": "linear",
+                "photon_noise": True,
+                "bayer": "bggr",
+                "bits": 16,
+                "max_instants": 2,
+            }
+        },
         "rolling, low light": {
             "images": {
                 "preset": "low_light",

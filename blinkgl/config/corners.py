@@ -35,11 +35,13 @@ class Fill:
     """Values laid under what a configuration says: ``values(*reads)`` returns a tree of them.
 
     reads, writes : dotted keys from the top. ``values`` is given what the tree says at ``reads`` (None: nothing) and
-    nothing else, and may return keys at or below ``writes`` only."""
+    nothing else, and may return keys at or below ``writes`` only. parts : (key written, keys inside what is read that
+    it comes from, "*" for any), so that of a table that is read a key hangs on its own part alone."""
 
     reads: tuple[str, ...]
     writes: tuple[str, ...]
     values: Callable[..., dict[str, Any]]
+    parts: tuple[tuple[str, str], ...] = ()
 
     def __call__(self, tree: dict[str, Any]) -> dict[str, Any]:
         """``tree`` over the fill's values. Raises TypeError where those are not the declared ones."""
@@ -105,7 +107,9 @@ def corners(model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Ite
         yield from combinations(tree, group, between=site)
     done: list[frozenset[Path]] = []
     for group in sorted(
-        {_together(keys, model, every, fills) for keys in _looked_at(model, every)}, key=len, reverse=True
+        {_together(keys, model, every, fills) for keys in _looked_at(model, [*every, *_written(every, fills)])},
+        key=len,
+        reverse=True,
     ):
         if not any(group <= other for other in done):
             done.append(group)
@@ -209,6 +213,10 @@ def _together(
             writes = [tuple(w.split(".")) for w in fill.writes]
             if any(_related(key, w, True) and (deep or len(key) >= len(w)) for w in writes):
                 more += [(tuple(r.split(".")), False) for r in fill.reads]
+            for written, source in fill.parts:
+                top = tuple(written.split("."))
+                if key[: len(top)] == top:
+                    more.append(((*source.split("."), *key[len(top) :]), deep))
         for one in more:
             if one not in wanted:
                 wanted[one] = None
@@ -268,6 +276,16 @@ def placed_rules(model: type[Config]) -> tuple[tuple[Path, Rule], ...]:
 
     walk(model, ())
     return tuple(dict.fromkeys(found))
+
+
+def _written(every: list[Path], fills: tuple[Fill, ...]) -> Iterator[Path]:
+    """Where fills put what is drawn inside the tables that they read."""
+    for fill in fills:
+        for written, source in fill.parts:
+            top = tuple(source.split("."))
+            for site in every:
+                if len(site) > len(top) and _related(site[: len(top)], top, False):
+                    yield (*written.split("."), *site[len(top) :])
 
 
 def _looked_at(model: type[Config], every: list[Path]) -> Iterator[list[tuple[Path, bool]]]:

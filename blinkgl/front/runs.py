@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from blinkgl.config.base import Config, validate_field
+from blinkgl.config.draw import middle
 from blinkgl.config.recipe import merge
-from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run, with_sensors
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.front.scenes import Scene
@@ -130,9 +132,11 @@ def configured(
         own["labels"] = labels_tree(labels)
     if images is not None:
         own["images"] = images_tree(images)
-    for key in ("sensor", "quality"):
-        if key in own:
-            validate_field(SequenceConfig, key, own[key])
+    own = with_sensors(own, Path.cwd())
+    if "quality" in own:
+        validate_field(SequenceConfig, "quality", own["quality"])
+    if "sensor" in own:
+        validate_field(SequenceConfig, "sensor", middle(own["sensor"]))
     return RunTemplate(merge(template.tree, own), template.base) if own else template
 
 

@@ -42,7 +42,7 @@ class RecordedSequence(Simulation):
         self._recorded = frames
         self.folder = folder_of(frames, index, base)
         self.files = used_images(frames, self.folder)
-        self.flows, self.masks = flow_files(self.folder, frames, len(self.files))
+        self.flows, self.masks = flow_files(self.folder, frames, self.files)
         self._kept: dict[int, np.ndarray] = {
             0: read_frame(self.files[0])
         }  # read already, and an image of a label to come

@@ -24,8 +24,8 @@ class ImageDataset(Dataset):
 
     A dict: images, and sharp and clean where the data set has them, (3, H, W) or (1, H, W) float32, code / largest
     code; events (C, H, W) float32 of the time from the first row's start to the last row's end; start_us, end_us,
-    exposure_us, row_us, gain_db; name. Made by the same camera all samples have the same keys, so that torch's own collation takes
-    them.
+    exposure_us, row_us, gain_db; name. All samples of one camera have the same keys, so that torch's own collation
+    takes them.
 
     representation : of the events; None: their :class:`~eflow.data.window.Window` itself, as "window".
     margin_us : of time before and after the exposure whose events are given, too (interpolation looks at neighbours).

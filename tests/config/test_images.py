@@ -28,8 +28,8 @@ def read(tmp_path, **changes):
         (
             {"exposure_us": 40_000, "rate": 30},
             (
-                "images.exposure_us: an exposure lasts into the next image's (got 40000.0); expected at most 33333.3, or "
-                "a lower rate"
+                "images.exposure_us: an exposure lasts into the next image's (got 40000.0); expected at most 33333.3, "
+                "or a lower rate"
             ),
         ),
         ({"row_us": 200, "rate": 30}, "images.row_us: the rows are not read before the next image begins"),

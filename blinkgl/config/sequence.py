@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from blinkgl.camera import CameraModel, PinHole, focal_length
-from blinkgl.config.base import Config, Refused, rule, validate, validate_field
+from blinkgl.config.base import Config, Refused, remembering, rule, validate, validate_field
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
@@ -429,9 +429,10 @@ class RunTemplate:
                     accepted="plain values",
                 )
         first = None
-        for tree in corners(SequenceConfig, self.tree, FILLS):
-            config = _validated(tree)
-            first = config if first is None else first
+        with remembering():
+            for tree in corners(SequenceConfig, self.tree, FILLS):
+                config = _validated(tree)
+                first = config if first is None else first
         assert first is not None
         return first
 

@@ -138,9 +138,16 @@ class RenderedSequence(Simulation):
         last = k == self.config.time.label_count
         if last:
             request = LabelRequest(*(name for name in request if LABELS[name].at_last))
-        frame = self.renderer.labels(t_ns, request, t_ns + interval, t_ns - interval)
+        return self._truth_over(k, t_ns, interval, request, last)
+
+    def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
+        self._resume()
+        return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
+
+    def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
+        frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns)
         camera, objects = poses_at(self.scene, [t_ns])
-        leads_to = (None, None) if last else (t_ns + interval, t_ns - interval)
+        leads_to = (None, None) if last else (t_ns + span_ns, t_ns - span_ns)
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:

@@ -169,6 +169,20 @@ class Simulation(ABC):
         """The events alone."""
         return (item for item in self if isinstance(item, EventChunk))
 
+    def gather(self) -> Events:
+        """All events at once, for whoever cuts windows out of a short sequence. OpenGL stays until :meth:`close`, so
+        that :meth:`truth` can be asked at any time in it: use it in ``with``."""
+        held, self._stack = self._stack, ExitStack()
+        try:
+            return Events.concatenate([chunk.events for chunk in self.chunks()])
+        finally:
+            self._stack = held
+
+    @abstractmethod
+    def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
+        """What is true at any time t_ns, with flow forward to t_ns + span_ns and back to t_ns - span_ns (k is -1).
+        Raises ConfigError for recorded frames, of which nobody knows more than their files say."""
+
     def _items(self) -> Iterator[Item]:
         with self:
             self._resume()

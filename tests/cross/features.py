@@ -9,6 +9,7 @@ of any two features meet. Whoever adds a feature adds its kinds to ``FEATURES``;
 from __future__ import annotations
 
 import copy
+import importlib.util
 import itertools
 import random
 import typing
@@ -40,13 +41,13 @@ _RANDOM = {
     "camera_motion": _FAST,
     "object_motion": _FAST,
 }
-_AWAY = {0: 0, 1: 1, 2: 1, 3: 0, 4: -1}
-"""Something passes at 0 s and comes back at 3 s, so that a sequence that starts late sees it, too."""
+# To and fro about y = 0, once a second, so that things are in view at the late start, too.
+_TO_AND_FRO = [(k / 4, (0, 1, 0, -1)[k % 4]) for k in range(17)]
 _KEYED = {
-    "keyframes": [{"time": t, "position": [0, 20 * y, 0.1]} for t, y in _AWAY.items()],
+    "keyframes": [{"time": t, "position": [0, 5 * y, 0.1]} for t, y in _TO_AND_FRO],
     "interpolation": "linear",
 }
-_CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * y, 0], "look_at": [0, 14 * y, 0]} for t, y in _AWAY.items()]}
+_CAMERA = {"keyframes": [{"time": t, "position": [-3, 2.2 * y, 0], "look_at": [0, 2.2 * y, 0]} for t, y in _TO_AND_FRO]}
 _EXPLICIT = {
     "kind": "explicit",
     "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
@@ -55,6 +56,45 @@ _EXPLICIT = {
     "camera": _CAMERA,
 }
 _FILE = {"kind": "file", "path": "scene.glb", "pose": _CAMERA}
+_FALLS = importlib.util.find_spec("mujoco") is not None
+_LIVING = {  # figures, flags and fish among what deforms, falls and stands
+    **_RANDOM,
+    "pool": {
+        **_POOLS["pool"],
+        "primitives": ["cuboid", "sphere", "figure", "flag", "fish"],
+        "variants": 3,
+        "keep_materials": True,
+    },
+    "objects": {"count": 6, "distance": [1, 4], "deform": {"share": 0.7, "period": [0.05, 0.2]}},
+    **({"physics": {"share": 0.5}} if _FALLS else {}),
+}
+_STEPS = {"clip": "run", "height": 0.8, "tempo": 2, "coat": 3}
+_ALIVE = {  # one of everything that moves by itself, beside each other
+    "kind": "explicit",
+    "meshes": {
+        "arm": {"file": "arm.glb"},
+        "sheet": {"primitive": "cuboid", "parameters": {"extents": [0.1, 0.8, 0.8]}},
+        "runner": {"primitive": "figure", "parameters": _STEPS},
+        "ball": {"primitive": "icosphere"},
+        "floor": {"primitive": "grid", "parameters": {"width": 9, "depth": 9}},
+    },
+    "materials": {"checks": {"procedural": "checks", "max_size": 32}},
+    "objects": [
+        {"mesh": "floor", "category": "ground", "position": [0, 0, -0.7], "material": "checks"},
+        {"mesh": "arm", "animation": {"clip": "wave", "speed": 3}, "scale": 0.4, "position": [0, -0.9, 0]},
+        {"mesh": "sheet", "material": "checks", "position": [0.3, 0.7, 0.2], "deform": {"kind": "wave", "period": 0.1}},
+        {"mesh": "runner", "way": {"points": [[-0.5, 0.6, -0.7], [-0.5, -2, -0.7], [-0.7, -9, -0.7]]}},
+        {
+            "mesh": "ball",
+            "material": "checks",
+            "scale": 0.4,
+            "position": [-0.6, 0, -0.4],
+            **({"physics": {"velocity": [0, 2, -8]}} if _FALLS else {}),
+        },
+    ],
+    **({"physics": {}} if _FALLS else {}),
+    "camera": {"position": [-3, 0, 0], "look_at": [0, 0, 0]},
+}
 
 BASE = {
     "camera": {"width": WIDTH, "height": HEIGHT},
@@ -75,6 +115,8 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "still camera": {"scene": {"camera_motion": {"kind": "static"}}},
         "explicit": {"scene": _EXPLICIT},
         "file": {"scene": _FILE},
+        "living": {"scene": _LIVING},
+        "explicit, alive": {"scene": _ALIVE},
         "frames, motion": _frames(interpolate="motion", max_px=0.5),
         "frames, linear": _frames(interpolate="linear", flow="flow_flo", gamma="linear"),
         "frames, cubic": _frames(interpolate="cubic", flow=None, first=1, count=4),
@@ -237,8 +279,8 @@ multi-sampling and anisotropy (beside a triangle that ends at the horizon the fo
 adds up every texel of it)."""
 
 ELSEWHERE = {
-    "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit and whether the "
-    "camera moves",
+    "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
+    "camera moves, and what moves by itself",
     "gl": RUN_LEVEL["gl"],
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}

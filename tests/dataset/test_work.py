@@ -29,7 +29,7 @@ from blinkgl.sequence.clock import StageClock
 
 
 @pytest.mark.parametrize(
-    "workers, cores, share, drawing", [(1, 1, 1, None), (2, 1, 1, "0"), (3, 8, 2, "2"), (8, 8, 1, "0"), (0, 4, 4, None)]
+    "workers, cores, share, drawing", [(1, 1, 1, "0"), (2, 1, 1, "0"), (3, 8, 2, "2"), (8, 8, 1, "0"), (0, 4, 4, None)]
 )
 def test_cores_are_divided(workers, cores, share, drawing):
     names = {name: str(share) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}

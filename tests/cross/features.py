@@ -170,6 +170,48 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")},
         "no images": {"labels": {"images": False}},
     },
+    "frame camera": {
+        "none": NOTHING,
+        "plain": {
+            "images": {"preset": "plain", "rate": 100, "max_instants": 4, "response": "srgb", "photon_noise": False}
+        },
+        "raw": {
+            "images": {
+                "preset": "raw",
+                "rate": 50,
+                "response": "linear",
+                "photon_noise": True,
+                "bayer": "bggr",
+                "bits": 16,
+                "max_instants": 2,
+            }
+        },
+        "rolling, low light": {
+            "images": {
+                "preset": "low_light",
+                "times": [0.006, 0.018],
+                "exposure_us": 4000,
+                "row_us": 100,
+                "response": "gamma",
+                "max_instants": 3,
+                "also": ["sharp", "clean"],
+            }
+        },
+        "automatic": {
+            "images": {
+                "preset": "deblurring",
+                "rate": 120,
+                "exposure_us": 2000,
+                "max_instants": 2,
+                "vignetting": 0.5,
+                "bayer": "grbg",
+                "lens": {"aperture": 0.05, "focus": 4.0},
+                "auto_exposure": {"longest_us": 4000},
+            }
+        },
+        "interpolation": {"images": {"preset": "interpolation", "max_instants": 2, "bayer": "gbrg"}},
+        "rolling shutter": {"images": {"preset": "rolling_shutter", "rate": 100, "max_instants": 3, "bayer": "rggb"}},
+    },
     "textures": {
         "plain": NOTHING,
         "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}},
@@ -217,9 +259,17 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
         for curve in ("pchip", "hermite")
         for emulator in _STRAIGHT_ONLY
     },
+    **{
+        (("source", source), ("frame camera", camera)): "images: recorded frames are images already"
+        for source in FEATURES["source"]
+        if source.startswith("frames")
+        for camera in FEATURES["frame camera"]
+        if camera != "none"
+    },
+    (("frame camera", "rolling, low light"), ("time", "late")): "images.times: an exposure outside the sequence",
 }
-"""Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there
-they are no contradiction."""
+"""Pairs that make no sense, and the line that says so. Recorded frames have neither a timeline nor a time: there those
+are no contradiction."""
 
 TOO_SLOW: set[tuple[Kind, Kind]] = {
     (one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))
@@ -263,9 +313,15 @@ def configuration(row: dict[str, str]) -> dict[str, Any]:
 
 def refusal(row: dict[str, str]) -> str | None:
     """What is said when this row is given; None: it is accepted."""
-    if row.get("source", "").startswith("frames"):
-        return None
-    return next((line for (a, b), line in REFUSED.items() if row.get(a[0]) == a[1] and row.get(b[0]) == b[1]), None)
+    recorded = row.get("source", "").startswith("frames")
+    return next(
+        (
+            line
+            for (a, b), line in REFUSED.items()
+            if row.get(a[0]) == a[1] and row.get(b[0]) == b[1] and (not recorded or a[0] == "source")
+        ),
+        None,
+    )
 
 
 def fits(row: dict[str, str]) -> bool:

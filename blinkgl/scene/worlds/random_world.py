@@ -19,7 +19,7 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.base import tag_of
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
-from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
+from blinkgl.config.scene import RandomSceneConfig, SkyConfig, WallsConfig
 from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
@@ -27,6 +27,7 @@ from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
 from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
 from blinkgl.scene.importing.mesh_files import Asset
+from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import Barrier, Exploded, simulate
 from blinkgl.scene.motion.paths import StaticPath
@@ -36,7 +37,7 @@ from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import filled, gait
 from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
-from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.types import Lamp, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
 
 _PLACEMENTS = 300  # positions tried for an object before it is left out
@@ -152,12 +153,22 @@ def random_world(
         except Exploded as error:  # squeezed between two that nothing stops
             kept = tuple(o for o in kept if o.name != error.body)
             log.append(f"left out, it came to be faster than scene.physics.max_speed: {error.body}")
+    lamps: tuple[Lamp, ...] = ()
+    if config.lights is not None:
+        lamps = random_lamps(config.lights, generator(seed, sequence, Role.LIGHT), half, floor)
+        if len(lamps) + len(config.light.lights) + 1 > MAX_LAMPS:
+            raise ConfigError(
+                "too many lights",
+                where="scene.lights.count",
+                value=config.lights.count[1],
+                accepted=f"at most {MAX_LAMPS - 1} with those of scene.light.lights",
+            )
     return Scene(
         objects=kept,
         rig=Rig.alone(camera, result.camera_path),
         t0_ns=t0_ns,
         t1_ns=t1_ns,
-        light=make_light(config.light, rng),
+        light=make_light(config.light, rng, lamps),
         background=config.background,
         log=tuple(log),
         omissions=tuple(omissions),
@@ -174,12 +185,6 @@ def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
 
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
 _texture_pool = lru_cache(maxsize=4)(texture_pool)
-
-
-def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:
-    """Sun direction drawn where the configuration leaves it open and ``rng`` is given."""
-    drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
-    return Light(config.sun_direction(*drawn), config.sun, config.sky)
 
 
 def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray, np.ndarray]:

@@ -182,8 +182,19 @@ class SkyConfig(Config):
     per_face: bool = Field(True, description="a texture of its own on each face, or one on all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
     panoramas: Paths = Field(
-        (), description="equirectangular images or folders of them (jpg, png, hdr) used instead of the texture pool"
+        (),
+        description="equirectangular images or folders of them (jpg, png, hdr, exr) used instead of the texture pool",
     )
+    lights: bool = Field(
+        False,
+        description="the panorama lights the world, too, in the place of light.sun and light.sky: what is drawn and "
+        "what shines are one picture",
+    )
+
+    @rule("lights", "#panoramas")
+    def _a_panorama_lights(lights, panoramas):
+        if lights and not [*panoramas]:
+            raise Refused("only panoramas light", where="lights", value=lights, accepted="false, or sky.panoramas")
 
 
 class GroundConfig(Config):
@@ -267,6 +278,18 @@ class SpotLampConfig(_PlacedLampConfig):
 LampConfig = one_of("kind", SunLampConfig, PointLampConfig, SpotLampConfig)
 
 
+class EnvironmentConfig(Config):
+    """A panorama that lights a scene in the place of light.sun and light.sky, and is seen as its sky."""
+
+    map: str = Field(description="equirectangular image: hdr or exr, or one of 8 bits, which knows no bright sun")
+    strength: Radiance = Field(
+        1.0, description="factor on its radiance, which is exposed so that its 90th percentile is 0.8"
+    )
+    heading: float = Field(0.0, ge=-360, le=360, description="degrees by which it is turned from +x towards +y")
+    visible: bool = Field(True, description="whether it is drawn, as a box around everything")
+    size: float = Field(100.0, gt=0, le=1e6, description="edge of that box, m; it stands around the world's origin")
+
+
 class LightConfig(Config):
     """A sun and a sky, white as long as nobody says otherwise: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and
     lights beside them."""
@@ -288,6 +311,10 @@ class LightConfig(Config):
     lights: tuple[LampConfig, ...] = Field(
         (), description="suns, point and spot lights beside the sun and the sky, in the world's coordinates"
     )
+    environment: EnvironmentConfig | None = Field(
+        None,
+        description="a panorama that lights the scene; null: the sun and the sky shine. In random worlds: sky.lights",
+    )
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
     def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
@@ -302,10 +329,11 @@ class LightConfig(Config):
         if (given := len([*lights])) > MAX_LIGHTS:
             raise Refused("too many lights", where="lights", value=given, accepted=f"at most {MAX_LIGHTS}")
 
-    @rule("unlit", "#lights")
-    def _lit(unlit, lights):
-        if unlit and [*lights]:
-            raise Refused("nothing is lit by them", where="lights", value="unlit: true", accepted="unlit: false")
+    @rule("unlit", "#lights", "?environment")
+    def _lit(unlit, lights, environment):
+        for where, given in (("lights", [*lights]), ("environment", environment)):
+            if unlit and given:
+                raise Refused("nothing is lit by them", where=where, value="unlit: true", accepted="unlit: false")
 
 
 def direction_of(elevation: float, azimuth: float) -> Vector3:
@@ -332,12 +360,12 @@ class RandomLightsConfig(Config):
     angle: PositiveRange = Field((30.0, 100.0), description="of a spot light's cone, degrees; uniform")
 
     @rule("count")
-    def _fewest_first(count):
+    def _fewest_first(count: tuple[int, int]):
         if count[0] > count[1]:
             raise Refused("the range must be [fewest, most]", where="count", value=list(count))
 
     @rule("angle")
-    def _a_cone(angle):
+    def _a_cone(angle: tuple[float, float]):
         if angle[1] > 170 or angle[0] < 0.5:
             raise Refused("out of range", where="angle", value=list(angle), accepted="0.5 to 170 degrees")
 
@@ -367,10 +395,19 @@ class RandomSceneConfig(Config):
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
 
-    @rule("?lights", "light.unlit")
-    def _lit(lights, unlit):
-        if lights and unlit:
-            raise Refused("nothing is lit by them", where="lights", accepted="null, or light.unlit: false")
+    @rule("?lights", "sky.lights", "light.unlit", "?light.environment")
+    def _lit(lights, sky_lights, unlit, environment):
+        for where, given in (("lights", lights), ("sky.lights", sky_lights)):
+            if given and unlit:
+                raise Refused(
+                    "nothing is lit by them", where=where, value="light.unlit: true", accepted="light.unlit: false"
+                )
+        if environment:
+            raise Refused(
+                "a random world is lit by its own sky",
+                where="light.environment",
+                accepted="sky.panoramas and sky.lights",
+            )
 
     @rule("region.width", "region.height", "objects.size", "sky.size")
     def _sky_holds_everything(width: float, height: float, sizes: tuple[float, float], sky: float | None):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from blinkgl.config.scene import (
     direction_of,
 )
 from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.surfaces.environment import Environment
 from blinkgl.scene.types import Lamp, Light
 
 if TYPE_CHECKING:
@@ -67,7 +69,8 @@ def quadric_of(light: Light) -> np.ndarray:
     one = np.zeros((4, 4))
     one[3, 3] = 0.5
     one[2, 3] = one[3, 2] = 0.25  # 0.5 + 0.5 n_z
-    return light.sky * np.asarray(light.sky_color, np.float64)[:, None, None] * one
+    sky = light.sky * np.asarray(light.sky_color, np.float64)[:, None, None] * one
+    return sky if light.around is None else sky + np.asarray(light.around, np.float64)
 
 
 def is_coloured(light: Light) -> bool:
@@ -130,6 +133,16 @@ def _lamp(config: SunLampConfig | PointLampConfig | SpotLampConfig) -> Lamp:
     outer = math.radians(config.angle / 2)
     pose = lamp_pose(config.position, np.subtract(config.look_at, config.position))
     return Lamp("spot", strength, StaticPath(pose), reach, outer * (1 - config.edge), outer, config.size)
+
+
+def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
+    """A panorama's light in the place of the light's sun and sky. factor : on its radiance."""
+    suns = [
+        Lamp("sun", _scaled(sun.strength, factor), StaticPath(lamp_pose(shines=-sun.towards)), size=sun.size)
+        for sun in panorama.suns
+    ]
+    around = tuple(tuple(tuple(float(factor * v) for v in row) for row in one) for one in panorama.quadric)
+    return replace(light, sun=0.0, sky=0.0, lamps=(*suns, *light.lamps), around=around)
 
 
 LUMENS_PER_WATT = 683.0

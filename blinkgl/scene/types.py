@@ -176,6 +176,8 @@ class Light:
     sun_direction : unit vector in the world, from the surface towards the sun (s).
     sun_color, sky_color : (3,) linear factors.   sun_size : rad, as of a lamp.
     lamps : what shines beside them.
+    around : quadric of what else comes from all around (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers; None:
+        nothing.
 
     The defaults are those of ``light:`` in the configuration, where nothing is random.
     """
@@ -187,11 +189,12 @@ class Light:
     sky_color: tuple[float, float, float] = WHITE
     sun_size: float = math.radians(LightConfig().sun_size)
     lamps: tuple[Lamp, ...] = ()
+    around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
 
     @property
     def plain(self) -> bool:
         """Whether a white sun and sky are all there is: the formula above."""
-        return not self.lamps and self.sun_color == WHITE == self.sky_color
+        return not self.lamps and self.around is None and self.sun_color == WHITE == self.sky_color
 
 
 @dataclass(frozen=True)

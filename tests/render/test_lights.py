@@ -120,6 +120,26 @@ def test_every_light_is_the_references(gl, offset):
                 assert np.quantile(error, 0.999) < 1e-4
 
 
+def test_light_of_a_panorama_is_the_references(gl):
+    """Nine numbers per channel, turned into each object's axes; and their rate."""
+    quadric = np.random.default_rng(1).normal(size=(3, 4, 4)) * 0.1
+    quadric = quadric + quadric.swapaxes(1, 2) + np.diag([0, 0, 0, 1.0])
+    light = Light(sun=0, sky=0, around=tuple(tuple(map(tuple, one)) for one in quadric.tolist()))
+    world, t, h = replace(mixed_scene(textured=False), light=light), SECOND // 3, 1_000_000
+    ref = reference.render(world, t)
+    with Renderer(gl, world, RenderConfig(image_antialiasing="none"), whole=True) as renderer:
+        seen, colour = renderer.luminance(t).read(), renderer.colour(t).read()
+        before, after = (renderer.luminance(t + dt).read().astype(np.float64) for dt in (-h, h))
+        rate = renderer.luminance(t, rate=True).read("rate").astype(np.float64)
+    off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth, width=3) & (ref.instance > 2)
+    assert (
+        np.quantile(np.abs(seen - ref.luminance)[off], 0.999) < 1e-4
+        and np.median(np.abs(colour - ref.colour)[off]) < 1e-6
+    )
+    true = (after - before) / (2e-9 * h)
+    assert np.quantile(np.abs(rate - true)[off], 0.9) < 0.03 * np.abs(true[off]).max()
+
+
 def test_one_channel_does_where_a_surface_has_one_colour(gl):
     """And three are taken where it has several; both give the luminance of the picture."""
     light = Light(lamps=LAMPS, sky_color=(0.5, 0.8, 1.0))

@@ -2,14 +2,18 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 
 from blinkgl.config.base import validate
-from blinkgl.config.scene import LightConfig, RandomLightsConfig, RandomSceneConfig
+from blinkgl.config.scene import ExplicitSceneConfig, LightConfig, RandomLightsConfig, RandomSceneConfig
+from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
+from blinkgl.scene.build import build_scene
 from blinkgl.scene.lights import ambient, beam, is_coloured, lamp_pose, lamps_of, make_light, quadric_of, random_lamps
+from blinkgl.scene.surfaces.environment import pixel_directions
 from blinkgl.scene.types import Light
 
 SPOT = {"kind": "spot", "position": [1, 2, 3], "look_at": [1, 2, 0], "strength": 4, "angle": 40, "edge": 0.5}
@@ -85,6 +89,9 @@ def test_a_spot_light_fades_by_the_square_of_the_cosines_ramp():
         ({"lights": [{"kind": "point", "position": [0, 0, 1], "angle": 4}]}, "lights.0.*angle"),
         ({"lights": [{**SPOT, "look_at": [1, 2, 3]}]}, "look_at: must differ from the position"),
         ({"lights": [SPOT] * 32}, "scene.light.lights: too many lights .got 32.; expected at most 31"),
+        ({"environment": {"map": "a.hdr"}, "unlit": True}, "scene.light.environment: nothing is lit by them"),
+        ({"environment": {}}, "scene.light.environment.map"),
+        ({"environment": {"map": "a.hdr", "strength": -1}}, "environment.strength.*got -1"),
         ({"lights": [SPOT], "unlit": True}, "scene.light.lights: nothing is lit by them"),
     ],
 )
@@ -119,6 +126,57 @@ def test_bad_random_lights():
         ({"lights": {"angle": [10, 179]}}, "lights.angle: out of range"),
         ({"lights": {"kinds": []}}, "lights.kinds"),
         ({"lights": {}, "light": {"unlit": True}}, "lights: nothing is lit by them"),
+        ({"sky": {"lights": True}}, "sky.lights: only panoramas light"),
+        ({"sky": {"lights": True, "panoramas": "a.hdr"}, "light": {"unlit": True}}, "sky.lights: nothing is lit"),
+        ({"light": {"environment": {"map": "a.hdr"}}}, "light.environment: a random world is lit by its own sky"),
     ):
         with pytest.raises(ConfigError, match=expected):
             validate(RandomSceneConfig, tree, where="scene")
+
+
+def panorama(folder):
+    """A dark hall with one window, towards +y."""
+    directions, _ = pixel_directions(64, 128)
+    image = np.full((64, 128, 3), 0.05, np.float32)
+    image[directions @ np.array([0, 0.8, 0.6]) > math.cos(0.15)] = (200.0, 150.0, 100.0)
+    assert cv2.imwrite(str(folder / "hall.hdr"), image[..., ::-1].copy())
+    return "hall.hdr"
+
+
+def test_a_panorama_is_sky_and_light_at_once(tmp_path):
+    """Of a random world and of an explicit one: the sun stands where the sky is brightest."""
+    camera = CameraConfig(width=32, height=24)
+    tree = {
+        "objects": {"count": 1},
+        "sky": {"panoramas": panorama(tmp_path), "lights": True, "brightness": 0.5},
+        "textures": {"procedural": ["checks"], "photographs": False, "variants": 2, "test_fraction": 0},
+        "pool": {"primitives": ["cuboid"], "variants": 2},
+    }
+    fixed = {
+        "kind": "explicit",
+        "meshes": {"box": {"primitive": "cuboid"}},
+        "objects": [{"mesh": "box"}],
+        "camera": {"position": [-3, 0, 1]},
+        "light": {"environment": {"map": "hall.hdr", "strength": 0.5, "heading": 30}},
+    }
+    for config in (validate(RandomSceneConfig, tree), validate(ExplicitSceneConfig, fixed)):
+        scene = build_scene(config, camera, 0, 10**9, base=tmp_path)
+        (sun,) = lamps_of(scene.light)
+        assert scene.light.sun == scene.light.sky == 0 and is_coloured(scene.light)
+        (sky,) = (thing for thing in scene.objects if thing.category == "sky")
+        best, where = 0.0, None
+        for part in sky.parts:  # the middle of the brightest texels, on the box
+            image = part.material.texture.image.sum(axis=2)
+            y, x = (c.mean() for c in np.nonzero(image > 0.9 * image.max()))
+            if image.max() > best and (image > 0.9 * image.max()).mean() < 0.3:
+                uv = np.array([(x + 0.5) / image.shape[1], (y + 0.5) / image.shape[0]])
+                corner = np.linalg.lstsq(
+                    np.c_[part.mesh.uvs, np.ones(len(part.mesh.uvs))], part.mesh.vertices, rcond=None
+                )[0]
+                best, where = image.max(), np.array([*uv, 1.0]) @ corner
+        assert sun.path.pose(0)[:3, 2] @ where > 0.99 * np.linalg.norm(where)
+    towards = sun.path.pose(0)[:3, 2]
+    assert math.degrees(math.atan2(towards[1], towards[0])) == pytest.approx(120, abs=1)  # +y, turned by 30
+    with pytest.raises(ConfigError, match="scene.light.environment.map: no such file .got 'none.hdr'"):
+        tree = {**fixed, "light": {"environment": {"map": "none.hdr"}}}
+        build_scene(validate(ExplicitSceneConfig, tree), camera, 0, 10**9, base=tmp_path)

@@ -38,6 +38,7 @@ from blinkgl.scene.surfaces.images import content_hash, shrink
 from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.explicit import motion_path
 from blinkgl.scene.worlds.pool import resolve
+from blinkgl.scene.worlds.sky import with_environment
 
 if TYPE_CHECKING:
     import trimesh
@@ -71,6 +72,8 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
         max_faces=config.max_faces,
         max_texture=config.max_texture_size,
     )
+    light, objects = with_environment(config.light.environment, scene.light, base, scene.objects)
+    scene = replace(scene, light=light, objects=objects)
     return unlit(scene) if config.light.unlit else scene
 
 

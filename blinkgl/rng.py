@@ -23,6 +23,7 @@ class Role(IntEnum):
     PHYSICS = 5
     SHAPE = 6
     LIGHT = 7
+    IMAGES = 8
 
 
 def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:

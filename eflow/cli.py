@@ -253,7 +253,10 @@ def submit(
 
 @app.command()
 def bench(
-    model: Annotated[list[str] | None, typer.Option("--model", "-m", help="May be repeated; default: all.")] = None,
+    model: Annotated[
+        list[str] | None,
+        typer.Option("--model", "-m", help="May be repeated, e.g. eraft-tiny; default: every network as published."),
+    ] = None,
     size: Annotated[
         list[str] | None, typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")
     ] = None,
@@ -273,7 +276,7 @@ def bench(
     from eflow.evaluate import write_json
 
     _one_of("--precision", precision, ("fp32", "bf16"))
-    names = model or list(benchmark.PRESETS)
+    names = model or [name for name, tree in benchmark.PRESETS.items() if tree.get("size") == "base"]
     for name in names:
         benchmark.preset(name)
     sizes = [_size(s) for s in size or ["640x480"]]

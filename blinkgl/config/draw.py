@@ -59,6 +59,30 @@ def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) 
     return list(dict.fromkeys((low, high, low + 0.381966 * (high - low)) if between else (low, high)))
 
 
+def middle(tree: Any) -> Any:
+    """``tree`` with the middle of every distribution in its place: half-way between the ends of a range (of their
+    logarithms for ``log_uniform``; the lower of two integers), and the value in the list of choices that half of the
+    chances have been dealt out by. Raises ConfigError (with the path) for a malformed one."""
+    return _walk(tree, (), _middle)
+
+
+def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
+    _check(path, kind, spec)
+    if kind == "choice":
+        return spec[(len(spec) - 1) // 2]
+    if kind in ("weighted", "shares"):
+        parts = spec.items() if kind == "weighted" else [(part["value"], part["share"]) for part in spec]
+        half, dealt = math.fsum(_number(chance) for _, chance in parts) / 2, 0.0
+        for value, chance in parts:
+            dealt += _number(chance)
+            if dealt >= half and _number(chance) > 0:
+                return value
+    low, high = (_number(x) for x in spec)
+    if kind == "integer":
+        return (int(low) + int(high)) // 2
+    return math.exp(0.5 * (math.log(low) + math.log(high))) if kind == "log_uniform" else low + 0.5 * (high - low)
+
+
 def _walk(node: Any, path: tuple[str, ...], replace) -> Any:
     if is_distribution(node):
         kind, spec = next(iter(node.items()))

@@ -52,7 +52,7 @@ class EmulatorConfig(Family):
     @classmethod
     @abstractmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
-        """Values of those of its keys of which a camera's data sheet says something."""
+        """Values of those of its keys of which a camera's data sheet says something; None where this one does not."""
 
 
 def followers(reconstruction: str) -> list[str]:
@@ -273,9 +273,9 @@ class VoltmeterConfig(EmulatorConfig):
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
-        """k1 = 1 / threshold replaces the calibrated gain only where the sensor is not the calibrated camera itself."""
-        gain = {} if sensor.name in ("DAVIS346", "DAVIS240C") else {"k1": 1 / sensor.contrast_threshold}
-        return {"preset": sensor.calibrated.get("voltmeter", "DVS346"), "refractory_us": sensor.refractory_us, **gain}
+        """The constants of the nearest calibrated camera, with the gain that the threshold asks for."""
+        gain = None if sensor.contrast_threshold is None else 1 / sensor.contrast_threshold
+        return {"preset": "DVS346", "refractory_us": sensor.refractory_us, "k1": gain}
 
 
 for _model in (EsimConfig, V2eConfig, VoltmeterConfig):

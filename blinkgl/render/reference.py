@@ -332,6 +332,14 @@ def flow_to(scene: Scene, hits: Hits, t_ns: int) -> Flow:
     return Flow(int(t_ns), flow, valid, occluded, valid & ~inside, depth, hidden_by)
 
 
+def is_hidden(scene: Scene, t_ns: int, xy: np.ndarray, depth: np.ndarray, slack: float) -> np.ndarray:
+    """(N,) bool: something is in front of points that are at (N, 2) ``xy`` px and (N,) ``depth`` at t_ns.
+
+    slack : what is nearer by less than this part of the depth counts as the point's own surface."""
+    hit, _, _ = _nearest(scene, t_ns, _rays(scene.camera, xy)[:, :2], far=depth * (1.0 - slack))
+    return hit[:, 0] >= 0
+
+
 def velocity(scene: Scene, hits: Hits) -> np.ndarray:
     """(N, 2) px/s image velocity of every hit point at ``hits.t_ns``, from the analytic twists."""
     rate = _apply(scene, hits, lambda thing: _relative_rate(scene, thing, hits.t_ns))

@@ -115,16 +115,26 @@ def _decode_ldr(data: bytes, where: str) -> np.ndarray:
         _check_size(*image.size, where)
         image.load()
         ImageOps.exif_transpose(image, in_place=True)
-        if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey
-            grey = np.asarray(image, np.float32)
-            scale = 255 / (65535 if grey.max() > 255 else 255)
-            return np.repeat((grey * scale).clip(0, 255).astype(np.uint8)[..., None], 3, axis=2)
+        if image.mode.startswith("I") or image.mode == "F":
+            return _sixteen_bits(np.asarray(image), where)
         width, height = image.size
         pixels = np.empty((height, width, 3), np.uint8)
         for rows in _blocks(height, width):
             block = image.crop((0, rows.start, width, rows.stop))
             pixels[rows] = block if block.mode == "RGB" else block.convert("RGB")
         return pixels
+
+
+def _sixteen_bits(grey: np.ndarray, where: str) -> np.ndarray:
+    """(h, w, 3) uint8 of 16-bit grey, white 65535 however dark the picture is. AssetError: numbers without a white."""
+    if grey.dtype.kind == "f" or grey.min() < 0 or grey.max() > 65535:
+        raise AssetError(
+            "the image does not say how bright its numbers are",
+            where=where,
+            value=f"{8 * grey.itemsize}-bit {'floats' if grey.dtype.kind == 'f' else 'integers'}",
+            accepted="8 or 16 bits a channel, or Radiance HDR",
+        )
+    return np.repeat((grey * (255 / 65535)).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def _blocks(height: int, width: int) -> list[slice]:

@@ -121,6 +121,12 @@ def test_variants_differ_and_are_always_the_same(kind):
     assert moved[0].shape != moved[1].shape or not np.allclose(*moved)
 
 
+def test_what_a_pool_draws_is_what_may_be_asked_for():
+    """Fish of some proportions were drawn that the builder refuses."""
+    assert all(random_primitive("fish", k).closed for k in range(64))
+    assert all(random_primitive("figure", k).deformer.span_ns > 0 for k in range(30))
+
+
 def test_all_clips_are_drawn_in_a_pool():
     speeds = [random_primitive("figure", k).deformer.speed for k in range(6)]
     assert sum(s > 0 for s in speeds) == 3 and sum(s == 0 for s in speeds) == 3

@@ -175,7 +175,12 @@ def bodies() -> dict[str, Any]:
 def living() -> dict[str, Any]:
     """People, flags and fish as they are bound, and where they are at other times."""
     keys = {
-        "figure": [{}, {"height": 1.1, "head": 1.4, "build": 1.3, "clip": "run"}, {"legs": 1.2, "clip": "dance"}],
+        "figure": [
+            {},
+            {"height": 1.1, "head": 1.4, "build": 1.3, "clip": "run"},
+            {"clip": "wave"},
+            *({"legs": 1.2, "clip": "dance", "variant": variant} for variant in range(8)),
+        ],
         "flag": [{}],
         "fish": [{}, {"deep": 0.7}],
     }

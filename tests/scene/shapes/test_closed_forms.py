@@ -55,6 +55,16 @@ def test_normals_are_those_of_the_surface(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_shape_elsewhere_in_its_file_changes_in_the_same_way(kind):
+    here, offset = BUILDERS["icosphere"](), np.array([3.0, -2.0, 5.0])
+    at = []
+    for mesh in (here, replace(here, vertices=here.vertices + offset)):
+        ends = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        at.append(deformer_of(KINDS[kind], *ends).positions(mesh, 137 * MS))
+    np.testing.assert_allclose(at[1] - offset, at[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_shape_that_is_not_to_move_stays_as_it_is(kind):
     still = {"amplitude": 0.0, "angle": 0.0, "amount": (0.0, 0.0, 0.0)}
     config = KINDS[kind]

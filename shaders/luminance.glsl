@@ -8,9 +8,10 @@
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
 //                       pixels
+//            FOG        seen through fog, see fog.glsl
 //            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
-#if defined(RATE) && (defined(TEXTURED) || defined(LIT))
+#if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG))
 #define CHANGES
 #endif
 
@@ -43,6 +44,9 @@ uniform vec2 image_size;
 uniform mat4x3 rate;
 #include "motion.glsl"
 #include "rate.glsl"
+#endif
+#ifdef FOG
+#include "fog.glsl"
 #endif
 #ifdef EVERY
 const float every = float(EVERY);
@@ -126,6 +130,12 @@ void main()
 #endif
 #ifdef LIT
     luminance *= light;
+#endif
+#ifdef FOG
+#ifdef CHANGES
+    change = in_fog_rate(luminance, change, motion);
+#endif
+    luminance = in_fog(luminance);
 #endif
 #ifdef RATE
     result = vec2(luminance, finite(change));

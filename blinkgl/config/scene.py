@@ -235,6 +235,16 @@ class LightConfig(Config):
         return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
 
 
+class FogConfig(Config):
+    """A medium that swallows light and sends its own, for event frames and images alike."""
+
+    density: float = Field(gt=0, le=1e6, description="per world unit: light from 1 / density away has faded to 37 %")
+    radiance: Radiance = Field(0.7, description="linear radiance of fog alone, which is what the background becomes")
+
+
+FOG = Field(None, description="null: clear air")
+
+
 class RandomSceneConfig(Config):
     """A random world, as in the paper: objects from a pool between sky and ground."""
 
@@ -249,6 +259,7 @@ class RandomSceneConfig(Config):
         Field(WallsConfig(), description="true: four walls")
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
     physics: RandomPhysicsConfig | None = Field(None, description="null: nothing falls. Needs the extra [physics]")
@@ -522,6 +533,7 @@ class ExplicitSceneConfig(Config):
         "[physics]",
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
 
@@ -576,6 +588,7 @@ class FileSceneConfig(Config):
         0, description="name or index of the animation played, at the file's own times; null: none"
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")
     max_texture_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")

@@ -218,6 +218,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}},
     },
     "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
+    "fog": {"none": NOTHING, "thin": {"scene": {"fog": {"density": 0.02}}}},
     "light": {"lit": NOTHING, "unlit": {"scene": {"light": {"unlit": True}}}},
     "flow": {
         "forward": NOTHING,

@@ -40,5 +40,7 @@ def _defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:
                 defines = pass_.defines(kind) | (kind.defines if kind is not None else {})
-                found.setdefault(tuple(sorted(defines.items())), defines)
+                foggy = pass_.foggy and kind in (KINDS[0], KINDS[-1])
+                for one_of in (defines, defines | {"FOG": 1}) if foggy else (defines,):
+                    found.setdefault(tuple(sorted(one_of.items())), one_of)
     return list(found.values())

@@ -67,7 +67,8 @@ class Pass:
     depth : whether it has a depth buffer; "texture": one that a later pass may read.
     still : whether a camera that stands still has only what moves drawn again.
     pointwise : each pixel comes of the inputs' pixel at the same place, so that it does
-    not change where they do not."""
+    not change where they do not.
+    foggy : whether what it shows is seen through the scene's fog."""
 
     program: ClassVar[str]
     outputs: tuple[Output, ...]
@@ -77,6 +78,7 @@ class Pass:
     depth: ClassVar[bool | str] = True
     still: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
+    foggy: ClassVar[bool] = False
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Of its target, px, for an image of width x height: ``samples.grid`` times as fine,
@@ -136,6 +138,8 @@ class ScenePass(Pass):
             painter.place(uniforms, item, shot.moment)
             if item.deformer is not None:
                 painter.deform(uniforms, item, shot)
+            if "fog" in uniforms:
+                painter.fog(uniforms, shot)
             self.bind(uniforms, shot)
             self.set(painter, uniforms, item, shot)
             painter.draw(uniforms, item)

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 class _Luminance(ScenePass):
     program: ClassVar[str] = "luminance.glsl"
+    foggy: ClassVar[bool] = True
 
     def background(self, scene: Scene) -> tuple[float, ...]:
-        return scene.background, 0.0
+        return scene.backdrop, 0.0
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         if item.textured:

@@ -110,7 +110,9 @@ def exposure_strip(renderer: Renderer, out: Path) -> None:
     strip = []
     for _ in range(8):
         image = camera.take().image[..., ::-1]
-        strip.append(cv2.resize(image, (image.shape[1] * 2 // 5, image.shape[0] * 2 // 5), interpolation=cv2.INTER_AREA))
+        strip.append(
+            cv2.resize(image, (image.shape[1] * 2 // 5, image.shape[0] * 2 // 5), interpolation=cv2.INTER_AREA)
+        )
     sheet = np.vstack([np.hstack(strip[:4]), np.hstack(strip[4:])])
     cv2.imwrite(str(out / "camera_auto_exposure.jpg"), sheet, [cv2.IMWRITE_JPEG_QUALITY, 85])
 
@@ -147,14 +149,20 @@ def main() -> None:
 def say(result: dict[str, Any]) -> None:
     """The tables, as Markdown."""
     lines = [result["machine"], "", "| effect | instants | processor ms per image |", "|---|---|---|"]
-    lines += [f"| {row['effect'].replace('_', ' ')} | {row['instants']} | {row['ms']:.0f} |" for row in result["effects"]]
-    lines += ["", "| `max_px` | instants | ms | median error | within half a step | 99.9 % within |", "|---|---|---|---|---|---|"]
+    lines += [
+        f"| {row['effect'].replace('_', ' ')} | {row['instants']} | {row['ms']:.0f} |" for row in result["effects"]
+    ]
+    lines += [
+        "",
+        "| `max_px` | instants | ms | median error | within half a step | 99.9 % within |",
+        "|---|---|---|---|---|---|",
+    ]
     lines += [
         f"| {r['max_px']:g} | {r['instants']} | {r['ms']:.0f} | {r['median']:.3f} | {100 * r['within_half']:.1f} % | "
         f"{r['p999']:.2f} |"
         for r in result["spacings"]
     ]
-    print("\n".join(lines))  # noqa: T201
+    print("\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import blinkgl
 from blinkgl.config.sequence import RenderConfig, RunTemplate
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LabelRequest
@@ -83,6 +84,18 @@ def test_the_rate_of_change_is_that_of_the_frames(gl, path):
     assert np.median(error) < 0.01 and np.percentile(error, 95) < 0.08, (np.median(error), np.percentile(error, 95))
     assert np.median(np.abs(without - true)[inside]) > 4 * np.median(error), "without the fog's own term it is another"
     assert (rate[~np.isfinite(d[1])] == 0).all(), "fog without end does not change"
+
+
+def test_fog_from_python():
+    there = blinkgl.Scene(blinkgl.Camera(32, 24), fog=(0.5, 0.25)) + blinkgl.Primitive(
+        "cuboid", pose=blinkgl.Pose((3, 0, 0))
+    )
+    clear = blinkgl.Scene(blinkgl.Camera(32, 24)) + blinkgl.Primitive("cuboid", pose=blinkgl.Pose((3, 0, 0)))
+    foggy, plain = (blinkgl.render_frame(one, 0.1).colour for one in (there, clear))
+    assert (foggy[0, 0] == 0.25).all() and not np.array_equal(foggy, plain)
+    for wrong in ((1.0,), 3.0, (0.0, 1.0), ("a", 1)):
+        with pytest.raises(ConfigError):
+            blinkgl.Scene(blinkgl.Camera(32, 24), fog=wrong) + blinkgl.Primitive("cuboid")
 
 
 def test_fog_of_a_configuration(tmp_path):

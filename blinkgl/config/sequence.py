@@ -30,11 +30,10 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.readout import ReadoutConfig, drain_us
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import (
-    ReadoutConfig,
     SensorConfig,
-    drain_us,
     fill_sensor,
     known_sensor,
     sensor_names,
@@ -271,7 +270,9 @@ class SequenceConfig(Config):
     )
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
     readout: ReadoutConfig | None = Field(
-        None, description="the sensor's bus: events above its rate are late, then lost; null: no limit"
+        None,
+        description="what is behind the pixels: their defects and latency, the bus (events above its rate are late, "
+        "then lost) and its clock, filters; null: nothing",
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
     images: ImagesConfig | None = Field(

@@ -329,7 +329,7 @@ adds up every texel of it)."""
 ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
     "camera moves, and what moves by itself",
-    "images": "tests/config/test_images.py, tests/imaging: every preset and every choice; here what is written and read",
+    "images": "tests/config/test_images.py, tests/imaging: every preset, every choice; here what is written and read",
     "gl": RUN_LEVEL["gl"],
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}

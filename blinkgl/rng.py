@@ -22,6 +22,7 @@ class Role(IntEnum):
     EVENTS = 4
     PHYSICS = 5
     SHAPE = 6
+    IMAGES = 8
 
 
 def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:

@@ -251,9 +251,30 @@ def submit(
     typer.echo(f"written and checked: {out}, {count} files")
 
 
+@app.command("import")
+def import_(
+    checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar …, or RAFT's .pth.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
+    bins: Annotated[
+        int | None, typer.Option(min=2, max=64, help="RAFT: time bins that its three colours are spread over.")
+    ] = None,
+) -> None:
+    """Make a published checkpoint a file that predict, evaluate, submit and train (init_from) take.
+
+    Tensors are read and nothing else; E-RAFT's padding, border and time bins go with them."""
+    from eflow.models import parameters_of
+    from eflow.published import import_published
+
+    model = import_published(checkpoint, out, bins=bins)
+    typer.echo(f"written: {out}, {parameters_of(model) / 1e6:.2f} M parameters")
+
+
 @app.command()
 def bench(
-    model: Annotated[list[str] | None, typer.Option("--model", "-m", help="May be repeated; default: all.")] = None,
+    model: Annotated[
+        list[str] | None,
+        typer.Option("--model", "-m", help="May be repeated, e.g. eraft-tiny; default: every network as published."),
+    ] = None,
     size: Annotated[
         list[str] | None, typer.Option("--size", metavar="WxH", help="May be repeated; default 640x480.")
     ] = None,
@@ -273,7 +294,7 @@ def bench(
     from eflow.evaluate import write_json
 
     _one_of("--precision", precision, ("fp32", "bf16"))
-    names = model or list(benchmark.PRESETS)
+    names = model or [name for name, tree in benchmark.PRESETS.items() if tree.get("size") == "base"]
     for name in names:
         benchmark.preset(name)
     sizes = [_size(s) for s in size or ["640x480"]]

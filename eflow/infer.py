@@ -30,12 +30,16 @@ PICTURED = VoxelGrid(bins=2, normalise="none")
 """Of a method's windows: it sees the events themselves."""
 
 
-def pad_batch(batch: dict, divisor: int) -> dict:
-    """old and new padded at the bottom and right with empty pixels to multiples of ``divisor``. Less than one
-    low-resolution token is added on a side, so no token of padding alone enters the network."""
+def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
+    """old and new padded with empty pixels to sizes that the network takes, and the (left, top) pixel of what was
+    there: at the right and bottom to multiples of its stride, so that less than one low-resolution token is added on a
+    side and none is of padding alone; or as the network asks (``pad_to``, ``pad_start``)."""
     height, width = batch["new"].shape[-2:]
-    pad = (0, -width % divisor, 0, -height % divisor)
-    return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}
+    multiple = model.pad_to or model.divisor
+    right, down = -width % multiple, -height % multiple
+    left, top = (right, down) if model.pad_start else (0, 0)
+    pad = (left, right - left, top, down - top)
+    return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}, left, top
 
 
 @torch.inference_mode()
@@ -57,11 +61,16 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
     model.eval()
     try:
         with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-            out = model(pad_batch(batch, model.divisor))
+            padded, left, top = pad_batch(batch, model)
+            out = model(padded)
     finally:
         model.train(was_training)
     return FlowPrediction(
-        [f[..., :height, :width].float() for f in out.flows], out.kind, out.has_match, out.low, out.backward_match
+        [f[..., top : top + height, left : left + width].float() for f in out.flows],
+        out.kind,
+        out.has_match,
+        out.low,
+        out.backward_match,
     )
 
 

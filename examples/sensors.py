@@ -17,8 +17,8 @@ def main(out: Path) -> None:
         sensor, emulator = load_sensor(name), Esim(120, 160, sensor=name, seed=1)
         counts[name] = sum(len(emulator.step(frame, t_ns)) for frame, t_ns in frames)
         print(
-            f"{sensor.name:27} {sensor.width:4} x {sensor.height:<4} threshold {sensor.contrast_threshold:.2f}, "
-            f"dead time {sensor.refractory_us:5.0f} µs: {counts[name]} events of 160 x 120 px"
+            f"{sensor.name:27} {sensor.width:4} x {sensor.height:<4} threshold {emulator.config.contrast_threshold:.2f}, "
+            f"dead time {emulator.config.refractory_us:5.0f} µs: {counts[name]} events of 160 x 120 px"
         )
     (out / "counts.json").write_text(json.dumps(counts))
 

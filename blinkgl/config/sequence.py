@@ -19,12 +19,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from blinkgl.camera import CameraModel, PinHole, focal_length
-from blinkgl.config.base import Config, Refused, rule, validate, validate_field
+from blinkgl.config.base import Config, Refused, remembering, rule, validate, validate_field
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
+from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
@@ -275,6 +276,9 @@ class SequenceConfig(Config):
         "then lost) and its clock, filters; null: nothing",
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
+    images: ImagesConfig | None = Field(
+        None, description="a frame camera beside the event camera (docs/images.md); null: none"
+    )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
@@ -312,6 +316,42 @@ class SequenceConfig(Config):
                 accepted="at most 8000000",
             )
 
+    @rule("?images", "?frames")
+    def _frames_have_no_camera(images: bool, frames: bool):
+        if images and frames:
+            raise Refused(
+                "recorded frames are images already: nothing is there to be exposed",
+                where="images",
+                accepted="null, or a scene instead of frames",
+            )
+
+    @rule(
+        "images.rate",
+        "images.times",
+        "images.exposure_us",
+        "images.auto_exposure.longest_us",
+        "images.row_us",
+        "camera.height",
+        "time.duration",
+        "time.label_rate",
+        "time.start",
+    )
+    def _exposures_fit(
+        rate: float | None,
+        times: tuple[float, ...] | None,
+        exposure: float,
+        longest: float | None,
+        row_us: float,
+        height: int,
+        duration: float,
+        label_rate: float,
+        start: float,
+    ):
+        if rate is not None:
+            lasts = exposure if longest is None else longest
+            count = int(duration * label_rate + 1e-9) + 1
+            check_images(rate, times, lasts, readout_us(height, row_us), start, count / label_rate)
+
     @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
     def _room_for_the_camera(kind, height, clearance, camera):
         if kind != "random":
@@ -335,6 +375,7 @@ FILLS = (
         fill_sensor,
         (("events", "sensor.emulators.*"), ("events", "sensor"), ("camera", "sensor"), ("readout", "sensor.readout")),
     ),
+    Fill(("images",), ("labels.images",), lambda images: {} if images is None else {"labels": {"images": False}}),
 )
 _OF_THE_RUN = ("seed", "output", "gl")
 
@@ -390,9 +431,10 @@ class RunTemplate:
                     accepted="plain values",
                 )
         first = None
-        for tree in corners(SequenceConfig, self.tree, FILLS):
-            config = _validated(tree)
-            first = config if first is None else first
+        with remembering():
+            for tree in corners(SequenceConfig, self.tree, FILLS):
+                config = _validated(tree)
+                first = config if first is None else first
         assert first is not None
         return first
 

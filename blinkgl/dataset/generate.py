@@ -17,9 +17,11 @@ from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
+from blinkgl.imaging.metering import decibels
+from blinkgl.io.frame_camera import ExposureLine
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.labels import LABELS
-from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate_sequence
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock
 
 
@@ -87,6 +89,9 @@ def generate_sequence(
                 elif isinstance(item, GroundTruth):
                     with clock("write"):
                         _write_labels(writer, item)
+                elif isinstance(item, CameraImage):
+                    with clock("write"):
+                        writer.image(item.pictures, exposure_line(item))
                 else:
                     preview.show(item)
         report.count(sequence)
@@ -109,6 +114,18 @@ def _write_labels(writer: SequenceWriter, truth: GroundTruth) -> None:
     for name, value in truth.frame.values.items():
         to_ns = leads_to.get(LABELS[name].towards)
         writer.label(name, truth.k, value, truth.t_ns // 1000, None if to_ns is None else to_ns // 1000)
+
+
+def exposure_line(image: CameraImage) -> ExposureLine:
+    """What the list of exposures says of an image."""
+    return ExposureLine(
+        image.start_ns / 1000,
+        image.end_ns / 1000,
+        image.exposure_ns / 1000,
+        image.row_ns / 1000,
+        decibels(image.gain),
+        image.instants,
+    )
 
 
 def manifest_info(sequence: Simulation) -> dict:

@@ -273,9 +273,7 @@ def file_to_events(
             yield frame, t_ns, f"{source}: frame {i} ({name})"
 
     with contextlib.ExitStack() as stack:
-        out = stack.enter_context(
-            event_writer(target, height, width, t_offset_us=start_us if kind == "dsec" else 0, overwrite=overwrite)
-        )
+        out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
         video = None
         if preview is not None:
             rate = min(1e9 / gap_ns, 100.0)

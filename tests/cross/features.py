@@ -256,7 +256,21 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}},
     },
     "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
-    "light": {"lit": NOTHING, "unlit": {"scene": {"light": {"unlit": True}}}},
+    "light": {
+        "lit": NOTHING,
+        "unlit": {"scene": {"light": {"unlit": True}}},
+        "lamps": {
+            "scene": {
+                "light": {
+                    "sky_color": [0.6, 0.8, 1.0],
+                    "lights": [
+                        {"kind": "point", "position": [0.5, 0.5, 2.0], "strength": 4, "color": [1.0, 0.7, 0.4]},
+                        {"kind": "spot", "position": [0, 0, 4], "look_at": [1, 0, 0], "strength": 9},
+                    ],
+                }
+            }
+        },
+    },
     "flow": {
         "forward": NOTHING,
         "both": {"labels": {"flow": ["forward", "backward"]}},

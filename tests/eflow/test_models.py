@@ -254,6 +254,24 @@ def test_correlations_are_fp32_under_autocast():
     assert torch.equal(inside.volume, exact.volume)
 
 
+def test_iterations_that_nothing_was_trained_for_come_to_rest():
+    """Without damping each adds as much as the last; with it all together no more than the last trained one, however
+    many there are."""
+    flows = {}
+    for damping in (0.5, 1.0):
+        for iterations in (3, 12, 60):
+            model = build(name="eraft", size="tiny", levels=1, train_iterations=3, iterations=3, damping=damping).eval()
+            model.update.forward = lambda h, c, taps, flow, mask: (
+                h,
+                torch.ones_like(flow),
+                torch.zeros(1, 576, *flow.shape[2:]) if mask else None,
+            )
+            model.config = model.config.model_copy(update={"iterations": iterations})
+            flows[damping, iterations] = float(predict(model, batch_for(model, 1, 32, 32)).low.mean())
+    assert [flows[1.0, n] for n in (3, 12, 60)] == pytest.approx([3, 12, 60])
+    assert [flows[0.5, n] for n in (3, 12, 60)] == pytest.approx([3, 4, 4], abs=0.01)
+
+
 def test_burn_in_draws_from_the_saved_generator_and_half_of_the_steps_have_none():
     model = build(name="eraft", size="tiny", trunk=[8, 8, 8], features=16, hidden=16, iterations=5, train_iterations=1)
     model.train()
@@ -271,7 +289,7 @@ def test_burn_in_draws_from_the_saved_generator_and_half_of_the_steps_have_none(
     before = len(seen)
     seen.clear(), model(batch)
     assert len(seen) == before
-    model.config = model.config.model_copy(update={"burn_in": 0})
+    model = build(name="eraft", size="tiny", iterations=5, train_iterations=1, burn_in=0).train()
     state = torch.get_rng_state()
     model(batch)
     assert torch.equal(torch.get_rng_state(), state), "nothing is drawn where nothing is asked for"

@@ -22,6 +22,7 @@ class Role(IntEnum):
     EVENTS = 4
     PHYSICS = 5
     SHAPE = 6
+    LIGHT = 7
     IMAGES = 8
 
 

@@ -27,8 +27,9 @@ from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
+from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.shapes.table import DEFORMERS
-from blinkgl.scene.types import Scene
+from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.folders import folder_of
 from blinkgl.sequence.qualify import Verdict, shown, verdict
@@ -190,12 +191,24 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         "triangles": f"{renderer.triangles:,}"
         + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
-        "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit"
+        "light": f"{_shining(scene.light)} on {lit} of {len(parts)} parts, the others unlit"
         if lit
         else "none: every surface is unlit",
         "notes": "; ".join(scene.log) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
+
+
+def _shining(light: Light) -> str:
+    """What shines, in words."""
+    if light.plain:
+        return "sun and sky"
+    count = Counter(lamp.kind for lamp in lamps_of(light))
+    words = {"sun": "sun", "point": "point light", "spot": "spot light"}
+    names = [f"{count[kind]} {word}{'s' * (count[kind] > 1)}" for kind, word in words.items() if count[kind]]
+    if light.sky:
+        names.append("sky")
+    return ", ".join(names or ["nothing"]) + (", coloured" if is_coloured(light) else "")
 
 
 def _timed(run, times) -> float:

@@ -67,7 +67,8 @@ class Renderer:
         self._labels = Labels(self)
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         some_stand = any(o.is_static for o in scene.objects)
-        self.whole = whole or not (scene.camera_path.is_static and some_stand)
+        lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
+        self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand)
 
     def __enter__(self) -> Renderer:
         return self

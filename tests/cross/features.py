@@ -19,7 +19,6 @@ from pydantic import BaseModel
 
 from blinkgl.config.base import is_model, members
 from blinkgl.config.quality import QUALITIES
-from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 
 WIDTH, HEIGHT, FPS = 32, 24, 100
@@ -175,7 +174,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in QUALITIES}},
     "sensor": {
         "unsaid": NOTHING,
-        **{name: {"sensor": name} for name in sensor_names()},
+        **{name: {"sensor": name} for name in ("davis346", "dvxplorer")},
         "a table": {"sensor": _SENSOR},
     },
     "readout": {

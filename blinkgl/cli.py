@@ -368,6 +368,62 @@ def compare(
 
 
 @app.command()
+def calibrate(
+    recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Event file of a camera.")],
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="The sensor file, .yaml; a page goes beside it, .html.")
+    ] = "sensor.yaml",
+    frames: Annotated[
+        str | None,
+        typer.Option(help="What the camera saw, of its size (default: the recording's own frames)."),
+    ] = None,
+    still: Annotated[
+        bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
+    ] = False,
+    emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    sensor: Annotated[str | None, typer.Option("--sensor", help="A sensor whose values the fit begins with.")] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="key=value", help="Emulator parameter that is not fitted; may be repeated."),
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
+    gamma: Annotated[str, typer.Option(help="Of the frames: linear, srgb or an exponent.")] = "linear",
+    interpolate: Annotated[str, typer.Option(help="Between frames: motion (dense-flow warp) or linear.")] = "motion",
+    max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
+    frame_delay_ms: Annotated[
+        float | None, typer.Option(help="Added to the frame times, ms (default: found from both).")
+    ] = None,
+    starts: Annotated[int, typer.Option(min=1, max=20, help="Of the search.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulations and of the search.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+) -> int:
+    """Fit an emulator to a camera's own recording: a sensor file, and a page that says how near it comes."""
+    from blinkgl.show import calibrate as command
+
+    return command.run(
+        recording,
+        frames,
+        out,
+        still=still,
+        emulator=emulator,
+        sensor=sensor,
+        overrides=overrides or [],
+        fps=fps,
+        timestamps=timestamps,
+        gamma=gamma,
+        interpolate=interpolate,
+        max_px=max_px,
+        frame_delay_ms=frame_delay_ms,
+        starts=starts,
+        seed=seed,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+
+
+@app.command()
 def convert(
     source: Annotated[
         str,

@@ -13,7 +13,7 @@ from rich.table import Table
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.recordings.calibration import calibrate
-from blinkgl.recordings.calibration_page import page, parameters, rows
+from blinkgl.report.calibration import page, parameters, rows
 from blinkgl.show.simulate import emulator_options
 from blinkgl.show.terminal import plain_column, plain_console, say
 

@@ -24,7 +24,7 @@ def page(result: Calibration, sensor_text: str) -> str:
     a, b = result.halves
     span = lambda part: (result.clip.edges_us[list(part)] - result.clip.edges_us[0]) / 1e6
     return render(
-        "recordings/calibration.html",
+        "report/calibration.html",
         title=f"{result.config.emulator} fitted to {result.recording.rsplit('/', 1)[-1]}",
         result=result,
         emulator=result.config.emulator,

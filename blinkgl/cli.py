@@ -348,6 +348,9 @@ def compare(
     frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
+    judge: Annotated[
+        bool, typer.Option("--judge", help="Also say how well a classifier tells A from B, and the halves of each.")
+    ] = False,
 ) -> int:
     """Describe a recording, or compare it with another or with frames: counts, rates,
     intervals, polarity against brightness."""
@@ -364,6 +367,7 @@ def compare(
         frame_delay_ms=frame_delay_ms,
         interval_ms=interval_ms,
         zero_time=zero_time,
+        judge=judge,
     )
 
 

@@ -48,7 +48,6 @@ _ESIM_FITTED = {
     "contrast_threshold": Fitted(0.05, 2.0),
     "contrast_threshold_off": Fitted(0.05, 2.0),
     "threshold_sigma": Fitted(0.003, 0.5),
-    "threshold_jitter": Fitted(0.003, 0.5),
     "log_eps": Fitted(1e-4, 1.0),
     "refractory_us": Fitted(10.0, 20_000.0),
 }

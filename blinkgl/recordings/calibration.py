@@ -41,7 +41,7 @@ _DAMPINGS = (1e-3, 0.1, 3.0)
 _FARTHEST = 1.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Judged:
     """A simulation against the recording in one half. Rates are of all pixels that count."""
 

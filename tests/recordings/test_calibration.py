@@ -127,7 +127,7 @@ def test_tiles_of_a_large_sensor_have_the_same_events(monkeypatch):
 def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
     camera, frames = files(tmp_path, shift_us=3000)
     out = tmp_path / "mine.yaml"
-    fixed = [part for key in ("threshold_jitter=0", "log_eps=0.03", "threshold_sigma=0.03") for part in ("--set", key)]
+    fixed = [part for key in ("log_eps=0.03", "threshold_sigma=0.03") for part in ("--set", key)]
     assert run(["calibrate", str(camera), "--frames", str(frames), "--out", str(out), "--starts", "1", *fixed]) == 0
     said = capsys.readouterr().out
     assert "Clock: the polarity sums follow the frames best when +" in said and "dense flow" in said

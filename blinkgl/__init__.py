@@ -15,8 +15,10 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "blinkgl.front.scenes": (
+        "Animation",
         "Body",
         "Camera",
+        "Deform",
         "Keyframes",
         "Light",
         "Material",
@@ -24,6 +26,7 @@ _HOMES = {
         "Pose",
         "Primitive",
         "Scene",
+        "Way",
         "look_at",
     ),
     "blinkgl.front.runs": ("Timeline", "generate", "load", "verify"),
@@ -42,7 +45,7 @@ _HOMES = {
         "write_flow",
     ),
     "blinkgl.events.types": ("Events",),
-    "blinkgl.sequence.items": ("EventChunk", "GroundTruth", "Picture"),
+    "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
     "blinkgl.labels.frames": ("Flow", "LabelFrame"),
     "blinkgl.errors": ("AssetError", "BlinkGLError", "ConfigError", "EventDataError", "GLError", "OutputError"),
 }
@@ -64,18 +67,35 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
         write_flow,
     )
     from blinkgl.front.runs import Timeline, generate, load, verify
-    from blinkgl.front.scenes import Body, Camera, Keyframes, Light, Material, Mesh, Pose, Primitive, Scene, look_at
+    from blinkgl.front.scenes import (
+        Animation,
+        Body,
+        Camera,
+        Deform,
+        Keyframes,
+        Light,
+        Material,
+        Mesh,
+        Pose,
+        Primitive,
+        Scene,
+        Way,
+        look_at,
+    )
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
     from blinkgl.front.sequences import Recording, record, simulate_sequence
     from blinkgl.labels.frames import Flow, LabelFrame
-    from blinkgl.sequence.items import EventChunk, GroundTruth, Picture
+    from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Picture
 
 __all__ = [
+    "Animation",
     "AssetError",
     "BlinkGLError",
     "Body",
     "Camera",
+    "CameraImage",
     "ConfigError",
+    "Deform",
     "DvsVoltmeter",
     "Esim",
     "EventChunk",
@@ -98,6 +118,7 @@ __all__ = [
     "Scene",
     "Timeline",
     "V2e",
+    "Way",
     "compare",
     "convert",
     "generate",

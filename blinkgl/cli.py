@@ -284,7 +284,8 @@ def simulate(
         str | None,
         typer.Option(
             "--sensor",
-            help="davis240c, davis346, dvxplorer, gen31_vga or imx636: its thresholds, noise and read-out limit.",
+            help="davis240c, davis346, dvxplorer, gen31_vga or imx636, or a sensor file (.yaml): its thresholds, noise "
+            "and read-out limit.",
         ),
     ] = None,
     config: Annotated[str | None, typer.Option("--config", help="YAML file of emulator parameters.")] = None,

@@ -16,15 +16,12 @@ from blinkgl.errors import ConfigError
 from eflow.allocator import keep_memory
 from eflow.counting import count
 from eflow.losses import sequence_loss
-from eflow.models import NAMES, build_model, model_config
+from eflow.models import NETWORKS, SIZES, build_model, model_config
 
 PRESETS: dict[str, dict] = {
-    "eraft": {"name": "eraft"},
-    "eflowformer": {"name": "eflowformer"},
-    "eflowformer-small": {"name": "eflowformer", "variant": "small"},
-    "eflowformer-twins": {"name": "eflowformer", "variant": "twins"},
-    **{n: {"name": n} for n in NAMES if n.endswith("flownet")},
-}
+    name if size == "base" else f"{name}-{size}": {"name": name, "size": size} for name in NETWORKS for size in SIZES
+} | {"eflowformer-twins": {"name": "eflowformer", "layers": 2, "attention": "twins"}}
+"""Names that ``eflow bench`` and ``compare_networks`` take: every network in every size."""
 
 
 def preset(name: str):

@@ -4,7 +4,7 @@ Nothing here can execute what it reads.
     000500/weights.safetensors      parameters and buffers; the metadata holds the model configuration
            ema.safetensors          the same, averaged (what evaluation uses), where averaging is on
            optimizer.safetensors    AdamW's moments, named by parameter, and torch's generator states
-           state.json               step, configuration, loader position
+           state.json               step, seconds, configuration
 """
 
 from __future__ import annotations
@@ -244,6 +244,9 @@ def read_state(folder: Path) -> dict[str, Any]:
     try:
         state = json.loads(path.read_text(encoding="utf-8"))
         if state["format"] != FORMAT or type(state["step"]) is not int or state["step"] < 0:
+            raise ValueError
+        state["seconds"] = float(state.get("seconds", 0.0))  # of all parts of the training; 0 before there was a clock
+        if not 0 <= state["seconds"] < 1e12:
             raise ValueError
     except OSError as error:
         raise AssetError("cannot be read", where=str(path)) from error

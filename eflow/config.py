@@ -24,12 +24,43 @@ class VoxelConfig(Config):
     )
 
 
+Size = Literal["tiny", "small", "base"]
+"""How large a network is: ``base`` as published, ``tiny`` about a million parameters, which a CPU trains in minutes."""
+
+
 class _Refined(Config):
     """What E-RAFT and E-FlowFormer share."""
 
     input: VoxelConfig = Field(VoxelConfig(), description="the voxel grid")
+    trunk: tuple[int, int, int] | None = Field(
+        None, description="channels of the CNNs at 1/2, 1/4 and 1/8; null: the size's"
+    )
+    features: int | None = Field(
+        None, ge=16, le=1024, multiple_of=16, description="channels that are correlated; null: the size's"
+    )
+    hidden: int | None = Field(
+        None, ge=16, le=1024, multiple_of=4, description="channels of the GRU's state; null: the size's"
+    )
+    levels: int | None = Field(
+        None, ge=1, le=4, description="of the correlation pyramid; the least input is 8 * 2^levels px; null: the size's"
+    )
+    radius: int | None = Field(None, ge=1, le=8, description="of a correlation look-up, cells; null: the size's")
     iterations: int = Field(12, ge=1, le=64, description="GRU iterations in evaluation")
-    train_iterations: int = Field(12, ge=1, le=64, description="GRU iterations in training")
+    train_iterations: int = Field(12, ge=1, le=64, description="GRU iterations in training that gradients pass through")
+    burn_in: int | None = Field(
+        None,
+        ge=0,
+        le=64,
+        description="at most so many iterations before those, without gradients (none in half of the steps, else a "
+        "random number), so that further iterations converge; null: iterations - train_iterations",
+    )
+    damping: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="in evaluation, the step of iteration k beyond train_iterations and burn_in is multiplied by this "
+        "to the power of k, so that what nothing was trained for stands still",
+    )
     context_norm: Literal["batch", "instance"] = Field(
         "batch", description="norm of the context CNN; instance for batches of one or two"
     )
@@ -37,24 +68,46 @@ class _Refined(Config):
     checkpoint_iterations: bool = Field(
         False, description="recompute each iteration in the backward pass: less memory, ~30 % slower"
     )
+    border: Literal["replicate", "zero"] = Field(
+        "replicate", description="flow beyond the edge in the convex upsampling; zero: as E-RAFT's own code"
+    )
+    padding: Literal["end", "start"] = Field(
+        "end",
+        description="where inputs of other sizes are filled up: right and bottom to multiples of 8, or left and top to "
+        "multiples of 32 as E-RAFT's own code does",
+    )
+
+    @rule("trunk")
+    def _widths(trunk):
+        if trunk is not None and not all(8 <= w <= 1024 for w in trunk):
+            raise Refused("not widths", where="trunk", value=list(trunk), accepted="three numbers from 8 to 1024")
 
 
 class EraftConfig(_Refined):
     """E-RAFT (Gehrig et al., 3DV 2021)."""
 
     name: Literal["eraft"] = "eraft"
+    size: Size = Field("base", description="widths: 5.3 M parameters as published; small 2.4 M; tiny 0.9 M")
 
 
 class EFlowFormerConfig(_Refined):
     """E-FlowFormer (BlinkFlow, IROS 2023)."""
 
     name: Literal["eflowformer"] = "eflowformer"
-    variant: Literal["base", "small", "twins"] = Field(
-        "base", description="4 layers; 2 layers; 2 layers with dense reduction"
+    size: Size = Field("base", description="4 layers; small: 2 layers; tiny: 1 layer, and widths as tiny E-RAFT")
+    attention: Literal["separable", "twins"] = Field(
+        "separable", description="twins: keys reduced by a dense convolution, and an MLP after each attention"
     )
-    layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: the variant's")
+    layers: int | None = Field(None, ge=0, le=32, description="enhancement layers; null: the size's")
     init: Literal["match", "zero"] = Field(
         "match", description="start of the GRU: the matching layer's flow, or zero as E-RAFT"
+    )
+    match_prior: float | None = Field(
+        0.5,
+        gt=0,
+        le=1000,
+        description="matching layer: standard deviation, in cells of 8 px, of a learned prior for short flow, at the "
+        "start; null: none, and it starts with flow to the middle of the image",
     )
 
 
@@ -62,17 +115,24 @@ class EvFlowNetConfig(Config):
     """EV-FlowNet (Zhu et al., RSS 2018), supervised."""
 
     name: Literal["ev_flownet"] = "ev_flownet"
+    size: Size = Field("base", description="widths of 64 as published, 32, 16 channels")
     input: Literal["counts", "voxel"] = Field(
         "counts", description="4 channels of counts and latest times, or a voxel grid"
     )
     bins: int = Field(15, ge=2, le=64, description="time bins of the voxel input")
-    width: int = Field(64, ge=4, le=512, multiple_of=2, description="channels of the first encoder; 64 as published")
+    width: int | None = Field(
+        None, ge=4, le=512, multiple_of=2, description="channels of the first encoder; null: the size's"
+    )
 
 
 class SpikeFlowNetConfig(Config):
     """Spike-FlowNet (Lee et al., ECCV 2020), supervised."""
 
     name: Literal["spike_flownet"] = "spike_flownet"
+    size: Size = Field("base", description="widths of 64 as published, 32, 16 channels")
+    width: int | None = Field(
+        None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: the size's"
+    )
     steps: int = Field(5, ge=1, le=50, description="spike time steps per group")
     threshold: float = Field(0.75, gt=0, description="firing threshold of the integrate-and-fire neurons")
 
@@ -81,8 +141,15 @@ class SteFlowNetConfig(Config):
     """STE-FlowNet (Ding et al., AAAI 2022), supervised."""
 
     name: Literal["ste_flownet"] = "ste_flownet"
+    size: Size = Field(
+        "base", description="widths of 64 as published, 32, 8 channels; tiny looks 2 instead of 4 px round"
+    )
+    width: int | None = Field(
+        None, ge=4, le=512, multiple_of=4, description="channels of the first encoder; null: the size's"
+    )
+    radius: int | None = Field(None, ge=1, le=8, description="of the local correlation, cells; null: the size's")
     slices: int = Field(5, ge=2, le=20, description="count slices of the window")
-    sweeps: int = Field(3, ge=1, le=10, description="passes of residual flow decoding")
+    sweeps: int = Field(3, ge=1, le=10, description="times that the slices are gone through")
 
 
 ModelConfig = one_of("name", EraftConfig, EFlowFormerConfig, EvFlowNetConfig, SpikeFlowNetConfig, SteFlowNetConfig)
@@ -115,14 +182,46 @@ class AugmentConfig(Config):
 
 
 class SourceConfig(Config):
-    """One data set."""
+    """One data set: a folder, or a recipe that is rendered while it is trained on."""
 
-    path: str = Field(description="folder; relative to the YAML file")
+    path: str | None = Field(None, description="folder; relative to the YAML file")
     format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field(
         "auto", description="layout of the set; auto: told by its files"
     )
     dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
     weight: float = Field(1.0, gt=0, le=1e6, description="share of this set in the mixture")
+    recipe: str | None = Field(
+        None, description="YAML file of `blinkgl generate`, in place of a folder; relative to the YAML file"
+    )
+    online: bool = Field(False, description="render the recipe's sequences while training; no sample comes twice")
+    set: tuple[str, ...] = Field((), description="overrides of the recipe, as `a.b=c`")
+    workers: int = Field(1, ge=0, le=256, description="rendering processes; 0: rendered in the training process")
+    samples: int = Field(8, ge=1, le=1000, description="windows out of each sequence, each with its own flow")
+    window_ms: tuple[float, float] | None = Field(
+        None,
+        description="lengths of the windows, [shortest, longest], log-uniform; null: the recipe's label interval",
+    )
+    min_events: int = Field(1, ge=1, le=10**9, description="fewest events in each of a sample's two windows")
+    max_flow: float = Field(400.0, gt=0, le=1e4, description="longest median flow of a sample, px")
+
+    @rule("path", "recipe", "online")
+    def _folder_or_recipe(path, recipe, online):
+        if (path is None) == (recipe is None):
+            raise Refused("give a folder (path) or a recipe, one of the two")
+        if (recipe is not None) != online:
+            raise Refused(
+                "a recipe is rendered while it is trained on: online: true says so"
+                if recipe is not None
+                else "a folder is not rendered",
+                where="online",
+                value=online,
+                accepted="recipe: FILE with online: true, or the folder that blinkgl generate made of it as path",
+            )
+
+    @rule("window_ms")
+    def _ordered(window_ms):
+        if window_ms is not None and not 0.01 <= window_ms[0] <= window_ms[1] <= 1e6:
+            raise Refused("not a range", where="window_ms", value=list(window_ms), accepted="0.01 <= low <= high, ms")
 
 
 class DataConfig(Config):
@@ -139,23 +238,73 @@ class DataConfig(Config):
         AugmentConfig(), description="random changes to the training samples; null: none"
     )
 
+    @rule("train.*.workers", "train.*.online", "workers")
+    def _who_renders(rendering, online, loaders):
+        for k, (workers, live) in enumerate(zip(rendering, online, strict=True)):
+            if live and workers == 0 and loaders > 0:
+                raise Refused(
+                    "loader processes do not render", where=f"train.{k}.workers", value=0, accepted="1 or more"
+                )
+
     @rule("crop", "augment.scale_probability")
     def _one_size(crop, scaling):
         if crop is None and scaling:
             raise Refused("scaled samples differ in size: set crop, or augment.scale_probability to 0")
 
 
+class LossConfig(Config):
+    """What is made small: a sum of terms of each pixel's error, by weight."""
+
+    l1: float = Field(1.0, ge=0, le=1e6, description="weight of the components' absolute errors, px")
+    epe: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error, px")
+    relative: float = Field(
+        0.0, ge=0, le=1e6, description="weight of the end-point error as a share of the true length (and knee)"
+    )
+    log: float = Field(0.0, ge=0, le=1e6, description="weight of the end-point error compressed by a logarithm, px")
+    knee: float = Field(
+        1.0,
+        gt=0,
+        le=1e3,
+        description="px: shorter flow counts as so long, larger errors are compressed",
+    )
+
+    @rule("l1", "epe", "relative", "log")
+    def _something(l1, epe, relative, log):
+        if not l1 + epe + relative + log:
+            raise Refused("no term has a weight", where="l1", value=0, accepted="l1, epe, relative or log above 0")
+
+
 class OptimConfig(Config):
-    """AdamW with a linear one-cycle schedule."""
+    """AdamW; the rate rises, stays, and falls towards the end, by steps or by the clock."""
 
     steps: int = Field(200_000, ge=1, le=10**9, description="updates of the weights")
+    minutes: float | None = Field(
+        None,
+        gt=0,
+        le=1e6,
+        description="training ends after so many minutes if that is before the last step, and the rate goes by "
+        "whichever is nearer its end (counted over resumed parts; such a run does not repeat bit for bit); null: "
+        "by steps alone",
+    )
     lr: float = Field(2e-4, gt=0, le=1, description="peak learning rate")
-    warmup: float = Field(0.05, ge=0, lt=1, description="fraction of the steps that the rate rises over")
+    warmup: float = Field(0.05, ge=0, lt=1, description="share of the training that the rate rises over")
+    cooldown: float = Field(0.4, ge=0, le=1, description="share of the training, its last, that the rate falls over")
     weight_decay: float = Field(1e-4, ge=0, le=1, description="of AdamW, decoupled")
     clip: float = Field(1.0, gt=0, description="largest gradient norm")
-    gamma: float = Field(0.8, gt=0, le=1, description="decay of the sequence loss towards early iterations")
-    match_weight: float = Field(1.0, ge=0, description="factor on the matching layer's term of the loss")
+    loss: LossConfig = Field(LossConfig(), description="what is made small")
+    gamma: float = Field(0.8, gt=0, le=1, description="decay of the loss towards early iterations")
+    scale_gamma: float = Field(1.0, gt=0, le=1, description="decay of the loss towards coarse decoder scales")
+    match_weight: float = Field(
+        0.5, ge=0, description="weight of the matching layer's term of the loss, where the last iteration's is 1"
+    )
     ema: float = Field(0.999, ge=0, lt=1, description="decay of the averaged weights; 0: none")
+
+    @rule("warmup", "cooldown")
+    def _fit(warmup, cooldown):
+        if warmup + cooldown > 1 + 1e-9:
+            raise Refused(
+                "more than the whole training", where="cooldown", value=cooldown, accepted="at most 1 - warmup"
+            )
 
 
 class RunConfig(Config):
@@ -174,7 +323,10 @@ class RunConfig(Config):
     keep_checkpoints: int = Field(3, ge=1, description="older ones are deleted")
     picture_every: int = Field(2000, ge=1, description="steps between sample pictures")
     time_limit: float | None = Field(
-        None, gt=0, description="minutes after which training stops with a last validation and a checkpoint; null: none"
+        None,
+        gt=0,
+        description="minutes after which this call stops with a checkpoint, to be resumed; null: none (optim.minutes "
+        "is the length of the training)",
     )
 
 
@@ -184,7 +336,7 @@ class TrainConfig(Config):
     seed: int = Field(0, ge=0, lt=2**63, description="of weights, order and augmentation; 0 is a seed")
     model: ModelConfig = Field(description="the network")
     data: DataConfig = Field(description="what is trained and validated on")
-    optim: OptimConfig = Field(OptimConfig(), description="AdamW with a linear one-cycle schedule")
+    optim: OptimConfig = Field(OptimConfig(), description="AdamW, its schedule and the loss")
     run: RunConfig = Field(RunConfig(), description="how it runs and what it writes")
     init_from: str | None = Field(None, description="checkpoint whose weights training starts from (fine-tuning)")
 
@@ -197,7 +349,10 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p stays
     sources = {
-        k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k))
+        k: tuple(
+            s.model_copy(update={key: absolute(p) for key in ("path", "recipe") if (p := getattr(s, key)) is not None})
+            for s in getattr(config.data, k)
+        )
         for k in ("train", "validate_on")
     }
     return config.model_copy(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,12 +30,16 @@ PICTURED = VoxelGrid(bins=2, normalise="none")
 """Of a method's windows: it sees the events themselves."""
 
 
-def pad_batch(batch: dict, divisor: int) -> dict:
-    """old and new padded at the bottom and right with empty pixels to multiples of ``divisor``. Less than one
-    low-resolution token is added on a side, so no token of padding alone enters the network."""
+def pad_batch(batch: dict, model: FlowModel) -> tuple[dict, int, int]:
+    """old and new padded with empty pixels to sizes that the network takes, and the (left, top) pixel of what was
+    there: at the right and bottom to multiples of its stride, so that less than one low-resolution token is added on a
+    side and none is of padding alone; or as the network asks (``pad_to``, ``pad_start``)."""
     height, width = batch["new"].shape[-2:]
-    pad = (0, -width % divisor, 0, -height % divisor)
-    return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}
+    multiple = model.pad_to or model.divisor
+    right, down = -width % multiple, -height % multiple
+    left, top = (right, down) if model.pad_start else (0, 0)
+    pad = (left, right - left, top, down - top)
+    return {**batch, "old": F.pad(batch["old"], pad), "new": F.pad(batch["new"], pad)}, left, top
 
 
 @torch.inference_mode()
@@ -57,11 +61,16 @@ def predict(model: FlowModel, batch: dict, *, precision: str = "fp32") -> FlowPr
     model.eval()
     try:
         with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-            out = model(pad_batch(batch, model.divisor))
+            padded, left, top = pad_batch(batch, model)
+            out = model(padded)
     finally:
         model.train(was_training)
     return FlowPrediction(
-        [f[..., :height, :width].float() for f in out.flows], out.kind, out.has_match, out.low, out.backward_match
+        [f[..., top : top + height, left : left + width].float() for f in out.flows],
+        out.kind,
+        out.has_match,
+        out.low,
+        out.backward_match,
     )
 
 
@@ -97,6 +106,37 @@ def windows(
             return
     if t is not None and last + 1 >= t + span_us and (end_us is None or t + span_us <= end_us):
         yield _pair(pending, t, span_us)
+
+
+LIKELY_PX = 5.0
+"""Displacement in a window that :func:`likely_span` looks for: networks are trained on 2 to 8 px."""
+
+
+def likely_span(file: EventFile, predictor: Callable[[StreamWindow], tuple[np.ndarray, np.ndarray]]) -> int:
+    """Δ, µs, at which things in the recording move by about :data:`LIKELY_PX`: ``predictor``'s own flow where there are
+    events, at three places of the recording, tells how fast they are; tried with shorter and longer windows until it
+    stands. From 1 ms to a third of the recording. Raises EventDataError: no events."""
+    ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
+    if not ends:
+        raise EventDataError("holds no events", where=str(file.path))
+    first, last = ends[0][0], ends[-1][1]
+    longest = max((last - first) // 3, 1000)
+    span = min(30_000, longest)
+    for _ in range(4):
+        speeds = []
+        for place in (0.25, 0.5, 0.75):
+            start = max(first, min(round(first + place * (last - first)) - span, last + 1 - 2 * span))
+            pair = next(windows(file, span, start_us=start), None)
+            if pair is None or not (len(pair.old) and len(pair.new)):
+                continue
+            flow, _ = predictor(pair)
+            speeds.append(float(np.median(np.hypot(*flow[pair.new.y, pair.new.x].T))))
+        speed = float(np.median(speeds)) if speeds else 0.0
+        factor = min(max(LIKELY_PX / max(speed, 1e-3), 0.4), 2.5)
+        span = int(min(max(span * factor, 1000), longest))
+        if 0.8 < factor < 1.25:
+            break
+    return span
 
 
 def whole_file(file: EventFile) -> tuple[StreamWindow, float]:

@@ -5,8 +5,9 @@
 
 A run folder holds config.yaml, log.jsonl, tb/ (tensorboard), checkpoints/<step>/ and pictures/. SIGINT and SIGTERM end
 the current step, write a checkpoint and exit 0; ``--resume`` goes on from the newest one and is, on the CPU, bit for
-bit what the uninterrupted run would have been: data order and augmentation are functions of
-(seed, step), the rate of the step alone.
+bit what the uninterrupted run would have been: data order and augmentation are functions of (seed, step), the rate of
+the step alone. (With ``optim.minutes`` the rate goes by the clock, which checkpoints keep, and a run that is as
+long on another day is another run.)
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ import contextlib
 import importlib
 import json
 import os
+import re
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,16 +35,16 @@ from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.sequence_dir import refuse_existing
 from eflow import checkpoint as ckpt
 from eflow.allocator import keep_memory
-from eflow.config import SourceConfig, TrainConfig
-from eflow.data.dataset import FlowDataset, Mixture, StepSampler, batches, collate
-from eflow.data.sources import open_source
+from eflow.config import OptimConfig, SourceConfig, TrainConfig
+from eflow.data.dataset import FlowDataset, Mixture, StepSampler, batches, collate, is_endless
+from eflow.data.sources import Source, open_source
 from eflow.infer import predict
 from eflow.losses import sequence_loss
 from eflow.metrics import frame_metrics
 from eflow.models import FlowModel, build_model
 from eflow.pictures import comparison, events_of, write_picture
 from eflow.precision import precision_on
-from eflow.progress import TrainProgress
+from eflow.progress import TrainProgress, Waiting, told
 
 
 class TrainingError(BlinkGLError):
@@ -58,13 +61,47 @@ class TrainResult:
     loss: float
 
 
-def learning_rate(step: int, steps: int, peak: float, warmup: float) -> float:
-    """One cycle, linear: from peak / 25 up to ``peak`` over the first ``warmup`` of the
-    steps, then down to 1e-4 of the start."""
-    start, end, top = peak / 25, peak / 25e4, max(warmup * steps, 1)
-    if step < top:
-        return start + (peak - start) * step / top
-    return peak + (end - peak) * min((step - top) / max(steps - top, 1), 1)
+def learning_rate(done: float, peak: float, warmup: float, cooldown: float) -> float:
+    """The rate when a share ``done`` (0 … 1) of the training is over: linear from peak / 25 up to ``peak`` over its
+    first ``warmup``, then ``peak``, and linear down to peak / 25e4 over its last ``cooldown``."""
+    start, end = peak / 25, peak / 25e4
+    if done < warmup:
+        return start + (peak - start) * done / warmup
+    if done < 1 - cooldown:
+        return peak
+    return peak + (end - peak) * min((done - (1 - cooldown)) / max(cooldown, 1e-9), 1)
+
+
+@dataclass
+class Course:
+    """How far a training is, by steps and, where ``optim.minutes`` says so, by the clock of all its parts together.
+
+    before : seconds of the parts before this one."""
+
+    optim: OptimConfig
+    began: float
+    before: float
+    clock: Callable[[], float]
+
+    @property
+    def seconds(self) -> float:
+        return self.before + self.clock() - self.began
+
+    def done(self, step: int, device: torch.device, world: int) -> float:
+        """Share of the training that is over after ``step`` steps; the same on all ranks."""
+        share = step / self.optim.steps
+        if self.optim.minutes is None:
+            return share
+        seconds = torch.tensor(self.seconds, dtype=torch.float64, device=device)
+        if world > 1:
+            dist.broadcast(seconds, 0)
+        return max(share, float(seconds) / (60 * self.optim.minutes))
+
+    def minutes_left(self, time_limit: float | None) -> float | None:
+        """Until the end or this call's ``time_limit``; None where there is no clock."""
+        ends = [] if time_limit is None else [time_limit]
+        ends += [] if self.optim.minutes is None else [self.optim.minutes - self.before / 60]
+        return min(ends, default=None)
 
 
 def train(
@@ -74,12 +111,27 @@ def train(
     resume: bool = False,
     stop_after: int | None = None,
     quiet: bool = False,
+    clock: Callable[[], float] = time.monotonic,
 ) -> TrainResult:
-    """Trains to ``config.optim.steps``. ``stop_after``: leave after this many steps of this call, as a signal would.
+    """Trains to the end of ``config.optim.steps`` or ``minutes``. ``stop_after``: leave after this many steps of this
+    call, as a signal would. clock : seconds, of ``optim.minutes``.
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
     finite: the batch's sample names are in ``nan_batch.json``)."""
-    out = Path(out)
+    with contextlib.ExitStack() as stack:  # of what renders while it is trained on
+        return _train(config, Path(out), stack, resume=resume, stop_after=stop_after, quiet=quiet, clock=clock)
+
+
+def _train(
+    config: TrainConfig,
+    out: Path,
+    stack: contextlib.ExitStack,
+    *,
+    resume: bool,
+    stop_after: int | None,
+    quiet: bool,
+    clock: Callable[[], float],
+) -> TrainResult:
     rank, world, device = _setup(config)
     lead = rank == 0
     precision = precision_on(device, config.run.precision, quiet=not lead)
@@ -105,9 +157,9 @@ def train(
         weight_decay=config.optim.weight_decay,
     )
     ema = {k: v.detach().clone() for k, v in model.state_dict().items()} if config.optim.ema else None
-    start = _resume(out, config, model, optimizer, ema) if resume else 0
+    start, spent = _resume(out, config, model, optimizer, ema) if resume else (0, 0.0)
 
-    sources = [open_source(s.path, s.format, dt=s.dt) for s in config.data.train]
+    mixture, sources = _training_sets(config, start, world, stack)
     dataset = FlowDataset(
         sources,
         model.representation,
@@ -118,7 +170,6 @@ def train(
     )
     _check_sizes(dataset, model, config.data.crop)
     validation = _validation(config, model) if lead else []
-    mixture = Mixture([len(s) for s in sources], [s.weight for s in config.data.train], config.seed)
     if config.data.batch % world:
         raise ConfigError(
             "not a multiple of the number of processes",
@@ -140,7 +191,11 @@ def train(
     net.train()
     if lead:
         _write_config(out, config)
-    step, reason, loss_value, began = start, "finished", float("nan"), time.monotonic()
+    step, reason, loss_value, began = start, None, float("nan"), time.monotonic()
+    course = Course(config.optim, clock(), spent, clock)
+    done = course.done(step, device, world)
+    if done >= 1:
+        sampler = StepSampler(mixture, config.data.batch, start, start, rank, world)
 
     def save() -> Path:
         return ckpt.save_checkpoint(
@@ -149,7 +204,7 @@ def train(
             model,
             ema,
             optimizer,
-            {"config": json.loads(config.model_dump_json())},
+            {"seconds": course.seconds, "config": json.loads(config.model_dump_json())},
             config.run.keep_checkpoints,
         )
 
@@ -162,12 +217,12 @@ def train(
             config.data.batch,
             enabled=lead and not quiet,
             where=f"{device.type}, {precision}",
-            minutes=config.run.time_limit,
-            began=began,
+            minutes=course.minutes_left(config.run.time_limit),
         ) as progress,
     ):
-        for batch in batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"):
-            rate = learning_rate(step, steps, config.optim.lr, config.optim.warmup)
+        waiting = Waiting(batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"))
+        for batch in waiting:
+            rate = learning_rate(done, config.optim.lr, config.optim.warmup, config.optim.cooldown)
             for group in optimizer.param_groups:
                 group["lr"] = rate
             optimizer.zero_grad(set_to_none=True)
@@ -184,37 +239,70 @@ def train(
                 _average(ema, model, min(config.optim.ema, step / (step + 10)))
 
             progress.update(step, loss_value, epe)
-            last = step == stop
+            done = course.done(step, device, world)
+            last = step == stop or done >= 1
+            if done >= 1:
+                reason = "finished"
+            else:
+                reason = (
+                    signals.reason
+                    or ("time limit" if _over(began, config.run.time_limit) else None)
+                    or ("stop" if last else None)
+                )
+                reason = _agree(reason, device) if world > 1 else reason
             if lead and (step % config.run.log_every == 0 or last):
                 log.write(
-                    step, "train", loss=loss_value, epe=epe, lr=rate, grad_norm=float(norm), samples_per_s=progress.rate
+                    step,
+                    "train",
+                    loss=loss_value,
+                    epe=epe,
+                    lr=rate,
+                    grad_norm=float(norm),
+                    samples_per_s=progress.rate,
+                    processor_s=time.process_time(),
+                    waited=waiting.share,
+                    **_rendering(sources),
                 )
             if lead and step % config.run.picture_every == 0:
                 _picture(out / "pictures" / f"{step:09d}.png", batch, flow)
-            reason = (
-                signals.reason
-                or ("time limit" if _over(began, config.run.time_limit) else None)
-                or ("stop" if last and step < steps else reason)
-            )
-            if world > 1 and not last:
-                reason = _agree(reason, device)
             # The clock ends a training as its last step does; a signal is in a hurry.
-            ended = step == steps or reason == "time limit"
+            ended = reason in ("finished", "time limit")
             if lead and validation and (step % config.run.validate_every == 0 or ended):
                 scores = validate(model, ema, validation, config.run.precision)
                 log.write(step, "validation", **scores)
                 progress.note(step, scores)
-            if lead and (step % config.run.checkpoint_every == 0 or last or reason != "finished"):
+            if lead and (step % config.run.checkpoint_every == 0 or reason is not None):
                 path = save()
-            if reason != "finished":
+            if reason is not None:
                 break
         else:
-            if lead and step == start:  # nothing was left to do
+            if lead:  # nothing was left to do
                 path = ckpt.newest(out) or save()
+        if lead and any(is_endless(s) for s in sources):
+            progress.say("online: " + told(_rendering(sources), waiting.share))
     if world > 1:
         dist.barrier()
         dist.destroy_process_group()
-    return TrainResult(step, reason, path if lead else out, loss_value)
+    return TrainResult(step, reason or "finished", path if lead else out, loss_value)
+
+
+def _training_sets(
+    config: TrainConfig, start: int, world: int, stack: contextlib.ExitStack
+) -> tuple[Mixture, list[Source]]:
+    """The order of the samples, and the open sets; what renders is ended by ``stack``."""
+    data = config.data
+    if world > 1 and any(s.online for s in data.train):
+        raise ConfigError("online data are for one process", where="data.train", accepted="folders, or one process")
+    sources = {k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if not s.online}
+    sizes = [len(sources[k]) if k in sources else None for k in range(len(data.train))]
+    mixture = Mixture(sizes, [s.weight for s in data.train], config.seed)
+    for k, s in enumerate(data.train):
+        if s.online:
+            from eflow.data.online import open_online  # brings the renderer
+
+            first = mixture.first(k, start * data.batch)
+            sources[k] = stack.enter_context(open_online(s, config.seed, first=first, batch=data.batch))
+    return mixture, [sources[k] for k in range(len(data.train))]
 
 
 def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, float, Tensor]:
@@ -235,7 +323,9 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
         prediction,
         batch["flow"],
         batch["valid"],
+        loss=config.optim.loss,
         gamma=config.optim.gamma,
+        scale_gamma=config.optim.scale_gamma,
         match_weight=config.optim.match_weight,
         count=count,
     )
@@ -243,6 +333,20 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
         error = (prediction.flow - torch.where(batch["valid"][:, None], batch["flow"], 0)).norm(dim=1)
         epe = float(error[batch["valid"]].mean()) if batch["valid"].any() else 0.0
     return loss, epe, prediction.flow.detach()
+
+
+def _rendering(sources: list[Source]) -> dict[str, float]:
+    """What the online sources say of themselves, for the log; nothing of folders."""
+    stats = [s.stats for s in sources if is_endless(s)]
+    if not stats:
+        return {}
+    made = sum(s.samples for s in stats)
+    return {
+        "rendered": made,
+        "render_ms": 1000 * sum(s.cpu_s for s in stats) / max(made, 1),
+        "failed_sequences": sum(s.failures for s in stats),
+        "replaced_workers": sum(s.replaced for s in stats),
+    }
 
 
 @contextlib.contextmanager
@@ -324,10 +428,10 @@ def _weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
 
 def _check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | None) -> None:
     """Refuses, before anything is written, what the network would refuse at the first step."""
+    firsts = [source[getattr(source, "first", 0)] for source in dataset.sources if crop is None or is_endless(source)]
     if crop is not None:
         sizes = {"data.crop": crop}
     else:
-        firsts = (source[0] for source in dataset.sources)
         sizes = {f"data.crop is not set, {s.name}": (s.height, s.width) for s in firsts}
     for where, size in sizes.items():
         if min(size) < model.least or any(side % model.divisor for side in size):
@@ -343,8 +447,8 @@ _FREE = {"run"}
 """Parts of the configuration that may change between a run and its resumption (how it runs, not what it computes)."""
 
 
-def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> int:
-    """Restores everything from the newest checkpoint; returns its step."""
+def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) -> tuple[int, float]:
+    """Restores everything from the newest checkpoint; returns its step and the seconds that it took."""
     folder = ckpt.newest(out)
     if folder is None:
         raise AssetError("no checkpoint to resume from", where=str(out), accepted="a run folder of eflow train")
@@ -353,7 +457,7 @@ def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) ->
     for path in sorted(set(_leaves(saved)) | set(_leaves(now))):
         if (
             path.split(".")[0] not in _FREE
-            and path != "data.workers"
+            and not re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
             and _leaves(saved).get(path) != _leaves(now).get(path)
         ):
             raise ConfigError(
@@ -370,7 +474,7 @@ def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) ->
         if k not in averaged or averaged[k].shape != ema[k].shape:
             raise AssetError(f"lacks the tensor '{k}' of this model", where=str(folder / "ema.safetensors"))
         ema[k].copy_(averaged[k])
-    return state["step"]
+    return state["step"], state["seconds"]
 
 
 def _leaves(tree, prefix: str = "") -> dict[str, object]:
@@ -386,14 +490,20 @@ def _leaves(tree, prefix: str = "") -> dict[str, object]:
 def _validation(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDataset, list[int]]]:
     sets = []
     for s in config.data.validate_on:
-        dataset = FlowDataset([open_source(s.path, s.format, dt=s.dt)], model.representation, empty=config.data.empty)
+        if s.online:
+            from eflow.data.online import held
+
+            source = held(s, config.data.validate_samples)
+        else:
+            source = open_source(s.path, s.format, dt=s.dt)
+        dataset = FlowDataset([source], model.representation, empty=config.data.empty)
         count = min(config.data.validate_samples, len(dataset))
         sets.append((_title(s), dataset, [int(i) for i in np.linspace(0, len(dataset) - 1, count).round()]))
     return sets
 
 
 def _title(s: SourceConfig) -> str:
-    return Path(s.path).name + (f"_dt{s.dt}" if s.dt != 1 else "")
+    return Path(s.path or s.recipe).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
 
 
 def _to_device(batch: dict, device: torch.device, channels_last: bool) -> dict:
@@ -441,9 +551,9 @@ def _over(began: float, minutes: float | None) -> bool:
     return minutes is not None and time.monotonic() - began > 60 * minutes
 
 
-def _agree(reason: str, device: torch.device) -> str:
-    """All ranks stop at the same step: the first reason any of them has."""
-    codes = ["finished", "signal", "time limit", "stop"]
+def _agree(reason: str | None, device: torch.device) -> str | None:
+    """All ranks stop at the same step: the first reason any of them has; None goes on."""
+    codes = [None, "signal", "time limit", "stop"]
     code = torch.tensor(codes.index(reason), device=device)
     dist.all_reduce(code, op=dist.ReduceOp.MAX)
     return codes[int(code)]

@@ -20,6 +20,7 @@ from blinkgl.dataset.run import run_dataset
 from blinkgl.errors import BlinkGLError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.scene.build import build_scene
+from tests.scene.gltf_files import arm_file
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FRONT = ("arguments", "drawing", "files", "runs", "scenes", "sensors", "sequences")
@@ -50,7 +51,7 @@ def test_import_brings_nothing_with_it():
 
 
 def test_table_list_and_type_checker_agree():
-    assert sorted(blinkgl._HOME) == sorted(blinkgl.__all__) and 30 <= len(blinkgl.__all__) <= 45
+    assert sorted(blinkgl._HOME) == sorted(blinkgl.__all__) and 30 <= len(blinkgl.__all__) <= 60
     tree = ast.parse((REPOSITORY / "blinkgl/__init__.py").read_text(encoding="utf-8"))
     typed = [
         node
@@ -338,6 +339,24 @@ WRONG = [
     ("path", lambda d: b.load(None)),
     ("overrides", lambda d: b.load(d / "a.yaml", "camera.width=3")),
     ("seed", lambda d: b.load(d / "a.yaml", seed="x")),
+    ("Deform.kind", lambda d: b.Deform("melt")),
+    ("Deform.kind", lambda d: b.Deform(7)),
+    ("Deform.amplitude", lambda d: b.Deform("wave", amplitude=-1)),
+    ("Deform.angle", lambda d: b.Deform("wave", angle=3)),
+    ("Deform.towards", lambda d: b.Deform("wave", along="z", towards="z")),
+    ("Primitive.deform", lambda d: b.Primitive("cuboid", deform="wave")),
+    ("Primitive.clip", lambda d: b.Primitive("figure", clip="jog")),
+    ("Primitive.pose", lambda d: b.Primitive("figure", pose="ahead")),
+    ("Animation.speed", lambda d: b.Animation(speed="fast")),
+    ("Animation.clip", lambda d: b.Animation(1.5)),
+    ("Animation.blend", lambda d: b.Animation(blend=b.Animation(blend=b.Animation()))),
+    ("Mesh.animation", lambda d: b.Mesh("chair.obj", animation=0)),
+    ("Mesh.animation", lambda d: b.Mesh("chair.glb", animation=1.5)),
+    ("Mesh.deform", lambda d: b.Mesh("chair.glb", animation=0, deform=b.Deform())),
+    ("Way.points", lambda d: b.Way([(0, 0, 0)])),
+    ("Way.points.0", lambda d: b.Way([(0, 0), (1, 1)])),
+    ("Way.speed", lambda d: b.Way([(0, 0, 0), (1, 0, 0)], speed=0)),
+    ("Camera.pose", lambda d: b.Camera(pose=b.Way([(0, 0, 0), (1, 0, 0)]))),
     ("{d}/none", lambda d: b.verify(d / "none")),
     ("deep", lambda d: b.verify(d, deep=-1)),
 ]
@@ -351,6 +370,48 @@ def test_wrong_calls_name_the_argument(where, call, tmp_path):
     assert line.startswith(where.format(d=tmp_path) + ": ") and "\n" not in line, line
     assert len(line) < 400 and "pydantic" not in line
     assert list(tmp_path.iterdir()) == [], "half-written"
+
+
+# --- what changes its shape, and goes its way -------------------------------------------------------------------------
+
+
+def test_what_lives_is_what_yaml_makes_of_it(tmp_path):
+    """Figures in their coats on their ways, deformed primitives and triangles, clips of files: the tree of the YAML,
+    and from it the same shapes and places."""
+    (tmp_path / "arm.glb").write_bytes(arm_file().glb())
+    b, file = blinkgl, str(tmp_path / "arm.glb")
+    bodies = [
+        b.Primitive("figure", clip="walk", coat=3, pose=b.Way([(4, 1, 0), (4, -2, 0)], start=0.1)),
+        b.Primitive("cuboid", deform=b.Deform("twist", angle=40, along="x"), pose=(1, 0, 0)),
+        b.Mesh(file, animation="wave", pose=(2, 0, 0)),
+        b.Mesh(file, animation=b.Animation(0, speed=2, blend=b.Animation("wave", phase=0.3), share=0.2)),
+        b.Mesh(file, deform=b.Deform("breathe", amount=(0.1, 0, -0.1))),
+    ]
+    scene = b.Scene(b.Camera(32, 24, pose=(-3, 0, 1)), bodies, duration=0.5)
+    template = RunTemplate(yaml.safe_load(yaml.safe_dump(scene.template().tree)), tmp_path)
+    config = template.sequence(0)
+    ours, theirs = scene.build(config), build_scene(config.scene, config.camera, config.time.t0_ns, config.time.t1_ns)
+    assert all(o.deforms for o in ours.objects)
+    for a, c in zip(ours.objects, theirs.objects):
+        for t in (0, 3 * 10**8):
+            first, second = (o.parts[0].mesh.deformer.positions(o.parts[0].mesh, t) for o in (a, c))
+            assert np.array_equal(first, second) and np.array_equal(a.path.pose(t), c.path.pose(t))
+    walker = ours.objects[0]
+    assert walker.parts[0].material.texture is not None, "wears its coat, and not white"
+    moved = np.linalg.norm(walker.path.pose(10**9 // 2)[:3, 3] - walker.path.pose(0)[:3, 3])
+    assert moved == pytest.approx(0.5 * walker.parts[0].mesh.deformer.speed, rel=1e-3)
+    paint = b.Primitive("figure", material=b.Material(color=(1, 0, 0)))
+    assert paint.material.tree["color"] == [1, 0, 0]
+
+
+def test_triangles_can_deform():
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]], float)
+    sheet = blinkgl.Mesh(vertices=corners, faces=[[0, 1, 2], [0, 2, 3]], deform=blinkgl.Deform("flag", amplitude=0.3))
+    scene = blinkgl.Scene(blinkgl.Camera(32, 24, pose=(0.5, -3, 0.5)), [sheet])
+    built = scene.build(scene.template().sequence(0))
+    mesh = built.objects[0].parts[0].mesh
+    assert built.objects[0].deforms and len(mesh.faces) > 500
+    assert np.ptp(mesh.deformer.positions(mesh, 10**8)[:, 1]) > 0.1
 
 
 # --- what falls -------------------------------------------------------------------------------------------------------

@@ -23,15 +23,14 @@ from pathlib import Path
 import numpy as np
 
 from blinkgl.config.reader import read_table
+from eflow.bench import PRESETS
 from eflow.config import load_train_config
 
 AGAIN = 75
 """Exit status for "not finished, run again" (sysexits' EX_TEMPFAIL)."""
 MODELS = {
-    "eflowformer": "{name: eflowformer, variant: base}",
-    "eflowformer-small": "{name: eflowformer, variant: small}",
-    "eraft": "{name: eraft}",
-    "ev_flownet": "{name: ev_flownet, input: voxel}",
+    name: json.dumps(tree | ({"input": "voxel"} if tree["name"] == "ev_flownet" else {}))
+    for name, tree in PRESETS.items()
 }
 SHOWN = ("AEE", "outlier", "1PE", "AE2D", "AE3D")
 

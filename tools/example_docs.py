@@ -27,6 +27,11 @@ PICTURES = {
         "example_scene.png",
         "a checked ball, a red ring and a box with a photograph on a brick floor",
     ),
+    "living_scene": (
+        "living.png",
+        "example_living.png",
+        "a dancer, someone who walks, a fish, a flag and a tower that bends",
+    ),
     "frame_with_labels": ("labels.png", "example_labels.png", "image, depth, instance ids and flow of one frame"),
     "own_label": ("position.png", "example_own_label.png", "a frame, and a map of where its surfaces are"),
     "events_over_frame": ("events.png", "example_events.png", "a frame, and the events that follow it drawn over it"),
@@ -35,6 +40,7 @@ PICTURES = {
 """Of an example: the picture it makes, its name in docs/images, and what it shows."""
 ORDER = (
     "scene_in_python",
+    "living_scene",
     "frame_with_labels",
     "own_label",
     "own_trajectory",

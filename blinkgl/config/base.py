@@ -24,7 +24,9 @@ import inspect
 import re
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Any, ClassVar, Generic, TypeVar
@@ -77,6 +79,20 @@ def rule(*keys: str) -> Callable[[Callable[..., None]], Rule]:
     return lambda function: Rule(keys, function)
 
 
+_known: ContextVar[dict[tuple[type, int], tuple[Any, Any]] | None] = ContextVar("known", default=None)
+
+
+@contextmanager
+def remembering() -> Iterator[None]:
+    """Inside, a table that is the same object as one before is not looked at again: its model is the same object, too.
+    For many trees that share their parts, which nobody changes meanwhile."""
+    token = _known.set({})
+    try:
+        yield
+    finally:
+        _known.reset(token)
+
+
 class Config(BaseModel):
     """Frozen; unknown keys, NaN and infinity are refused. Numbers written as strings ("1e-4") are converted,
     because YAML 1.1 reads ``1e-4`` as a string.
@@ -100,6 +116,7 @@ class Config(BaseModel):
         cls.rules = tuple(found.values())
         decorators = cls.__pydantic_decorators__
         others = {*decorators.model_validators, *decorators.field_validators, *decorators.validators} - {
+            "_remembered",
             "_fill_preset",
             "_keep_rules",
         }
@@ -116,7 +133,13 @@ class Config(BaseModel):
     def _fill_preset(cls, data: Any) -> Any:
         if cls.presets and isinstance(data, dict):
             name = data.get("preset", cls.model_fields["preset"].default)
-            return {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **data}
+            data = {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **data}
+        return cls.completed(data) if isinstance(data, dict) else data
+
+    @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """``data`` with keys that follow from others that are given; what cannot be used is left as it is, for the
+        validation that comes next."""
         return data
 
     @model_validator(mode="after")
@@ -124,6 +147,17 @@ class Config(BaseModel):
         for one in self.rules:
             one(self)
         return self
+
+    @model_validator(mode="wrap")  # the last, so that it is round the others
+    @classmethod
+    def _remembered(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
+        known = _known.get()
+        if known is None or not isinstance(data, dict):
+            return handler(data)
+        found = known.get((cls, id(data)))
+        if found is None:
+            found = known[cls, id(data)] = data, handler(data)  # the data, too: nothing else may get its place
+        return found[1]
 
 
 def one_of(tag: str, *models: type[Config], default: str | None = None) -> Any:

@@ -35,11 +35,13 @@ class Fill:
     """Values laid under what a configuration says: ``values(*reads)`` returns a tree of them.
 
     reads, writes : dotted keys from the top. ``values`` is given what the tree says at ``reads`` (None: nothing) and
-    nothing else, and may return keys at or below ``writes`` only."""
+    nothing else, and may return keys at or below ``writes`` only. parts : (key written, keys inside what is read that
+    it comes from, "*" for any), so that of a table that is read a key hangs on its own part alone."""
 
     reads: tuple[str, ...]
     writes: tuple[str, ...]
     values: Callable[..., dict[str, Any]]
+    parts: tuple[tuple[str, str], ...] = ()
 
     def __call__(self, tree: dict[str, Any]) -> dict[str, Any]:
         """``tree`` over the fill's values. Raises TypeError where those are not the declared ones."""
@@ -100,16 +102,19 @@ def corners(model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Ite
     if not every:
         yield tree
         return
+    made: Made = {}
     for site in every:
         group = _together([(site, is_leaf(model, site))], model, every, fills)
-        yield from combinations(tree, group, between=site)
+        yield from combinations(tree, group, between=site, made=made)
     done: list[frozenset[Path]] = []
     for group in sorted(
-        {_together(keys, model, every, fills) for keys in _looked_at(model, every)}, key=len, reverse=True
+        {_together(keys, model, every, fills) for keys in _looked_at(model, [*every, *_written(every, fills)])},
+        key=len,
+        reverse=True,
     ):
         if not any(group <= other for other in done):
             done.append(group)
-            yield from combinations(tree, group)
+            yield from combinations(tree, group, made=made)
 
 
 def corners_of(keys: tuple[str, ...], model: type[Config], tree: Any, fills: tuple[Fill, ...] = ()) -> Iterator[Any]:
@@ -119,10 +124,18 @@ def corners_of(keys: tuple[str, ...], model: type[Config], tree: Any, fills: tup
     yield from combinations(tree, _together([(tuple(key.split(".")), True) for key in keys], model, every, fills))
 
 
-def combinations(tree: Any, group: frozenset[Path], between: Path | None = None) -> Iterator[Any]:
+Made = dict[int, tuple[Any, Any]]
+"""Identity of a node -> the node, which keeps it taken, and what it is with every first option."""
+
+
+def combinations(
+    tree: Any, group: frozenset[Path], between: Path | None = None, made: Made | None = None
+) -> Iterator[Any]:
     """``tree`` with every combination of options of the distributions at the paths in ``group``, the first option of
-    all others. ``between``: the one of which a value inside the range is an option, too."""
-    number = _count(tree, (), group)
+    all others. ``between``: the one of which a value inside the range is an option, too. made : to be shared by all
+    calls for one tree."""
+    expansion = _Expansion(group, between, {} if made is None else made)
+    number = expansion.count(tree, ())
     if number > MOST:
         raise ConfigError(
             "too many distributions are looked at together",
@@ -130,16 +143,28 @@ def combinations(tree: Any, group: frozenset[Path], between: Path | None = None)
             value=f"{number} combinations",
             accepted=f"at most {MOST}; draw fewer of them",
         )
-    yield from _Expansion(group, between).of(tree, ())
+    yield from expansion.of(tree, ())
 
 
 class _Expansion:
-    """What does not vary is made once, and the trees share it: hundreds of them cost little beside reading them."""
+    """What does not vary is made once, and the trees share it: thousands of them cost little, and what is the same
+    object was looked at before (:func:`blinkgl.config.base.remembering`)."""
 
-    def __init__(self, group: frozenset[Path], between: Path | None):
-        self.group, self.between = group, between
+    def __init__(self, group: frozenset[Path], between: Path | None, made: Made):
+        self.group, self.between, self.made = group, between, made
         self.towards = {site[:depth] for site in group for depth in range(len(site) + 1)}
-        self.made: dict[int, tuple[Any, Any]] = {}  # identity of a node -> the node, which keeps it taken; what it is
+
+    def count(self, node: Any, path: Path) -> int:
+        """How many trees there will be."""
+        if path not in self.towards:
+            return 1
+        if is_distribution(node):
+            given = options(path, node)
+            return sum(self.count(option, path) for option in (given if path in self.group else given[:1]))
+        number = 1
+        for step, child in _children(node):
+            number *= self.count(child, (*path, step))
+        return number
 
     def of(self, node: Any, path: Path) -> Iterator[Any]:
         if path not in self.towards:
@@ -171,16 +196,6 @@ class _Expansion:
         return self.made[id(node)][1]
 
 
-def _count(node: Any, path: Path, group: frozenset[Path]) -> int:
-    if is_distribution(node):
-        given = options(path, node)
-        return sum(_count(option, path, group) for option in (given if path in group else given[:1]))
-    number = 1
-    for step, child in _children(node):
-        number *= _count(child, (*path, step), group)
-    return number
-
-
 def _children(node: Any) -> list[tuple[str, Any]]:
     if isinstance(node, dict):
         return [(str(key), value) for key, value in node.items()]
@@ -209,6 +224,10 @@ def _together(
             writes = [tuple(w.split(".")) for w in fill.writes]
             if any(_related(key, w, True) and (deep or len(key) >= len(w)) for w in writes):
                 more += [(tuple(r.split(".")), False) for r in fill.reads]
+            for written, source in fill.parts:
+                top = tuple(written.split("."))
+                if key[: len(top)] == top:
+                    more.append(((*source.split("."), *key[len(top) :]), deep))
         for one in more:
             if one not in wanted:
                 wanted[one] = None
@@ -268,6 +287,16 @@ def placed_rules(model: type[Config]) -> tuple[tuple[Path, Rule], ...]:
 
     walk(model, ())
     return tuple(dict.fromkeys(found))
+
+
+def _written(every: list[Path], fills: tuple[Fill, ...]) -> Iterator[Path]:
+    """Where fills put what is drawn inside the tables that they read."""
+    for fill in fills:
+        for written, source in fill.parts:
+            top = tuple(source.split("."))
+            for site in every:
+                if len(site) > len(top) and _related(site[: len(top)], top, False):
+                    yield (*written.split("."), *site[len(top) :])
 
 
 def _looked_at(model: type[Config], every: list[Path]) -> Iterator[list[tuple[Path, bool]]]:

@@ -34,6 +34,8 @@ from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.errors import ConfigError
 
 _TAGS = ("kind", "emulator")
+_WHOLE = ("sensor",)
+"""Keys whose tables are not mixed: another camera is another camera."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,8 @@ def merge(common: Any, own: Any) -> Any:
     )
     if not both or any(tag in own and own[tag] != common.get(tag) for tag in _TAGS):
         return copy.deepcopy(own)
-    return {**copy.deepcopy(common), **{key: merge(common.get(key), value) for key, value in own.items()}}
+    laid = {key: copy.deepcopy(value) if key in _WHOLE else merge(common.get(key), value) for key, value in own.items()}
+    return {**copy.deepcopy(common), **laid}
 
 
 def _plain(node: Any) -> Any:

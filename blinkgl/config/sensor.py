@@ -1,81 +1,117 @@
-"""Sensors: what a camera's data sheet and papers say, in a form the emulators can use."""
+"""Sensors: what is known of a camera, in a form the emulators can use.
+
+A sensor is a YAML file, shipped or a person's own:
+
+    name: my DAVIS
+    width: 346
+    height: 260
+    contrast_threshold: 0.3                    # of any emulator, where nothing more exact is said below
+    emulators:                                 # keys of `events:` by emulator; they win over the above
+      esim: {contrast_threshold: 0.29, log_eps: 0.03}
+      voltmeter: {preset: DVS346, k1: {log_uniform: [1.8, 4.1]}}
+    readout: {events_per_second: 12.0e+6}
+    sources:                                   # where values come from, by their place in the file
+      contrast_threshold: data sheet, table 2
+      emulators.esim: fitted here to slider_depth, first half
+    uncertainty: {emulators.esim.log_eps: 0.004}
+
+A value may be a distribution over units and bias settings (:mod:`blinkgl.config.draw`): two cameras of one name differ.
+A sequence draws one unit; whoever wants a single camera takes the middle, or a unit by number (:func:`load_sensor`).
+"""
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Iterator
 from functools import lru_cache
 from importlib import resources
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from blinkgl.config.base import Config, Refused, rule, validate
+from blinkgl.config.corners import corners
+from blinkgl.config.draw import draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.reader import parse_yaml
+from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 
 
-class ReadoutConfig(Config):
-    """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`."""
-
-    events_per_second: float = Field(ge=1, le=1e12, description="Peak rate of the bus, events per second.")
-    row_ns: float = Field(
-        0.0,
-        ge=0,
-        le=1e6,
-        description="Time to open a row before its events go out, nanoseconds; 0: every event is arbitrated by itself.",
-    )
-    queue_events: int = Field(
-        4096, ge=1, le=2**24, description="Events that may wait for the bus; one that finds the queue full is lost."
-    )
-
-    @rule("events_per_second", "row_ns", "queue_events")
-    def _queue_empties(rate: float, row_ns: float, queue: int):
-        if drain_us(rate, row_ns, queue) > 2**32:
-            raise Refused(
-                "the last event of a full queue would wait for more than an hour",
-                where="queue_events",
-                value=queue,
-                accepted="a shorter queue or a faster bus",
-            )
-
-    @property
-    def drain_us(self) -> float:
-        """Longest that an event may be late, microseconds: the time that a full queue takes to empty."""
-        return drain_us(self.events_per_second, self.row_ns, self.queue_events)
-
-
-def drain_us(events_per_second: float, row_ns: float, queue_events: int) -> float:
-    """Longest wait for a bus, microseconds (see :class:`ReadoutConfig`)."""
-    return (queue_events + 1) * (1e6 / events_per_second + row_ns / 1000)
+def _emulator_tables(tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """A field's own look and no rule: what is looked at together is one emulator's keys, not those of all."""
+    models = EmulatorConfig.members.models
+    for name, keys in tables.items():
+        if name not in models:
+            raise Refused("unknown emulator", value=name, accepted="one of " + ", ".join(models))
+        if "emulator" in keys:
+            raise Refused("the name of the table is the emulator", where=name, value=keys["emulator"])
+        try:
+            validate(models[name], keys)
+        except ConfigError as error:
+            where = name if error.where in (None, "", "config") else f"{name}.{error.where}"
+            raise Refused(error.problem, where=where, value=error.value, accepted=error.accepted) from None
+    return tables
 
 
 class SensorConfig(Config):
-    """One camera. Thresholds are in ln units: a contrast of 15 % is ln 1.15 = 0.14."""
+    """One camera, one unit of it. Thresholds are in ln units: a contrast of 15 % is ln 1.15 = 0.14. What is null is not
+    known, and the emulator's own default holds."""
 
     name: str = Field(description="The camera's name.")
     width: int = Field(ge=1, le=65535, description="Columns, px.")
     height: int = Field(ge=1, le=65535, description="Rows, px.")
-    pixel_pitch_um: float = Field(gt=0, le=1000, description="Distance between pixel centres, micrometres.")
-    contrast_threshold: float = Field(ge=0.001, le=10, description="Nominal ON threshold, ln units.")
+    pixel_pitch_um: float | None = Field(
+        None, gt=0, le=1000, description="Distance between pixel centres, micrometres."
+    )
+    contrast_threshold: float | None = Field(None, ge=0.001, le=10, description="Nominal ON threshold, ln units.")
     contrast_threshold_off: float | None = Field(
         None, ge=0.001, le=10, description="Nominal OFF threshold; default: equal."
     )
-    threshold_sigma: float = Field(0.0, ge=0, le=5, description="Spread of the threshold over the pixels, ln units.")
-    cutoff_hz: float = Field(0.0, ge=0, le=1e7, description="Photoreceptor bandwidth in good light, Hz; 0: unlimited.")
-    refractory_us: float = Field(0.0, ge=0, le=1e9, description="Dead time of a pixel, microseconds.")
-    leak_rate_hz: float = Field(0.0, ge=0, le=1e4, description="Leak events per second and pixel.")
-    shot_noise_rate_hz: float = Field(0.0, ge=0, le=1e4, description="Noise events per second and pixel in the dark.")
-    calibrated: dict[str, str] = Field(
-        {},
-        description="Presets of emulators that were calibrated on this camera or, failing that, on the "
-        "nearest one, by the emulator's name.",
+    threshold_sigma: float | None = Field(
+        None, ge=0, le=5, description="Spread of the threshold over the pixels, ln units."
     )
-    readout: ReadoutConfig = Field(description="Read-out limit.")
+    cutoff_hz: float | None = Field(
+        None, ge=0, le=1e7, description="Photoreceptor bandwidth in good light, Hz; 0: unlimited."
+    )
+    refractory_us: float | None = Field(None, ge=0, le=1e9, description="Dead time of a pixel, microseconds.")
+    leak_rate_hz: float | None = Field(None, ge=0, le=1e4, description="Leak events per second and pixel.")
+    shot_noise_rate_hz: float | None = Field(
+        None, ge=0, le=1e4, description="Noise events per second and pixel in the dark."
+    )
+    emulators: Annotated[dict[str, dict[str, Any]], AfterValidator(_emulator_tables)] = Field(
+        {},
+        description="Keys of `events:` by the emulator's name: what was fitted or published for that model. They win "
+        "over the values above.",
+    )
+    readout: ReadoutConfig | None = Field(
+        None, description="What is behind the pixels: their defects and latency, the bus, its clock, filters."
+    )
+    sources: dict[str, str] = Field(
+        {},
+        description="Where values come from, by their dotted place in the file, or that of the table that they are in.",
+    )
+    uncertainty: dict[str, float] = Field(
+        {}, description="Standard deviations of fitted values, by their dotted place, in the value's unit."
+    )
+
+    @rule("#sources", "#uncertainty", "#emulators")
+    def _of_values_there_are(sources: tuple, uncertainty: tuple, emulators: tuple):
+        for table, names in (("sources", sources), ("uncertainty", uncertainty)):
+            for name in names:
+                key, *rest = name.split(".")
+                known = key in SensorConfig.model_fields and key not in ("sources", "uncertainty")
+                if not known or (key == "emulators" and rest and rest[0] not in emulators):
+                    raise Refused("there is no such value in the file", where=table, value=name)
 
     def values(self, emulator: Any) -> dict[str, Any]:
         """What this sensor says about the keys of the emulator of this name; of one that is not known nothing."""
         models = EmulatorConfig.members.models
-        return models[emulator].from_sensor(self) if isinstance(emulator, str) and emulator in models else {}
+        if not isinstance(emulator, str) or emulator not in models:
+            return {}
+        said = {key: value for key, value in models[emulator].from_sensor(self).items() if value is not None}
+        return {**said, **copy.deepcopy(self.emulators.get(emulator, {}))}
 
     def emulator(self, emulator: str, **overrides: Any) -> EmulatorConfig:
         """Config of the emulator of this name with this sensor's values, ``overrides`` on top. Raises ConfigError."""
@@ -99,12 +135,50 @@ def sensor_names() -> tuple[str, ...]:
     )
 
 
-def load_sensor(name: str) -> SensorConfig:
-    """A shipped sensor by name (case and punctuation do not matter). Raises ConfigError naming the known ones."""
+def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
+    """A shipped sensor by name (case and punctuation do not matter), or one of a YAML file by its path (ending in .yaml
+    or .yml). Raises ConfigError naming the known ones, or what is wrong with the file.
+
+    unit : of a sensor whose values are distributions over units: the unit of this number, drawn by it alone; None: the
+    middle of every distribution."""
+    table = sensor_table(name)
+    _check(table, str(name))
+    return validate(SensorConfig, middle(table) if unit is None else draw(table, unit, 0), where=str(name))
+
+
+def _check(table: dict[str, Any], where: str) -> None:
+    """Validates what stands for all that a sensor can draw. Raises ConfigError."""
+    for tree in (*corners(SensorConfig, table), *_mixed(table)):
+        validate(SensorConfig, tree, where=where)
+
+
+def _mixed(table: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Sensors of one emulator, with the combinations of what it can draw that the emulator looks at together."""
+    models, tables = EmulatorConfig.members.models, table.get("emulators")
+    for name, keys in tables.items() if isinstance(tables, dict) else ():
+        if name in models and isinstance(keys, dict) and _has_distributions(keys):
+            for tree in corners(models[name], keys):
+                yield middle({**table, "emulators": {name: tree}, "sources": {}, "uncertainty": {}})
+
+
+def sensor_table(name: Any) -> dict[str, Any]:
+    """What a sensor's file says, distributions as they stand (a copy). Raises ConfigError as :func:`load_sensor`."""
+    if is_sensor_file(name):
+        return read_table(name, "a sensor: name, width, height, ...")
     known = known_sensor(name)
     if known is None:
-        raise ConfigError("unknown sensor", where="sensor", value=name, accepted="one of " + ", ".join(sensor_names()))
-    return _shipped(known)
+        raise ConfigError(
+            "unknown sensor",
+            where="sensor",
+            value=name,
+            accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
+        )
+    return copy.deepcopy(_shipped(known))
+
+
+def is_sensor_file(name: Any) -> bool:
+    """Whether a sensor's name is the path of a file."""
+    return isinstance(name, str) and name.lower().endswith((".yaml", ".yml"))
 
 
 def known_sensor(name: Any) -> str | None:
@@ -118,19 +192,46 @@ def known_sensor(name: Any) -> str | None:
 
 
 @lru_cache
-def _shipped(known: str) -> SensorConfig:
+def _shipped(known: str) -> dict[str, Any]:
     text = (resources.files("blinkgl.configs") / "sensors" / f"{known}.yaml").read_text(encoding="utf-8")
-    return validate(SensorConfig, parse_yaml(text, f"sensors/{known}.yaml"), where=f"sensors/{known}.yaml")
+    return parse_yaml(text, f"sensors/{known}.yaml")
+
+
+def spelled_out(sensor: Any, base: Path) -> Any:
+    """What a run's key ``sensor`` says, with the table of a file in the place of its path (from ``base``): a run then
+    says all by itself. A shipped sensor whose values are distributions is spelled out, too, because a
+    sequence has to say which unit it drew; the others stay a name. Raises ConfigError."""
+    if is_distribution(sensor):
+        kind, spec = next(iter(sensor.items()))
+        if kind == "choice" and isinstance(spec, list):
+            return {kind: [spelled_out(one, base) for one in spec]}
+        if kind == "shares" and isinstance(spec, list) and all(isinstance(part, dict) for part in spec):
+            return {kind: [{**part, "value": spelled_out(part.get("value"), base)} for part in spec]}
+        return sensor
+    if is_sensor_file(sensor):
+        table = sensor_table(str(base / sensor))
+        _check(table, str(base / sensor))
+        return table
+    known = known_sensor(sensor)
+    return sensor if known is None or not _has_distributions(_shipped(known)) else sensor_table(sensor)
+
+
+def _has_distributions(node: Any) -> bool:
+    if is_distribution(node):
+        return True
+    inside = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    return any(_has_distributions(child) for child in inside)
 
 
 def fill_sensor(sensor: Any, emulator: Any) -> dict[str, Any]:
-    """What the sensor called ``sensor`` says about a configuration with ``emulator`` (None: the
-    default one); nothing for an unknown one."""
-    if known_sensor(sensor) is None:
+    """What ``sensor``, a name or a table, says about a configuration with ``emulator`` (None: the
+    default one); nothing for an unknown one, and for a table that is none."""
+    try:
+        camera = validate(SensorConfig, sensor) if isinstance(sensor, dict) else load_sensor(sensor)
+    except ConfigError:  # of which the configuration's own key speaks
         return {}
-    camera = load_sensor(sensor)
-    return {
+    said = {
         "camera": {"width": camera.width, "height": camera.height},
-        "readout": camera.readout.model_dump(),
         "events": camera.values(EmulatorConfig.members.default if emulator is None else emulator),
     }
+    return said if camera.readout is None else {**said, "readout": camera.readout.model_dump()}

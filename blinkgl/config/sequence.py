@@ -16,21 +16,30 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from blinkgl.camera import CameraModel, PinHole, focal_length
-from blinkgl.config.base import Config, Refused, rule, validate, validate_field
+from blinkgl.config.base import Config, Refused, remembering, rule, validate, validate_field
 from blinkgl.config.corners import Fill, corners, corners_of, sites
 from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
+from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.readout import ReadoutConfig, drain_us
+from blinkgl.config.recipes import with_recipes
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
-from blinkgl.config.sensor import ReadoutConfig, drain_us, fill_sensor, known_sensor, sensor_names
+from blinkgl.config.sensor import (
+    SensorConfig,
+    fill_sensor,
+    known_sensor,
+    sensor_names,
+    spelled_out,
+)
 from blinkgl.config.timeline import DisplacementTimeline, TimelineConfig
 from blinkgl.errors import ConfigError
 from blinkgl.labels import LABELS  # noqa: F401 - whose rows bring the keys of `labels:`
@@ -220,8 +229,18 @@ class OutputConfig(Config):
 
 def _sensor(name: str) -> str:
     if known_sensor(name) is None:
-        raise Refused("unknown sensor", value=name, accepted="one of " + ", ".join(sensor_names()))
+        raise Refused(
+            "unknown sensor",
+            value=name,
+            accepted=f"one of {', '.join(sensor_names())}, or a sensor file ending in .yaml",
+        )
     return name
+
+
+Sensor = Annotated[
+    Annotated[Annotated[str, AfterValidator(_sensor)], Tag("one by name")] | Annotated[SensorConfig, Tag("a table")],
+    Discriminator(lambda value: "a table" if isinstance(value, (dict, SensorConfig)) else "one by name"),
+]
 
 
 class SequenceConfig(Config):
@@ -244,16 +263,22 @@ class SequenceConfig(Config):
         "`timeline`, `scene` and `render` have no meaning",
     )
     render: RenderConfig = Field(RenderConfig(), description="how a frame is drawn")
-    sensor: Annotated[str, AfterValidator(_sensor)] | None = Field(
+    sensor: Sensor | None = Field(
         None,
-        description="davis240c, davis346, dvxplorer, gen31_vga or imx636: gives camera.width and height, events and "
-        "readout the camera's values; what is said beside it wins",
+        description="davis240c, davis346, dvxplorer, gen31_vga or imx636, or the path of a sensor file (its table may "
+        "stand here, too): gives camera.width and height, events and readout the camera's values; what is said beside "
+        "it wins",
     )
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
     readout: ReadoutConfig | None = Field(
-        None, description="the sensor's bus: events above its rate are late, then lost; null: no limit"
+        None,
+        description="what is behind the pixels: their defects and latency, the bus (events above its rate are late, "
+        "then lost) and its clock, filters; null: nothing",
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
+    images: ImagesConfig | None = Field(
+        None, description="a frame camera beside the event camera (docs/images.md); null: none"
+    )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
@@ -291,6 +316,42 @@ class SequenceConfig(Config):
                 accepted="at most 8000000",
             )
 
+    @rule("?images", "?frames")
+    def _frames_have_no_camera(images: bool, frames: bool):
+        if images and frames:
+            raise Refused(
+                "recorded frames are images already: nothing is there to be exposed",
+                where="images",
+                accepted="null, or a scene instead of frames",
+            )
+
+    @rule(
+        "images.rate",
+        "images.times",
+        "images.exposure_us",
+        "images.auto_exposure.longest_us",
+        "images.row_us",
+        "camera.height",
+        "time.duration",
+        "time.label_rate",
+        "time.start",
+    )
+    def _exposures_fit(
+        rate: float | None,
+        times: tuple[float, ...] | None,
+        exposure: float,
+        longest: float | None,
+        row_us: float,
+        height: int,
+        duration: float,
+        label_rate: float,
+        start: float,
+    ):
+        if rate is not None:
+            lasts = exposure if longest is None else longest
+            count = int(duration * label_rate + 1e-9) + 1
+            check_images(rate, times, lasts, readout_us(height, row_us), start, count / label_rate)
+
     @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
     def _room_for_the_camera(kind, height, clearance, camera):
         if kind != "random":
@@ -308,7 +369,13 @@ class SequenceConfig(Config):
 
 FILLS = (
     Fill(("quality", "timeline.kind", "events.emulator", "frames"), ("timeline", "render"), fill_quality),
-    Fill(("sensor", "events.emulator"), ("camera.width", "camera.height", "events", "readout"), fill_sensor),
+    Fill(
+        ("sensor", "events.emulator"),
+        ("camera.width", "camera.height", "events", "readout"),
+        fill_sensor,
+        (("events", "sensor.emulators.*"), ("events", "sensor"), ("camera", "sensor"), ("readout", "sensor.readout")),
+    ),
+    Fill(("images",), ("labels.images",), lambda images: {} if images is None else {"labels": {"images": False}}),
 )
 _OF_THE_RUN = ("seed", "output", "gl")
 
@@ -364,9 +431,10 @@ class RunTemplate:
                     accepted="plain values",
                 )
         first = None
-        for tree in corners(SequenceConfig, self.tree, FILLS):
-            config = _validated(tree)
-            first = config if first is None else first
+        with remembering():
+            for tree in corners(SequenceConfig, self.tree, FILLS):
+                config = _validated(tree)
+                first = config if first is None else first
         assert first is not None
         return first
 
@@ -389,12 +457,13 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
     optional seed, checks all that can be drawn.
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
-    tree = apply_overrides(_with_scenes(read_table(path), Path(path).parent), overrides)
+    base = Path(path).parent
+    tree = with_recipes(with_sensors(apply_overrides(_with_scenes(read_table(path), base), overrides), base))
     if seed is not None:
         tree["seed"] = seed
     if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses
         tree["seed"] = validate_field(SequenceConfig, "seed", tree["seed"])
-    template = RunTemplate(tree, Path(path).parent)
+    template = RunTemplate(tree, base)
     template.check()
     return template
 
@@ -420,6 +489,20 @@ def _with_scenes(tree: dict[str, Any], base: Path) -> dict[str, Any]:
                 "the file has no scene of its own", where=where, value=given, accepted="a file with a table scene"
             )
         table["scene"] = merge(scene, own)
+    return tree
+
+
+def with_sensors(tree: dict[str, Any], base: Path) -> dict[str, Any]:
+    """``tree`` with sensors' files, at the top and in groups, read from ``base`` and spelled out.
+    Raises ConfigError."""
+    tree, groups = dict(tree), tree.get("groups")
+    if isinstance(groups, dict):
+        tree["groups"] = {
+            name: with_sensors(group, base) if isinstance(group, dict) and "groups" not in group else group
+            for name, group in groups.items()
+        }
+    if "sensor" in tree:
+        tree["sensor"] = spelled_out(tree["sensor"], base)
     return tree
 
 

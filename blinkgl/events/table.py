@@ -19,20 +19,27 @@ from typing import Any
 
 from blinkgl.config.base import tag_of, validate
 from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.sensor import ReadoutConfig, SensorConfig
+from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.sensor import SensorConfig
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.response import Response
 
 EMULATORS: dict[str, type[Emulator]] = {}
 """By ``Config``'s key ``emulator``."""
-_SOME_SENSOR = SensorConfig(
-    name="some",
-    width=4,
-    height=3,
-    pixel_pitch_um=10,
-    contrast_threshold=0.2,
-    refractory_us=10,
-    readout=ReadoutConfig(events_per_second=1e6),
+_SOME_SENSORS = (
+    SensorConfig(name="unknown", width=4, height=3),
+    SensorConfig(
+        name="some",
+        width=4,
+        height=3,
+        contrast_threshold=0.2,
+        threshold_sigma=0.01,
+        cutoff_hz=100,
+        refractory_us=10,
+        leak_rate_hz=0.1,
+        shot_noise_rate_hz=0.1,
+        readout=ReadoutConfig(events_per_second=1e6),
+    ),
 )
 
 
@@ -112,9 +119,11 @@ def _checked(emulator: Any) -> str:
     )
     for part in sorted(model.__abstractmethods__):
         unless(False, f"Config.{part}", "is missing")
-    values = result("Config.from_sensor", model.from_sensor, _SOME_SENSOR)
-    unless(isinstance(values, dict), "Config.from_sensor", f"gives {values!r} and not a table of keys")
-    result("Config.from_sensor", validate, model, values)
+    for sensor in _SOME_SENSORS:
+        values = result("Config.from_sensor", model.from_sensor, sensor)
+        unless(isinstance(values, dict), "Config.from_sensor", f"gives {values!r} and not a table of keys")
+        said = {key: value for key, value in values.items() if value is not None}
+        result("Config.from_sensor", validate, model, said)
     config = result("Config", model)
 
     for part in sorted(emulator.__abstractmethods__):

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from blinkgl.config.base import Config, validate
+from blinkgl.config.deform import AnimationConfig
 from blinkgl.config.physics import BodyConfig, PhysicsConfig
 from blinkgl.config.scene import (
     ExplicitSceneConfig,
@@ -36,6 +37,7 @@ from blinkgl.errors import AssetError, ConfigError
 from blinkgl.front import arguments as check
 from blinkgl.scene import types as data
 from blinkgl.scene.geometry.meshes import make_mesh
+from blinkgl.scene.surfaces.coats import COATS
 from blinkgl.scene.surfaces.images import content_hash
 from blinkgl.scene.worlds.explicit import InMemory, explicit_scene, primitive_mesh
 
@@ -112,11 +114,11 @@ class Keyframes(_Piece):
         )
 
 
-def _motion(pose: Pose | Keyframes | Vector, where: str) -> dict[str, Any]:
-    """A position alone is a pose."""
+def _motion(pose: Pose | Keyframes | Vector, where: str, others: str = "") -> dict[str, Any]:
+    """A position alone is a pose. others : what else may be given, for the message."""
     if isinstance(pose, (Pose, Keyframes)):
         return pose.tree
-    check.one_of(pose, where, (list, tuple, np.ndarray), "a Pose, Keyframes or a position of three numbers")
+    check.one_of(pose, where, (list, tuple, np.ndarray), f"a Pose, Keyframes, {others}or a position of three numbers")
     return Pose(pose).tree
 
 
@@ -148,10 +150,14 @@ class Camera(_Piece):
 
 
 class Light(_Piece):
-    """One white sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z).
+    """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
+    lights beside them.
 
-    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60,
-    40).   unlit : radiance = albedo everywhere.
+    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60, 40).
+    sun_color, sky_color : (3,) linear factors, white by default.
+    lights : tables as under ``light.lights`` of the YAML: ``{"kind": "point", "position": (0, 0, 2), "strength": 3}``,
+    ``{"kind": "spot", "position": …, "look_at": …, "angle": 40}``, ``{"kind": "sun", "elevation": 20}``.
+    unlit : radiance = albedo everywhere.
     Raises ConfigError."""
 
     def __init__(
@@ -161,9 +167,25 @@ class Light(_Piece):
         *,
         elevation: float | None = None,
         azimuth: float | None = None,
+        sun_color: Vector | None = None,
+        sky_color: Vector | None = None,
+        lights: Sequence[Mapping[str, Any]] = (),
         unlit: bool = False,
     ):
-        tree = check.given(sun=sun, sky=sky, sun_elevation=elevation, sun_azimuth=azimuth, unlit=unlit)
+        check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
+        tree = check.given(
+            sun=sun,
+            sky=sky,
+            sun_elevation=elevation,
+            sun_azimuth=azimuth,
+            sun_color=sun_color,
+            sky_color=sky_color,
+            unlit=unlit,
+        )
+        if lights:
+            for k, one in enumerate(lights):
+                check.one_of(one, f"Light.lights[{k}]", Mapping, "a table")
+            tree["lights"] = [check.given(**one) for one in lights]
         self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
 
 
@@ -264,6 +286,76 @@ class Body(_Piece):
         self.tree = self._checked(BodyConfig, tree)
 
 
+class Deform(_Piece):
+    """How a body's shape changes with time, by formula: ``Mesh("tree.glb", deform=Deform("bend", angle=10))``.
+
+    kind : "wave", "flag", "twist", "bend", "breathe", or that of a deformer of your own.
+    keys : of that kind (docs/configuration.md, "deform"), such as ``amplitude`` and ``wavelength`` in parts of the
+    body's size, ``period`` s, ``phase`` and ``angle`` degrees, ``along`` and ``towards`` axes of the body at rest.
+    Raises ConfigError."""
+
+    def __init__(self, kind: str = "wave", **keys: float | str | Vector):
+        tree = {"kind": check.one_of(kind, "Deform.kind", str, "the name of a deformation"), **check.given(**keys)}
+        self._checked(ObjectConfig, {"mesh": "mesh", "deform": tree}, deform="")
+        self.tree = tree
+
+
+class Animation(_Piece):
+    """A clip that a glTF file's skins, morph targets and nodes play, or two at once: ``Mesh("ann.glb",
+    animation=Animation("Walk", speed=1.2))``.
+
+    clip : name or number of the animation.   file : another glTF file that it is taken from, whose joints have the
+    same names; None: the mesh's own.   speed : of the clip's own, negative backwards.   phase : s of the clip at
+    time 0.   loop : begins again at its end; False: held before its first and after its last key.
+    blend : a second :class:`Animation`, mixed with this one joint by joint.   share : of the second, 0 to 1.
+    Raises ConfigError; a clip that the file does not have is found when the scene is built."""
+
+    def __init__(
+        self,
+        clip: str | int = 0,
+        *,
+        file: str | os.PathLike | None = None,
+        speed: float = 1.0,
+        phase: float = 0.0,
+        loop: bool = True,
+        blend: Animation | None = None,
+        share: float = 0.5,
+    ):
+        tree = check.given(clip=clip, file=file, speed=speed, phase=phase, loop=loop, share=share)
+        if blend is not None:
+            second = dict(check.one_of(blend, "Animation.blend", Animation, "an Animation").tree)
+            if "blend" in second:
+                raise ConfigError(
+                    "only two clips can be mixed", where="Animation.blend", accepted="an Animation without blend"
+                )
+            second.pop("share")
+            tree["blend"] = second
+        self.tree = self._checked(AnimationConfig, tree)
+
+
+class Way(_Piece):
+    """A curve that a body follows at one speed, its x axis ahead: the ``pose`` of a figure that walks.
+
+    points : (N, 3) m, two or more, which the curve passes smoothly; beyond its ends it goes straight on.
+    speed : m/s; None: as fast as a figure's steps or a fish's strokes take it, 1 for other bodies.
+    closed : from the last point back to the first, and on.   level : the body's z axis stays up; False: its nose goes
+    up and down with the way.   start : share of the way that lies behind it at time 0.
+    Raises ConfigError."""
+
+    def __init__(
+        self,
+        points: Sequence[Vector] | np.ndarray,
+        *,
+        speed: float | None = None,
+        closed: bool = False,
+        level: bool = True,
+        start: float = 0.0,
+    ):
+        tree = check.given(points=points, speed=speed, closed=closed, level=level, start=start)
+        self._checked(ObjectConfig, {"mesh": "mesh", "way": tree}, way="")
+        self.tree = tree
+
+
 class _Object(_Piece):
     """What primitives and meshes share: an object of the scene, its mesh and its material."""
 
@@ -274,32 +366,39 @@ class _Object(_Piece):
         self,
         name: str | None,
         material: Material | None,
-        pose: Pose | Keyframes | Vector,
+        pose: Pose | Keyframes | Way | Vector,
         scale: float | Vector,
         category: str,
         body: Body | None,
+        deform: Deform | None,
+        animation: str | int | Animation | None = None,
     ) -> dict[str, Any]:
         kind = type(self).__name__
         self.material = None if material is None else check.one_of(material, f"{kind}.material", Material, "a Material")
-        tree = {
-            "mesh": "mesh",
-            **check.given(name=name, scale=scale, category=category),
-            **_motion(pose, f"{kind}.pose"),
-        }
+        motion = {"way": pose.tree} if isinstance(pose, Way) else _motion(pose, f"{kind}.pose", "Way, ")
+        tree = {"mesh": "mesh", **check.given(name=name, scale=scale, category=category), **motion}
         if body is not None:
             tree["physics"] = check.one_of(body, f"{kind}.body", Body, "a Body").tree
-        return self._checked(ObjectConfig, tree)
+        if deform is not None:
+            tree["deform"] = check.one_of(deform, f"{kind}.deform", Deform, "a Deform").tree
+        if animation is not None:
+            said = "an Animation, or a clip's name or number"
+            check.one_of(animation, f"{kind}.animation", (str, int, Animation), said)
+            tree["animation"] = animation.tree if isinstance(animation, Animation) else animation
+        return self._checked(ObjectConfig, tree, way="pose")
 
 
 class Primitive(_Object):
-    """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid.
+    """A body of a known shape: cuboid, sphere, icosphere, cylinder, cone, torus, capsule, prism, pyramid, grid, die,
+    or one that lives: figure, flag, fish.
 
-    parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``
-    (docs/configuration.md, "primitives").
-    material : :class:`Material`, default white.   scale : one factor, or (3,).
-    pose : :class:`Pose`, :class:`Keyframes` or a position (3,).
+    parameters : the shape's sizes (m) and numbers of faces, such as ``extents=(1, 1, 2)``, and what a figure does,
+    such as ``clip="dance"`` (docs/configuration.md, "primitives").
+    material : :class:`Material`, default white, or the coat of what lives.   scale : one factor, or (3,).
+    pose : :class:`Pose`, :class:`Keyframes`, :class:`Way` or a position (3,).
     name : default the shape's.   category : "object", "ground", "wall" or "sky": what collisions make of it.
     body : what it is where things fall, :class:`Body`; None: in the way.
+    deform : how its shape changes, :class:`Deform`; None: not, or as what lives does by itself.
     Raises ConfigError."""
 
     def __init__(
@@ -307,12 +406,13 @@ class Primitive(_Object):
         kind: str,
         *,
         material: Material | None = None,
-        pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
+        pose: Pose | Keyframes | Way | Vector = (0.0, 0.0, 0.0),
         scale: float | Vector = 1.0,
         name: str | None = None,
         category: Literal["object", "ground", "wall", "sky"] = "object",
         body: Body | None = None,
-        **parameters: float | Vector,
+        deform: Deform | None = None,
+        **parameters: float | str | Vector,
     ):
         check.one_of(kind, "Primitive.kind", str, "the name of a shape")
         self.mesh = {"primitive": kind, "parameters": check.plain(parameters)}
@@ -326,7 +426,9 @@ class Primitive(_Object):
             raise ConfigError(
                 error.problem, where=f"Primitive{key}" if said else key, value=error.value, accepted=error.accepted
             ) from None
-        self.tree = self._placed(name, material if material is not None else Material(), pose, scale, category, body)
+        if material is None and kind not in COATS:
+            material = Material()
+        self.tree = self._placed(name, material, pose, scale, category, body, deform)
         self.tree.setdefault("name", kind)
 
 
@@ -337,7 +439,8 @@ class Mesh(_Object):
     vertices : (V, 3) m, body axes.   faces : (F, 3) indices, counter-clockwise seen from outside.
     uvs : (V, 2), (0, 0) the texture's top left, v down; default: projected along the axes of a box.
     material : :class:`Material`; default: the file's own, or white.   pose, scale, name,
-    category, body : as of :class:`Primitive`.
+    category, body, deform : as of :class:`Primitive`.
+    animation : of a glTF file, what it plays: a clip's name or number, looped, or an :class:`Animation`; None: nothing.
     Raises ConfigError; a missing or damaged file raises when the scene is built."""
 
     def __init__(
@@ -349,11 +452,13 @@ class Mesh(_Object):
         uvs: ArrayLike | None = None,
         up: Literal["auto", "y", "z"] = "auto",
         material: Material | None = None,
-        pose: Pose | Keyframes | Vector = (0.0, 0.0, 0.0),
+        pose: Pose | Keyframes | Way | Vector = (0.0, 0.0, 0.0),
         scale: float | Vector = 1.0,
         name: str | None = None,
         category: Literal["object", "ground", "wall", "sky"] = "object",
         body: Body | None = None,
+        deform: Deform | None = None,
+        animation: str | int | Animation | None = None,
     ):
         if (file is None) == (vertices is None) or (vertices is None) != (faces is None):
             raise ConfigError("give a file, or vertices and faces", where="Mesh.file", value=file)
@@ -363,7 +468,13 @@ class Mesh(_Object):
             # The model wants a shape or a file; explicit_scene is given these triangles under the mesh's name.
             self.mesh, self.triangles = {"primitive": "grid"}, _triangles(vertices, faces, uvs)
             material = material if material is not None else Material()
-        self.tree = self._placed(name, material, pose, scale, category, body)
+        if animation is not None and (file is None or Path(file).suffix.lower() not in (".glb", ".gltf")):
+            raise ConfigError(
+                "only glTF files have animations", where="Mesh.animation", value=animation, accepted="None, or deform"
+            )
+        if animation is not None and deform is not None:
+            raise ConfigError("a body deforms by one thing", where="Mesh.deform", accepted="deform or animation")
+        self.tree = self._placed(name, material, pose, scale, category, body, deform, animation)
         self.tree.setdefault("name", "mesh" if file is None else Path(file).stem)
 
 

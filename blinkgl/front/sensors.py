@@ -12,7 +12,8 @@ from blinkgl.recordings.simulation import emulator_config
 
 _STEP = """
 
-    height, width : px.   seed : of its noise.   sensor : a camera whose values are the defaults, such as "davis346".
+    height, width : px.   seed : of its noise.   sensor : a camera whose values are the defaults, such as "davis346",
+    or a sensor file.
     reconstruction : log intensity between frames, "linear", or for Esim "pchip" and "hermite".
     values : keys of ``events:`` (docs/configuration.md).
 
@@ -53,10 +54,11 @@ DvsVoltmeter.__doc__ = (
 )
 
 
-def load_sensor(name: str) -> SensorConfig:
+def load_sensor(name: str, unit: int | None = None) -> SensorConfig:
     """The values of a shipped camera: davis240c, davis346, dvxplorer, gen31_vga, imx636
-    (case and punctuation do not matter).
+    (case and punctuation do not matter), or of a sensor file by its path.
 
-    ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …;
-    ``values("v2e")`` is what they say of an emulator's keys. Raises ConfigError."""
-    return _load_sensor(name)
+    ``width``, ``height`` (px), ``contrast_threshold`` (ln units), ``refractory_us`` (µs), ``readout`` …, None where
+    the file does not say; ``values("v2e")`` is what they say of an emulator's keys.
+    unit : where values are distributions over units: the unit of this number; None: the middle. Raises ConfigError."""
+    return _load_sensor(name, None if unit is None else check.whole(unit, "unit", 0, 2**31))

@@ -68,8 +68,7 @@ class View:
     error, and the most that is let pass.
     error : (drawn, true, label interval in s) -> (H, W) >= 0.   statistic : "max" of the
     pixels' errors, or their "mean".
-    same_triangle : judged only where both sides see the same triangle.   band_there : not judged where the point lands
-    beside a silhouette at the time that the label leads to.   note : said beside the figure."""
+    same_triangle : judged only where both sides see the same triangle.   note : said beside the figure."""
 
     name: str
     title: str
@@ -82,18 +81,18 @@ class View:
     error: Any = grading.absolute
     statistic: Literal["max", "mean"] = "max"
     same_triangle: bool = True
-    band_there: bool = False
     note: str = ""
 
 
 class Drawn(Protocol):
     """What :meth:`Label.finish` is given: the buffers of one time as the shader wrote them.
 
-    scene : as it is drawn.
+    scene : as it is drawn.   end_ns : the time that this label leads to; None: it is of one time.
     raw(name) : (H, W[, C]) buffer of a label, its own or one of ``needs``.   value(name) : what that label made of its.
     there(name) : buffer of a label among its ``there``, at the time that this label leads to."""
 
     scene: Scene
+    end_ns: int | None
 
     def raw(self, name: str) -> np.ndarray: ...
 

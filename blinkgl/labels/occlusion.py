@@ -52,13 +52,14 @@ class OcclusionAt(Label):
         flow = drawn.value(f"flow_{self.towards}")
         z_there = drawn.raw(f"flow_{self.towards}")[..., 2]
         return occlusion_mask(
+            drawn.scene,
+            drawn.end_ns,
             flow.flow,
             z_there,
             flow.valid,
             drawn.raw("ids"),
             drawn.there("depth"),
             drawn.there("ids"),
-            drawn.scene.camera.near,
         )
 
     @property
@@ -77,11 +78,9 @@ class OcclusionAt(Label):
                 lambda value: value,
                 lambda scene, frame: getattr(frame, way).occluded,
                 "fraction of pixels",
-                1e-2,
+                1e-3,
                 grading.different,
                 "mean",
                 same_triangle=False,
-                band_there=True,
-                note="off the band at t' as well: the mask rests on one depth sample per pixel there",
             ),
         )

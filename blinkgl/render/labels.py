@@ -28,7 +28,8 @@ class Labels:
 
     def frame(self, t_ns: int, request: LabelRequest, forward_ns: int | None, backward_ns: int | None) -> LabelFrame:
         """See :meth:`Renderer.labels`."""
-        draw, ends = self._renderer, {}
+        draw = self._renderer
+        ends: dict[str, int] = {}
         for towards, end_ns in (("forward", forward_ns), ("backward", backward_ns)):
             if who := [name for name in request if LABELS[name].towards == towards]:
                 if end_ns is None:
@@ -49,12 +50,17 @@ class Labels:
                 values[name] = draw.colour(t_ns).read()
         started = working_clock()
         for name in request:
-            self._finished(name, drawn, there, values)
+            self._finished(name, drawn, ends, there, values)
         draw.stats.render_s += working_clock() - started
         return LabelFrame(t_ns, {name: values[name] for name in request})
 
     def _finished(
-        self, name: str, drawn: dict[str, np.ndarray], there: dict[str, dict[str, np.ndarray]], values: dict[str, Any]
+        self,
+        name: str,
+        drawn: dict[str, np.ndarray],
+        ends: dict[str, int],
+        there: dict[str, dict[str, np.ndarray]],
+        values: dict[str, Any],
     ) -> Any:
         if name not in values:
             label, draw = LABELS[name], self._renderer
@@ -62,9 +68,10 @@ class Labels:
                 _Drawn(
                     label,
                     draw.scene,
+                    ends.get(label.towards),
                     drawn,
                     there.get(label.towards, {}),
-                    lambda other: self._finished(other, drawn, there, values),
+                    lambda other: self._finished(other, drawn, ends, there, values),
                 )
             )
             if (wrong := label.wrong(value, draw.height, draw.width)) is not None:
@@ -101,9 +108,16 @@ class _Drawn:
     """:class:`blinkgl.labels.label.Drawn`: what one label may look at."""
 
     def __init__(
-        self, label: Label, scene: Scene, drawn: dict[str, np.ndarray], there: dict[str, np.ndarray], value_of
+        self,
+        label: Label,
+        scene: Scene,
+        end_ns: int | None,
+        drawn: dict[str, np.ndarray],
+        there: dict[str, np.ndarray],
+        value_of,
     ):
-        self.scene, self._label, self._drawn, self._there, self._value_of = scene, label, drawn, there, value_of
+        self.scene, self.end_ns = scene, end_ns
+        self._label, self._drawn, self._there, self._value_of = label, drawn, there, value_of
 
     def raw(self, name: str) -> np.ndarray:
         return self._allowed(self._drawn, name, (self._label.name, *self._label.needs), "needs")

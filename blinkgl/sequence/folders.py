@@ -2,12 +2,14 @@
 
 A folder is expected to look like a TartanAir trajectory: images in one sub-folder, one flow file per pair of frames in
 another, and, where there are any, masks of occluded pixels beside the flow (``*_mask.npy``, non-zero: the point is
-hidden or outside the image in the next frame). A third may hold the flow back, one file per pair of frames, too.
+hidden or outside the image in the next frame). All are taken in the order of their names. A third may hold the flow
+back, one file per pair of frames, too.
 """
 
 from __future__ import annotations
 
 import glob
+import re
 from pathlib import Path
 
 import numpy as np
@@ -88,30 +90,57 @@ def _listed(folder: Path, suffixes) -> list[Path]:
     )
 
 
-def flow_files(folder: Path, frames: FramesConfig, used: int) -> tuple[list[Path], list[Path]]:
-    """(flow, masks) of the frames used; the k-th goes from frame k to frame k + 1. AssetError: too few, no folder."""
+def flow_files(folder: Path, frames: FramesConfig, images: list[Path]) -> tuple[list[Path], list[Path]]:
+    """(flow, masks) of the frames ``images``, which :func:`used_images` found; the k-th goes from frame k to frame
+    k + 1. AssetError: no folder, too few, or, by the numbers in their names, one that is missing in between."""
     if frames.flow is None:
         return [], []
-    return _flow_and_masks(folder / frames.flow, frames.first, used)
+    return _flow_and_masks(folder / frames.flow, frames.first, images)
 
 
-def backward_files(folder: Path, frames: FramesConfig, used: int) -> list[Path]:
+def backward_files(folder: Path, frames: FramesConfig, images: list[Path]) -> list[Path]:
     """Flow back, the k-th from frame k + 1 to frame k. AssetError as :func:`flow_files`."""
-    return [] if frames.backward is None else _flow_and_masks(folder / frames.backward, frames.first, used)[0]
+    return [] if frames.backward is None else _flow_and_masks(folder / frames.backward, frames.first, images)[0]
 
 
-def _flow_and_masks(folder: Path, first: int, used: int) -> tuple[list[Path], list[Path]]:
-    everything = _listed(folder, _FLOW)
+def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[Path], list[Path]]:
+    everything, pairs = _listed(folder, _FLOW), len(images) - 1
     masks = [p for p in everything if p.stem.endswith("_mask")]
-    flows = [p for p in everything if p not in set(masks)][first:]
-    if len(flows) < used - 1 or (masks and len(masks) < first + used - 1):
+    flows = [p for p in everything if p not in set(masks)]
+    if len(flows) < first + pairs or (masks and len(masks) < first + pairs):
         raise AssetError(
             "not one flow file per pair of frames",
             where=str(folder),
-            value=f"{len(flows)} flow files, {len(masks)} masks",
-            accepted=f"at least {used - 1} for {used} frames",
+            value=f"{max(len(flows) - first, 0)} flow files, {len(masks)} masks",
+            accepted=f"at least {pairs} for {len(images)} frames",
         )
-    return flows, masks[first:]
+    # Files are taken in the order of their names; one that is missing would give every later pair its neighbour's.
+    one_each = len(_listed(images[0].parent, IMAGE)) - 1
+    for files in (flows, masks):
+        _check_in_step(files[first : first + pairs], images, shifted=len(files) == one_each)
+    return flows[first : first + pairs], masks[first : first + pairs]
+
+
+def _check_in_step(files: list[Path], images: list[Path], shifted: bool) -> None:
+    """The first numbers in the names of ``files`` are those of ``images``, or, where they may be ``shifted`` (frames
+    from 0, flow from 1), go up with them. Names without numbers say nothing. Raises AssetError."""
+    numbers = [(_number(file), _number(image)) for file, image in zip(files, images)]
+    offsets = [of_file - of_image for of_file, of_image in numbers if of_file is not None and of_image is not None]
+    if len(offsets) < len(numbers):
+        return
+    for file, image, offset in zip(files, images, offsets):
+        if offset != (offsets[0] if shifted else 0):
+            raise AssetError(
+                "the files do not go with the frames: one is missing before it, or the numbers in their names differ",
+                where=str(file),
+                value=f"it would go with {image.name}",
+                accepted="the same numbers",
+            )
+
+
+def _number(path: Path) -> int | None:
+    found = re.search(r"\d+", path.stem)
+    return None if found is None else int(found[0])
 
 
 def read_flow_of(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

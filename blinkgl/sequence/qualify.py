@@ -162,8 +162,8 @@ def verdict(
     Raises AssetError (unreadable, too few frames, flow files that are missing, of another size or without a single
     valid vector), EventDataError (a changed size, NaN or negative light), ConfigError (too long)."""
     files = used_images(frames, folder)
-    flows, masks = flow_files(folder, frames, len(files))
-    backs = backward_files(folder, frames, len(files))
+    flows, masks = flow_files(folder, frames, files)
+    backs = backward_files(folder, frames, files)
     light = _Light(frames, files)
     given = partial(_given, light.size, flows, masks, backs) if flows else None
     pairs = []

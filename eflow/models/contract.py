@@ -7,13 +7,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from torch import Tensor, nn
 
 from blinkgl.errors import EventDataError
 
 if TYPE_CHECKING:
+    from blinkgl.config.base import Config as BaseConfig
     from eflow.data.representation import Representation
 
 
@@ -42,13 +43,20 @@ class FlowPrediction:
 
 
 class FlowModel(nn.Module):
-    """Base: the input check. Subclasses set ``divisor``, ``least`` and ``representation``."""
+    """Base: the input check. Subclasses name their ``Config`` and set ``divisor``, ``least`` and ``representation``."""
 
+    Config: ClassVar[type[BaseConfig]]
+    """What the network is made from; its key ``name`` is the network's in :data:`eflow.models.NETWORKS`."""
     divisor: int = 8
     """Height and width must be multiples of this; :mod:`eflow.infer` pads."""
     least: int = 32
     """Smallest accepted height and width, px."""
+    pad_to: int | None = None
+    """Multiple that :mod:`eflow.infer` pads to; None: ``divisor``."""
+    pad_start: bool = False
+    """Pad at the left and top instead of the right and bottom."""
     representation: Representation
+    config: Any
 
     def check_input(self, batch: dict) -> None:
         """Raises EventDataError for sizes and shapes the network cannot work on."""

@@ -3,19 +3,23 @@ features and a supervised matching layer."""
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
 from eflow.config import EFlowFormerConfig
 from eflow.models.contract import initialise
-from eflow.models.eraft import FEATURES, Eraft
+from eflow.models.eraft import Eraft
 from eflow.ops.attention import ConditionalPosition, GlobalAttention, WindowAttention, sine_position
 from eflow.ops.upsample import bilinear_upsample
 
-LAYERS = {"base": 4, "small": 2, "twins": 2}
-HEADS, WINDOW, REDUCTION, MLP_RATIO = 8, 10, 4, 4
+LAYERS = {"base": 4, "small": 2, "tiny": 1}
+WINDOW, REDUCTION, MLP_RATIO, PER_HEAD = 10, 4, 4, 32
 
-
+START_GAIN = 0.25
+RATE = 20.0
+"""Prior and gain change by this factor faster than an optimiser would change their logarithms."""
 _TOKENS = 1024
 
 
@@ -23,18 +27,18 @@ class Mlp(nn.Sequential):
     """Norm, expand fourfold, GELU, contract. Without gradients in blocks of tokens, whose
     hidden layer then stays in the cache."""
 
-    def __init__(self):
+    def __init__(self, dim: int):
         super().__init__(
-            nn.LayerNorm(FEATURES),
-            nn.Linear(FEATURES, MLP_RATIO * FEATURES),
+            nn.LayerNorm(dim),
+            nn.Linear(dim, MLP_RATIO * dim),
             nn.GELU(),
-            nn.Linear(MLP_RATIO * FEATURES, FEATURES),
+            nn.Linear(MLP_RATIO * dim, dim),
         )
 
     def forward(self, x: Tensor) -> Tensor:
         if torch.is_grad_enabled() or x.device.type != "cpu":
             return super().forward(x)
-        blocks = x.reshape(-1, FEATURES).split(_TOKENS)
+        blocks = x.reshape(-1, x.shape[-1]).split(_TOKENS)
         return torch.cat([super(Mlp, self).forward(block) for block in blocks]).view(x.shape)
 
 
@@ -42,18 +46,16 @@ class EnhancementLayer(nn.Module):
     """Pre-norm: local self-attention, conditional position, global self-attention, MLP, global cross-attention, MLP.
     ``twins`` puts an MLP after the local attention too and reduces keys by a dense convolution, as Twins-SVT does."""
 
-    def __init__(self, twins: bool):
+    def __init__(self, dim: int, twins: bool):
         super().__init__()
-        self.norm_local, self.local = nn.LayerNorm(FEATURES), WindowAttention(FEATURES, HEADS, WINDOW)
-        self.mlp_local = Mlp() if twins else None
-        self.position = ConditionalPosition(FEATURES)
-        self.norm_global, self.globally = (
-            nn.LayerNorm(FEATURES),
-            GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins),
-        )
-        self.mlp_global = Mlp()
-        self.norm_cross, self.cross = nn.LayerNorm(FEATURES), GlobalAttention(FEATURES, HEADS, REDUCTION, dense=twins)
-        self.mlp_cross = Mlp()
+        heads = max(dim // PER_HEAD, 1)
+        self.norm_local, self.local = nn.LayerNorm(dim), WindowAttention(dim, heads, WINDOW)
+        self.mlp_local = Mlp(dim) if twins else None
+        self.position = ConditionalPosition(dim)
+        self.norm_global, self.globally = nn.LayerNorm(dim), GlobalAttention(dim, heads, REDUCTION, dense=twins)
+        self.mlp_global = Mlp(dim)
+        self.norm_cross, self.cross = nn.LayerNorm(dim), GlobalAttention(dim, heads, REDUCTION, dense=twins)
+        self.mlp_cross = Mlp(dim)
 
     def forward(self, x: Tensor) -> Tensor:
         """x: (2N, h, w, C), the old windows' features, then the new ones'; each half's
@@ -73,18 +75,26 @@ class EnhancementLayer(nn.Module):
 class EFlowFormer(Eraft):
     """With ``layers=0`` and ``init="zero"`` it is E-RAFT, parameter names included."""
 
+    Config = EFlowFormerConfig
+
     def __init__(self, config: EFlowFormerConfig):
         super().__init__(config)
-        count = LAYERS[config.variant] if config.layers is None else config.layers
-        self.layers = nn.ModuleList([EnhancementLayer(config.variant == "twins") for _ in range(count)])
-        self.norm = nn.LayerNorm(FEATURES) if count else None
+        count = LAYERS[config.size] if config.layers is None else config.layers
+        dim = self.widths.features
+        self.layers = nn.ModuleList([EnhancementLayer(dim, config.attention == "twins") for _ in range(count)])
+        self.norm = nn.LayerNorm(dim) if count else None
+        self.log_prior = self.log_gain = None
+        if config.init == "match" and config.match_prior is not None:
+            # Logits of features that know nothing yet differ by 1; the gain makes them small beside the prior.
+            self.log_prior = nn.Parameter(torch.tensor(-math.log(2 * config.match_prior**2) / RATE))
+            self.log_gain = nn.Parameter(torch.tensor(math.log(START_GAIN) / RATE))
         initialise(self.layers)
 
     def enhance(self, f1: Tensor, f2: Tensor) -> tuple[Tensor, Tensor]:
         if not len(self.layers):
             return f1, f2
         x = torch.cat([f1, f2])
-        x = (x + sine_position(*x.shape[-2:], FEATURES, x).to(x.dtype)).permute(0, 2, 3, 1)
+        x = (x + sine_position(*x.shape[-2:], x.shape[1], x).to(x.dtype)).permute(0, 2, 3, 1)
         for layer in self.layers:
             x = layer(x)
         return self.norm(x).permute(0, 3, 1, 2).chunk(2)
@@ -92,11 +102,18 @@ class EFlowFormer(Eraft):
     def start(self, correlation, warm: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor | None]:
         if self.config.init == "zero":
             return super().start(correlation, warm, like)
-        matched = correlation.match()
+        matched = correlation.match(*self._prior())
         return (matched if warm is None else matched * 0 + warm), bilinear_upsample(matched) if self.training else None
 
     def backward(self, correlation) -> Tensor | None:
-        return correlation.match_backward() if self.want_backward else None
+        return correlation.match_backward(*self._prior()) if self.want_backward else None
+
+    def _prior(self) -> tuple[Tensor | None, Tensor | None]:
+        """Price of a displacement and gain of the logits, both learnt: without them the softmax of features that know
+        nothing yet is flat, and its expectation the middle of the image, far worse than no flow at all."""
+        if self.log_prior is None:
+            return None, None
+        return (RATE * self.log_prior.float()).exp(), (RATE * self.log_gain.float()).exp()
 
     want_backward = False
     """True: the prediction carries ``backward_match`` (a second softmax over the same volume)."""

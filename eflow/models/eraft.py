@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields, replace
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -11,11 +13,34 @@ from torch.utils.checkpoint import checkpoint
 from eflow.config import EraftConfig
 from eflow.data.representation import VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
-from eflow.ops.correlation import CHANNELS, DENSE_TOKENS, DenseCorrelation, OnDemandCorrelation, pixel_grid
+from eflow.ops.correlation import DENSE_TOKENS, DenseCorrelation, OnDemandCorrelation, channels_of, pixel_grid
 from eflow.ops.precision import fp32
 from eflow.ops.upsample import convex_upsample, convex_upsample_slow
 
-FEATURES, HIDDEN, CONTEXT = 256, 128, 128
+
+@dataclass(frozen=True)
+class Widths:
+    """How wide the parts are. trunk : channels at 1/2, 1/4, 1/8. features : of the correlated maps. hidden : of the
+    GRU's state, of the context and of the motion it sees. levels, radius : of the correlation look-up."""
+
+    trunk: tuple[int, int, int]
+    features: int
+    hidden: int
+    levels: int
+    radius: int
+
+
+SIZES = {
+    "base": Widths((64, 96, 128), 256, 128, 4, 4),
+    "small": Widths((48, 64, 96), 128, 96, 4, 3),
+    "tiny": Widths((32, 48, 64), 128, 48, 3, 3),
+}
+
+
+def widths_of(config: EraftConfig) -> Widths:
+    """Those of the configuration's size, but for what it gives itself."""
+    own = {f.name: getattr(config, f.name) for f in fields(Widths)}
+    return replace(SIZES[config.size], **{k: v for k, v in own.items() if v is not None})
 
 
 class ResidualBlock(nn.Module):
@@ -36,27 +61,36 @@ class ResidualBlock(nn.Module):
 
 
 class Trunk(nn.Sequential):
-    """(N, inputs, H, W) -> (N, outputs, H/8, W/8)."""
+    """(N, inputs, H, W) -> (N, outputs, H/8, W/8). widths : channels at 1/2, 1/4, 1/8."""
 
-    def __init__(self, inputs: int, outputs: int, norm: str):
+    def __init__(self, inputs: int, widths: tuple[int, int, int], outputs: int, norm: str):
         make = {"instance": nn.InstanceNorm2d, "batch": nn.BatchNorm2d}[norm]
+        half, quarter, eighth = widths
         blocks = [
             ResidualBlock(a, b, s, make)
-            for a, b, s in ((64, 64, 1), (64, 64, 1), (64, 96, 2), (96, 96, 1), (96, 128, 2), (128, 128, 1))
+            for a, b, s in (
+                (half, half, 1),
+                (half, half, 1),
+                (half, quarter, 2),
+                (quarter, quarter, 1),
+                (quarter, eighth, 2),
+                (eighth, eighth, 1),
+            )
         ]
         super().__init__(
-            nn.Conv2d(inputs, 64, 7, 2, 3), make(64), nn.ReLU(inplace=True), *blocks, nn.Conv2d(128, outputs, 1)
+            nn.Conv2d(inputs, half, 7, 2, 3), make(half), nn.ReLU(inplace=True), *blocks, nn.Conv2d(eighth, outputs, 1)
         )
 
 
 class MotionEncoder(nn.Module):
-    """Correlation taps and flow to 128 motion channels, the last two the flow itself."""
+    """Correlation taps and flow to ``hidden`` motion channels, the last two the flow itself."""
 
-    def __init__(self):
+    def __init__(self, taps: int, hidden: int):
         super().__init__()
-        self.corr1, self.corr2 = nn.Conv2d(CHANNELS, 256, 1), nn.Conv2d(256, 192, 3, padding=1)
-        self.flow1, self.flow2 = nn.Conv2d(2, 128, 7, padding=3), nn.Conv2d(128, 64, 3, padding=1)
-        self.join = nn.Conv2d(192 + 64, 128 - 2, 3, padding=1)
+        wide, narrow = hidden + hidden // 2, hidden // 2
+        self.corr1, self.corr2 = nn.Conv2d(taps, 2 * hidden, 1), nn.Conv2d(2 * hidden, wide, 3, padding=1)
+        self.flow1, self.flow2 = nn.Conv2d(2, hidden, 7, padding=3), nn.Conv2d(hidden, narrow, 3, padding=1)
+        self.join = nn.Conv2d(wide + narrow, hidden - 2, 3, padding=1)
 
     def forward(self, taps: Tensor, flow: Tensor) -> Tensor:
         relu = lambda x: F.relu(x, inplace=True)
@@ -72,24 +106,22 @@ class SepConvGru(nn.Module):
     The context does not change over the iterations, so its third of every convolution is computed
     once (:meth:`prepare`)."""
 
-    def __init__(self):
+    def __init__(self, hidden: int):
         super().__init__()
-        inputs = HIDDEN + CONTEXT + 128
+        self.hidden = hidden  # as many as channels of context, and of motion
         self.gates = nn.ModuleList(
-            [nn.Conv2d(inputs, 2 * HIDDEN, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
+            [nn.Conv2d(3 * hidden, 2 * hidden, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
         )
         self.candidates = nn.ModuleList(
-            [nn.Conv2d(inputs, HIDDEN, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
+            [nn.Conv2d(3 * hidden, hidden, k, padding=p) for k, p in (((1, 5), (0, 2)), ((5, 1), (2, 0)))]
         )
 
     def prepare(self, context: Tensor) -> list[tuple[Tensor, Tensor]]:
         """For each convolution, its weights over [hidden, motion] and the context's contribution (bias included)."""
-        ready = []
+        ready, first, last = [], self.hidden, 2 * self.hidden
         for conv in (c for pair in zip(self.gates, self.candidates, strict=True) for c in pair):
-            weight = torch.cat([conv.weight[:, :HIDDEN], conv.weight[:, HIDDEN + CONTEXT :]], 1)
-            ready.append(
-                (weight, F.conv2d(context, conv.weight[:, HIDDEN : HIDDEN + CONTEXT], conv.bias, padding=conv.padding))
-            )
+            weight = torch.cat([conv.weight[:, :first], conv.weight[:, last:]], 1)
+            ready.append((weight, F.conv2d(context, conv.weight[:, first:last], conv.bias, padding=conv.padding)))
         return ready
 
     def forward(self, h: Tensor, ready: list[tuple[Tensor, Tensor]], motion: Tensor) -> Tensor:
@@ -112,21 +144,21 @@ class SepConvGru(nn.Module):
 class Update(nn.Module):
     """One refinement step."""
 
-    def __init__(self):
+    def __init__(self, taps: int, hidden: int):
         super().__init__()
-        self.motion, self.gru = MotionEncoder(), SepConvGru()
+        self.motion, self.gru = MotionEncoder(taps, hidden), SepConvGru(hidden)
         self.flow_head = nn.Sequential(
-            nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 2, 3, padding=1)
+            nn.Conv2d(hidden, 2 * hidden, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(2 * hidden, 2, 3, padding=1)
         )
         self.mask_head = nn.Sequential(
-            nn.Conv2d(HIDDEN, 256, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(256, 9 * 64, 1)
+            nn.Conv2d(hidden, 2 * hidden, 3, padding=1), nn.ReLU(inplace=True), nn.Conv2d(2 * hidden, 9 * 64, 1)
         )
 
     def forward(
         self, h: Tensor, context, taps: Tensor, flow: Tensor, with_mask: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """h (N, 128, h, w), context: :meth:`SepConvGru.prepare`'s result (or the context itself: the slow twin), taps
-        (N, 324, h, w), flow (N, 2, h, w) -> hidden, Δflow, mask logits (None unless wanted)."""
+        """h (N, hidden, h, w), context: :meth:`SepConvGru.prepare`'s result (or the context itself: slow twin), taps
+        (N, taps, h, w), flow (N, 2, h, w) -> hidden, Δflow, mask logits (None unless wanted)."""
         motion = self.motion(taps, flow)
         h = self.gru.forward_slow(h, context, motion) if isinstance(context, Tensor) else self.gru(h, context, motion)
         # 0.25 balances the gradients of the two heads, as RAFT does.
@@ -136,15 +168,22 @@ class Update(nn.Module):
 class Eraft(FlowModel):
     """E-RAFT. ``plain = True`` switches to the RAFT-style slow twin of lookup, GRU, mask head and upsampling."""
 
-    divisor, least = 8, 128  # below 128 px the top of the pyramid has one cell
+    Config = EraftConfig
 
-    def __init__(self, config):
+    def __init__(self, config: EraftConfig):
         super().__init__()
-        self.config: EraftConfig = config
+        self.config, self.widths = config, widths_of(config)
+        w = self.widths
+        # A look-up divides by the size of a level less one (lookup_slow), so the top one needs two cells.
+        self.divisor, self.least = 8, 8 * 2**w.levels
+        if config.padding == "start":
+            self.pad_to, self.pad_start = 32, True
+        unseen = max(config.iterations - config.train_iterations, 0)
+        self._most = unseen if config.burn_in is None else config.burn_in
         self.representation = VoxelGrid(config.input.bins, config.input.normalise, config.input.bounds)
-        self.features = Trunk(config.input.bins, FEATURES, "instance")
-        self.context = Trunk(config.input.bins, HIDDEN + CONTEXT, config.context_norm)
-        self.update = Update()
+        self.features = Trunk(config.input.bins, w.trunk, w.features, "instance")
+        self.context = Trunk(config.input.bins, w.trunk, 2 * w.hidden, config.context_norm)
+        self.update = Update(channels_of(w.levels, w.radius), w.hidden)
         self.plain = False
         initialise(self)
         # The first Δflows are near zero, whatever the depth.
@@ -154,7 +193,7 @@ class Eraft(FlowModel):
         """Optional ``batch["flow_init"]`` (N, 2, H/8, W/8): warm start, low-resolution px."""
         self.check_input(batch)
         f1, f2 = self.enhance(*self.features(torch.cat([batch["old"], batch["new"]])).chunk(2))
-        h, c = self.context(batch["new"]).split([HIDDEN, CONTEXT], 1)
+        h, c = self.context(batch["new"]).chunk(2, 1)
         h, c = torch.tanh(h), F.relu(c)
         correlation = self._correlation(f1, f2)
         flow, first = self.start(correlation, batch.get("flow_init"), f1)
@@ -163,6 +202,8 @@ class Eraft(FlowModel):
         grid = pixel_grid(*f1.shape[-2:], f1)
         context = c if self.plain else self.update.gru.prepare(c)
         iterations = self.config.train_iterations if self.training else self.config.iterations
+        h, flow = self._burn_in(h, flow, context, correlation, grid) if self.training else (h, flow)
+        upsample = convex_upsample_slow if self.plain else convex_upsample
         for i in range(iterations):
             flow = flow.detach()
             wanted = self.training or self.plain or i == iterations - 1
@@ -171,16 +212,32 @@ class Eraft(FlowModel):
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
             else:
                 h, delta, mask = step(h, flow)
+            beyond = 0 if self.training else max(i + 1 - self._most - self.config.train_iterations, 0)
             with fp32(flow):
-                flow = flow + delta.float()
+                flow = flow + self.config.damping**beyond * delta.float()
             if wanted:
-                flows.append((convex_upsample_slow if self.plain else convex_upsample)(flow, mask))
+                flows.append(upsample(flow, mask, self.config.border))
         return FlowPrediction(
             flows if self.training else flows[-1:],
             has_match=self.training and first is not None,
             low=flow,
             backward_match=self.backward(correlation),
         )
+
+    @torch.no_grad()
+    def _burn_in(self, h: Tensor, flow: Tensor, context, correlation, grid: Tensor) -> tuple[Tensor, Tensor]:
+        """State and flow after a number of refinements that nothing is learnt from, so that those that follow learn to
+        go on from any, and to stand still where nothing is left to do. (Half of the steps have none: every answer
+        begins with the first refinement.) The draw is of torch's generator, whose state checkpoints hold."""
+        most = self._most
+        if not most:
+            return h, flow
+        draw = int(torch.randint(2 * most, ()))
+        for _ in range(max(draw - most + 1, 0)):
+            h, delta, _mask = self.update(h, context, correlation.lookup(grid + flow), flow, False)
+            with fp32(flow):
+                flow = flow + delta.float()
+        return h, flow
 
     # ---- what E-FlowFormer changes -------------------------------------------------------------------------------
 
@@ -199,5 +256,5 @@ class Eraft(FlowModel):
     def _correlation(self, f1: Tensor, f2: Tensor):
         tokens = f1.shape[-1] * f1.shape[-2]
         if self.config.correlation == "on_demand" or (self.config.correlation == "auto" and tokens > DENSE_TOKENS):
-            return OnDemandCorrelation(f1, f2)
-        return DenseCorrelation(f1, f2, slow=self.plain)
+            return OnDemandCorrelation(f1, f2, self.widths.levels, self.widths.radius)
+        return DenseCorrelation(f1, f2, self.widths.levels, self.widths.radius, slow=self.plain)

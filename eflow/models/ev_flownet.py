@@ -12,21 +12,22 @@ from torch import nn
 from eflow.config import EvFlowNetConfig
 from eflow.data.representation import CountsAndTimes, VoxelGrid
 from eflow.models.contract import FlowModel, FlowPrediction, initialise
-from eflow.models.unets import Residual, ScaledTanh, double, to_size
+from eflow.models.unets import Residual, ScaledTanh, double, encoder_widths, to_size
 
 
 class EvFlowNet(FlowModel):
     """U-Net on one window: four stride-2 convolutions, two residual blocks, four nearest-x2 decoders with skips and a
     tanh flow head each; every decoder also sees the flow of the one before."""
 
+    Config = EvFlowNetConfig
     divisor, least = 16, 32
 
     def __init__(self, config: EvFlowNetConfig):
         super().__init__()
         self.config = config
         self.representation = CountsAndTimes() if config.input == "counts" else VoxelGrid(config.bins)
-        w = config.width
-        widths = (self.representation.channels, w, 2 * w, 4 * w, 8 * w)
+        widths = (self.representation.channels, *encoder_widths(config))
+        w = widths[1]
         self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
         self.residuals = nn.Sequential(Residual(8 * w), Residual(8 * w))
         self.decoders = nn.ModuleList(

@@ -1,58 +1,66 @@
 """Spike-FlowNet (Lee et al., "Spike-FlowNet: Event-based Optical Flow Estimation with Energy-Efficient Hybrid Neural
-Networks", ECCV 2020), supervised here."""
+Networks", ECCV 2020): the published network, supervised here."""
 
 from __future__ import annotations
 
 import itertools
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from eflow.config import SpikeFlowNetConfig
 from eflow.data.representation import CountSlices
-from eflow.models.contract import FlowModel, FlowPrediction, initialise
-from eflow.models.unets import CHANNELS, Residual, to_size
+from eflow.models.contract import FlowModel, FlowPrediction
+from eflow.models.unets import LeakyResidual, UpDecoder, encoder_widths, initialise_wide, to_size
 
 
 class _Fire(torch.autograd.Function):
-    """Spike where the membrane exceeds the threshold; backwards a straight-through gradient 1 / threshold."""
+    """Spike where the membrane exceeds the threshold; the gradient passes where it spiked, divided by the threshold."""
 
     @staticmethod
     def forward(ctx, membrane: Tensor, threshold: float) -> Tensor:
         ctx.threshold = threshold
-        return (membrane > threshold).to(membrane.dtype)
+        spikes = (membrane > threshold).to(membrane.dtype)
+        ctx.save_for_backward(spikes)
+        return spikes
 
     @staticmethod
     def backward(ctx, gradient: Tensor):
-        return gradient / ctx.threshold, None
+        return gradient * ctx.saved_tensors[0] / ctx.threshold, None
+
+
+def integrate_and_fire(membrane: Tensor, threshold: float) -> tuple[Tensor, Tensor]:
+    """(spikes, membrane afterwards): neurons that spiked begin again at 0, whatever they exceeded the threshold by."""
+    spikes = _Fire.apply(membrane, threshold)
+    return spikes, membrane * (1 - spikes.detach())
 
 
 class SpikeFlowNet(FlowModel):
-    """Spiking encoder, ordinary residual blocks and decoders.
+    """Spiking encoder, ordinary residual blocks and decoders; no convolution has a bias.
 
     The window is halved into two groups of ``steps`` count frames; spike step s sees frame s of both groups (four
-    channels). Each encoder layer is a bias-free stride-2 convolution into integrate-and-fire neurons with soft reset;
+    channels). Each encoder layer is a stride-2 convolution into integrate-and-fire neurons with hard reset;
     its *accumulated input current* over all steps is the skip connection and, at the last
-    layer, the residual blocks' input."""
+    layer, the residual blocks' input. Flow comes at 1/8, 1/4, 1/2 and 1/1."""
 
+    Config = SpikeFlowNetConfig
     divisor, least = 16, 32
 
     def __init__(self, config: SpikeFlowNetConfig):
         super().__init__()
         self.config = config
         self.representation = CountSlices(2 * config.steps)
-        widths = (4, *CHANNELS)
-        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1, bias=False) for a, b in itertools.pairwise(widths)])
-        self.residuals = nn.Sequential(Residual(512), Residual(512))
-        inputs = (512, 128 + 256 + 2, 64 + 128 + 2, 64 + 64 + 2)  # decoder features, skip, flow; at 1/16, 1/8, 1/4, 1/2
-        self.ups = nn.ModuleList([nn.ConvTranspose2d(c, c_out, 4, 2, 1) for c, c_out in zip(inputs, (128, 64, 64))])
-        self.heads = nn.ModuleList(
-            [nn.Sequential(nn.Conv2d(c, 32, 3, padding=1), nn.LeakyReLU(0.1), nn.Conv2d(32, 2, 1)) for c in inputs]
+        w1, w2, w3, w4 = widths = encoder_widths(config)
+        self.encoders = nn.ModuleList(
+            [nn.Conv2d(a, b, 3, 2, 1, bias=False) for a, b in itertools.pairwise((4, *widths))]
         )
-        initialise(self)
-        for head in self.heads:
-            nn.init.normal_(head[-1].weight, std=1e-3)
+        self.residuals = nn.Sequential(LeakyResidual(w4, bias=False), LeakyResidual(w4, bias=False))
+        ups = (w2, w1, 4)
+        inputs = (w4, *(skip + up + 2 for skip, up in zip((w3, w2, w1), ups, strict=True)))
+        self.decoders = nn.ModuleList(
+            [UpDecoder(c, up, bias=False) for c, up in zip(inputs, (*ups, None), strict=True)]
+        )
+        initialise_wide(self)
 
     def forward(self, batch: dict) -> FlowPrediction:
         self.check_input(batch)
@@ -66,22 +74,12 @@ class SpikeFlowNet(FlowModel):
             for layer, encoder in enumerate(self.encoders):
                 current = encoder(x).float()
                 currents[layer] = currents[layer] + current
-                membrane = membranes[layer] + current
-                x = _Fire.apply(membrane, self.config.threshold)
-                # Soft reset: what exceeds the threshold stays.
-                membranes[layer] = membrane - self.config.threshold * x.detach()
-        x, flows = self.residuals(F.leaky_relu(currents[3], 0.1)), []
-        for scale, head in enumerate(self.heads):
-            flows.append(head(x).float())
-            if scale < 3:
-                up = F.leaky_relu(self.ups[scale](x), 0.1)
-                x = torch.cat(
-                    [
-                        up,
-                        currents[2 - scale].to(up.dtype),
-                        F.interpolate(flows[-1], scale_factor=2, mode="bilinear").to(up.dtype),
-                    ],
-                    1,
-                )
-        full = [to_size(f, height, width) for f in (flows if self.training else flows[-1:])]
+                x, membranes[layer] = integrate_and_fire(membranes[layer] + current, self.config.threshold)
+        x, flows = self.residuals(currents[3]), []
+        for scale, decoder in enumerate(self.decoders):
+            flow, up = decoder(x)
+            flows.append(flow)
+            if up is not None:
+                x = torch.cat([currents[2 - scale].to(up.dtype), up, flow.to(up.dtype)], 1)
+        full = [to_size(f * (height / f.shape[-2]), height, width) for f in (flows if self.training else flows[-1:])]
         return FlowPrediction(full, kind="scales")

@@ -1,22 +1,23 @@
 """STE-FlowNet (Ding et al., "Spatio-Temporal Recurrent Networks for Event-Based Optical Flow
-Estimation", AAAI 2022), supervised."""
+Estimation", AAAI 2022): the published network, supervised."""
 
 from __future__ import annotations
 
 import itertools
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from eflow.config import SteFlowNetConfig
 from eflow.data.representation import CountSlices
-from eflow.models.contract import FlowModel, FlowPrediction, initialise
-from eflow.models.unets import CHANNELS, Residual, double, to_size
+from eflow.models.contract import FlowModel, FlowPrediction
+from eflow.models.unets import LeakyResidual, UpDecoder, encoder_widths, initialise_wide, leaky, to_size
 from eflow.ops.correlation import local_correlation
 from eflow.ops.warp import backward_warp
 
-TAPS = 81
+RADII = {"base": 4, "small": 3, "tiny": 2}
+TINY = 8
+"""Width of ``tiny``: the GRUs, whose states hold the correlations too, are most of this network."""
 
 
 class ConvGru(nn.Module):
@@ -27,83 +28,79 @@ class ConvGru(nn.Module):
         self.gates = nn.Conv2d(2 * channels, 2 * channels, 3, padding=1)
         self.candidate = nn.Conv2d(2 * channels, channels, 3, padding=1)
 
-    def forward(self, x: Tensor, h: Tensor) -> Tensor:
-        z, r = torch.sigmoid(self.gates(torch.cat([x, h], 1))).chunk(2, 1)
-        return torch.lerp(h, torch.tanh(self.candidate(torch.cat([x, r * h], 1))).to(h.dtype), z.to(h.dtype))
-
-
-class Decoder(nn.Module):
-    """Fuses state, correlation, flow (and the coarser decoder's features) into a residual flow
-    and features for the next scale."""
-
-    def __init__(self, inputs: int, channels: int, last: bool):
-        super().__init__()
-        self.fuse = nn.Conv2d(inputs, channels, 3, padding=1)
-        self.residuals = nn.Sequential(Residual(channels), Residual(channels))
-        self.flow = nn.Conv2d(channels, 2, 3, padding=1)
-        self.up = None if last else nn.Conv2d(channels, channels // 2, 3, padding=1)
-
-    def forward(self, *parts: Tensor) -> tuple[Tensor, Tensor | None]:
-        x = self.residuals(F.relu(self.fuse(torch.cat(parts, 1))))
-        return self.flow(x).float(), None if self.up is None else F.relu(self.up(double(x)))
+    def forward(self, x: Tensor, h: Tensor | None) -> Tensor:
+        h = torch.zeros_like(x) if h is None else h
+        z, r = torch.sigmoid(self.gates(torch.cat([h, x], 1))).chunk(2, 1)
+        return torch.lerp(h, torch.tanh(self.candidate(torch.cat([r * h, x], 1))).to(h.dtype), z.to(h.dtype))
 
 
 class SteFlowNet(FlowModel):
-    """The window's count slices go through the encoder one after the other, a ConvGRU at each of four scales carrying
-    state. Each of ``sweeps`` passes decodes from coarse to fine: at a scale, slice 0's state is correlated (9x9) with
-    the states of the later slices i, warped back by i / slices of the current flow, averaged over i,
-    and a decoder adds a residual to the flow."""
+    """The window's count slices go through the network one after the other, ``sweeps`` times; every slice has a flow of
+    its own at each of four scales, which each sweep adds to. For a slice, at each scale of the encoder: its features
+    (of a tower beside the encoder) are warped by its flow and correlated with those of slice 0; the ConvGRU of that
+    scale, whose state lives on through slices and sweeps, takes what came from the scale above beside the correlation.
+    Then the states are decoded, from coarse to fine. The last slice's flow is the window's."""
 
+    Config = SteFlowNetConfig
     divisor, least = 16, 32
 
     def __init__(self, config: SteFlowNetConfig):
         super().__init__()
         self.config = config
         self.representation = CountSlices(config.slices)
-        widths = (2, *CHANNELS)
-        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
-        self.grus = nn.ModuleList([ConvGru(c) for c in CHANNELS])
-        self.bottleneck = nn.Sequential(Residual(512), Residual(512))
-        inputs = [c + TAPS + 2 + (0 if c == 512 else c) for c in CHANNELS]
-        self.decoders = nn.ModuleList([Decoder(i, c, c == 64) for i, c in zip(inputs, CHANNELS, strict=True)])
-        initialise(self)
-        for decoder in self.decoders:
-            nn.init.normal_(decoder.flow.weight, std=1e-3)
+        self.radius = config.radius or RADII[config.size]
+        width = config.width or (TINY if config.size == "tiny" else None)
+        w1, w2, _, w4 = widths = encoder_widths(config.model_copy(update={"width": width}))
+        taps = (2 * self.radius + 1) ** 2
+        states = [w + taps for w in widths]
+        self.encoders = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in zip((2, *states[:3]), widths, strict=True)])
+        self.tower = nn.ModuleList([nn.Conv2d(a, b, 3, 2, 1) for a, b in itertools.pairwise(widths)])
+        self.grus = nn.ModuleList([ConvGru(c) for c in states])
+        self.entry = nn.Conv2d(states[3], w4, 3, padding=1)
+        self.residuals = nn.Sequential(LeakyResidual(w4, bias=True), LeakyResidual(w4, bias=True))
+        ups = (w2, w1, 4)
+        inputs = (states[3] + w4, *(s + up + 2 for s, up in zip(states[2::-1], ups, strict=True)))
+        self.decoders = nn.ModuleList([UpDecoder(c, up, bias=True) for c, up in zip(inputs, (*ups, None), strict=True)])
+        initialise_wide(self)
 
     def forward(self, batch: dict) -> FlowPrediction:
         self.check_input(batch)
-        slices = batch["new"]
-        n, _, height, width = slices.shape
-        states = self._encode(slices.view(n, self.config.slices, 2, height, width))  # states[scale][slice]
-        flow = torch.zeros(n, 2, height // 16, width // 16, device=slices.device)
-        top, flows = self.bottleneck(states[3][-1]), []
-        for sweep in range(self.config.sweeps):
-            features = None
-            for scale in (3, 2, 1, 0):
-                first = states[scale][0]
-                h, w = first.shape[-2:]
-                flow = to_size(flow, h, w)  # full-resolution px at every scale
-                local = flow.detach() / (height / h)
-                taps = sum(
-                    local_correlation(first, backward_warp(state, local * (i / self.config.slices)).to(first.dtype))
-                    for i, state in enumerate(states[scale][1:], 1)
-                ) / (self.config.slices - 1)
-                parts = [top if scale == 3 else states[scale][-1], taps, local.to(taps.dtype)] + (
-                    [] if features is None else [features]
-                )
-                residual, features = self.decoders[scale](*parts)
-                flow = flow.detach() + residual
-                if self.training:
-                    flows.append(to_size(flow, height, width))
-            flow = to_size(flow, height // 16, width // 16) if sweep < self.config.sweeps - 1 else flow
-        return FlowPrediction(flows if self.training else [to_size(flow, height, width)], kind="scales")
+        new = batch["new"]
+        n, _, height, width = new.shape
+        slices = new.view(n, self.config.slices, 2, height, width)
+        hidden: list[Tensor | None] = [None] * 4
+        # Flow of each slice at 1/8, 1/4, 1/2, 1/1, px of that scale.
+        flows = [
+            [torch.zeros(n, 2, height // s, width // s, device=new.device) for s in (8, 4, 2, 1)]
+            for _ in range(self.config.slices)
+        ]
+        seen = [self._look(slices[:, i]) for i in range(self.config.slices)]
+        for _ in range(self.config.sweeps):
+            for i in range(self.config.slices):
+                for scale, (there, here) in enumerate(zip(seen[0], seen[i], strict=True)):
+                    x = leaky(self.encoders[scale](hidden[scale - 1])) if scale else here
+                    aligned = here if scale == 3 else backward_warp(here, flows[i][2 - scale], border="replicate")
+                    # The published code has the activation twice, in the correlation and after it.
+                    taps = leaky(leaky(local_correlation(there, aligned.to(here.dtype), self.radius)))
+                    hidden[scale] = self.grus[scale](torch.cat([x, taps], 1), hidden[scale])
+                flows[i] = self._decode(hidden, flows[i])
+        answer = [to_size(f * (height / f.shape[-2]), height, width) for f in flows[-1]]
+        return FlowPrediction(answer if self.training else answer[-1:], kind="scales")
 
-    def _encode(self, slices: Tensor) -> list[list[Tensor]]:
-        states: list[list[Tensor]] = [[] for _ in CHANNELS]
-        for i in range(slices.shape[1]):
-            x = slices[:, i]
-            for scale, (encoder, gru) in enumerate(zip(self.encoders, self.grus, strict=True)):
-                x = F.relu(encoder(x))
-                x = gru(x, states[scale][-1] if i else torch.zeros_like(x))
-                states[scale].append(x)
-        return states
+    def _look(self, counts: Tensor) -> list[Tensor]:
+        """Features of a slice (N, 2, H, W) at 1/2, 1/4, 1/8, 1/16, which no state has touched: they are compared."""
+        features = [leaky(self.encoders[0](counts))]
+        for layer in self.tower:
+            features.append(leaky(layer(features[-1])))
+        return features
+
+    def _decode(self, hidden: list, before: list[Tensor]) -> list[Tensor]:
+        """What the decoders make of the states, added to the slice's flow ``before``, coarse to fine."""
+        x = torch.cat([hidden[3], self.residuals(leaky(self.entry(hidden[3])))], 1)
+        after = []
+        for scale, decoder in enumerate(self.decoders):
+            residual, up = decoder(x)
+            after.append(before[scale] + residual)
+            if up is not None:
+                x = torch.cat([hidden[2 - scale], up, after[-1].to(up.dtype)], 1)
+        return after

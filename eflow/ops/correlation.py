@@ -24,10 +24,13 @@ from torch import Tensor
 
 from eflow.ops.precision import fp32
 
-RADIUS, LEVELS = 4, 4
-CHANNELS = LEVELS * (2 * RADIUS + 1) ** 2
 DENSE_TOKENS = 8192
 _CHUNK, _ROWS = 2048, 256
+
+
+def channels_of(levels: int, radius: int) -> int:
+    """Taps of a look-up."""
+    return levels * (2 * radius + 1) ** 2
 
 
 def pixel_grid(h: int, w: int, like: Tensor) -> Tensor:
@@ -41,56 +44,58 @@ def pixel_grid(h: int, w: int, like: Tensor) -> Tensor:
 
 
 class DenseCorrelation:
-    """The whole volume in memory: (N h w, h, w) fp32 and three pooled levels."""
+    """The whole volume in memory, (N h w, h, w) fp32, and its pooled levels. The product is fp32, under autocast as
+    well: in bf16 a match can be off by a quarter of a pixel."""
 
-    def __init__(self, f1: Tensor, f2: Tensor, *, slow: bool = False):
+    def __init__(self, f1: Tensor, f2: Tensor, levels: int = 4, radius: int = 4, *, slow: bool = False):
         n, d, h, w = f1.shape
-        volume = torch.bmm(f1.flatten(2).transpose(1, 2) * (1 / math.sqrt(d)), f2.flatten(2))
-        self.shape, self.slow = (n, h, w), slow
+        self.shape, self.radius, self.slow = (n, h, w), radius, slow
         with fp32(f1):
-            self.volume = volume.float()
+            scaled = f1.float().flatten(2).transpose(1, 2) * (1 / math.sqrt(d))
+            self.volume = torch.bmm(scaled, f2.float().flatten(2))
             self.levels = [self.volume.view(n * h * w, 1, h, w)]
-            for _ in range(LEVELS - 1):
+            for _ in range(levels - 1):
                 self.levels.append(F.avg_pool2d(self.levels[-1], 2))
         self.levels = [v.squeeze(1) for v in self.levels]
 
     def lookup(self, coords: Tensor) -> Tensor:
-        """coords (N, 2, h, w) fp32 target coordinates -> (N, 324, h, w) fp32; channel
-        level*81 + 9*dy + dx, zero outside."""
+        """coords (N, 2, h, w) fp32 target coordinates -> (N, taps, h, w) fp32; channel
+        (level*side + dy)*side + dx with side = 2r+1, zero outside."""
         if self.slow:
-            return lookup_slow(self.levels, coords)
+            return lookup_slow(self.levels, coords, self.radius)
         if coords.device.type == "cpu" and not torch.is_grad_enabled():
-            return _lookup_cpu(self.levels, coords)
+            return _lookup_cpu(self.levels, coords, self.radius)
         n, h, w = self.shape
         flat = coords.permute(0, 2, 3, 1).reshape(-1, 2)
         taps = []
         for level, volume in enumerate(self.levels):
-            index, inside, fraction = patch_index(flat / 2**level, *volume.shape[-2:])
+            index, inside, fraction = patch_index(flat / 2**level, *volume.shape[-2:], self.radius)
             patch = volume.flatten(1).gather(1, index.flatten(1)).view_as(inside) * inside
             taps.append(lerp_patch(patch, fraction))
-        return torch.cat(taps, 1).view(n, h, w, CHANNELS).permute(0, 3, 1, 2)
+        return torch.cat(taps, 1).view(n, h, w, -1).permute(0, 3, 1, 2)
 
-    def match(self) -> Tensor:
+    def match(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
         """The matching layer, see :func:`expected_flow`."""
         _, h, w = self.shape
-        return expected_flow(self.volume, h, w)
+        return expected_flow(self.volume, h, w, prior, gain)
 
-    def match_backward(self) -> Tensor:
+    def match_backward(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
         """The same volume's match from f2's pixels to f1, at no further product."""
         _, h, w = self.shape
-        return expected_flow(self.volume.transpose(1, 2), h, w)
+        return expected_flow(self.volume.transpose(1, 2), h, w, prior, gain)
 
 
 class OnDemandCorrelation:
-    """No volume: memory linear in the number of tokens, arithmetic per lookup 100 dot products per token and level."""
+    """No volume: memory linear in the number of tokens, arithmetic per lookup (2r+2)^2 dot products per token and
+    level."""
 
-    def __init__(self, f1: Tensor, f2: Tensor):
+    def __init__(self, f1: Tensor, f2: Tensor, levels: int = 4, radius: int = 4):
         n, d, h, w = f1.shape
-        self.shape = (n, h, w)
+        self.shape, self.radius = (n, h, w), radius
         with fp32(f1):
             self.f1 = f1.float().flatten(2).transpose(1, 2) / math.sqrt(d)  # (N, hw, D)
             pooled, self.levels = f2.float(), []
-            for level in range(LEVELS):
+            for level in range(levels):
                 pooled = F.avg_pool2d(pooled, 2) if level else pooled
                 self.levels.append(pooled)  # pooling is linear: <f1, pool f2> = pool <f1, f2>
 
@@ -103,7 +108,8 @@ class OnDemandCorrelation:
             for start in range(0, h * w, _CHUNK):
                 part, taps = slice(start, start + _CHUNK), []
                 for level, f2 in enumerate(self.levels):
-                    index, inside, fraction = patch_index(flat[:, part].reshape(-1, 2) / 2**level, *f2.shape[-2:])
+                    at = flat[:, part].reshape(-1, 2) / 2**level
+                    index, inside, fraction = patch_index(at, *f2.shape[-2:], self.radius)
                     tokens = f2.flatten(2).transpose(1, 2)  # (N, cells, D)
                     picked = torch.stack(
                         [
@@ -113,69 +119,84 @@ class OnDemandCorrelation:
                     )
                     patch = torch.einsum("ntd,ntkd->ntk", self.f1[:, part], picked)
                     taps.append(lerp_patch(patch.reshape(inside.shape) * inside, fraction))
-                rows.append(torch.cat(taps, 1).view(n, -1, CHANNELS))
-            return torch.cat(rows, 1).view(n, h, w, CHANNELS).permute(0, 3, 1, 2)
+                row = torch.cat(taps, 1)
+                rows.append(row.view(n, -1, row.shape[1]))
+            return torch.cat(rows, 1).view(n, h, w, -1).permute(0, 3, 1, 2)
 
-    def match(self) -> Tensor:
+    def match(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
+        return self._match(self.f1, self.levels[0].flatten(2), prior, gain)
+
+    def match_backward(self, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
+        return self._match(self.levels[0].flatten(2).transpose(1, 2), self.f1.transpose(1, 2), prior, gain)
+
+    def _match(self, source: Tensor, target: Tensor, prior: Tensor | None, gain: Tensor | None) -> Tensor:
         n, h, w = self.shape
-        with fp32(self.f1):
-            target = self.levels[0].flatten(2)
-            parts = [expected_position(self.f1[:, s : s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
+        with fp32(source):
+            parts = [
+                expected_position(source[:, s : s + _CHUNK] @ target, h, w, prior, gain, s)
+                for s in range(0, h * w, _CHUNK)
+            ]
             return torch.cat(parts, 2).view(n, 2, h, w) - pixel_grid(h, w, target)
 
-    def match_backward(self) -> Tensor:
-        n, h, w = self.shape
-        with fp32(self.f1):
-            target, source = self.f1.transpose(1, 2), self.levels[0].flatten(2).transpose(1, 2)
-            parts = [expected_position(source[:, s : s + _CHUNK] @ target, h, w) for s in range(0, h * w, _CHUNK)]
-            return torch.cat(parts, 2).view(n, 2, h, w) - pixel_grid(h, w, target)
 
-
-def expected_flow(volume: Tensor, h: int, w: int) -> Tensor:
+def expected_flow(volume: Tensor, h: int, w: int, prior: Tensor | None = None, gain: Tensor | None = None) -> Tensor:
     """Matching layer: V0 = E_P[coords] - grid, P = softmax of each row of ``volume`` (N, hw, hw) over the targets.
-    Returns (N, 2, h, w) low-resolution px, fp32."""
+    Returns (N, 2, h, w) low-resolution px, fp32. prior, gain : see :func:`expected_position`."""
     with fp32(volume):
-        return expected_position(volume, h, w).view(-1, 2, h, w) - pixel_grid(h, w, volume)
+        return expected_position(volume, h, w, prior, gain).view(-1, 2, h, w) - pixel_grid(h, w, volume)
 
 
-def expected_position(logits: Tensor, h: int, w: int) -> Tensor:
+def expected_position(
+    logits: Tensor, h: int, w: int, prior: Tensor | None = None, gain: Tensor | None = None, first: int = 0
+) -> Tensor:
     """(N, rows, h*w) logits -> (N, 2, rows) expected (x, y). By the marginals: sums, which
-    TF32 and bf16 products do not touch."""
+    TF32 and bf16 products do not touch.
+
+    gain : () factor on the logits.   prior : () price of a displacement, 1/cells^2: ``prior`` times its squared length
+    is taken off a target's logit.   first : token that the first row is of."""
     if not torch.is_grad_enabled() and logits.shape[1] > _ROWS:  # row blocks that stay in the cache
-        return torch.cat(
-            [expected_position(logits[:, s : s + _ROWS], h, w) for s in range(0, logits.shape[1], _ROWS)], 2
-        )
-    p = logits.float().softmax(-1).unflatten(-1, (h, w))
-    x = torch.arange(w, device=p.device, dtype=torch.float32)
-    y = torch.arange(h, device=p.device, dtype=torch.float32)
+        parts = [
+            expected_position(logits[:, s : s + _ROWS], h, w, prior, gain, first + s)
+            for s in range(0, logits.shape[1], _ROWS)
+        ]
+        return torch.cat(parts, 2)
+    x = torch.arange(w, device=logits.device, dtype=torch.float32)
+    y = torch.arange(h, device=logits.device, dtype=torch.float32)
+    logits = logits.float() if gain is None else gain * logits.float()
+    if prior is not None:
+        token = torch.arange(first, first + logits.shape[1], device=logits.device)
+        across, down = ((x - (token % w)[:, None]) ** 2, (y - (token // w)[:, None]) ** 2)
+        far = (down[:, :, None] + across[:, None]).flatten(1)
+        logits = logits - prior.float() * far
+    p = logits.softmax(-1).unflatten(-1, (h, w))
     return torch.stack([(p.sum(-2) * x).sum(-1), (p.sum(-1) * y).sum(-1)], 1)
 
 
-def patch_index(coords: Tensor, h: int, w: int) -> tuple[Tensor, Tensor, Tensor]:
-    """coords (M, 2) -> flat indices (M, 10, 10) of the patch floor(c) - r … floor(c) + r + 1 clamped into h x w, which
-    of them are inside (M, 10, 10) bool, and the fraction (M, 2)."""
-    limit = torch.tensor([w, h], device=coords.device, dtype=coords.dtype)
+def patch_index(coords: Tensor, h: int, w: int, radius: int = 4) -> tuple[Tensor, Tensor, Tensor]:
+    """coords (M, 2) -> flat indices (M, 2r+2, 2r+2) of the patch floor(c) - r … floor(c) + r + 1 clamped into h x w,
+    which of them are inside (M, 2r+2, 2r+2) bool, and the fraction (M, 2)."""
     # Beyond this every tap is outside; also keeps the conversion to integer defined for diverging flow.
-    coords = torch.minimum(coords.clamp(min=-(RADIUS + 2.0)), limit + RADIUS + 1)
+    x, y = (coords[:, k].clamp(-(radius + 2.0), size + radius + 1.0) for k, size in ((0, w), (1, h)))
+    coords = torch.stack([x, y], 1)
     base = coords.floor()
-    offsets = torch.arange(-RADIUS, RADIUS + 2, device=coords.device)
+    offsets = torch.arange(-radius, radius + 2, device=coords.device)
     ix, iy = (base[:, k].long()[:, None] + offsets for k in (0, 1))
     inside = ((iy >= 0) & (iy < h))[:, :, None] & ((ix >= 0) & (ix < w))[:, None, :]
     return iy.clamp(0, h - 1)[:, :, None] * w + ix.clamp(0, w - 1)[:, None, :], inside, coords - base
 
 
 def lerp_patch(patch: Tensor, fraction: Tensor) -> Tensor:
-    """(M, 10, 10) integer taps and (M, 2) fractions -> (M, 81) bilinear taps."""
+    """(M, 2r+2, 2r+2) integer taps and (M, 2) fractions -> (M, (2r+1)^2) bilinear taps."""
     fx, fy = fraction[:, 0, None, None], fraction[:, 1, None, None]
     rows = torch.lerp(patch[:, :-1], patch[:, 1:], fy)
     return torch.lerp(rows[:, :, :-1], rows[:, :, 1:], fx).flatten(1)
 
 
-def lookup_slow(levels: list[Tensor], coords: Tensor) -> Tensor:
-    """RAFT's lookup: 81 bilinear grid samples per token and level. (Its normalisation divides by the level's size - 1:
-    levels of one cell, inputs under 128 px, would be NaN; the models refuse those.)"""
+def lookup_slow(levels: list[Tensor], coords: Tensor, radius: int = 4) -> Tensor:
+    """RAFT's lookup: (2r+1)^2 bilinear grid samples per token and level. (Its normalisation divides by the level's size
+    - 1: levels of one cell, inputs under 128 px where there are four, would be NaN; the models refuse those.)"""
     n, _, h, w = coords.shape
-    d = torch.arange(-RADIUS, RADIUS + 1, device=coords.device, dtype=coords.dtype)
+    d = torch.arange(-radius, radius + 1, device=coords.device, dtype=coords.dtype)
     dy, dx = torch.meshgrid(d, d, indexing="ij")
     taps = []
     for level, volume in enumerate(levels):
@@ -187,29 +208,29 @@ def lookup_slow(levels: list[Tensor], coords: Tensor) -> Tensor:
     return torch.cat(taps, -1).permute(0, 3, 1, 2).contiguous()
 
 
-def _lookup_cpu(levels: list[Tensor], coords: Tensor) -> Tensor:
+def _lookup_cpu(levels: list[Tensor], coords: Tensor, radius: int) -> Tensor:
     n, _, h, w = coords.shape
     flat = coords.detach().permute(0, 2, 3, 1).reshape(-1, 2).contiguous().numpy()
-    out = np.empty((len(flat), CHANNELS), np.float32)
+    out = np.empty((len(flat), channels_of(len(levels), radius)), np.float32)
     for level, volume in enumerate(levels):
-        _taps(volume.numpy(), flat, np.float32(0.5**level), level * (2 * RADIUS + 1) ** 2, out)
-    return torch.from_numpy(out).view(n, h, w, CHANNELS).permute(0, 3, 1, 2)
+        _taps(volume.detach().numpy(), flat, np.float32(0.5**level), radius, level * (2 * radius + 1) ** 2, out)
+    return torch.from_numpy(out).view(n, h, w, -1).permute(0, 3, 1, 2)
 
 
 @numba.njit(cache=True, nogil=True)
-def _taps(volume, coords, scale, first, out):
+def _taps(volume, coords, scale, radius, first, out):
     _, h, w = volume.shape
-    side = 2 * RADIUS + 1
+    side = 2 * radius + 1
     patch = np.empty((side + 1, side + 1), np.float32)
     for m in range(len(coords)):
-        x = min(max(coords[m, 0] * scale, np.float32(-RADIUS - 2)), np.float32(w + RADIUS + 1))
-        y = min(max(coords[m, 1] * scale, np.float32(-RADIUS - 2)), np.float32(h + RADIUS + 1))
+        x = min(max(coords[m, 0] * scale, np.float32(-radius - 2)), np.float32(w + radius + 1))
+        y = min(max(coords[m, 1] * scale, np.float32(-radius - 2)), np.float32(h + radius + 1))
         if not (np.isfinite(x) and np.isfinite(y)):
             out[m, first : first + side * side] = np.nan
             continue
         bx, by = np.floor(x), np.floor(y)
         fx, fy = x - bx, y - by
-        left, top = int(bx) - RADIUS, int(by) - RADIUS
+        left, top = int(bx) - radius, int(by) - radius
         if left >= 0 and top >= 0 and left + side < w and top + side < h:
             for j in range(side + 1):
                 for i in range(side + 1):

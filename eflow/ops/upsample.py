@@ -12,16 +12,17 @@ from eflow.ops.precision import fp32
 SCALE = 8
 
 
-def convex_upsample(flow: Tensor, mask: Tensor) -> Tensor:
+def convex_upsample(flow: Tensor, mask: Tensor, border: str = "replicate") -> Tensor:
     """flow (N, 2, h, w) low-resolution px; mask (N, 9*64, h, w) logits, channel k*64 + 8*i + j: neighbour k (row-major
     3x3) of sub-pixel (i, j). Returns (N, 2, 8h, 8w) full-resolution px, fp32.
 
-    Neighbours outside the image repeat the edge: padding with zeros turns a constant 24 px into 10.7 in the corners.
+    border : neighbours outside the image repeat the edge ("replicate"), or are "zero" as in RAFT's code, which turns a
+    constant 24 px into 10.7 in the corners unless the network has learnt it so.
     """
     n, _, h, w = flow.shape
     with fp32(flow):
         weights = mask.float().view(n, 9, SCALE * SCALE, h * w).softmax(1)
-        padded = F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode="replicate")
+        padded = _padded(flow, border)
         neighbours = torch.stack([padded[..., dy : dy + h, dx : dx + w] for dy in range(3) for dx in range(3)], 2).view(
             n, 2, 9, 1, h * w
         )
@@ -29,11 +30,16 @@ def convex_upsample(flow: Tensor, mask: Tensor) -> Tensor:
         return F.pixel_shuffle(fine.view(n, 2 * SCALE * SCALE, h, w), SCALE)
 
 
-def convex_upsample_slow(flow: Tensor, mask: Tensor) -> Tensor:
+def _padded(flow: Tensor, border: str) -> Tensor:
+    """Full-resolution px with a pixel round it."""
+    return F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode={"replicate": "replicate", "zero": "constant"}[border])
+
+
+def convex_upsample_slow(flow: Tensor, mask: Tensor, border: str = "replicate") -> Tensor:
     """:func:`convex_upsample` as RAFT writes it: unfold, one big product, one big permutation."""
     n, _, h, w = flow.shape
     weights = torch.softmax(mask.float().view(n, 1, 9, SCALE, SCALE, h, w), dim=2)
-    patches = F.unfold(F.pad(SCALE * flow.float(), (1, 1, 1, 1), mode="replicate"), [3, 3]).view(n, 2, 9, 1, 1, h, w)
+    patches = F.unfold(_padded(flow, border), [3, 3]).view(n, 2, 9, 1, 1, h, w)
     fine = torch.sum(weights * patches, dim=2).permute(0, 1, 4, 2, 5, 3)
     return fine.reshape(n, 2, SCALE * h, SCALE * w)
 

@@ -10,13 +10,15 @@ from eflow.ops.correlation import pixel_grid
 from eflow.ops.precision import fp32
 
 
-def backward_warp(image: Tensor, flow: Tensor) -> Tensor:
-    """image (N, C, h, w) read at x + flow(x), bilinear, zero outside. flow (N, 2, h, w) px of this resolution."""
+def backward_warp(image: Tensor, flow: Tensor, border: str = "zero") -> Tensor:
+    """image (N, C, h, w) read at x + flow(x), bilinear; outside it is "zero", or its edge goes on ("replicate").
+    flow (N, 2, h, w) px of this resolution."""
     h, w = image.shape[-2:]
     with fp32(image):
         at = (pixel_grid(h, w, flow) + flow.float()).permute(0, 2, 3, 1)
         size = torch.tensor([w, h], device=flow.device, dtype=torch.float32)
-        return F.grid_sample(image.float(), (2 * at + 1) / size - 1, align_corners=False)
+        beyond = {"zero": "zeros", "replicate": "border"}[border]
+        return F.grid_sample(image.float(), (2 * at + 1) / size - 1, align_corners=False, padding_mode=beyond)
 
 
 def forward_warp(flow: Tensor) -> Tensor:

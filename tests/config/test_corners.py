@@ -2,14 +2,15 @@
 
 import itertools
 import random
+from pathlib import Path
 
 import pytest
 from pydantic import Field, model_validator
 
-from blinkgl.config.base import Config, Refused, rule, validate
+from blinkgl.config.base import Config, Refused, Rule, remembering, rule, validate
 from blinkgl.config.corners import Fill, corners, placed_rules, sites
 from blinkgl.config.recipe import all_groups
-from blinkgl.config.sequence import FILLS, RunTemplate, SequenceConfig
+from blinkgl.config.sequence import FILLS, RunTemplate, SequenceConfig, load_run
 from blinkgl.errors import ConfigError
 
 # Sound at all low and at all high ends, or at each single one; refused by a combination.
@@ -116,8 +117,11 @@ MIXED = [
         "timeline.max_px: unknown key",
     ),
     (
-        {"sensor": {"choice": ["davis346", None]}, "readout": {"choice": [None, {"row_ns": 5}]}},
-        "readout.events_per_second: is required",
+        {
+            "sensor": {"choice": [None, {"name": "x", "width": 9, "height": 9, "readout": {"queue_events": 16384}}]},
+            "readout": {"choice": [None, {"events_per_second": 1}]},
+        },
+        "readout.queue_events: the last event of a full queue would wait for more than an hour",
     ),
     ({"scene": {"objects": {"count": {"uniform": [1, 9]}}}}, "scene.objects.count: not a whole number"),
     ({"labels": {"depth": {"uniform": [0, 1]}}}, "labels.depth: not true or false"),
@@ -431,3 +435,64 @@ def test_entries_of_a_list_are_not_looked_at_together_for_a_rule_of_one_entry():
     assert len(found) < 1000
     poses = {tuple(t["scene"]["objects"][3]["position"] + t["scene"]["objects"][3]["euler"]) for t in found}
     assert len([p for p in poses if set(p) <= {0, 1}]) == 64, "and all of its own are"
+
+
+# --- what was looked at before ----------------------------------------------------------------------------------------
+
+
+class Leaf(Config):
+    value: int = Field(0, ge=0, le=9)
+    other: int = 0
+
+    @rule("value", "other")
+    def _unlike(value, other):
+        LOOKED_AT.append((value, other))
+        if value == other:
+            raise Refused("must differ", where="value", value=value)
+
+
+class Row(Config):
+    leaves: tuple[Leaf, ...] = ()
+
+
+LOOKED_AT: list[tuple[int, int]] = []
+
+
+def test_the_same_table_is_looked_at_once():
+    """The same object, not one that is equal; and only while it is asked for."""
+    LOOKED_AT.clear()
+    table, twin = {"value": 3}, {"value": 3}
+    with remembering():
+        first, second = (validate(Row, {"leaves": [table, twin]}) for _ in range(2))
+        assert first == second and first.leaves[0] is second.leaves[0] is not first.leaves[1]
+        assert LOOKED_AT == [(3, 0), (3, 0)]
+        with pytest.raises(ConfigError, match="leaves.1.value: must differ"):
+            validate(Row, {"leaves": [table, {"value": 0}]})
+        with pytest.raises(ConfigError, match="leaves.0: not a table"):
+            validate(Row, {"leaves": [7]})
+    LOOKED_AT.clear()
+    assert validate(Row, {"leaves": [table]}).leaves[0] is not first.leaves[0] and LOOKED_AT == [(3, 0)]
+
+
+def test_what_is_refused_is_refused_every_time():
+    wrong = {"value": 0}
+    with remembering():
+        for _ in range(2):
+            with pytest.raises(ConfigError, match="leaves.0.value: must differ"):
+                validate(Row, {"leaves": [wrong]})
+
+
+def test_a_large_recipe_is_looked_at_by_what_differs(monkeypatch):
+    """Of the dancers' scene, a thousand configurations of 75 rules each, few rules are run again and again; and each
+    is what it is alone."""
+    template = load_run(Path(__file__).parents[2] / "configs/scenes/dancers.yaml")
+    calls = [0]
+    run = Rule.__call__
+    monkeypatch.setattr(Rule, "__call__", lambda self, model: (calls.__setitem__(0, calls[0] + 1), run(self, model))[1])
+    trees = list(corners(SequenceConfig, template.tree, FILLS))
+    RunTemplate(template.tree, template.base).check()
+    together = calls[0]
+    alone = [validate(SequenceConfig, tree) for tree in trees[:40]]
+    assert len(trees) > 300 and together / len(trees) < 0.4 * (calls[0] - together) / len(alone)
+    with remembering():
+        assert [validate(SequenceConfig, tree) for tree in trees[:40]] == alone

@@ -1,4 +1,4 @@
-"""The files that rows name: a scene file, and two folders of frames with their flow."""
+"""The files that rows name: a scene file, a rigged one, and two folders of frames with their flow."""
 
 import sys
 from pathlib import Path
@@ -10,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "scene"))
 
 from features import HEIGHT, WIDTH
-from gltf_files import GltfBuilder
+from gltf_files import GltfBuilder, arm_file
 
 FRAMES, SHIFT = 5, (1.25, -0.5)
 
@@ -28,6 +28,7 @@ def assets(tmp_path_factory) -> Path:
     """Folder that relative paths of the rows start from."""
     folder = tmp_path_factory.mktemp("assets")
     scene_file(folder / "scene.glb")
+    (folder / "arm.glb").write_bytes(arm_file(morphs=True).glb())
     for number in range(2):
         frame_folder(folder / f"P{number:03d}", number)
     return folder

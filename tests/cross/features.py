@@ -9,6 +9,7 @@ of any two features meet. Whoever adds a feature adds its kinds to ``FEATURES``;
 from __future__ import annotations
 
 import copy
+import importlib.util
 import itertools
 import random
 import typing
@@ -40,8 +41,13 @@ _RANDOM = {
     "camera_motion": _FAST,
     "object_motion": _FAST,
 }
-_KEYED = {"keyframes": [{"time": t, "position": [0, 20 * t, 0.1]} for t in (0, 4)], "interpolation": "linear"}
-_CAMERA = {"keyframes": [{"time": t, "position": [-3, 14 * t, 0], "look_at": [0, 14 * t, 0]} for t in (0, 2, 4)]}
+# To and fro about y = 0, once a second, so that things are in view at the late start, too.
+_TO_AND_FRO = [(k / 4, (0, 1, 0, -1)[k % 4]) for k in range(17)]
+_KEYED = {
+    "keyframes": [{"time": t, "position": [0, 5 * y, 0.1]} for t, y in _TO_AND_FRO],
+    "interpolation": "linear",
+}
+_CAMERA = {"keyframes": [{"time": t, "position": [-3, 2.2 * y, 0], "look_at": [0, 2.2 * y, 0]} for t, y in _TO_AND_FRO]}
 _EXPLICIT = {
     "kind": "explicit",
     "meshes": {"box": {"primitive": "cuboid"}, "ball": {"primitive": "sphere"}},
@@ -50,6 +56,45 @@ _EXPLICIT = {
     "camera": _CAMERA,
 }
 _FILE = {"kind": "file", "path": "scene.glb", "pose": _CAMERA}
+_FALLS = importlib.util.find_spec("mujoco") is not None
+_LIVING = {  # figures, flags and fish among what deforms, falls and stands
+    **_RANDOM,
+    "pool": {
+        **_POOLS["pool"],
+        "primitives": ["cuboid", "sphere", "figure", "flag", "fish"],
+        "variants": 3,
+        "keep_materials": True,
+    },
+    "objects": {"count": 6, "distance": [1, 4], "deform": {"share": 0.7, "period": [0.05, 0.2]}},
+    **({"physics": {"share": 0.5}} if _FALLS else {}),
+}
+_STEPS = {"clip": "run", "height": 0.8, "tempo": 2, "coat": 3}
+_ALIVE = {  # one of everything that moves by itself, beside each other
+    "kind": "explicit",
+    "meshes": {
+        "arm": {"file": "arm.glb"},
+        "sheet": {"primitive": "cuboid", "parameters": {"extents": [0.1, 0.8, 0.8]}},
+        "runner": {"primitive": "figure", "parameters": _STEPS},
+        "ball": {"primitive": "icosphere"},
+        "floor": {"primitive": "grid", "parameters": {"width": 9, "depth": 9}},
+    },
+    "materials": {"checks": {"procedural": "checks", "max_size": 32}},
+    "objects": [
+        {"mesh": "floor", "category": "ground", "position": [0, 0, -0.7], "material": "checks"},
+        {"mesh": "arm", "animation": {"clip": "wave", "speed": 3}, "scale": 0.4, "position": [0, -0.9, 0]},
+        {"mesh": "sheet", "material": "checks", "position": [0.3, 0.7, 0.2], "deform": {"kind": "wave", "period": 0.1}},
+        {"mesh": "runner", "way": {"points": [[-0.5, 0.6, -0.7], [-0.5, -2, -0.7], [-0.7, -9, -0.7]]}},
+        {
+            "mesh": "ball",
+            "material": "checks",
+            "scale": 0.4,
+            "position": [-0.6, 0, -0.4],
+            **({"physics": {"velocity": [0, 2, -8]}} if _FALLS else {}),
+        },
+    ],
+    **({"physics": {}} if _FALLS else {}),
+    "camera": {"position": [-3, 0, 0], "look_at": [0, 0, 0]},
+}
 
 BASE = {
     "camera": {"width": WIDTH, "height": HEIGHT},
@@ -64,12 +109,30 @@ def _frames(**more: Any) -> dict[str, Any]:
 
 
 NOTHING: dict[str, Any] = {}
+_SENSOR = {
+    "name": "of one's own",
+    "width": 20,
+    "height": 16,
+    "emulators": {"esim": {"contrast_threshold": 0.25}, "v2e": {"cutoff_hz": 100}, "voltmeter": {"k1": 4}},
+    "readout": {
+        "filters": [
+            {"kind": "trail", "keep": "first", "threshold_us": 5},
+            {"kind": "trail", "keep": "second", "threshold_us": 50_000},
+            {"kind": "trail", "keep": "not_first", "threshold_us": 50_000},
+            {"kind": "rate", "events_per_second": 1e7},
+            {"kind": "flicker", "mode": "stop"},
+            {"kind": "flicker", "mode": "pass", "block": 64},
+        ]
+    },
+}
 FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "source": {
         "random": NOTHING,
         "still camera": {"scene": {"camera_motion": {"kind": "static"}}},
         "explicit": {"scene": _EXPLICIT},
         "file": {"scene": _FILE},
+        "living": {"scene": _LIVING},
+        "explicit, alive": {"scene": _ALIVE},
         "frames, motion": _frames(interpolate="motion", max_px=0.5),
         "frames, linear": _frames(interpolate="linear", flow="flow_flo", gamma="linear"),
         "frames, cubic": _frames(interpolate="cubic", flow=None, first=1, count=4),
@@ -110,11 +173,33 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "hermite": {"timeline": {"reconstruction": "hermite"}},
     },
     "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in QUALITIES}},
-    "sensor": {"unsaid": NOTHING, **{name: {"sensor": name} for name in sensor_names()}},
+    "sensor": {
+        "unsaid": NOTHING,
+        **{name: {"sensor": name} for name in sensor_names()},
+        "a table": {"sensor": _SENSOR},
+    },
     "readout": {
         "unsaid": NOTHING,
         "ample": {"readout": {"events_per_second": 1e9}},
         "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
+        "filters": {
+            "readout": {
+                "filters": [
+                    {"kind": "trail", "keep": "first", "threshold_us": 10},
+                    {"kind": "trail", "keep": "not_first"},
+                    {"kind": "rate", "events_per_second": 1e6},
+                    {"kind": "flicker", "start": 2, "stop_below": 1, "mode": "stop"},
+                ],
+                "clock_us": 10,
+            }
+        },
+        "pixels": {
+            "readout": {
+                "pixels": {"dead_fraction": 0.1, "hot_fraction": 0.02, "hot_rate_hz": 500, "rate_hz": 5},
+                "latency": {"fixed_us": 100, "dark_us": 2000, "jitter_us": 20},
+                "filters": [{"kind": "trail", "keep": "second"}, {"kind": "flicker", "mode": "pass", "block": 256}],
+            }
+        },
     },
     "anti-aliasing": {
         name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")
@@ -123,13 +208,69 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")},
         "no images": {"labels": {"images": False}},
     },
+    "frame camera": {
+        "none": NOTHING,
+        "plain": {
+            "images": {"preset": "plain", "rate": 100, "max_instants": 4, "response": "srgb", "photon_noise": False}
+        },
+        "raw": {
+            "images": {
+                "preset": "raw",
+                "rate": 50,
+                "response": "linear",
+                "photon_noise": True,
+                "bayer": "bggr",
+                "bits": 16,
+                "max_instants": 2,
+            }
+        },
+        "rolling, low light": {
+            "images": {
+                "preset": "low_light",
+                "times": [0.006, 0.018],
+                "exposure_us": 4000,
+                "row_us": 100,
+                "response": "gamma",
+                "max_instants": 3,
+                "also": ["sharp", "clean"],
+            }
+        },
+        "automatic": {
+            "images": {
+                "preset": "deblurring",
+                "rate": 120,
+                "exposure_us": 2000,
+                "max_instants": 2,
+                "vignetting": 0.5,
+                "bayer": "grbg",
+                "lens": {"aperture": 0.05, "focus": 4.0},
+                "auto_exposure": {"longest_us": 4000},
+            }
+        },
+        "interpolation": {"images": {"preset": "interpolation", "max_instants": 2, "bayer": "gbrg"}},
+        "rolling shutter": {"images": {"preset": "rolling_shutter", "rate": 100, "max_instants": 3, "bayer": "rggb"}},
+    },
     "textures": {
         "plain": NOTHING,
         "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}},
         "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}},
     },
     "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
-    "light": {"lit": NOTHING, "unlit": {"scene": {"light": {"unlit": True}}}},
+    "light": {
+        "lit": NOTHING,
+        "unlit": {"scene": {"light": {"unlit": True}}},
+        "lamps": {
+            "scene": {
+                "light": {
+                    "sky_color": [0.6, 0.8, 1.0],
+                    "lights": [
+                        {"kind": "point", "position": [0.5, 0.5, 2.0], "strength": 4, "color": [1.0, 0.7, 0.4]},
+                        {"kind": "spot", "position": [0, 0, 4], "look_at": [1, 0, 0], "strength": 9},
+                    ],
+                }
+            }
+        },
+    },
     "flow": {
         "forward": NOTHING,
         "both": {"labels": {"flow": ["forward", "backward"]}},
@@ -170,9 +311,17 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
         for curve in ("pchip", "hermite")
         for emulator in _STRAIGHT_ONLY
     },
+    **{
+        (("source", source), ("frame camera", camera)): "images: recorded frames are images already"
+        for source in FEATURES["source"]
+        if source.startswith("frames")
+        for camera in FEATURES["frame camera"]
+        if camera != "none"
+    },
+    (("frame camera", "rolling, low light"), ("time", "late")): "images.times: an exposure outside the sequence",
 }
-"""Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there
-they are no contradiction."""
+"""Pairs that make no sense, and the line that says so. Recorded frames have neither a timeline nor a time: there those
+are no contradiction."""
 
 TOO_SLOW: set[tuple[Kind, Kind]] = {
     (one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))
@@ -182,8 +331,8 @@ multi-sampling and anisotropy (beside a triangle that ends at the horizon the fo
 adds up every texel of it)."""
 
 ELSEWHERE = {
-    "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit and whether the "
-    "camera moves",
+    "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
+    "camera moves, and what moves by itself",
     "gl": RUN_LEVEL["gl"],
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}
@@ -216,9 +365,15 @@ def configuration(row: dict[str, str]) -> dict[str, Any]:
 
 def refusal(row: dict[str, str]) -> str | None:
     """What is said when this row is given; None: it is accepted."""
-    if row.get("source", "").startswith("frames"):
-        return None
-    return next((line for (a, b), line in REFUSED.items() if row.get(a[0]) == a[1] and row.get(b[0]) == b[1]), None)
+    recorded = row.get("source", "").startswith("frames")
+    return next(
+        (
+            line
+            for (a, b), line in REFUSED.items()
+            if row.get(a[0]) == a[1] and row.get(b[0]) == b[1] and (not recorded or a[0] == "source")
+        ),
+        None,
+    )
 
 
 def fits(row: dict[str, str]) -> bool:

@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 from blinkgl.config.recipe import all_groups
 from blinkgl.config.sequence import load_run
 from eflow.config import load_train_config
-from eflow.models import NAMES, model_config
+from eflow.models import NETWORKS, model_config
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 FOLDER = REPOSITORY / "configs" / "eflow"
@@ -66,5 +66,5 @@ def test_documented_commands_do_not_refuse_each_other(text):
 
 def test_one_per_network_and_a_smoke_run():
     models = {load_train_config(FOLDER / n).model.name for n in TRAINING}
-    assert models == set(NAMES)
+    assert models == set(NETWORKS)
     assert {"smoke.yaml", "eflowformer.yaml", "h100_30min.yaml"} <= set(TRAINING)

@@ -55,7 +55,7 @@ def log(run_folder: Path) -> list[dict]:
     return [json.loads(line) for line in (run_folder / "log.jsonl").read_text().splitlines()]
 
 
-TINY = {"name": "eflowformer", "layers": 1, "train_iterations": 1, "input": {"bins": 3}}
+TINY = {"name": "eflowformer", "size": "tiny", "levels": 4, "train_iterations": 1, "input": {"bins": 3}}
 
 
 def test_resumed_equals_uninterrupted_bit_for_bit(tmp_path, data):
@@ -225,11 +225,40 @@ def test_time_limit(tmp_path, data):
     assert (result.step, result.reason) == (1, "time limit")
 
 
-def test_learning_rate_is_one_linear_cycle():
-    rates = [learning_rate(s, 1000, 2e-4, 0.05) for s in range(1001)]
-    assert max(rates) == rates[50] == 2e-4
-    assert rates[0] == pytest.approx(2e-4 / 25) and rates[-1] < 1e-8
-    assert np.allclose(np.diff(rates[:51], 2), 0, atol=1e-18) and np.allclose(np.diff(rates[50:], 2), 0, atol=1e-18)
+def test_learning_rate_rises_stays_and_falls():
+    rates = np.array([learning_rate(s / 1000, 2e-4, 0.05, 0.4) for s in range(1001)])
+    assert rates[0] == pytest.approx(2e-4 / 25) and (rates[50:600] == 2e-4).all() and 0 < rates[-1] < 1e-8
+    assert np.allclose(np.diff(rates[:51], 2), 0, atol=1e-18) and np.allclose(np.diff(rates[600:], 2), 0, atol=1e-18)
+    cycle = [learning_rate(s / 1000, 2e-4, 0.05, 0.95) for s in range(1001)]
+    assert cycle[50] == max(cycle) == 2e-4 and sorted(cycle[50:], reverse=True) == cycle[50:], "the papers' one cycle"
+    flat = [learning_rate(d, 1.0, 0.0, 0.0) for d in (0.0, 0.5, 0.999)]
+    assert flat == [1.0] * 3
+
+
+def test_a_training_as_long_as_the_clock_says(tmp_path, data):
+    """A minute of which every reading of the clock takes ten seconds: the rate rises, stays and falls by the clock, and
+    a resumed part goes on where the first one stopped."""
+    path = config_file(tmp_path, data, steps=1000, optim__minutes=1.0, optim__warmup=0.3, optim__cooldown=0.3)
+    config = load_train_config(path)
+
+    def ticking(folder, **options):
+        now = iter(np.arange(0, 1e4, 10.0))
+        return train(config, folder, quiet=True, clock=lambda: float(next(now)), **options)
+
+    whole = ticking(tmp_path / "whole")
+    lines = log(tmp_path / "whole")
+    # The clock is read when it begins, before the first step, and after each.
+    assert (whole.reason, whole.step) == ("finished", 5) and ckpt.read_state(whole.checkpoint)["seconds"] >= 60
+    expected = [learning_rate(d, 1e-3, 0.3, 0.3) for d in np.arange(1, 6) / 6]
+    assert [line["lr"] for line in lines] == pytest.approx(expected)
+    first = ticking(tmp_path / "parts", stop_after=1)
+    assert first.reason == "stop"
+    spent = ckpt.read_state(first.checkpoint)["seconds"]
+    assert spent == 30.0, "the clock began, was read twice, and once more for the state"
+    second = ticking(tmp_path / "parts", resume=True)
+    assert (second.reason, second.step) == ("finished", 3)
+    again = ticking(tmp_path / "parts", resume=True)
+    assert (again.reason, again.step, again.checkpoint) == ("finished", 3, second.checkpoint), "nothing is left to do"
 
 
 @pytest.mark.slow

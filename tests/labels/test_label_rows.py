@@ -267,12 +267,11 @@ def test_how_strictly_each_is_judged():
         "valid_forward": (0.0, "max", "mismatch"),
         "flow_backward": (1e-2, "max", "px"),
         "valid_backward": (0.0, "max", "mismatch"),
-        "occluded_forward": (1e-2, "mean", "fraction of pixels"),
-        "occluded_backward": (1e-2, "mean", "fraction of pixels"),
+        "occluded_forward": (1e-3, "mean", "fraction of pixels"),
+        "occluded_backward": (1e-3, "mean", "fraction of pixels"),
     }
     loose = {v.name for label in LABELS.values() for v in label.views if not v.same_triangle}
     assert loose == {"id", "occluded_forward", "occluded_backward"}
-    assert {v.name for label in LABELS.values() for v in label.views if v.band_there} == loose - {"id"}
 
 
 def test_a_label_that_shows_itself_in_its_own_way_needs_no_reference():

@@ -128,22 +128,17 @@ def test_every_buffer_of_the_label_pass(gl, name):
     assert (luminance[empty] == world.background).all()
 
 
-def test_occluded_masks_agree_off_the_bands_at_both_times(gl):
-    """At t' the mask rests on one depth sample per pixel, so the band at t' is as blurred as the one at t."""
+def test_occluded_masks_agree_off_the_band(gl):
+    """Of the picture at t alone: what a point lands beside at t' does not matter."""
     world = mixed_scene()
     for to in (T1, T_BACK):
-        ref, other = reference.render(world, T0, forward_ns=to), reference.render(world, to)
+        ref = reference.render(world, T0, forward_ns=to)
         labels, _ = drawn(gl, world, forward=to, backward=to)
-        there = np.floor(np.moveaxis(np.indices(ref.hit.shape)[::-1], 0, -1) + ref.forward.flow + 0.5).astype(int)
-        x = np.clip(there[..., 0], 0, world.camera.width - 1)
-        y = np.clip(there[..., 1], 0, world.camera.height - 1)
-        clear = off_silhouettes(ref) & (
-            ~reference.silhouette_band(other.instance, other.depth)[y, x] | ref.forward.outside
-        )
-        assert clear.mean() > 0.8 and ref.forward.occluded[clear].sum() > 300
+        clear = off_silhouettes(ref)
         hidden = ref.forward.occluded & ~ref.forward.outside
+        assert clear.mean() > 0.8 and ref.forward.occluded[clear].sum() > 300
         assert hidden[clear].sum() > 30  # some by other objects, not only by leaving the image
-        np.testing.assert_array_equal(labels.forward.occluded[clear], ref.forward.occluded[clear])
+        assert (labels.forward.occluded != ref.forward.occluded)[clear].sum() <= 1
         np.testing.assert_array_equal(labels.backward.occluded, labels.forward.occluded)
         assert (labels.forward.occluded != ref.forward.occluded).mean() < 0.02
         assert not (labels.forward.occluded & ~labels.forward.valid).any()

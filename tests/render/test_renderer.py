@@ -9,7 +9,6 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.labels import LABELS, LabelRequest
 from blinkgl.render.matrices import cam_from_obj, cam_from_obj_rate
 from blinkgl.render.moment import Moment
-from blinkgl.render.occlusion import occlusion_mask
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.geometry import primitives
 from blinkgl.scene.rig import Rig
@@ -256,49 +255,3 @@ def test_largest_speed():
     velocity[0, 1] = (np.nan, 0)
     assert largest_speed(velocity) == 5.0
     assert largest_speed(np.zeros((2, 2, 2), np.float32)) == 0.0
-
-
-def test_occlusion_by_hand():
-    """A near strip (id 2, Z = 1) moves over a far plane (id 1, Z = 4); everything shifts by one pixel."""
-    ids = np.ones((1, 6), np.uint32)
-    ids[0, 1] = 2
-    depth = np.where(ids == 2, 1.0, 4.0).astype(np.float32)
-    ids_next, depth_next = np.roll(ids, 2), np.roll(depth, 2)  # the strip goes from x = 1 to x = 3
-    flow = np.zeros((1, 6, 2), np.float32)
-    flow[0, 1, 0] = 2.0
-    valid = np.ones((1, 6), bool)
-    hidden = occlusion_mask(flow, depth, valid, ids, depth_next, ids_next)
-    np.testing.assert_array_equal(hidden[0], [False, False, False, True, False, False])
-    flow[..., 0] = 3.0
-    gone = occlusion_mask(flow, depth, valid, ids, np.full_like(depth, 4), np.ones_like(ids))
-    np.testing.assert_array_equal(gone[0], [False, False, False, True, True, True]), "outside the image is not visible"
-    assert not occlusion_mask(flow, depth, ~valid, ids, depth_next, ids_next).any()
-
-
-def flat_patch(depths, size=6):
-    """(ids, depth) of an image that shows object 1 alone, at one depth or one per column."""
-    return np.ones((size, size), np.uint32), np.broadcast_to(np.asarray(depths, np.float32), (size, size)).copy()
-
-
-@pytest.mark.parametrize("nearer_id", [1, 2])
-@pytest.mark.parametrize("by, hidden", [(0.002, True), (0.01, True), (0.0005, False)])
-def test_a_surface_nearer_by_more_than_a_thousandth_hides(nearer_id, by, hidden):
-    """Whether it is another object or another side of the same one: leaves of a book, a cup's wall behind its front."""
-    ids, depth = flat_patch(2.0)
-    shown, at = np.full_like(ids, nearer_id), depth * np.float32(1 - by)
-    mask = occlusion_mask(np.full((6, 6, 2), 0.3, np.float32), depth, np.ones((6, 6), bool), ids, at, shown)
-    assert (mask[1:-1, 1:-1] == hidden).all()
-
-
-@pytest.mark.parametrize("spreads, hidden", [(0.45, False), (0.55, True), (1.5, True), (-3.0, False)])
-def test_half_of_the_spread_around_is_allowed_to_a_curved_surface(spreads, hidden):
-    """1/Z at t' goes up by a tenth per column; the point lies that many times a column's difference behind the mean of
-    its neighbours (besides a thousandth of tolerance)."""
-    inverse = 0.5 * (1 + 0.1 * np.arange(6))
-    ids, depth_next = flat_patch(1 / inverse)
-    flow = np.full((6, 6, 2), 0.5, np.float32)  # between two columns: the mean of both
-    mean = (inverse[:-1] + inverse[1:]) / 2
-    w_next = np.full((6, 6), 1.0, np.float32)
-    w_next[:, :-1] = 1 / ((mean - spreads * 0.05) / 1.001)
-    mask = occlusion_mask(flow, w_next, np.ones((6, 6), bool), ids, depth_next, ids)
-    assert (mask[:-1, :-1] == hidden).all()

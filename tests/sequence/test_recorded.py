@@ -151,6 +151,9 @@ def test_what_is_too_little(clip, frames, error, said):
         ("3_flow", {"count": 4}, None),
         ("3_mask", {"count": 4}, None),
         ("3_mask", {"first": 1, "count": 3}, None),
+        ("1_flow", {"count": 4}, "2_flow.npy: the files do not go with the frames.*go with 1.png"),
+        ("1_mask", {"count": 4}, "2_mask.npy: the files do not go with the frames"),
+        ("0_flow", {"count": 4}, "1_flow.npy: the files do not go with the frames"),
     ],
 )
 def test_a_flow_file_for_every_pair_that_is_used(clip, gone, frames, said):
@@ -161,6 +164,13 @@ def test_a_flow_file_for_every_pair_that_is_used(clip, gone, frames, said):
     else:
         number = frames.get("first", 0) + 1
         assert truths(opened(clip, frames=frames))[0].frame.forward.flow[0, 0, 0] == number
+
+
+def test_numbers_of_flow_may_be_shifted_where_none_is_missing(clip):
+    for k in reversed(range(N - 1)):
+        for what in ("flow", "mask"):
+            (clip / f"flow/{k}_{what}.npy").rename(clip / f"flow/{k + 1}_{what}.npy")
+    assert truths(opened(clip))[0].frame.forward.flow[0, 0, 0] == 1
 
 
 @pytest.mark.parametrize("what, shape", [("flow", (H, W + 1, 2)), ("flow", (W, H, 2)), ("mask", (H + 1, W))])

@@ -39,7 +39,6 @@ from blinkgl.tools.shader_debugger.moments import (
     check_pass,
     lookup_of,
     luma_of,
-    view_of,
 )
 from blinkgl.tools.shader_debugger.poses import displaced, pose_suspicions
 from blinkgl.tools.shader_debugger.suspicions import suspicions
@@ -312,8 +311,6 @@ class Comparison:
         graded = ~self.band
         if quantity.same_triangle:
             graded &= self.same_triangle
-        if (found := view_of(name)) is not None and found[1].band_there:
-            graded &= ~self._band_there(found[0].towards)
         if name == "dL_dt":
             for t_ns in (self.gpu.when.before_ns, self.gpu.when.after_ns):
                 other, drawn = self.ref.at(t_ns), self.gpu.renderer.inspect(t_ns)
@@ -330,16 +327,6 @@ class Comparison:
         if not report.passed:
             report.suspicions = pose_suspicions(self, report) if name == "local" else suspicions(self, report)
         return report
-
-    def _band_there(self, way: str) -> np.ndarray:
-        """Pixels whose point lands, inside the image, in the silhouette band of t'."""
-        flow = getattr(self.ref.frame, way)
-        there = self.ref.at(flow.t_ns)
-        band = reference.silhouette_band(there.instance, there.depth)
-        height, width = band.shape
-        xy = np.nan_to_num(flow.flow) + np.moveaxis(np.indices(band.shape)[::-1], 0, -1)
-        x, y = (np.clip(np.rint(xy[..., k]), 0, n - 1).astype(int) for k, n in ((0, width), (1, height)))
-        return band[y, x] & flow.valid & ~flow.outside
 
     def _per_object(self, report: Report) -> list[dict]:
         name = report.quantity.name

@@ -43,7 +43,7 @@ PARAMETERS = {
     "tube": "radius of the tube, m, less than radius",
     "height": "along z, m; capsule: of the cylinder between the two half spheres; figure: from the soles to the crown",
     "length": "fish: from the nose to the end of the tail, m",
-    "deep": "fish: height of its body, parts of an average fish's",
+    "deep": "fish: height of its body, parts of an average fish's, 0.6 to 1.6",
     "build": "figure: how thick it is, parts of an average body's, 0.7 to 1.4",
     "legs": "figure: how long they are, parts of an average body's of this height, 0.7 to 1.4; likewise arms, head",
     "arms": "figure: see legs",
@@ -69,8 +69,8 @@ _MAX_SEGMENTS = 4096
 _MOST = {"variant": 10**9, "coat": 10**9}
 _WORDS = {"clip": tuple(CLIPS)}
 _PART = (0.7, 1.4)
-_RANGES = {"figure.build": _PART, "figure.legs": _PART, "figure.arms": _PART, "figure.head": _PART, "fish.deep": _PART}
-_RANGES |= {"phase": (0.0, 1.0), "tempo": (0.1, 4.0), "wind": (0.1, 4.0)}
+_RANGES = {"figure.build": _PART, "figure.legs": _PART, "figure.arms": _PART, "figure.head": _PART}
+_RANGES |= {"fish.deep": (0.6, 1.6), "phase": (0.0, 1.0), "tempo": (0.1, 4.0), "wind": (0.1, 4.0)}
 
 
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]

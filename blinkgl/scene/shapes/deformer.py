@@ -158,9 +158,9 @@ class Sweep:
         low, high, margin, before = np.full(3, np.inf), np.full(3, -np.inf), 0.0, None
         for i, t in enumerate(times):
             at, velocity = deformer.positions(mesh, t), deformer.velocity(mesh, t)
-            low, high = np.minimum(low, at.min(axis=0)), np.maximum(high, at.max(axis=0))
+            _widen(at, low, high)
             if before is not None:
-                jump = float(np.sqrt(((velocity - before) ** 2).sum(axis=1).max()))
+                jump = float(_largest_difference(velocity, before))
                 margin = max(margin, _MARGIN * jump * (t - times[i - 1]) * 1e-9 / 4)
             before = velocity
         return cls(deformer, mesh, times, low - margin, high + margin, margin)
@@ -170,12 +170,11 @@ class Sweep:
         """((K, 3) float64, (F, 3) int32, facing out): a convex body round all positions that were looked at,
         without the margin: what lies behind a plane in each of 162 directions. A ball's is 1.5 % larger than the
         ball."""
-        directions = _directions()
+        directions, halves, order = _directions()
         reach, inside = np.full(len(directions), -np.inf), np.zeros(3)
         for t in self.times:
-            inside += _reach(np.ascontiguousarray(self.deformer.positions(self.mesh, t)), directions, reach) / len(
-                self.times
-            )
+            points = np.ascontiguousarray(self.deformer.positions(self.mesh, t))
+            inside += _reach(points, halves, order, reach) / len(self.times)
         # A little apart, so that flat ones have an inside.
         reach += 1e-6 * float(np.linalg.norm(self.high - self.low))
         corners = HalfspaceIntersection(np.column_stack([directions, -reach]), inside).intersections
@@ -189,25 +188,60 @@ class Sweep:
 
 
 @njit(cache=True, nogil=True)
-def _reach(points, directions, reach):
-    """Raises ``reach``, how far points go in each direction; the mean of those that go furthest."""
+def _reach(points, halves, order, reach):
+    """Raises ``reach``, (162,) how far (V, 3) points go in each direction; the mean of those that go furthest.
+    halves, order : of :func:`_directions`. Point by point and one sign after the other, so that a processor takes
+    several directions at once."""
+    x, y, z = halves[0], halves[1], halves[2]
+    count = len(x)
+    ahead, behind = np.full(count, -np.inf), np.full(count, -np.inf)
+    foremost, hindmost = np.zeros(count), np.zeros(count)  # numbers of points, as large as what they go with
+    for i in range(len(points)):
+        a, b, c, number = points[i, 0], points[i, 1], points[i, 2], float(i)
+        for d in range(count):
+            height = a * x[d] + b * y[d] + c * z[d]
+            foremost[d] = number if height > ahead[d] else foremost[d]
+            ahead[d] = max(ahead[d], height)
+        for d in range(count):
+            height = -(a * x[d] + b * y[d] + c * z[d])
+            hindmost[d] = number if height > behind[d] else hindmost[d]
+            behind[d] = max(behind[d], height)
+    heights, furthest = np.concatenate((ahead, behind)), np.concatenate((foremost, hindmost))
     mean = np.zeros(3)
-    for d in range(len(directions)):
-        x, y, z = directions[d]
-        furthest, first = -np.inf, 0
-        for i in range(len(points)):
-            height = points[i, 0] * x + points[i, 1] * y + points[i, 2] * z
-            if height > furthest:
-                furthest, first = height, i
-        reach[d] = max(reach[d], furthest)
-        mean += points[first] / len(directions)
+    for d in range(len(order)):
+        reach[d] = max(reach[d], heights[order[d]])
+        mean += points[int(furthest[order[d]])] / len(order)
     return mean
 
 
+@njit(cache=True, nogil=True)
+def _widen(points, low, high):
+    """Widens the box low to high, (3,) both, to hold (V, 3) points."""
+    for i in range(len(points)):
+        for j in range(3):
+            low[j], high[j] = min(low[j], points[i, j]), max(high[j], points[i, j])
+
+
+@njit(cache=True, nogil=True)
+def _largest_difference(a, b):
+    """The largest distance between the rows of (V, 3) a and b."""
+    most = 0.0
+    for i in range(len(a)):
+        x, y, z = a[i, 0] - b[i, 0], a[i, 1] - b[i, 1], a[i, 2] - b[i, 2]
+        most = max(most, x * x + y * y + z * z)
+    return np.sqrt(most)
+
+
 @cache
-def _directions() -> np.ndarray:
-    """(162, 3) unit vectors, evenly spread."""
-    return np.array(trimesh.creation.icosphere(subdivisions=2, radius=1.0).vertices)
+def _directions() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """((162, 3) unit vectors, evenly spread, each with its opposite; (3, 81) one of each two; (162,) where a vector is
+    among those 81 and, after them, their opposites)."""
+    every = np.array(trimesh.creation.icosphere(subdivisions=2, radius=1.0).vertices)
+    opposite = (every[:, None] == -every).all(axis=2).argmax(axis=1)
+    chosen = np.flatnonzero(np.arange(len(every)) < opposite)
+    order = np.empty(len(every), np.int64)
+    order[chosen], order[opposite[chosen]] = np.arange(len(chosen)), np.arange(len(chosen)) + len(chosen)
+    return every, np.ascontiguousarray(every[chosen].T), order
 
 
 _sweeps: WeakKeyDictionary[Mesh, dict[tuple[int, int], Sweep]] = WeakKeyDictionary()

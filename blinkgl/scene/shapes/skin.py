@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike
 
 from blinkgl.errors import AssetError
@@ -171,21 +172,26 @@ class Skin(Deformer):
         vectors = np.asarray(vectors, np.float64)
         return vectors if deltas is None else vectors + np.tensordot(weights, deltas, 1)
 
+    def _follow(self, points: np.ndarray, matrices: np.ndarray, place: float = 1.0) -> np.ndarray:
+        """(V, 3) the vertices' blends of (m, 4, 4) times (V, 3) points; place : 0 for directions."""
+        return _followed(
+            np.ascontiguousarray(points), self.joints, self.weights, np.ascontiguousarray(matrices[:, :3]), place
+        )
+
     def positions(self, mesh: Mesh, t_ns: int) -> np.ndarray:
-        points, blend = mesh.vertices, self._blend(self.matrices(t_ns)[0])
+        points = mesh.vertices
         if self.morphs is not None:
             points = self._morphed(points, self.morphs.positions, self.morphs.weights(t_ns)[0])
-        return np.einsum("vij,vj->vi", blend[:, :, :3], points) + blend[:, :, 3]
+        return self._follow(points, self.matrices(t_ns)[0])
 
     def velocity(self, mesh: Mesh, t_ns: int) -> np.ndarray:
         J, dJ = self.matrices(t_ns)
-        points, rates, blend = mesh.vertices, None, self._blend(dJ)
-        if self.morphs is not None:
-            weights, d_weights = self.morphs.weights(t_ns)
-            points = self._morphed(points, self.morphs.positions, weights)
-            rates = np.tensordot(d_weights, self.morphs.positions, 1)
-        out = np.einsum("vij,vj->vi", blend[:, :, :3], points) + blend[:, :, 3]
-        return out if rates is None else out + np.einsum("vij,vj->vi", self._blend(J)[:, :, :3], rates)
+        if self.morphs is None:
+            return self._follow(mesh.vertices, dJ)
+        weights, d_weights = self.morphs.weights(t_ns)
+        points = self._morphed(mesh.vertices, self.morphs.positions, weights)
+        rates = np.tensordot(d_weights, self.morphs.positions, 1)
+        return self._follow(points, dJ) + self._follow(rates, J, 0.0)
 
     def normals(self, mesh: Mesh, t_ns: int) -> np.ndarray:
         a, b, c = np.moveaxis(self._blend(self.matrices(t_ns)[0])[:, :, :3], 1, 0)
@@ -214,6 +220,25 @@ class Skin(Deformer):
         if self.morphs is not None:
             weights = self.morphs.weights(there_ns)[0] - self.morphs.weights(t_ns)[0]
         return self._packed(self.matrices(there_ns)[0] - self.matrices(t_ns)[0], weights)
+
+
+@njit(cache=True, nogil=True)
+def _followed(points, joints, weights, matrices, place):
+    """(V, 3) of (V, 3) points, (V, k) joints and weights, (m, 3, 4) matrices whose last columns count ``place``
+    times."""
+    out = np.empty((len(points), 3))
+    for v in range(len(points)):
+        x, y, z = points[v]
+        for i in range(3):
+            a = b = c = d = 0.0
+            for k in range(weights.shape[1]):
+                w, j = weights[v, k], joints[v, k]
+                a += w * matrices[j, i, 0]
+                b += w * matrices[j, i, 1]
+                c += w * matrices[j, i, 2]
+                d += w * matrices[j, i, 3]
+            out[v, i] = a * x + c * z + b * y + place * d
+    return out
 
 
 def joined(skins: Sequence[Skin]) -> Skin | None:

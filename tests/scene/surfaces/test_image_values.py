@@ -53,12 +53,21 @@ def test_a_panorama_s_size_has_to_stand_near_its_beginning():
             I._decode_hdr(b"#?RADIANCE\n\n" + text + b"\n", "a.hdr")
 
 
-@pytest.mark.parametrize("most, code", [(65535, 128), (256, 0), (255, 128)])
-def test_sixteen_bits_of_grey(most, code):
-    grey = np.full((2, 3), round(most * 128.4 / 255) if most != 256 else 100, np.uint16)
-    grey[0, 0] = most
-    image = I.decode_image(cv2.imencode(".png", grey)[1].tobytes(), None, "a.png")
-    assert image.shape == (2, 3, 3) and (image[1, 1] == code).all() and image[0, 0, 0] == (255 if most != 256 else 0)
+@pytest.mark.parametrize("kind", [".png", ".pgm", ".tiff"])
+def test_sixteen_bits_of_grey(kind):
+    grey = np.array([[65535, 33000, 0], [255, 256, 2570]], np.uint16)
+    image = I.decode_image(cv2.imencode(kind, grey)[1].tobytes(), None, "a")
+    assert image.shape == (2, 3, 3) and (image[..., 1] == [[255, 128, 0], [0, 0, 10]]).all()
+    dark = I.decode_image(cv2.imencode(kind, grey // 300)[1].tobytes(), None, "a")  # no number above 255
+    assert dark.max() == 0
+
+
+@pytest.mark.parametrize("dtype, value", [(np.float32, 0.5), (np.int32, 70_000), (np.int32, -1)])
+def test_grey_without_a_white_is_refused(dtype, value):
+    stream = io.BytesIO()
+    Image.fromarray(np.full((2, 3), value, dtype)).save(stream, "TIFF")
+    with pytest.raises(AssetError, match="a: the image does not say how bright .*32-bit (floats|integers)"):
+        I.decode_image(stream.getvalue(), None, "a")
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "BMP", "WEBP", "TIFF", "PPM", "GIF", "TGA"])

@@ -169,7 +169,9 @@ def predict(
     FWL is how much sharper the new window's events are when the flow takes them back to its start: above 1 it helps."""
     import numpy as np
 
+    from blinkgl.events.types import Events
     from eflow import infer
+    from eflow.doubts import doubts
     from eflow.methods.iwe import flow_warp_loss
     from eflow.metrics import frame_metrics
 
@@ -187,6 +189,8 @@ def predict(
         at = lambda ms: None if ms is None else first + round(ms * 1000)
         span, factor = round(window_ms * 1000), 1.0
         stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
+    for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
+        typer.echo(f"{events}: {line}", err=True)
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
     if method is not None:
         predictor = infer.MethodPredictor(method, file.height, file.width, empty=empty)

@@ -153,9 +153,7 @@ def recordings(root: Path) -> list[Path]:
 
 def of_recipe(recipe: str, count: int, workers: int) -> list[dict[str, float]]:
     """Statistics of ``count`` samples as training gets them."""
-    asked = dict(
-        recipe=recipe, online=True, workers=workers, samples=10, window_ms=WINDOW_MS, min_events=LEAST, max_flow=40
-    )
+    asked = dict(samples=10, window_ms=WINDOW_MS, min_events=LEAST, max_flow=40)
     rows = []
     with open_online(SourceConfig(recipe=recipe, online=True, workers=workers, **asked), 0) as source:
         for n in range(count):
@@ -285,23 +283,23 @@ def main() -> None:
     parser.add_argument("--motions", type=int, default=8, help="windows of a recording whose flow is estimated")
     parser.add_argument("--workers", type=int, default=1)
     a = parser.parse_args()
+    rows = of_recipe(a.recipe, a.samples, a.workers)
     found, said = {}, {}
     paths = recordings(a.recordings)
     for path in paths:
         alone = sum(p.parent == path.parent for p in paths) == 1
         name = (path.parent if alone else path.with_suffix("")).relative_to(a.recordings).as_posix()
         try:
-            rows, said[name] = of_recording(path, a.windows, a.motions)
+            seen, said[name] = of_recording(path, a.windows, a.motions)
         except BlinkGLError as error:
             print(f"left out: {error}")
             continue
-        if rows:
-            found[name] = rows
+        if seen:
+            found[name] = seen
         else:
             said[name] += f"; shorter than two windows of {WINDOW_MS[0]:g} ms, or none with {LEAST} events: left out"
     if not found:
         raise SystemExit(f"no recording below {a.recordings}")
-    rows = of_recipe(a.recipe, a.samples, a.workers)
     made = {key: column(rows, key) for key in STATISTICS}
     draw(made, found, a.picture)
     command = f"python -m blinkgl.tools.data_statistics {a.recipe} --recordings DIR --samples {a.samples}"

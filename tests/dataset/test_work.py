@@ -126,9 +126,9 @@ def test_a_report_of_many():
     assert totals.summary() == {
         "sequences": 3, "frames": 30, "events": 3000, "labels": 9, "simulated_s": 1.5, "total_s": 6.0,
         "seconds_per_simulated_second": 4.0, "events_per_second": 500.0, "render_s": 3.0, "write_s": 0.75,
-        "scene_s": 0.0, "read-back_s": 0.0, "events_s": 0.0, "preview_s": 0.0, "other_s": 2.25,
+        "scene_s": 0.0, "read-back_s": 0.0, "events_s": 0.0, "images_s": 0.0, "preview_s": 0.0, "other_s": 2.25,
     }  # fmt: skip
-    assert STAGES == ("scene", "render", "read-back", "events", "write", "preview")
+    assert STAGES == ("scene", "render", "read-back", "events", "images", "write", "preview")
     totals.seconds["render"] = 99.0
     assert totals.summary()["other_s"] == 0.0
 

@@ -235,7 +235,7 @@ class PausedPath:
 
     is_static = False
 
-    def __init__(self, path: PosePath, stop_ns: int, hold_ns: int, ramp_ns: int):
+    def __init__(self, path: KeyframePath, stop_ns: int, hold_ns: int, ramp_ns: int):
         self.path, self.t0_ns, self.t1_ns = path, path.t0_ns, path.t1_ns + int(hold_ns) + int(ramp_ns)
         self.stop_ns, self.hold_ns, self.ramp_ns = int(stop_ns), int(hold_ns), int(ramp_ns)
 

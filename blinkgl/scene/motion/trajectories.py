@@ -188,7 +188,7 @@ def _heading(rng, config: CameraMotion, start: np.ndarray) -> np.ndarray | None:
     return start[:3, 0] * math.cos(angle) + start[:3, 1] * math.sin(angle)
 
 
-def _pausing(rng, config: MotionConfig, path: PosePath, t0_ns: int, t1_ns: int) -> PosePath:
+def _pausing(rng, config: MotionConfig, path: SplinePath, t0_ns: int, t1_ns: int) -> PosePath:
     """The path, which now and then stops for a while. Nothing is drawn where nothing ever stops."""
     if config.pauses == 0 or rng.random() >= config.pauses:
         return path

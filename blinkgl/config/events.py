@@ -192,7 +192,7 @@ class EsimConfig(EmulatorConfig):
         return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
 
     @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
-    def _the_ratio_is_theirs(ratio, on, off):
+    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
         if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
             raise Refused(
                 "is not the ratio of the two thresholds that are given beside it",
@@ -324,7 +324,7 @@ class V2eConfig(EmulatorConfig):
         return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
 
     @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
-    def _the_ratio_is_theirs(ratio, on, off):
+    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
         if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
             raise Refused(
                 "is not the ratio of the two thresholds that are given beside it",

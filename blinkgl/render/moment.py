@@ -127,6 +127,8 @@ class Moment:
     @_once
     def inverse_depths(self) -> np.ndarray:
         """(m, 2) uint32: ``inverse_depths`` of guard.glsl, a uvec2 per item."""
+        if self.view.projection[3, 3]:  # parallel rays: w is 1 everywhere
+            return np.tile(inverse_depth_bits(np.ones(1), np.zeros(1), 1.0), (len(self._stage.items), 1))
         return inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
 
     @_once

@@ -64,6 +64,20 @@ def lamps_of(light: Light) -> tuple[Lamp, ...]:
     return tuple(sorted(lamps, key=lambda lamp: order.index(lamp.kind)))
 
 
+MAX_SHADOWS = 4
+"""Lamps whose shadows are drawn: a map, and a texture unit, each."""
+
+
+def shadowing(light: Light) -> tuple[int, ...]:
+    """Which of :func:`lamps_of` cast shadows: suns, then spot lights, the first of each."""
+    if light.shadows == "off":
+        return ()
+    lamps = lamps_of(light)
+    suns, spots = ([k for k, lamp in enumerate(lamps) if lamp.kind == kind] for kind in ("sun", "spot"))
+    suns = suns[:MAX_SHADOWS]
+    return (*suns, *spots[: MAX_SHADOWS - len(suns)])
+
+
 def quadric_of(light: Light) -> np.ndarray:
     """(3, 4, 4) what comes from all around, per channel, for :func:`ambient`; world axes."""
     one = np.zeros((4, 4))
@@ -119,6 +133,8 @@ def make_light(config: LightConfig, rng: np.random.Generator | None = None, furt
         config.sky_color,
         math.radians(config.sun_size),
         (*(_lamp(one) for one in config.lights), *further),
+        shadows=config.shadows,
+        shadow_size=config.shadow_size,
     )
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import DrawItem
     from blinkgl.scene.types import PosePath, Scene
 
+_TEXTURE_FROM_CLIP = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 KEPT = 4
 """Moments in memory: a label looks at its own time and at those of its neighbours, which look at it."""
 
@@ -108,6 +109,12 @@ class Moment:
     def mvp_columns(self) -> np.ndarray:
         """(n, 4, 4) float32 the same as GLSL has it, column by column."""
         return np.ascontiguousarray(self.mvp.swapaxes(1, 2), np.float32)
+
+    @_once
+    def texture_from_obj(self) -> np.ndarray:
+        """(n, 4, 4) float32, row by row, from the object's axes to coordinates and depth in a picture of this moment that
+        is a texture, [0, 1] each, times w."""
+        return np.ascontiguousarray(_TEXTURE_FROM_CLIP @ self.mvp, np.float32)
 
     @_once
     def rates(self) -> Rates:

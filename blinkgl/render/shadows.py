@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 CV_FROM_LAMP = np.diag([1.0, -1.0, -1.0, 1.0])
 """A lamp shines along its -z axis, a camera looks along its z axis with y down."""
-FROM_CLIP = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-"""From clip space to texture coordinates and depth, [0, 1] each."""
 _TIMES = 129  # at which the places of what moves are looked up; in between its speed bounds them
 _SPARE = 4  # texels on every side of a map
 _NEAR = 0.02  # world units in front of a spot light in which nothing casts
@@ -137,9 +135,9 @@ def view_of(lamp: Lamp, box: Box | None, size: int, pose: np.ndarray) -> tuple[V
     return View(camera, camera.clip_from_cam(), np.zeros((1, 3))), T
 
 
-def scale_of(lamp: Lamp, view: View) -> tuple[float, float, float, float]:
+def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, float, float]:
     """``shadow_scale`` of shadows.glsl."""
-    camera = view.camera
+    camera = view_of(lamp, box, size, np.eye(4))[0].camera
     if isinstance(camera, Parallel):
         return 2 * max(camera.half_x, camera.half_y) / camera.size, 0.0, 1 / camera.depth, lamp.size
     return 0.0, 1 / camera.fx, 0.0, lamp.size

@@ -113,7 +113,7 @@ ILLUMINANT irradiance(vec3 normal)
 #ifdef SHADOW_SUNS
         if (i < SHADOW_SUNS)
         {
-            shadow_share[i] = facing > 0.0 ? shadow(i, local, n, vec3(0.0)) : 1.0; // not looked up where it does not shine
+            shadow_share[i] = facing > 0.0 ? shadow(i, local, n, facing, vec3(0.0)) : 1.0; // not looked up where it does not shine
             facing *= shadow_share[i];
         }
 #endif
@@ -131,7 +131,7 @@ ILLUMINANT irradiance(vec3 normal)
         {
             int map = SHADOWS - SHADOW_SPOTS + k;
             bool shines = facing > 0.0 && beam.strength != ILLUMINANT(0.0);
-            shadow_share[map] = shines ? shadow(map, local, n, lamp_place[i]) : 1.0;
+            shadow_share[map] = shines ? shadow(map, local, n, facing, lamp_place[i]) : 1.0;
             facing *= shadow_share[map];
         }
 #endif

@@ -78,45 +78,50 @@ float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, v
     }
     return lit / float(TAPS);
 }
-#else
-float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, vec4 scale)
-{
-    vec2 one = 1.0 / vec2(textureSize(map, 0));
-    float towards = min(dot(abs(slope), one) + SPARE * texel * unit, FARTHEST * texel * unit);
-    return texture(map, vec3(at.xy, max(at.z + towards, 0.0))); // behind all that casts: 0, as where nothing does
-}
 #endif
 
-// Of map k for the surface at ``at`` with unit normal n. lamp: where it is, of a spot light. Beside a map nothing is in
+// Of map k for the surface at ``at`` with unit normal n. facing: n.l > 0. lamp: where it is, of a spot light. Beside a map nothing is in
 // the way: its edge is empty, and holds for what lies outside.
-float shadow(int k, vec3 at, vec3 n, vec3 lamp)
+float shadow(int k, vec3 at, vec3 n, float facing, vec3 lamp)
 {
     vec4 scale = shadow_scale[k], p = vec4(at, 1.0);
     vec3 c = vec3(dot(shadow_rows[k][0], p), dot(shadow_rows[k][1], p), dot(shadow_rows[k][2], p));
-    float texel = scale.x, unit = scale.z, through = dot(shadow_plane[k][2], n);
+    float texel = scale.x, unit = scale.z;
 #ifdef SHADOW_SPOTS
+    float w = 1.0;
     if (scale.z == 0.0) // a spot light's: perspective; depth is near / Z, which is affine in its picture, too
     {
-        float w = max(dot(shadow_rows[k][3], p), 1e-6);
+        w = max(dot(shadow_rows[k][3], p), 1e-6);
         c /= w;
         texel = scale.y * w;
         unit = c.z / w;
-        through = dot(n, at - lamp) / (w * w);
     }
+#endif
+#ifdef SOFT
+    float through = dot(shadow_plane[k][2], n);
+#ifdef SHADOW_SPOTS
+    through = scale.z == 0.0 ? dot(n, at - lamp) / (w * w) : through;
 #endif
     through = abs(through) > 1e-4 ? through : 1e-4;
     vec2 slope = vec2(dot(shadow_plane[k][0], n), dot(shadow_plane[k][1], n)) * (unit / through);
+#define SEEN(map) seen_share(map, c, slope, unit, texel, scale)
+#else
+    // The four texels that an edge is smoothed over are up to one away in x and y, together at most sqrt(2) slopes.
+    float slant = sqrt(max(1.0 - facing * facing, 0.0)) / facing;
+    c.z = max(c.z + min(1.5 * slant + SPARE, FARTHEST) * texel * unit, 0.0); // 0: behind all that casts
+#define SEEN(map) texture(map, c)
+#endif
 #if SHADOWS > 3
     if (k == 3)
-        return seen_share(shadow_map_3, c, slope, unit, texel, scale);
+        return SEEN(shadow_map_3);
 #endif
 #if SHADOWS > 2
     if (k == 2)
-        return seen_share(shadow_map_2, c, slope, unit, texel, scale);
+        return SEEN(shadow_map_2);
 #endif
 #if SHADOWS > 1
     if (k == 1)
-        return seen_share(shadow_map_1, c, slope, unit, texel, scale);
+        return SEEN(shadow_map_1);
 #endif
-    return seen_share(shadow_map_0, c, slope, unit, texel, scale);
+    return SEEN(shadow_map_0);
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -11,8 +12,8 @@ from moderngl import LINEAR
 
 from blinkgl.render.canvas import DEPTH_BUFFER
 from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
-from blinkgl.render.shadows import FROM_CLIP, Box, boxes, planes_of, scale_of, view_of
-from blinkgl.scene.lights import lamps_of
+from blinkgl.render.shadows import Box, boxes, planes_of, scale_of, view_of
+from blinkgl.scene.lights import MAX_SHADOWS, lamps_of
 from blinkgl.scene.motion.paths import StaticPath
 from blinkgl.scene.types import Lamp
 
@@ -77,22 +78,31 @@ class Shaded(ScenePass):
 
     @property
     def inputs(self) -> tuple[Input, ...]:
-        return tuple(Input(f"shadow_map_{k}", map_, DEPTH_BUFFER) for k, map_ in enumerate(self.shadows))
+        return tuple(Input(name, map_, DEPTH_BUFFER) for name, map_ in zip(_SAMPLERS, self.shadows))
 
     def bind(self, uniforms: Uniforms, shot: Shot) -> None:
-        for unit, (map_, one) in enumerate(zip(self.shadows, self.inputs), 1):
-            if one.sampler in uniforms:
-                texture = shot.inputs[one.sampler].texture(one.output)
+        for unit, (name, map_) in enumerate(zip(_SAMPLERS, self.shadows), 1):
+            if name in uniforms:
+                texture = shot.inputs[name].texture(DEPTH_BUFFER)
                 if not map_.soft and texture.compare_func != ">=":
                     texture.compare_func, texture.filter = ">=", (LINEAR, LINEAR)
                 texture.use(unit)
-                uniforms[one.sampler].value = unit
+                uniforms[name].value = unit
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         if "shadow_rows" in uniforms:
-            seen = [shot.inputs[one.sampler].moment for one in self.inputs]
-            rows = np.stack([FROM_CLIP @ moment.mvp[item.object_index] for moment in seen])
-            scales = np.array([scale_of(map_.lamp, moment.view) for map_, moment in zip(self.shadows, seen)])
-            uniforms["shadow_rows"].write(rows.astype(np.float32).tobytes())
-            uniforms["shadow_plane"].write(planes_of(rows, scales).astype(np.float32).tobytes())
-            uniforms["shadow_scale"].write(scales.astype(np.float32).tobytes())
+            seen = [shot.inputs[name].moment for name, _ in zip(_SAMPLERS, self.shadows)]
+            rows = np.stack([moment.texture_from_obj[item.object_index] for moment in seen])
+            uniforms["shadow_rows"].write(rows.tobytes())
+            uniforms["shadow_scale"].write(_scales(self.shadows).tobytes())
+            if "shadow_plane" in uniforms:
+                uniforms["shadow_plane"].write(planes_of(rows, _scales(self.shadows)).astype(np.float32).tobytes())
+
+
+_SAMPLERS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))
+
+
+@lru_cache(maxsize=64)
+def _scales(maps: tuple[ShadowMap, ...]) -> np.ndarray:
+    """(maps, 4) float32, ``shadow_scale`` of shadows.glsl."""
+    return np.array([scale_of(one.lamp, one.box, one.texels) for one in maps], np.float32)

@@ -30,11 +30,11 @@ from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.readout import ReadoutConfig, drain_us
+from blinkgl.config.recipes import with_recipes
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import (
-    ReadoutConfig,
     SensorConfig,
-    drain_us,
     fill_sensor,
     known_sensor,
     sensor_names,
@@ -271,7 +271,9 @@ class SequenceConfig(Config):
     )
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
     readout: ReadoutConfig | None = Field(
-        None, description="the sensor's bus: events above its rate are late, then lost; null: no limit"
+        None,
+        description="what is behind the pixels: their defects and latency, the bus (events above its rate are late, "
+        "then lost) and its clock, filters; null: nothing",
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
     images: ImagesConfig | None = Field(
@@ -456,7 +458,7 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
     base = Path(path).parent
-    tree = with_sensors(apply_overrides(_with_scenes(read_table(path), base), overrides), base)
+    tree = with_recipes(with_sensors(apply_overrides(_with_scenes(read_table(path), base), overrides), base))
     if seed is not None:
         tree["seed"] = seed
     if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses

@@ -469,7 +469,9 @@ def _noisy(config: SequenceConfig) -> bool:
         "k3",
         "k6",
     )
-    return any(getattr(config.events, key, 0) > 0 for key in drawn)
+    readout = config.readout
+    behind = readout is not None and (readout.pixels is not None or readout.latency is not None)
+    return behind or any(getattr(config.events, key, 0) > 0 for key in drawn)
 
 
 def _against_run(root: Path, folders: list[Path], known: dict[str, _Known], result: Verification) -> list[str]:

@@ -231,6 +231,11 @@ class Simulation(ABC):
         return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
 
     @property
+    def filtered(self) -> int | None:
+        """Events so far that the filters on the camera have dropped; None without filters."""
+        return None if self.camera is None else self.camera.filtered
+
+    @property
     def causes(self) -> dict[str, int]:
         """Events so far by what caused them; empty unless ``events.causes`` asks for it."""
         asked = self.camera is not None and self.camera.emulator.causes

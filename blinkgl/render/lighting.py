@@ -26,7 +26,7 @@ EXAMPLES: tuple[dict[str, Any], ...] = (
     {"LIGHTS": 1, "SUNS": 1, "AMBIENT": 1, "SHADOWS": 1, "SHADOW_SUNS": 1},
     {
         "LIGHTS": 1, "SUNS": 2, "LAMPS": 3, "SPOTS": 2, "AMBIENT": 1,
-        "SHADOWS": 4, "SHADOW_SUNS": 2, "SHADOW_SPOTS": 2, "SOFT": 1,
+        "SHADOWS": 2, "SHADOW_SUNS": 1, "SHADOW_SPOTS": 1, "SOFT": 1,
     },
 )  # fmt: skip
 """Variants for which a program of a pass that is lit has to compile, besides the plain light's; HUED comes on top."""

@@ -112,8 +112,8 @@ class Moment:
 
     @_once
     def texture_from_obj(self) -> np.ndarray:
-        """(n, 4, 4) float32, row by row, from the object's axes to coordinates and depth in a picture of this moment that
-        is a texture, [0, 1] each, times w."""
+        """(n, 4, 4) float32, row by row, from the object's axes to coordinates and depth in a picture of this moment
+        that is a texture, [0, 1] each, times w."""
         return np.ascontiguousarray(_TEXTURE_FROM_CLIP @ self.mvp, np.float32)
 
     @_once

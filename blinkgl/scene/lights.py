@@ -64,8 +64,8 @@ def lamps_of(light: Light) -> tuple[Lamp, ...]:
     return tuple(sorted(lamps, key=lambda lamp: order.index(lamp.kind)))
 
 
-MAX_SHADOWS = 4
-"""Lamps whose shadows are drawn: a map, and a texture unit, each."""
+MAX_SHADOWS, MAX_SOFT = 4, 2
+"""Lamps whose shadows are drawn, and of soft ones, whose programs are long: a map, and a texture unit, each."""
 
 
 def shadowing(light: Light) -> tuple[int, ...]:
@@ -74,8 +74,9 @@ def shadowing(light: Light) -> tuple[int, ...]:
         return ()
     lamps = lamps_of(light)
     suns, spots = ([k for k, lamp in enumerate(lamps) if lamp.kind == kind] for kind in ("sun", "spot"))
-    suns = suns[:MAX_SHADOWS]
-    return (*suns, *spots[: MAX_SHADOWS - len(suns)])
+    most = MAX_SOFT if light.shadows == "soft" else MAX_SHADOWS
+    suns = suns[:most]
+    return (*suns, *spots[: most - len(suns)])
 
 
 def quadric_of(light: Light) -> np.ndarray:

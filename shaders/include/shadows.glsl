@@ -7,7 +7,9 @@
 // much as the surface's own plane changes over the texels that are looked at, so that no surface is in its own shadow;
 // it is not moved aside, so that edges stay where they are.
 uniform mat4 shadow_rows[SHADOWS];       // object frame to the map, by rows: x, y and depth in [0, 1], times w; and w
+#ifdef SOFT
 uniform mat3 shadow_plane[SHADOWS];      // by rows: what makes of a normal the slope of its plane's depth in the map
+#endif
 uniform vec4 shadow_scale[SHADOWS];      // width of a texel: .x + .y w, world units; depth per world unit: .z (suns);
                                          // what softens: a sun's angle, rad, or a lamp's diameter, world units: .w
 #ifdef SOFT

@@ -317,8 +317,8 @@ class LightConfig(Config):
     )
     shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
         "off",
-        description="of objects and walls, cast by the sun, further suns and spot lights, four at most (soft: two); hard: "
-        "edges are as wide as a texel of the shadow map; soft: by the size of the light, up to 48 texels",
+        description="of objects and walls, cast by the sun, further suns and spot lights, four at most (soft: two); "
+        "hard: edges are as wide as a texel of the shadow map; soft: by the size of the light, up to 48 texels",
     )
     shadow_size: int = Field(1024, ge=64, le=8192, description="texels a side of each shadow map")
     unlit: bool = Field(False, description="radiance = albedo on every surface")

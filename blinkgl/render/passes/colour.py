@@ -25,7 +25,7 @@ class Colour(Shaded):
     outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
 
     def background(self, scene: Scene) -> tuple[float, ...]:
-        return (scene.background,) * 3
+        return (scene.backdrop,) * 3
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         super().set(painter, uniforms, item, shot)

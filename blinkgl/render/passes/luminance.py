@@ -22,7 +22,7 @@ class _Luminance(Shaded):
     one_channel: ClassVar[bool] = True
 
     def background(self, scene: Scene) -> tuple[float, ...]:
-        return scene.background, 0.0
+        return scene.backdrop, 0.0
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         super().set(painter, uniforms, item, shot)

@@ -192,7 +192,8 @@ def test_noise_of_a_still_scene_comes_back(tmp_path):
 )
 def test_one_line_and_nothing_written(tmp_path, capsys, what, said):
     camera, file = files(tmp_path)
-    extra = {"no frames": [], "unknown key": ["--set", "speed=3"], "ratio": ["--set", "threshold_ratio=1.1"], "interpolation": ["--interpolate", "cubic"],
+    extra = {"no frames": [], "unknown key": ["--set", "speed=3"],
+             "ratio": ["--set", "threshold_ratio=1.1"], "interpolation": ["--interpolate", "cubic"],
              "still and frames": ["--still"]}.get(what, [])  # fmt: skip
     stored = dict(np.load(file))
     if what == "other size":

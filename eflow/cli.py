@@ -76,8 +76,21 @@ def train(
 @app.command()
 def evaluate(
     checkpoint: Answer,
-    dataset: Annotated[str, typer.Argument(help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences.")],
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences; or a recipe (.yaml), whose groups of split "
+            "test are rendered for it."
+        ),
+    ],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
+    by_density: Annotated[
+        bool, typer.Option("--by-density", help="How long the flow is where events are few, and where they are many.")
+    ] = False,
+    window_ms: Annotated[
+        str | None,
+        typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
+    ] = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
@@ -99,8 +112,14 @@ def evaluate(
     if model is None:
         model = _model(checkpoint, device, raw, precision, iterations)
         precision = _precision(model, precision)
-    source = open_source(dataset, _format(format), dt=dt)
     console = plain_console(stderr=True)
+    if dataset.endswith((".yaml", ".yml")):
+        with console.status("rendering"):
+            source = _rendered(dataset, window_ms, limit)
+    elif window_ms is not None:
+        raise ConfigError("only of a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
+    else:
+        source = open_source(dataset, _format(format), dt=dt)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -112,7 +131,7 @@ def evaluate(
             limit=limit,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
-    show(result)
+    show(result, by_density=by_density)
     if out:
         typer.echo(f"written: {out}/results.json")
 
@@ -123,8 +142,11 @@ def predict(
     events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
     window_ms: Annotated[
-        float, typer.Option("--window-ms", min=0.001, help="Δ: length of each of the two windows.")
-    ] = 100.0,
+        str,
+        typer.Option(
+            "--window-ms", help="Δ: length of each of the two windows; auto: as things move by about 5 px in it."
+        ),
+    ] = "100",
     start_ms: Annotated[float | None, typer.Option("--start-ms", help="From this time after the first event.")] = None,
     end_ms: Annotated[float | None, typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
     whole: Annotated[
@@ -135,6 +157,7 @@ def predict(
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
+    video: Annotated[str | None, typer.Option(help="Also a video of events and flow, .mp4.")] = None,
     warm_start: Annotated[
         bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")
     ] = False,
@@ -148,26 +171,24 @@ def predict(
     """Flow from any event file, by a network or by a method that needs no training.
 
     FWL is how much sharper the new window's events are when the flow takes them back to its start: above 1 it helps."""
+    import contextlib
+
     import numpy as np
 
+    from blinkgl.events.types import Events
     from eflow import infer
+    from eflow.doubts import doubts
     from eflow.methods.iwe import flow_warp_loss
     from eflow.metrics import frame_metrics
+    from eflow.pictures import FlowVideo, events_of
 
     _one_of("--empty", empty, ("error", "zero"))
+    milliseconds = _milliseconds(window_ms)
     method = _method(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     model = None if method is not None else _model(checkpoint, device, raw, precision, iterations)
     file = infer.open_sized(events, _size(size))
-    if whole:
-        window, factor = infer.whole_file(file)
-        stream, span = [window], window.new.t1 - window.old.t0
-    else:
-        first = next((int(c.t[0]) for c in file.chunks()), None)
-        if first is None:
-            raise BlinkGLError("holds no events", where=events)
-        at = lambda ms: None if ms is None else first + round(ms * 1000)
-        span, factor = round(window_ms * 1000), 1.0
-        stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
+    for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
+        typer.echo(f"{events}: {line}", err=True)
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
     if method is not None:
         predictor = infer.MethodPredictor(method, file.height, file.width, empty=empty)
@@ -180,11 +201,22 @@ def predict(
             precision=_precision(model, precision),
             empty=empty,
         )
-    writer = infer.FlowWriter(out, npy=npy) if out else None
+    if whole:
+        window, factor = infer.whole_file(file)
+        stream, span = [window], window.new.t1 - window.old.t0
+    else:
+        first = next((int(c.t[0]) for c in file.chunks()), None)
+        if first is None:
+            raise BlinkGLError("holds no events", where=events)
+        at = lambda ms: None if ms is None else first + round(ms * 1000)
+        span, factor = infer.likely_span(file, predictor) if milliseconds is None else round(milliseconds * 1000), 1.0
+        if milliseconds is None:
+            typer.echo(f"windows of {span / 1000:g} ms")
+        stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
     count = 0
-    if writer:
-        writer.__enter__()
-    try:
+    with contextlib.ExitStack() as opened:
+        writer = opened.enter_context(infer.FlowWriter(out, npy=npy)) if out else None
+        shown = opened.enter_context(FlowVideo(video, file.height, file.width, _fps(span))) if video else None
         for window in stream:
             flow, tensor = predictor(window)
             sharper = flow_warp_loss(window.new, flow)
@@ -209,19 +241,35 @@ def predict(
             typer.echo(line)
             if writer:
                 writer.add(window, flow, tensor, gt)
+            if shown:
+                caption = f"{(window.t_us - window.old.t0) / 1000:g} ms at {window.t_us / 1e6:.3f} s"
+                shown.add(caption, events_of(tensor), flow)
         if not count:
             raise BlinkGLError(
                 f"shorter than two windows of {span / 1000:g} ms",
                 where=events,
                 accepted="a smaller --window-ms, or --whole",
             )
-    except BaseException as error:
-        if writer:
-            writer.__exit__(type(error), error, None)
-        raise
-    if writer:
-        writer.__exit__(None, None, None)
-        typer.echo(f"written: {out}")
+    for path in filter(None, (out, video)):
+        typer.echo(f"written: {path}")
+
+
+def _fps(span_us: int) -> float:
+    """Windows a second of video: as fast as it happened, but no more than 20."""
+    return min(20.0, 1e6 / span_us)
+
+
+def _milliseconds(text: str) -> float | None:
+    """Of --window-ms; None for "auto"."""
+    if text == "auto":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.001 <= value < 1e9:
+        raise ConfigError("not a length", where="--window-ms", value=text, accepted="milliseconds, or auto")
+    return value
 
 
 @app.command()
@@ -387,6 +435,25 @@ def _format(name: str) -> str:
 def _one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
     if value not in accepted:
         raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
+
+
+def _rendered(recipe: str, window_ms: str | None, limit: int | None):
+    """Samples of a recipe, held in memory."""
+    from blinkgl.config.base import validate
+    from eflow.config import SourceConfig
+    from eflow.data.online import held
+
+    tree: dict = {"recipe": recipe, "online": True, "samples": 4, "min_events": 40, "max_flow": 40}
+    if window_ms is not None:
+        ends = window_ms.split("-")
+        try:
+            tree["window_ms"] = tuple(float(end) for end in (ends if len(ends) > 1 else 2 * ends))
+            validate(SourceConfig, tree)
+        except (ValueError, ConfigError):
+            raise ConfigError(
+                "not lengths of windows", where="--window-ms", value=window_ms, accepted="LOW-HIGH in ms, such as 5-100"
+            ) from None
+    return held(validate(SourceConfig, tree), limit or 128)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

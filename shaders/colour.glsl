@@ -8,7 +8,7 @@
 #ifdef TEXTURED
 #define NEEDS_UV
 #endif
-#ifdef LAMPS
+#if defined(LAMPS) || defined(SHADOWS)
 #define NEEDS_LOCAL
 #endif
 #include "vertex.glsl"
@@ -24,6 +24,9 @@ uniform sampler2D albedo;
 #endif
 #ifdef LIT
 #include "light.glsl"
+#endif
+#ifdef FOG
+#include "fog.glsl"
 #endif
 #include "guard.glsl"
 
@@ -54,6 +57,9 @@ void main()
 #endif
 #ifdef LIT
     radiance *= light;
+#endif
+#ifdef FOG
+    radiance = in_fog(radiance);
 #endif
     colour = vec4(radiance, 1.0);
     drop_artefact();

@@ -7,8 +7,11 @@ table of both, in :mod:`blinkgl.events.table`.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -34,6 +37,47 @@ _CAUSES = Field(
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
+class Fitted(NamedTuple):
+    """Ends of what a calibration tries for a key, more than 0; it goes in steps of a ratio. The lower end of a noise is
+    as good as none."""
+
+    low: float
+    high: float
+
+
+_ESIM_FITTED = {
+    "contrast_threshold": Fitted(0.05, 2.0),
+    "contrast_threshold_off": Fitted(0.05, 2.0),
+    "threshold_sigma": Fitted(0.003, 0.5),
+    "log_eps": Fitted(1e-4, 1.0),
+    "refractory_us": Fitted(10.0, 20_000.0),
+}
+
+_V2E_FITTED = {
+    "contrast_threshold": Fitted(0.05, 2.0),
+    "contrast_threshold_off": Fitted(0.05, 2.0),
+    "threshold_sigma": Fitted(0.003, 0.5),
+    "full_scale": Fitted(20.0, 3000.0),
+    "cutoff_hz": Fitted(3.0, 3000.0),
+    "leak_rate_hz": Fitted(1e-3, 30.0),
+    "leak_cov_decades": Fitted(0.02, 1.5),
+    "shot_noise_rate_hz": Fitted(1e-3, 100.0),
+    "refractory_us": Fitted(10.0, 20_000.0),
+    "hot_pixel_fraction": Fitted(1e-5, 0.05),
+    "hot_pixel_rate_hz": Fitted(1.0, 10_000.0),
+}
+
+_VOLTMETER_FITTED = {
+    "k1": Fitted(0.5, 20.0),
+    "k2": Fitted(1.0, 300.0),
+    "k3": Fitted(1e-6, 0.1),
+    "k4": Fitted(1e-9, 1e-5),
+    "k5": Fitted(1e-10, 1e-6),
+    "k6": Fitted(1e-6, 1e-2),
+    "refractory_us": Fitted(10.0, 20_000.0),
+}
+
+
 class EmulatorConfig(Family):
     """The configuration of any emulator; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its
     name, ``emulator: Literal["..."] = "..."``, takes no argument without a default, and says what stands here."""
@@ -48,6 +92,8 @@ class EmulatorConfig(Family):
 
     reconstructions: ClassVar[tuple[str, ...]]
     """Paths between frames that the emulator can follow; "linear" is one of them."""
+    fitted: ClassVar[Mapping[str, Fitted]] = MappingProxyType({})
+    """Keys that `blinkgl calibrate` finds from a recording."""
 
     @classmethod
     @abstractmethod
@@ -58,6 +104,20 @@ class EmulatorConfig(Family):
 def followers(reconstruction: str) -> list[str]:
     """Names of the emulators that can follow this path between frames."""
     return [kind for kind, model in EmulatorConfig.members.models.items() if reconstruction in model.reconstructions]
+
+
+def _with_both_thresholds(data: dict[str, Any], default: float) -> dict[str, Any]:
+    """The threshold that is not given, from the one that is and ``threshold_ratio``."""
+    ratio, off = data.get("threshold_ratio"), data.get("contrast_threshold_off")
+    if ratio is None or (off is not None and "contrast_threshold" in data):
+        return data
+    given, other = "contrast_threshold", "contrast_threshold_off"
+    if off is not None:
+        given, other = other, given
+    try:
+        return {**data, other: float(data.get(given, default)) * float(ratio)}
+    except (TypeError, ValueError, OverflowError):
+        return data
 
 
 def _pixel(sensor: SensorConfig) -> dict[str, Any]:
@@ -73,6 +133,7 @@ class EsimConfig(EmulatorConfig):
     """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
 
     reconstructions = ("linear", "pchip", "hermite")
+    fitted = _ESIM_FITTED
     emulator: Literal["esim"] = "esim"
     contrast_threshold: float = Field(
         0.2,
@@ -81,6 +142,13 @@ class EsimConfig(EmulatorConfig):
     )
     contrast_threshold_off: float | None = Field(
         None, **_THRESHOLD, description="C-, for OFF events; default: equal to contrast_threshold."
+    )
+    threshold_ratio: float | None = Field(
+        None,
+        ge=0.01,
+        le=100,
+        description="OFF threshold over contrast_threshold, instead of contrast_threshold_off; or, where only that is "
+        "given, ON over OFF.",
     )
     threshold_sigma: float = Field(
         0.021,
@@ -120,6 +188,20 @@ class EsimConfig(EmulatorConfig):
     causes: bool = _CAUSES
 
     @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
+
+    @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
+    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
+        if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
+            raise Refused(
+                "is not the ratio of the two thresholds that are given beside it",
+                where="threshold_ratio",
+                value=ratio,
+                accepted=f"one of them, or {off / on:.6g}",
+            )
+
+    @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
         return _pixel(sensor)
 
@@ -152,12 +234,20 @@ class V2eConfig(EmulatorConfig):
 
     reconstructions = ("linear",)
     presets = V2E_PRESETS
+    fitted = _V2E_FITTED
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
     )
     contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units (v2e: 0.2).")
     contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="OFF threshold; default: equal.")
+    threshold_ratio: float | None = Field(
+        None,
+        ge=0.01,
+        le=100,
+        description="OFF threshold over contrast_threshold, instead of contrast_threshold_off; or, where only that is "
+        "given, ON over OFF.",
+    )
     threshold_sigma: float = Field(
         0.03,
         ge=0,
@@ -230,6 +320,20 @@ class V2eConfig(EmulatorConfig):
             raise Refused("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
 
     @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
+
+    @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
+    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
+        if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
+            raise Refused(
+                "is not the ratio of the two thresholds that are given beside it",
+                where="threshold_ratio",
+                value=ratio,
+                accepted=f"one of them, or {off / on:.6g}",
+            )
+
+    @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
         return {
             **_pixel(sensor),
@@ -251,6 +355,7 @@ class VoltmeterConfig(EmulatorConfig):
 
     reconstructions = ("linear",)
     presets = VOLTMETER_PRESETS
+    fitted = _VOLTMETER_FITTED
     emulator: Literal["voltmeter"] = "voltmeter"
     preset: Literal["DVS346", "DVS240"] = Field(
         "DVS346", description="Camera whose calibrated k1...k6 are the defaults."

@@ -315,6 +315,12 @@ class LightConfig(Config):
         None,
         description="a panorama that lights the scene; null: the sun and the sky shine. In random worlds: sky.lights",
     )
+    shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
+        "off",
+        description="of objects and walls, cast by the sun, further suns and spot lights, four at most (soft: two); "
+        "hard: edges are as wide as a texel of the shadow map; soft: by the size of the light, up to 48 texels",
+    )
+    shadow_size: int = Field(1024, ge=64, le=8192, description="texels a side of each shadow map")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
     def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
@@ -329,9 +335,9 @@ class LightConfig(Config):
         if (given := len([*lights])) > MAX_LIGHTS:
             raise Refused("too many lights", where="lights", value=given, accepted=f"at most {MAX_LIGHTS}")
 
-    @rule("unlit", "#lights", "?environment")
-    def _lit(unlit, lights, environment):
-        for where, given in (("lights", [*lights]), ("environment", environment)):
+    @rule("unlit", "#lights", "?environment", "shadows")
+    def _lit(unlit, lights, environment, shadows):
+        for where, given in (("lights", [*lights]), ("environment", environment), ("shadows", shadows != "off")):
             if unlit and given:
                 raise Refused("nothing is lit by them", where=where, value="unlit: true", accepted="unlit: false")
 
@@ -370,6 +376,16 @@ class RandomLightsConfig(Config):
             raise Refused("out of range", where="angle", value=list(angle), accepted="0.5 to 170 degrees")
 
 
+class FogConfig(Config):
+    """A medium that swallows light and sends its own, for event frames and images alike."""
+
+    density: float = Field(gt=0, le=1e6, description="per world unit: light from 1 / density away has faded to 37 %")
+    radiance: Radiance = Field(0.7, description="linear radiance of fog alone, which is what the background becomes")
+
+
+FOG = Field(None, description="null: clear air")
+
+
 class RandomSceneConfig(Config):
     """A random world, as in the paper: objects from a pool between sky and ground."""
 
@@ -384,6 +400,7 @@ class RandomSceneConfig(Config):
         Field(WallsConfig(), description="true: four walls")
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     lights: RandomLightsConfig | None = Field(
         None, description="null: none but those of light.lights; {} is enough for one to three point and spot lights"
     )
@@ -674,6 +691,7 @@ class ExplicitSceneConfig(Config):
         "[physics]",
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
 
@@ -728,6 +746,7 @@ class FileSceneConfig(Config):
         0, description="name or index of the animation played, at the file's own times; null: none"
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     lights: Literal["config", "file"] = Field(
         "config",
         description="file: the file's own lights (KHR_lights_punctual) shine in the place of light.sun, beside "

@@ -194,9 +194,16 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         "light": f"{_shining(scene.light)} on {lit} of {len(parts)} parts, the others unlit"
         if lit
         else "none: every surface is unlit",
+        **_fog(scene),
         "notes": "; ".join(scene.log) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
+
+
+def _fog(scene: Scene) -> dict[str, str]:
+    if scene.fog is None:
+        return {}
+    return {"fog": f"{scene.fog.density:g} per unit, radiance {scene.fog.radiance:g}, in event frames and images"}
 
 
 def _shining(light: Light) -> str:
@@ -208,6 +215,10 @@ def _shining(light: Light) -> str:
     names = [f"{count[kind]} {word}{'s' * (count[kind] > 1)}" for kind, word in words.items() if count[kind]]
     if light.sky:
         names.append("sky")
+    if light.around is not None:
+        names.append("panorama")
+    if light.shadows != "off":
+        names.append(f"{light.shadows} shadows")
     return ", ".join(names or ["nothing"]) + (", coloured" if is_coloured(light) else "")
 
 
@@ -411,6 +422,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         add("anisotropic filtering", "render.anisotropy: 1")
     if all(p.material.unlit for o in scene.objects for p in o.parts):
         add("light", "every material is unlit: no normals in the vertex stream, no light in the shader")
+    if scene.fog is None:
+        add("fog", "scene.fog: null")
     if config.timeline.kind == "uniform":
         add("velocity pass", "timeline: uniform does not look at motion")
     if config.timeline.reconstruction != "hermite":
@@ -418,4 +431,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     for name, value in config.events.model_dump().items():
         if value in (0, 0.0, False) and name != "seed":
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
-    add("shadows, inter-reflection", "BlinkGL does not model them")
+    if config.scene.light.shadows == "off":
+        add("shadows", "scene.light.shadows: off")
+    elif config.timeline.kind in ("brightness", "budget") or config.timeline.reconstruction == "hermite":
+        add("the motion of shadows in rates of change", "dL/dt is that of the lit share of a surface: no edge is in it")
+    add("inter-reflection", "BlinkGL does not model it")

@@ -178,6 +178,7 @@ class Light:
     lamps : what shines beside them.
     around : quadric of what else comes from all around (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers; None:
         nothing.
+    shadows : of suns and spot lights; soft by their size.   shadow_size : px a side of the map of each.
 
     The defaults are those of ``light:`` in the configuration, where nothing is random.
     """
@@ -190,11 +191,23 @@ class Light:
     sun_size: float = math.radians(LightConfig().sun_size)
     lamps: tuple[Lamp, ...] = ()
     around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    shadows: Literal["off", "hard", "soft"] = "off"
+    shadow_size: int = LightConfig().shadow_size
 
     @property
     def plain(self) -> bool:
         """Whether a white sun and sky are all there is: the formula above."""
-        return not self.lamps and self.around is None and self.sun_color == WHITE == self.sky_color
+        lone = not self.lamps and self.around is None and self.shadows == "off"
+        return lone and self.sun_color == WHITE == self.sky_color
+
+
+@dataclass(frozen=True)
+class Fog:
+    """A medium that swallows light and sends its own: at a distance d from the camera L becomes
+    L e^(-density d) + radiance (1 - e^(-density d)). density : per world unit.   radiance : linear, of fog alone."""
+
+    density: float
+    radiance: float
 
 
 @dataclass(frozen=True)
@@ -224,6 +237,7 @@ class Scene:
     omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and
     the manifest.
     dynamics   : of the objects that an engine moves; None: there are none.
+    fog        : between the camera and everything; None: clear air.
     """
 
     objects: tuple[SceneObject, ...]
@@ -235,6 +249,12 @@ class Scene:
     log: tuple[str, ...] = field(default=())
     omissions: tuple[str, ...] = field(default=())
     dynamics: Dynamics | None = None
+    fog: Fog | None = None
+
+    @property
+    def backdrop(self) -> float:
+        """Linear radiance that is seen where nothing is hit: the background, or fog without end."""
+        return self.background if self.fog is None else self.fog.radiance
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:

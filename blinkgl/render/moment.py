@@ -28,9 +28,9 @@ KEPT = 4
 
 class View(NamedTuple):
     """What drawing needs of a camera. projection : (4, 4) float64 clip_from_cam.   frustum : (5, 3)
-    inward unit normals, camera axes."""
+    inward unit normals, camera axes.   camera : a camera model, or what is asked of one here (that of a shadow map)."""
 
-    camera: CameraModel
+    camera: Any
     projection: np.ndarray
     frustum: np.ndarray
 

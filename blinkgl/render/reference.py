@@ -431,11 +431,11 @@ def received(
     own : (N, 2) part and triangle that each point is on, which do not hide it from a lamp; None: no shadows."""
     lamps = lamps_of(scene.light)
     direct = np.zeros((len(lamps), *points.shape))
-    casting = shadowing(scene.light) if own is not None else ()
+    casting = shadowing(scene.light)
     for k, lamp in enumerate(lamps):
         towards, strength = beam(lamp, lamp.path.pose(t_ns), points)
         facing = np.maximum(0.0, (towards * normal).sum(axis=1))
-        if k in casting:
+        if own is not None and k in casting:
             facing = facing * seen_share(scene, t_ns, lamp, points, own)
         direct[k] = facing[:, None] * strength
     return Received(direct, ambient(quadric_of(scene.light), normal))

@@ -269,6 +269,7 @@ def broken(said, **change):
         broken("a morph target has another size", target=1),
         broken("the nodes are no tree", cycle=True),
         broken("too many joints and morph targets", joints=[0] * 400),
+        broken("a skin has too many joints", joints=[0] * 1_000_000),
         broken("skins.0.joints", joints=[]),
     ],
 )  # fmt: skip

@@ -45,7 +45,7 @@ _HOMES = {
         "write_flow",
     ),
     "blinkgl.events.types": ("Events",),
-    "blinkgl.sequence.items": ("EventChunk", "GroundTruth", "Picture"),
+    "blinkgl.sequence.items": ("CameraImage", "EventChunk", "GroundTruth", "Picture"),
     "blinkgl.labels.frames": ("Flow", "LabelFrame"),
     "blinkgl.errors": ("AssetError", "BlinkGLError", "ConfigError", "EventDataError", "GLError", "OutputError"),
 }
@@ -85,7 +85,7 @@ if TYPE_CHECKING:  # what a type checker and an editor see; a test compares it w
     from blinkgl.front.sensors import DvsVoltmeter, Esim, V2e, load_sensor
     from blinkgl.front.sequences import Recording, record, simulate_sequence
     from blinkgl.labels.frames import Flow, LabelFrame
-    from blinkgl.sequence.items import EventChunk, GroundTruth, Picture
+    from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Picture
 
 __all__ = [
     "Animation",
@@ -93,6 +93,7 @@ __all__ = [
     "BlinkGLError",
     "Body",
     "Camera",
+    "CameraImage",
     "ConfigError",
     "Deform",
     "DvsVoltmeter",

@@ -22,6 +22,8 @@ class Role(IntEnum):
     EVENTS = 4
     PHYSICS = 5
     SHAPE = 6
+    LIGHT = 7
+    IMAGES = 8
 
 
 def seed_sequence(seed: int, sequence: int, role: Role) -> np.random.SeedSequence:

@@ -25,6 +25,26 @@ def to_srgb8(linear: np.ndarray) -> np.ndarray:
     return (srgb_from_linear(linear) * np.float32(255) + np.float32(0.5)).astype(np.uint8)
 
 
+KNEE = 0.7
+"""Linear light up to which :func:`tone_mapped` leaves everything as it is."""
+
+
+def tone_mapped(linear: np.ndarray, brightest: float) -> np.ndarray:
+    """Linear light in which nothing up to ``brightest`` exceeds 1, float32; for pictures that are looked at. Where
+    ``brightest`` does not exceed 1 it is the array itself.
+
+    linear : (..., 3), whose largest channel decides so that hues stay, or (H, W). Up to KNEE nothing changes; beyond,
+    with x what exceeds it, x / (1 + a x): the slope is 1 at the knee and ``brightest`` becomes 1."""
+    if brightest <= 1.0:
+        return linear
+    a = np.float32(1.0 / (1.0 - KNEE) - 1.0 / (brightest - KNEE))
+    level = linear.max(axis=-1, keepdims=True) if linear.ndim == 3 else linear
+    over = np.maximum(level - np.float32(KNEE), 0)
+    # of what lies above the knee alone: below it the factor is 1
+    mapped = np.float32(KNEE) + over / (1 + a * over)
+    return np.where(over > 0, linear * (mapped / np.maximum(level, np.float32(KNEE))), linear).astype(np.float32)
+
+
 def _floating(x: np.ndarray) -> np.ndarray:
     x = np.asarray(x)
     return x if x.dtype == np.float64 else x.astype(np.float32, copy=False)

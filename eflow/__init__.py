@@ -1,4 +1,5 @@
-"""Optical flow from events: networks, training, scores. Reads what ``blinkgl.io`` wrote; never imports render or scene.
+"""Optical flow from events: networks, training, scores. Reads what ``blinkgl.io`` wrote, or
+what ``blinkgl.sequence`` renders meanwhile (:mod:`eflow.data.online`); never imports render or scene.
 
 In:    data sets, a YAML of eflow.config.
 Out:   a trained network, its scores, files for benchmarks.

@@ -251,6 +251,24 @@ def submit(
     typer.echo(f"written and checked: {out}, {count} files")
 
 
+@app.command("import")
+def import_(
+    checkpoint: Annotated[str, typer.Argument(help="E-RAFT's dsec.tar, mvsec_20.tar …, or RAFT's .pth.")],
+    out: Annotated[str, typer.Option("--out", "-o", help="New .safetensors file.")],
+    bins: Annotated[
+        int | None, typer.Option(min=2, max=64, help="RAFT: time bins that its three colours are spread over.")
+    ] = None,
+) -> None:
+    """Make a published checkpoint a file that predict, evaluate, submit and train (init_from) take.
+
+    Tensors are read and nothing else; E-RAFT's padding, border and time bins go with them."""
+    from eflow.models import parameters_of
+    from eflow.published import import_published
+
+    model = import_published(checkpoint, out, bins=bins)
+    typer.echo(f"written: {out}, {parameters_of(model) / 1e6:.2f} M parameters")
+
+
 @app.command()
 def bench(
     model: Annotated[

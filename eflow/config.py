@@ -175,14 +175,46 @@ class AugmentConfig(Config):
 
 
 class SourceConfig(Config):
-    """One data set."""
+    """One data set: a folder, or a recipe that is rendered while it is trained on."""
 
-    path: str = Field(description="folder; relative to the YAML file")
+    path: str | None = Field(None, description="folder; relative to the YAML file")
     format: Literal["auto", "blinkgl", "dsec", "mvsec", "blinkflow"] = Field(
         "auto", description="layout of the set; auto: told by its files"
     )
     dt: Literal[1, 4] = Field(1, description="MVSEC: images between the ends of the flow")
     weight: float = Field(1.0, gt=0, le=1e6, description="share of this set in the mixture")
+    recipe: str | None = Field(
+        None, description="YAML file of `blinkgl generate`, in place of a folder; relative to the YAML file"
+    )
+    online: bool = Field(False, description="render the recipe's sequences while training; no sample comes twice")
+    set: tuple[str, ...] = Field((), description="overrides of the recipe, as `a.b=c`")
+    workers: int = Field(1, ge=0, le=256, description="rendering processes; 0: rendered in the training process")
+    samples: int = Field(8, ge=1, le=1000, description="windows out of each sequence, each with its own flow")
+    window_ms: tuple[float, float] | None = Field(
+        None,
+        description="lengths of the windows, [shortest, longest], log-uniform; null: the recipe's label interval",
+    )
+    min_events: int = Field(1, ge=1, le=10**9, description="fewest events in each of a sample's two windows")
+    max_flow: float = Field(400.0, gt=0, le=1e4, description="longest median flow of a sample, px")
+
+    @rule("path", "recipe", "online")
+    def _folder_or_recipe(path, recipe, online):
+        if (path is None) == (recipe is None):
+            raise Refused("give a folder (path) or a recipe, one of the two")
+        if (recipe is not None) != online:
+            raise Refused(
+                "a recipe is rendered while it is trained on: online: true says so"
+                if recipe is not None
+                else "a folder is not rendered",
+                where="online",
+                value=online,
+                accepted="recipe: FILE with online: true, or the folder that blinkgl generate made of it as path",
+            )
+
+    @rule("window_ms")
+    def _ordered(window_ms):
+        if window_ms is not None and not 0.01 <= window_ms[0] <= window_ms[1] <= 1e6:
+            raise Refused("not a range", where="window_ms", value=list(window_ms), accepted="0.01 <= low <= high, ms")
 
 
 class DataConfig(Config):
@@ -198,6 +230,14 @@ class DataConfig(Config):
     augment: AugmentConfig | None = Field(
         AugmentConfig(), description="random changes to the training samples; null: none"
     )
+
+    @rule("train.*.workers", "train.*.online", "workers")
+    def _who_renders(rendering, online, loaders):
+        for k, (workers, live) in enumerate(zip(rendering, online, strict=True)):
+            if live and workers == 0 and loaders > 0:
+                raise Refused(
+                    "loader processes do not render", where=f"train.{k}.workers", value=0, accepted="1 or more"
+                )
 
     @rule("crop", "augment.scale_probability")
     def _one_size(crop, scaling):
@@ -302,7 +342,10 @@ def load_train_config(path: str | Path, overrides: list[str] | tuple[str, ...] =
     config = validate(TrainConfig, apply_overrides(tree, overrides))
     absolute = lambda p: str(path.parent.resolve() / p)  # an absolute p stays
     sources = {
-        k: tuple(s.model_copy(update={"path": absolute(s.path)}) for s in getattr(config.data, k))
+        k: tuple(
+            s.model_copy(update={key: absolute(p) for key in ("path", "recipe") if (p := getattr(s, key)) is not None})
+            for s in getattr(config.data, k)
+        )
         for k in ("train", "validate_on")
     }
     return config.model_copy(

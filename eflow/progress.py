@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from typing import Generic, TypeVar
 
 from rich.progress import BarColumn, Progress
 
 from blinkgl.show.terminal import plain_column, plain_console
 
+T = TypeVar("T")
 _QUIET_S = 10.0
 """Seconds between lines where there is no terminal."""
 
@@ -82,16 +84,55 @@ class TrainProgress:
     def _print(self, line: str) -> None:
         print(line, file=sys.stderr, flush=True)  # noqa: T201
 
+    def say(self, line: str) -> None:
+        """A line of its own."""
+        if self.enabled:
+            self._live.console.print(line) if self._live is not None else self._print(line)
+
     def note(self, step: int, scores: dict[str, float]) -> None:
         """A validation result."""
         self._time = self._clock()  # validation is not training time
-        if self.enabled:
-            line = f"step {step}  " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items())
-            self._live.console.print(line) if self._live is not None else self._print(line)
+        self.say(f"step {step}  " + "  ".join(f"{k} {v:.3f}" for k, v in scores.items()))
 
     def __exit__(self, *_) -> None:
         if self._live is not None:
             self._live.stop()
+
+
+class Waiting(Generic[T]):
+    """An iteration, and the share of the wall time that was spent on waiting for what comes next (``share``)."""
+
+    def __init__(self, items: Iterable[T], clock: Callable[[], float] = time.monotonic):
+        self._items, self._clock, self._waited, self._began = items, clock, 0.0, clock()
+
+    def __iter__(self) -> Iterator[T]:
+        items = iter(self._items)
+        while True:
+            since = self._clock()
+            try:
+                item = next(items)
+            except StopIteration:
+                return
+            finally:
+                self._waited += self._clock() - since
+            yield item
+
+    @property
+    def share(self) -> float:
+        return self._waited / max(self._clock() - self._began, 1e-9)
+
+
+def told(rendering: dict[str, float], waited: float) -> str:
+    """What online rendering cost, in words."""
+    line = (
+        f"{rendering['rendered']} samples rendered, {rendering['render_ms']:.1f} processor ms each; training waited "
+        f"{100 * waited:.0f} % of the time"
+    )
+    if rendering["failed_sequences"]:
+        line += f"; {rendering['failed_sequences']} sequences failed and were replaced"
+    if rendering["replaced_workers"]:
+        line += f"; {rendering['replaced_workers']} workers died and were replaced"
+    return line
 
 
 def _hms(seconds: float) -> str:

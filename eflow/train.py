@@ -16,6 +16,7 @@ import contextlib
 import importlib
 import json
 import os
+import re
 import signal
 import time
 from collections.abc import Callable
@@ -35,15 +36,15 @@ from blinkgl.io.sequence_dir import refuse_existing
 from eflow import checkpoint as ckpt
 from eflow.allocator import keep_memory
 from eflow.config import OptimConfig, SourceConfig, TrainConfig
-from eflow.data.dataset import FlowDataset, Mixture, StepSampler, batches, collate
-from eflow.data.sources import open_source
+from eflow.data.dataset import FlowDataset, Mixture, StepSampler, batches, collate, is_endless
+from eflow.data.sources import Source, open_source
 from eflow.infer import predict
 from eflow.losses import sequence_loss
 from eflow.metrics import frame_metrics
 from eflow.models import FlowModel, build_model
 from eflow.pictures import comparison, events_of, write_picture
 from eflow.precision import precision_on
-from eflow.progress import TrainProgress
+from eflow.progress import TrainProgress, Waiting, told
 
 
 class TrainingError(BlinkGLError):
@@ -117,7 +118,20 @@ def train(
 
     Raises ConfigError, AssetError, EventDataError (data), OutputError (run folder exists), TrainingError (loss not
     finite: the batch's sample names are in ``nan_batch.json``)."""
-    out = Path(out)
+    with contextlib.ExitStack() as stack:  # of what renders while it is trained on
+        return _train(config, Path(out), stack, resume=resume, stop_after=stop_after, quiet=quiet, clock=clock)
+
+
+def _train(
+    config: TrainConfig,
+    out: Path,
+    stack: contextlib.ExitStack,
+    *,
+    resume: bool,
+    stop_after: int | None,
+    quiet: bool,
+    clock: Callable[[], float],
+) -> TrainResult:
     rank, world, device = _setup(config)
     lead = rank == 0
     precision = precision_on(device, config.run.precision, quiet=not lead)
@@ -145,7 +159,7 @@ def train(
     ema = {k: v.detach().clone() for k, v in model.state_dict().items()} if config.optim.ema else None
     start, spent = _resume(out, config, model, optimizer, ema) if resume else (0, 0.0)
 
-    sources = [open_source(s.path, s.format, dt=s.dt) for s in config.data.train]
+    mixture, sources = _training_sets(config, start, world, stack)
     dataset = FlowDataset(
         sources,
         model.representation,
@@ -156,7 +170,6 @@ def train(
     )
     _check_sizes(dataset, model, config.data.crop)
     validation = _validation(config, model) if lead else []
-    mixture = Mixture([len(s) for s in sources], [s.weight for s in config.data.train], config.seed)
     if config.data.batch % world:
         raise ConfigError(
             "not a multiple of the number of processes",
@@ -207,7 +220,8 @@ def train(
             minutes=course.minutes_left(config.run.time_limit),
         ) as progress,
     ):
-        for batch in batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"):
+        waiting = Waiting(batches(dataset, sampler, config.data.workers, pin=device.type == "cuda"))
+        for batch in waiting:
             rate = learning_rate(done, config.optim.lr, config.optim.warmup, config.optim.cooldown)
             for group in optimizer.param_groups:
                 group["lr"] = rate
@@ -246,6 +260,8 @@ def train(
                     grad_norm=float(norm),
                     samples_per_s=progress.rate,
                     processor_s=time.process_time(),
+                    waited=waiting.share,
+                    **_rendering(sources),
                 )
             if lead and step % config.run.picture_every == 0:
                 _picture(out / "pictures" / f"{step:09d}.png", batch, flow)
@@ -262,10 +278,31 @@ def train(
         else:
             if lead:  # nothing was left to do
                 path = ckpt.newest(out) or save()
+        if lead and any(is_endless(s) for s in sources):
+            progress.say("online: " + told(_rendering(sources), waiting.share))
     if world > 1:
         dist.barrier()
         dist.destroy_process_group()
     return TrainResult(step, reason or "finished", path if lead else out, loss_value)
+
+
+def _training_sets(
+    config: TrainConfig, start: int, world: int, stack: contextlib.ExitStack
+) -> tuple[Mixture, list[Source]]:
+    """The order of the samples, and the open sets; what renders is ended by ``stack``."""
+    data = config.data
+    if world > 1 and any(s.online for s in data.train):
+        raise ConfigError("online data are for one process", where="data.train", accepted="folders, or one process")
+    sources = {k: open_source(s.path, s.format, dt=s.dt) for k, s in enumerate(data.train) if not s.online}
+    sizes = [len(sources[k]) if k in sources else None for k in range(len(data.train))]
+    mixture = Mixture(sizes, [s.weight for s in data.train], config.seed)
+    for k, s in enumerate(data.train):
+        if s.online:
+            from eflow.data.online import open_online  # brings the renderer
+
+            first = mixture.first(k, start * data.batch)
+            sources[k] = stack.enter_context(open_online(s, config.seed, first=first, batch=data.batch))
+    return mixture, [sources[k] for k in range(len(data.train))]
 
 
 def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor, float, Tensor]:
@@ -296,6 +333,20 @@ def _forward(net, batch: dict, config: TrainConfig, world: int) -> tuple[Tensor,
         error = (prediction.flow - torch.where(batch["valid"][:, None], batch["flow"], 0)).norm(dim=1)
         epe = float(error[batch["valid"]].mean()) if batch["valid"].any() else 0.0
     return loss, epe, prediction.flow.detach()
+
+
+def _rendering(sources: list[Source]) -> dict[str, float]:
+    """What the online sources say of themselves, for the log; nothing of folders."""
+    stats = [s.stats for s in sources if is_endless(s)]
+    if not stats:
+        return {}
+    made = sum(s.samples for s in stats)
+    return {
+        "rendered": made,
+        "render_ms": 1000 * sum(s.cpu_s for s in stats) / max(made, 1),
+        "failed_sequences": sum(s.failures for s in stats),
+        "replaced_workers": sum(s.replaced for s in stats),
+    }
 
 
 @contextlib.contextmanager
@@ -377,10 +428,10 @@ def _weights_of(config: TrainConfig) -> tuple[dict[str, Tensor], str]:
 
 def _check_sizes(dataset: FlowDataset, model: FlowModel, crop: tuple[int, int] | None) -> None:
     """Refuses, before anything is written, what the network would refuse at the first step."""
+    firsts = [source[getattr(source, "first", 0)] for source in dataset.sources if crop is None or is_endless(source)]
     if crop is not None:
         sizes = {"data.crop": crop}
     else:
-        firsts = (source[0] for source in dataset.sources)
         sizes = {f"data.crop is not set, {s.name}": (s.height, s.width) for s in firsts}
     for where, size in sizes.items():
         if min(size) < model.least or any(side % model.divisor for side in size):
@@ -406,7 +457,7 @@ def _resume(out: Path, config: TrainConfig, model: FlowModel, optimizer, ema) ->
     for path in sorted(set(_leaves(saved)) | set(_leaves(now))):
         if (
             path.split(".")[0] not in _FREE
-            and path != "data.workers"
+            and not re.fullmatch(r"data\.(train\.\d+\.)?workers", path)
             and _leaves(saved).get(path) != _leaves(now).get(path)
         ):
             raise ConfigError(
@@ -439,14 +490,20 @@ def _leaves(tree, prefix: str = "") -> dict[str, object]:
 def _validation(config: TrainConfig, model: FlowModel) -> list[tuple[str, FlowDataset, list[int]]]:
     sets = []
     for s in config.data.validate_on:
-        dataset = FlowDataset([open_source(s.path, s.format, dt=s.dt)], model.representation, empty=config.data.empty)
+        if s.online:
+            from eflow.data.online import held
+
+            source = held(s, config.data.validate_samples)
+        else:
+            source = open_source(s.path, s.format, dt=s.dt)
+        dataset = FlowDataset([source], model.representation, empty=config.data.empty)
         count = min(config.data.validate_samples, len(dataset))
         sets.append((_title(s), dataset, [int(i) for i in np.linspace(0, len(dataset) - 1, count).round()]))
     return sets
 
 
 def _title(s: SourceConfig) -> str:
-    return Path(s.path).name + (f"_dt{s.dt}" if s.dt != 1 else "")
+    return Path(s.path or s.recipe).stem + (f"_dt{s.dt}" if s.dt != 1 else "")
 
 
 def _to_device(batch: dict, device: torch.device, channels_last: bool) -> dict:

@@ -1,5 +1,5 @@
 #version 430 core
-// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED.
+// Colour pass: linear radiance, rgb, into one target. Material variants as in luminance.glsl: TEXTURED, LIT, TWO_SIDED, LIGHTS, HUED.
 // SHOW_LOOKUP, the shader debugger's: also writes what was looked up, see lookup.glsl.
 
 #ifdef LIT
@@ -7,6 +7,9 @@
 #endif
 #ifdef TEXTURED
 #define NEEDS_UV
+#endif
+#ifdef LAMPS
+#define NEEDS_LOCAL
 #endif
 #include "vertex.glsl"
 
@@ -37,12 +40,17 @@ void main()
 #else
     vec3 facing = normal;
 #endif
-    float light = irradiance(facing);
+    ILLUMINANT light = irradiance(facing);
 #else
     const float light = 1.0;
 #endif
 #ifdef SHOW_LOOKUP
+#ifdef HUED
+    vec3 weighed = radiance * vec3(0.2126, 0.7152, 0.0722); // Rec. 709
+    show_lookup(radiance, dot(weighed, light) / max(weighed.r + weighed.g + weighed.b, 1e-30));
+#else
     show_lookup(radiance, light);
+#endif
 #endif
 #ifdef LIT
     radiance *= light;

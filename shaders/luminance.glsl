@@ -2,12 +2,14 @@
 // Event pass: linear luminance into one R32F target, nothing else (the event kernel takes the logarithm).
 //
 // Variants   TEXTURED   albedo luminance from a one-channel texture, else the uniform alone
-//            LIT        sun and sky Lambert, else unlit
+//            LIT        Lambert, of the light of light.glsl: a white sun and sky; else unlit
 //            TAPS4      four texture lookups per pixel instead of one, each one mip level finer
 //            TWO_SIDED  the normal is turned towards the camera on back faces
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
 //                       pixels
+//            LIGHTS     more light than that, see lights.glsl; HUED: the albedo is r, g, b, each times its share of the
+//                       luminance, since coloured light takes of each as much as it has
 //            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
 #if defined(RATE) && (defined(TEXTURED) || defined(LIT))
@@ -20,12 +22,24 @@
 #ifdef LIT
 #define NEEDS_NORMAL
 #endif
-#ifdef CHANGES
+#if defined(CHANGES) || defined(LAMPS)
 #define NEEDS_LOCAL
+#endif
+#ifdef CHANGES
 #define NEEDS_RATE
 #ifdef LIT
 #define NEEDS_NORMAL_RATE
+#ifdef LAMPS
+#define NEEDS_LOCAL_RATE
 #endif
+#endif
+#endif
+#ifdef HUED
+#define ALBEDO vec3
+#define CHANNELS rgb
+#else
+#define ALBEDO float
+#define CHANNELS r
 #endif
 #include "vertex.glsl"
 
@@ -67,16 +81,18 @@ void main()
     // At the centres of the pixel's four quarters, each filtered for a quarter: a box of two by two samples of the
     // texture.
     vec2 right = 0.25 * dFdx(uv), down = 0.25 * dFdy(uv);
-    float luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).r + texture(albedo, uv + right - down, -1.0).r
-                            + texture(albedo, uv - right + down, -1.0).r + texture(albedo, uv + right + down, -1.0).r);
+    ALBEDO luminance = 0.25 * (texture(albedo, uv - right - down, -1.0).CHANNELS
+                             + texture(albedo, uv + right - down, -1.0).CHANNELS
+                             + texture(albedo, uv - right + down, -1.0).CHANNELS
+                             + texture(albedo, uv + right + down, -1.0).CHANNELS);
 #elif defined(EVERY)
     // Neighbours in the target are n px of the image apart; the level is chosen as if they were one.
-    float luminance = texture(albedo, uv, -log2(every)).r;
+    ALBEDO luminance = texture(albedo, uv, -log2(every)).CHANNELS;
 #else
-    float luminance = texture(albedo, uv).r;
+    ALBEDO luminance = texture(albedo, uv).CHANNELS;
 #endif
 #else
-    float luminance = albedo;
+    ALBEDO luminance = albedo;
 #endif
 #ifdef LIT
 #ifdef TWO_SIDED
@@ -84,10 +100,10 @@ void main()
 #else
     vec3 facing = normal;
 #endif
-    float light = irradiance(facing);
+    ILLUMINANT light = irradiance(facing);
 #endif
 #ifdef RATE
-    float change = 0.0;
+    ALBEDO change = ALBEDO(0.0);
 #endif
 #ifdef CHANGES
     vec2 motion = velocity(rate, local, image_size);
@@ -114,11 +130,26 @@ void main()
     facing_rate += normal_rate;
 #endif
 #endif
+#ifdef LIGHTS
+#ifdef LAMPS
+    vec3 local_change = seen_rate(local, motion);
+#ifdef DEFORM
+    local_change += local_rate;
+#endif
+#else
+    const vec3 local_change = vec3(0.0);
+#endif
+    change = change * light + luminance * irradiance_rate(facing, facing_rate, local_change);
+#else
     change = change * light + luminance * irradiance_rate(facing, facing_rate);
 #endif
 #endif
+#endif
 #ifdef SHOW_LOOKUP
-#ifdef LIT
+#ifdef HUED
+    float unlit = luminance.r + luminance.g + luminance.b;
+    show_lookup(vec3(unlit), dot(luminance, light) / max(unlit, 1e-30));
+#elif defined(LIT)
     show_lookup(vec3(luminance), light);
 #else
     show_lookup(vec3(luminance), 1.0);
@@ -127,10 +158,20 @@ void main()
 #ifdef LIT
     luminance *= light;
 #endif
+#ifdef HUED
+    // The albedo has the luminance's weights in it.
+    float seen = luminance.r + luminance.g + luminance.b;
 #ifdef RATE
-    result = vec2(luminance, finite(change));
+    float seen_change = change.r + change.g + change.b;
+#endif
 #else
-    result = luminance;
+#define seen luminance
+#define seen_change change
+#endif
+#ifdef RATE
+    result = vec2(seen, finite(seen_change));
+#else
+    result = seen;
 #endif
     drop_artefact();
 }

@@ -41,7 +41,7 @@ def main(folder: Path) -> int:
     with np.load(folder / "job.npz", allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in stored.files}
     started, cpu = time.perf_counter(), time.process_time()
-    scene, bodies, camera = build(bpy, job, arrays)
+    scene, bodies, lamps, camera = build(bpy, job, arrays)
     say(
         blender=f"Blender {bpy.app.version_string}",
         setup_s=time.perf_counter() - started,
@@ -51,6 +51,8 @@ def main(folder: Path) -> int:
     for k in range(job["frames"]):
         for body, poses in zip(bodies, arrays["poses"]):
             place(body, poses[k])
+        for lamp, poses in zip(lamps, arrays["lamp_poses"]):
+            place(lamp, poses[k])
         place(camera, arrays["camera_poses"][k])
         scene.render.filepath = str(exr)
         started, cpu = time.perf_counter(), time.process_time()
@@ -101,7 +103,7 @@ def read_exr(bpy, path: Path, width: int, height: int) -> np.ndarray:
 
 
 def build(bpy, job: dict, arrays: dict):
-    """(scene, objects in the order of the job's bodies, camera)."""
+    """(scene, objects in the order of the job's bodies, lamps in its order, camera)."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     images = {}
@@ -130,7 +132,8 @@ def build(bpy, job: dict, arrays: dict):
     adjust(scene, job["settings"])
     scene.render.resolution_x, scene.render.resolution_y = job["size"]
     scene.render.resolution_percentage = 100
-    return scene, bodies, camera
+    lamps = [make_lamp(bpy, scene, lamp, job["settings"]["shadows"]) for lamp in job["light"]["lamps"]]
+    return scene, bodies, lamps, camera
 
 
 def make_mesh(bpy, k: int, arrays: dict):
@@ -255,6 +258,26 @@ def make_light(bpy, scene, job: dict) -> None:
     shine.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
     link(strength.outputs[0], shine.inputs["Strength"])
     link(shine.outputs[0], add("ShaderNodeOutputWorld").inputs["Surface"])
+
+
+def make_lamp(bpy, scene, lamp: dict, shadows: bool):
+    """A strength is the radiance of a white surface that faces it, of a point or spot light 1 unit away: an irradiance
+    of pi times that, and a power of 4 pi² times that, which Blender sends to all sides, whatever the cone."""
+    light = bpy.data.lights.new(lamp["kind"], lamp["kind"].upper())
+    largest = max(*lamp["strength"], 1e-30)
+    light.color = [s / largest for s in lamp["strength"]]
+    light.energy = (np.pi if lamp["kind"] == "sun" else 4 * np.pi**2) * largest
+    light.use_shadow = shadows
+    if lamp["kind"] == "sun":
+        light.angle = lamp["size"]
+    else:
+        light.shadow_soft_size = lamp["size"] / 2
+    if lamp["kind"] == "spot":
+        light.spot_size, light.spot_blend = 2 * lamp["outer"], lamp["blend"]
+    thing = bpy.data.objects.new(lamp["kind"], light)
+    thing.rotation_mode = "QUATERNION"
+    scene.collection.objects.link(thing)
+    return thing
 
 
 def turn_z_to(axis: np.ndarray) -> np.ndarray:

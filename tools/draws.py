@@ -23,8 +23,8 @@ import numpy as np
 from blinkgl.config.base import validate
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.config.lod import LodConfig
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.config.scene import PRIMITIVE_KINDS, TEXTURE_KINDS, RandomSceneConfig
-from blinkgl.config.sensor import ReadoutConfig
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.readout import Readout
@@ -32,6 +32,7 @@ from blinkgl.scene.build import build_scene
 from blinkgl.scene.geometry.lod import at_level_of_detail
 from blinkgl.scene.geometry.meshes import make_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS, random_primitive
+from blinkgl.scene.surfaces.coats import bunting, clothes, scales
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Scene
 
@@ -156,10 +157,36 @@ def textures() -> dict[str, Any]:
     }
 
 
+def coats() -> dict[str, Any]:
+    """What people, flags and fish wear, averaged over patches of 32 px."""
+    return {
+        f"{coat.__name__} {seed}": told(coat(seed).reshape(16, 32, 16, 32, 3).mean(axis=(1, 3)) / 255)
+        for coat in (clothes, bunting, scales)
+        for seed in range(8)
+    }
+
+
 def bodies() -> dict[str, Any]:
     return {
         f"{kind} {index}": told_mesh(random_primitive(kind, index)) for kind in PRIMITIVE_KINDS for index in range(3)
     }
+
+
+def living() -> dict[str, Any]:
+    """People, flags and fish as they are bound, and where they are at other times."""
+    keys = {
+        "figure": [{}, {"height": 1.1, "head": 1.4, "build": 1.3, "clip": "run"}, {"legs": 1.2, "clip": "dance"}],
+        "flag": [{}],
+        "fish": [{}, {"deep": 0.7}],
+    }
+    said = {}
+    for kind, several in keys.items():
+        for number, these in enumerate(several):
+            mesh = BUILDERS[kind](**these)
+            assert mesh.deformer is not None
+            at = np.stack([mesh.deformer.positions(mesh, int(t)) for t in TIMES_NS])
+            said[f"{kind} {number}"] = [*told_mesh(mesh), *told(at)]
+    return said
 
 
 def shapes() -> dict[str, Any]:
@@ -250,7 +277,7 @@ def events() -> dict[str, Any]:
     return said
 
 
-PARTS = (textures, bodies, shapes, worlds, coarse, events)
+PARTS = (textures, coats, bodies, living, shapes, worlds, coarse, events)
 
 
 def drawn(parts=PARTS) -> dict[str, Any]:

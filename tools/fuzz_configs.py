@@ -124,6 +124,15 @@ SMALL = {
     },
     "events.max_events_per_step": 100_000,
     "readout.queue_events": lambda r: r.choice([1, 16, 4096]),
+    "images.times": None,
+    "images.rate": lambda r: r.choice([50, {"uniform": [50, 100]}]),
+    "images.exposure_us": lambda r: r.choice([500, {"uniform": [20, 2000]}]),
+    "images.row_us": lambda r: r.choice([0, 10]),
+    "images.max_instants": lambda r: r.choice([1, 2, {"integer": [1, 3]}]),
+    "images.gain_db": lambda r: r.choice([0, {"uniform": [0, 20]}]),
+    "images.gamma": 2.2,
+    "images.also": lambda r: r.choice([[], ["clean"], {"choice": [["sharp"], ["clean", "sharp"]]}]),
+    "images.auto_exposure": lambda r: r.choice([None, {"longest_us": 5000, "lag": {"uniform": [0, 1]}}]),
 }
 SMALL_TIMELINE = {
     "uniform": {"fps": lambda r: r.choice([20, 200, {"uniform": [50, 400]}])},
@@ -296,7 +305,9 @@ def make(seed: int, what: str, number: int) -> Case:
     maker = Maker(rng, rng.choice([0.05, 0.15, 0.3, 0.6]), rng.choice([0.0, 0.1, 0.5]), rng.choice([0.0, 0.1, 0.3]))
     tree: dict[str, Any] = {}
     for name, info in SequenceConfig.model_fields.items():
-        if rng.random() < (0.15 if name in ("frames", "quality", "sensor", "readout", "gl", "output") else 0.5):
+        if rng.random() < (
+            0.15 if name in ("frames", "quality", "sensor", "readout", "gl", "output", "images") else 0.5
+        ):
             models = [m for m in members(info.annotation) if is_model(m)]
             if name == "scene" and rng.random() < 0.7:
                 models = models[:1]

@@ -43,8 +43,9 @@ from blinkgl.blender.process import Blender, how_it_ended, interpreter
 from blinkgl.camera import PinHole
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render.colour import LUMA, linear_image
+from blinkgl.scene.lights import lamps_of
 from blinkgl.scene.shapes.deformer import all_rigid
-from blinkgl.scene.types import Material, Scene
+from blinkgl.scene.types import WHITE, Material, Scene
 
 WORKER = Path(__file__).with_name("cycles_worker.py")
 # OpenCV's camera looks along +z with y down, Blender's along -z with y up.
@@ -159,11 +160,13 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     """Writes job.json and job.npz, all that the worker reads. World axes are the scene's (z up in
     both), its origin the first camera's place.
 
-    job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky}; settings; frames;
+    job.json: size [W, H]; blender_camera, near; background; light {sun_direction, sun, sky, lamps [{kind,
+    strength, size, outer, blend}], which are the sun, too, unless the light is plain}; settings; frames;
     materials [{texture index or null, base_color, unlit, culled}]; bodies [{name, picture_only, parts [[mesh,
     material], …]}]. job.npz, k counting what job.json refers to: vertices{k} (V, 3), normals{k} (V, 3), uvs{k} (V, 2)
     float32 with uv_scale in them and v growing upwards, faces{k} (F, 3) int32; texture{k} (h, w, 3) float32 linear, row
-    0 at the top; poses (bodies, N, 4, 4) and camera_poses (N, 4, 4) float64, the camera's in Blender's camera axes.
+    0 at the top; poses (bodies, N, 4, 4) and camera_poses (N, 4, 4), lamp_poses (lamps, N, 4, 4) float64, the
+    camera's in Blender's camera axes. Blender's spot lights fade otherwise between the inner and the outer angle.
     """
     all_rigid(scene, "the path tracer")
     times_ns = np.array(list(times_ns), np.int64)
@@ -197,6 +200,10 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
     arrays["poses"] = np.array([poses(thing.path) for thing in scene.objects]).reshape(-1, len(times_ns), 4, 4)
     arrays["camera_poses"] = poses(scene.camera_path) @ CV_FROM_BLENDER
     light = scene.light
+    if light.sky and light.sky_color != WHITE:
+        raise BlinkGLError("the path tracer's sky is white", where="scene.light.sky_color", value=light.sky_color)
+    lamps = () if light.plain else lamps_of(light)
+    arrays["lamp_poses"] = np.array([poses(lamp.path) for lamp in lamps]).reshape(-1, len(times_ns), 4, 4)
     job = {
         "size": [camera.width, camera.height],
         "blender_camera": blender_camera(camera),
@@ -206,8 +213,18 @@ def export(scene: Scene, times_ns: Iterable[int], settings: CyclesSettings, fold
         "settings": asdict(settings),
         "light": {
             "sun_direction": [float(s) for s in light.sun_direction],
-            "sun": float(light.sun),
+            "sun": float(light.sun) if light.plain else 0.0,
             "sky": float(light.sky),
+            "lamps": [
+                {
+                    "kind": lamp.kind,
+                    "strength": [float(s) for s in lamp.strength],
+                    "size": float(lamp.size),
+                    "outer": float(lamp.outer),
+                    "blend": 1.0 - lamp.inner / lamp.outer,
+                }
+                for lamp in lamps
+            ],
         },
         "materials": paints,
         "bodies": bodies,

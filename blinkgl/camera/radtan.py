@@ -79,15 +79,15 @@ class Radtan(DistortedModel):
         part keeps growing; beyond, nan."""
         distance = np.linalg.norm(d, axis=1)
         r = radial_inverse(distance, (self.k1, self.k2, self.k3), self._limit)
-        # The tangential part may bring it back.
-        r = np.where(np.isnan(r), 0.99 * self._limit if math.isfinite(self._limit) else np.nan, r)
         with np.errstate(divide="ignore", invalid="ignore"):
             u = d * np.where(distance > 0, r / distance, 1.0)[:, None]
         if self.p1 == 0.0 and self.p2 == 0.0:
             return np.where((distance <= self.reach)[:, None] & (np.hypot(u[:, :1], u[:, 1:]) < self._limit), u, np.nan)
         at, D = self._distort(u)
         lost = np.isnan(at[:, 0])
-        u[lost] = 0.0  # a start outside of the domain: from the middle, where the model is the identity
+        # A start outside of the domain (the tangential part may bring it back): from the middle, where the model is the
+        # identity.
+        u[lost] = 0.0
         at[lost], D[lost] = self._distort(u[lost])
         error, scale = at - d, np.ones(len(u))
         size = np.linalg.norm(error, axis=1)

@@ -90,6 +90,13 @@ class EsimConfig(EmulatorConfig):
         "units (rpg_esim's default 0.021), drawn once per pixel; each threshold stays >= 0.01 "
         "(or >= half of a smaller nominal one).",
     )
+    threshold_correlation: float = Field(
+        0.0,
+        ge=-1,
+        le=1,
+        description="Correlation over the pixels of the ON with the OFF threshold. 1: a pixel's gain is what differs; "
+        "-1: the place of its reference.",
+    )
     threshold_jitter: float = Field(
         0.0,
         ge=0,
@@ -156,6 +163,13 @@ class V2eConfig(EmulatorConfig):
         ge=0,
         le=5,
         description="Spread of the thresholds over the pixels, ln units (v2e: 0.03); each threshold stays >= 0.01.",
+    )
+    threshold_correlation: float = Field(
+        0.0,
+        ge=-1,
+        le=1,
+        description="Correlation over the pixels of the ON with the OFF threshold. 1: a pixel's gain is what differs; "
+        "-1: the place of its reference.",
     )
     full_scale: float = Field(
         255.0,

@@ -182,8 +182,19 @@ class SkyConfig(Config):
     per_face: bool = Field(True, description="a texture of its own on each face, or one on all")
     brightness: PositiveRange = Field((0.6, 1.1), description="factor on the texture's radiance; uniform")
     panoramas: Paths = Field(
-        (), description="equirectangular images or folders of them (jpg, png, hdr) used instead of the texture pool"
+        (),
+        description="equirectangular images or folders of them (jpg, png, hdr, exr) used instead of the texture pool",
     )
+    lights: bool = Field(
+        False,
+        description="the panorama lights the world, too, in the place of light.sun and light.sky: what is drawn and "
+        "what shines are one picture",
+    )
+
+    @rule("lights", "#panoramas")
+    def _a_panorama_lights(lights, panoramas):
+        if lights and not [*panoramas]:
+            raise Refused("only panoramas light", where="lights", value=lights, accepted="false, or sky.panoramas")
 
 
 class GroundConfig(Config):
@@ -212,8 +223,76 @@ class RegionConfig(Config):
     camera_height: PositiveRange = Field((1.0, 3.5), description="camera's first height above the ground, m; uniform")
 
 
+Color = tuple[Radiance, Radiance, Radiance]
+MAX_LIGHTS = 31  # and the sun
+
+
+class _LampConfig(Config):
+    strength: Radiance = Field(
+        1.0,
+        description="radiance of a white surface that faces it; of a point or spot light 1 m away from it, falling "
+        "with the square of the distance",
+    )
+    color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
+
+
+class SunLampConfig(_LampConfig):
+    """A further sun: parallel light."""
+
+    kind: Literal["sun"]
+    elevation: float = Field(60.0, ge=-90, le=90, description="degrees above the horizon")
+    azimuth: float = Field(40.0, ge=-360, le=360, description="degrees from +x towards +y")
+    size: float = Field(0.53, ge=0, le=45, description="its diameter in the sky, degrees: softens soft shadows")
+
+
+class _PlacedLampConfig(_LampConfig):
+    position: Position = Field(description="m")
+    reach: Positive | None = Field(
+        None,
+        description="m at which it has faded to nothing, by 1 - (distance / reach)^4; null: it falls with the square "
+        "of the distance alone",
+    )
+
+
+class PointLampConfig(_PlacedLampConfig):
+    """Shines to all sides."""
+
+    kind: Literal["point"]
+
+
+class SpotLampConfig(_PlacedLampConfig):
+    """Shines in a cone."""
+
+    kind: Literal["spot"]
+    look_at: Position = Field(description="a point on the cone's axis, m")
+    angle: float = Field(60.0, ge=0.5, le=170, description="of the whole cone, degrees")
+    edge: Fraction = Field(0.2, description="share of the half angle over which it fades out")
+    size: float = Field(0.1, ge=0, le=1e3, description="its diameter, m: softens soft shadows")
+
+    @rule("look_at", "position")
+    def _some_direction(look_at, position):
+        if max(abs(a - b) for a, b in zip(look_at, position)) < 1e-9:
+            raise Refused("must differ from the position", where="look_at", value=list(look_at))
+
+
+LampConfig = one_of("kind", SunLampConfig, PointLampConfig, SpotLampConfig)
+
+
+class EnvironmentConfig(Config):
+    """A panorama that lights a scene in the place of light.sun and light.sky, and is seen as its sky."""
+
+    map: str = Field(description="equirectangular image: hdr or exr, or one of 8 bits, which knows no bright sun")
+    strength: Radiance = Field(
+        1.0, description="factor on its radiance, which is exposed so that its 90th percentile is 0.8"
+    )
+    heading: float = Field(0.0, ge=-360, le=360, description="degrees by which it is turned from +x towards +y")
+    visible: bool = Field(True, description="whether it is drawn, as a box around everything")
+    size: float = Field(100.0, gt=0, le=1e6, description="edge of that box, m; it stands around the world's origin")
+
+
 class LightConfig(Config):
-    """One white sun and a sky: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z)."""
+    """A sun and a sky, white as long as nobody says otherwise: E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 n_z), and
+    lights beside them."""
 
     sun: float = Field(0.9, ge=0, le=1e9, description="strength of the sun, radiance of a white facing surface")
     sky: float = Field(0.6, ge=0, le=1e9, description="strength of the sky")
@@ -226,13 +305,69 @@ class LightConfig(Config):
     sun_azimuth: float | None = Field(
         None, ge=-360, le=360, description="degrees from +x towards +y; null: random (40 where nothing is random)"
     )
+    sun_color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
+    sky_color: Color = Field((1.0, 1.0, 1.0), description="linear factor")
+    sun_size: float = Field(0.53, ge=0, le=45, description="its diameter in the sky, degrees: softens soft shadows")
+    lights: tuple[LampConfig, ...] = Field(
+        (), description="suns, point and spot lights beside the sun and the sky, in the world's coordinates"
+    )
+    environment: EnvironmentConfig | None = Field(
+        None,
+        description="a panorama that lights the scene; null: the sun and the sky shine. In random worlds: sky.lights",
+    )
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
     def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
         """Unit vector towards the sun; the arguments (degrees) stand where the configuration leaves the angle open."""
-        e = math.radians(elevation if self.sun_elevation is None else self.sun_elevation)
-        a = math.radians(azimuth if self.sun_azimuth is None else self.sun_azimuth)
-        return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
+        return direction_of(
+            elevation if self.sun_elevation is None else self.sun_elevation,
+            azimuth if self.sun_azimuth is None else self.sun_azimuth,
+        )
+
+    @rule("#lights")
+    def _not_too_many(lights):
+        if (given := len([*lights])) > MAX_LIGHTS:
+            raise Refused("too many lights", where="lights", value=given, accepted=f"at most {MAX_LIGHTS}")
+
+    @rule("unlit", "#lights", "?environment")
+    def _lit(unlit, lights, environment):
+        for where, given in (("lights", [*lights]), ("environment", environment)):
+            if unlit and given:
+                raise Refused("nothing is lit by them", where=where, value="unlit: true", accepted="unlit: false")
+
+
+def direction_of(elevation: float, azimuth: float) -> Vector3:
+    """Unit vector in the world, of angles in degrees: above the horizon, and from +x towards +y."""
+    e, a = math.radians(elevation), math.radians(azimuth)
+    return math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)
+
+
+class RandomLightsConfig(Config):
+    """Lights that a random world has beside its sun and sky, each at a place above the ground of the region."""
+
+    count: tuple[Annotated[int, Field(ge=0, le=MAX_LIGHTS)], Annotated[int, Field(ge=0, le=MAX_LIGHTS)]] = Field(
+        (1, 3), description="[fewest, most] lights; every number as likely"
+    )
+    kinds: Annotated[tuple[Literal["sun", "point", "spot"], ...], Field(min_length=1)] = Field(
+        ("point", "spot"), description="each light is one of these, all as likely"
+    )
+    strength: PositiveRange = Field((3.0, 30.0), description="of point and spot lights, see light.lights; log-uniform")
+    sun_strength: PositiveRange = Field((0.1, 0.6), description="of further suns; log-uniform")
+    saturation: Fraction = Field(
+        0.5, description="how colourful they are at most; the brightest channel is 1 and all hues are as likely"
+    )
+    height: PositiveRange = Field((2.0, 6.0), description="above the ground, m; uniform")
+    angle: PositiveRange = Field((30.0, 100.0), description="of a spot light's cone, degrees; uniform")
+
+    @rule("count")
+    def _fewest_first(count: tuple[int, int]):
+        if count[0] > count[1]:
+            raise Refused("the range must be [fewest, most]", where="count", value=list(count))
+
+    @rule("angle")
+    def _a_cone(angle: tuple[float, float]):
+        if angle[1] > 170 or angle[0] < 0.5:
+            raise Refused("out of range", where="angle", value=list(angle), accepted="0.5 to 170 degrees")
 
 
 class RandomSceneConfig(Config):
@@ -249,6 +384,9 @@ class RandomSceneConfig(Config):
         Field(WallsConfig(), description="true: four walls")
     )
     light: LightConfig = LightConfig()
+    lights: RandomLightsConfig | None = Field(
+        None, description="null: none but those of light.lights; {} is enough for one to three point and spot lights"
+    )
     object_motion: ObjectMotion = ObjectMotion(static_share=0.3)
     camera_motion: CameraMotion = CameraMotion()
     physics: RandomPhysicsConfig | None = Field(None, description="null: nothing falls. Needs the extra [physics]")
@@ -256,6 +394,20 @@ class RandomSceneConfig(Config):
         0.3, gt=0, le=1e4, description="radius of the sphere round the camera centre that touches nothing, m"
     )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
+
+    @rule("?lights", "sky.lights", "light.unlit", "?light.environment")
+    def _lit(lights, sky_lights, unlit, environment):
+        for where, given in (("lights", lights), ("sky.lights", sky_lights)):
+            if given and unlit:
+                raise Refused(
+                    "nothing is lit by them", where=where, value="light.unlit: true", accepted="light.unlit: false"
+                )
+        if environment:
+            raise Refused(
+                "a random world is lit by its own sky",
+                where="light.environment",
+                accepted="sky.panoramas and sky.lights",
+            )
 
     @rule("region.width", "region.height", "objects.size", "sky.size")
     def _sky_holds_everything(width: float, height: float, sizes: tuple[float, float], sky: float | None):
@@ -576,9 +728,26 @@ class FileSceneConfig(Config):
         0, description="name or index of the animation played, at the file's own times; null: none"
     )
     light: LightConfig = LightConfig()
+    lights: Literal["config", "file"] = Field(
+        "config",
+        description="file: the file's own lights (KHR_lights_punctual) shine in the place of light.sun, beside "
+        "light.sky and light.lights",
+    )
+    lights_gain: Positive = Field(
+        1.0,
+        description="factor on the file's lights, whose lux and candela are divided by 683 lm/W, as Blender's exporter "
+        "multiplies them",
+    )
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a scene with more triangles is refused")
     max_texture_size: int = Field(2048, ge=1, le=16384, description="longer texture sides are reduced to this, px")
+
+    @rule("lights", "light.unlit")
+    def _lit(lights, unlit):
+        if lights == "file" and unlit:
+            raise Refused(
+                "nothing is lit by them", where="lights", value=lights, accepted="config, or light.unlit: false"
+            )
 
 
 SceneConfig = one_of("kind", RandomSceneConfig, ExplicitSceneConfig, FileSceneConfig, default="random")

@@ -35,42 +35,8 @@ from blinkgl.config.corners import corners
 from blinkgl.config.draw import draw, is_distribution, middle
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
-
-
-class ReadoutConfig(Config):
-    """The bus between pixels and time stamps; see :mod:`blinkgl.events.readout`."""
-
-    events_per_second: float = Field(ge=1, le=1e12, description="Peak rate of the bus, events per second.")
-    row_ns: float = Field(
-        0.0,
-        ge=0,
-        le=1e6,
-        description="Time to open a row before its events go out, nanoseconds; 0: every event is arbitrated by itself.",
-    )
-    queue_events: int = Field(
-        4096, ge=1, le=2**24, description="Events that may wait for the bus; one that finds the queue full is lost."
-    )
-
-    @rule("events_per_second", "row_ns", "queue_events")
-    def _queue_empties(rate: float, row_ns: float, queue: int):
-        if drain_us(rate, row_ns, queue) > 2**32:
-            raise Refused(
-                "the last event of a full queue would wait for more than an hour",
-                where="queue_events",
-                value=queue,
-                accepted="a shorter queue or a faster bus",
-            )
-
-    @property
-    def drain_us(self) -> float:
-        """Longest that an event may be late, microseconds: the time that a full queue takes to empty."""
-        return drain_us(self.events_per_second, self.row_ns, self.queue_events)
-
-
-def drain_us(events_per_second: float, row_ns: float, queue_events: int) -> float:
-    """Longest wait for a bus, microseconds (see :class:`ReadoutConfig`)."""
-    return (queue_events + 1) * (1e6 / events_per_second + row_ns / 1000)
 
 
 def _emulator_tables(tables: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -119,7 +85,9 @@ class SensorConfig(Config):
         description="Keys of `events:` by the emulator's name: what was fitted or published for that model. They win "
         "over the values above.",
     )
-    readout: ReadoutConfig | None = Field(None, description="Read-out limit.")
+    readout: ReadoutConfig | None = Field(
+        None, description="What is behind the pixels: their defects and latency, the bus, its clock, filters."
+    )
     sources: dict[str, str] = Field(
         {},
         description="Where values come from, by their dotted place in the file, or that of the table that they are in.",

@@ -25,15 +25,15 @@ from blinkgl.config.draw import draw, is_distribution
 from blinkgl.config.events import EmulatorConfig, EsimConfig, followers
 from blinkgl.config.frames import MAX_SPAN_S, FramesConfig
 from blinkgl.config.gl import GLConfig
+from blinkgl.config.images import ImagesConfig, check_images, readout_us
 from blinkgl.config.labels import LabelsConfig
 from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.readout import ReadoutConfig, drain_us
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import (
-    ReadoutConfig,
     SensorConfig,
-    drain_us,
     fill_sensor,
     known_sensor,
     sensor_names,
@@ -270,9 +270,14 @@ class SequenceConfig(Config):
     )
     events: EmulatorConfig = Field(EsimConfig(), description="the event camera's model and parameters")
     readout: ReadoutConfig | None = Field(
-        None, description="the sensor's bus: events above its rate are late, then lost; null: no limit"
+        None,
+        description="what is behind the pixels: their defects and latency, the bus (events above its rate are late, "
+        "then lost) and its clock, filters; null: nothing",
     )
     labels: LabelsConfig = Field(default_factory=LabelsConfig, description="which ground truth is written")
+    images: ImagesConfig | None = Field(
+        None, description="a frame camera beside the event camera (docs/images.md); null: none"
+    )
     preview: PreviewConfig = Field(PreviewConfig(), description="preview.mp4")
     gl: GLConfig = Field(GLConfig(), description="which OpenGL to use")
 
@@ -310,6 +315,42 @@ class SequenceConfig(Config):
                 accepted="at most 8000000",
             )
 
+    @rule("?images", "?frames")
+    def _frames_have_no_camera(images: bool, frames: bool):
+        if images and frames:
+            raise Refused(
+                "recorded frames are images already: nothing is there to be exposed",
+                where="images",
+                accepted="null, or a scene instead of frames",
+            )
+
+    @rule(
+        "images.rate",
+        "images.times",
+        "images.exposure_us",
+        "images.auto_exposure.longest_us",
+        "images.row_us",
+        "camera.height",
+        "time.duration",
+        "time.label_rate",
+        "time.start",
+    )
+    def _exposures_fit(
+        rate: float | None,
+        times: tuple[float, ...] | None,
+        exposure: float,
+        longest: float | None,
+        row_us: float,
+        height: int,
+        duration: float,
+        label_rate: float,
+        start: float,
+    ):
+        if rate is not None:
+            lasts = exposure if longest is None else longest
+            count = int(duration * label_rate + 1e-9) + 1
+            check_images(rate, times, lasts, readout_us(height, row_us), start, count / label_rate)
+
     @rule("scene.kind", "scene.region.height", "scene.camera_clearance", "camera")
     def _room_for_the_camera(kind, height, clearance, camera):
         if kind != "random":
@@ -333,6 +374,7 @@ FILLS = (
         fill_sensor,
         (("events", "sensor.emulators.*"), ("events", "sensor"), ("camera", "sensor"), ("readout", "sensor.readout")),
     ),
+    Fill(("images",), ("labels.images",), lambda images: {} if images is None else {"labels": {"images": False}}),
 )
 _OF_THE_RUN = ("seed", "output", "gl")
 

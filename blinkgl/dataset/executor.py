@@ -24,7 +24,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from blinkgl.dataset.work import RUN_FOLDER, Job, Maker, Message, thread_environment
+from blinkgl.dataset.work import RUN_FOLDER, Maker, Message, Work, maker_of, thread_environment
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.gl.context import egl_devices
 
@@ -45,7 +45,7 @@ class Executor(Protocol):
     listener: Callable[[Message], None]
     """Called with progress that does not come by ``poll`` (:class:`Inline`)."""
 
-    def open(self, job: Job) -> list[Message]: ...
+    def open(self, job: Work) -> list[Message]: ...
     def free(self) -> int: ...
     def submit(self, task: int, attempt: int) -> None: ...
     def poll(self, timeout_s: float) -> list[Message]: ...
@@ -61,8 +61,8 @@ class Inline:
         self._maker: Maker | None = None
         self._next: tuple[int, int] | None = None
 
-    def open(self, job: Job) -> list[Message]:
-        self._maker = Maker(job)
+    def open(self, job: Work) -> list[Message]:
+        self._maker = maker_of(job.maker, job.to_dict(), None)
         return [self._maker.open()]
 
     def free(self) -> int:
@@ -90,25 +90,27 @@ class Local:
 
     devices : EGL devices, dealt out to the workers in turn. Default: all graphics cards there are, if there are several
         and the configuration asks for no other than the first; else the configuration's.
+    cores : that they share. Default: all that this process may use.
 
     A worker that dies is replaced. Workers have sessions of their own, so that Ctrl-C reaches only the driver, and
     leave when the driver's end of their standard input closes, however it died.
     """
 
-    def __init__(self, workers: int, devices: list[int] | None = None):
+    def __init__(self, workers: int, devices: list[int] | None = None, cores: int | None = None):
         if workers < 1:
             raise ConfigError("too few", where="--workers", value=workers, accepted="1 or more")
         self.listener: Callable[[Message], None] = lambda message: None
-        self._wanted, self._devices = workers, devices
+        self._wanted, self._devices, self._cores = workers, devices, cores
         self._processes: list[_Process] = []
         self._selector = selectors.DefaultSelector()
         self._bad_starts = 0
 
-    def open(self, job: Job) -> list[Message]:
+    def open(self, job: Work) -> list[Message]:
         self._job = job
         if self._devices is None:
             self._devices = several_cards(job)
-        self._environment = {**os.environ, **thread_environment(self._wanted, len(os.sched_getaffinity(0)))}
+        cores = self._cores or len(os.sched_getaffinity(0))
+        self._environment = {**os.environ, **thread_environment(self._wanted, cores)}
         for slot in range(self._wanted):
             self._start(slot)
         hellos, deadline = [], time.monotonic() + _START_S
@@ -172,7 +174,7 @@ class Local:
         process = _Process(slot, self._log(slot), self._environment)
         self._processes.append(process)
         self._selector.register(process.channel, selectors.EVENT_READ, process)
-        process.send({"job": self._job.to_dict(), "device": device})
+        process.send({"job": self._job.to_dict(), "maker": self._job.maker, "device": device})
 
     def _bury(self, process: _Process) -> list[Message]:
         """The process ended by itself: its task failed, and another takes its place."""
@@ -279,7 +281,7 @@ def _condition(pid: int) -> str:
     return {"T": "is stopped", "t": "is held by a debugger", "D": "waits for a disk or a driver"}.get(state, "hangs")
 
 
-def several_cards(job: Job) -> list[int] | None:
+def several_cards(job: Work) -> list[int] | None:
     """The machine's graphics cards as EGL devices, when there are several and the
     configuration leaves the choice open."""
     wanted = [group.template.check().gl for group in job.plan().used]

@@ -18,15 +18,18 @@ from typing import Any
 
 import numpy as np
 
+from blinkgl.config.images import ImagesConfig
 from blinkgl.config.sequence import RunTemplate, SequenceConfig
 from blinkgl.gl import GLContext, create_context
+from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, asked_for
 from blinkgl.labels.label import BUFFERS
 from blinkgl.render.antialiasing import samples_of
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.build import sequence_scene
+from blinkgl.scene.lights import is_coloured, lamps_of
 from blinkgl.scene.shapes.table import DEFORMERS
-from blinkgl.scene.types import Scene
+from blinkgl.scene.types import Light, Scene
 from blinkgl.sequence import simulate_sequence
 from blinkgl.sequence.folders import folder_of
 from blinkgl.sequence.qualify import Verdict, shown, verdict
@@ -188,12 +191,24 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         "triangles": f"{renderer.triangles:,}"
         + (" (level of detail: see notes)" if renderer.config.lod.enabled else ""),
         "textures": f"{len(textures)}, {pixels / 1e6:.1f} Mpx",
-        "light": f"sun and sky on {lit} of {len(parts)} parts, the others unlit"
+        "light": f"{_shining(scene.light)} on {lit} of {len(parts)} parts, the others unlit"
         if lit
         else "none: every surface is unlit",
         "notes": "; ".join(scene.log) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
+
+
+def _shining(light: Light) -> str:
+    """What shines, in words."""
+    if light.plain:
+        return "sun and sky"
+    count = Counter(lamp.kind for lamp in lamps_of(light))
+    words = {"sun": "sun", "point": "point light", "spot": "spot light"}
+    names = [f"{count[kind]} {word}{'s' * (count[kind] > 1)}" for kind, word in words.items() if count[kind]]
+    if light.sky:
+        names.append("sky")
+    return ", ".join(names or ["nothing"]) + (", coloured" if is_coloured(light) else "")
 
 
 def _timed(run, times) -> float:
@@ -301,6 +316,8 @@ def _passes(
                 each * pictures,
             )
         )
+    if config.images is not None:
+        result.passes.append(_frame_camera(config.images, renderer, scene))
     each, rate = probe.clock.seconds["events"] / probe.frames, probe.events / max(1e-9 * (seen[-1] - t0), 1e-9)
     result.passes.append(
         Pass(
@@ -314,8 +331,45 @@ def _passes(
     )
 
 
+def _frame_camera(images: ImagesConfig, renderer: Renderer, scene: Scene) -> Pass:
+    """A few of its images, timed."""
+    camera = FrameCamera(renderer, images, 0, (scene.t0_ns, scene.t1_ns))
+    count = min(3, len(camera))
+    camera.take()
+    camera.rewind()
+    started = time.perf_counter()
+    taken = [camera.take() for _ in range(count)]
+    each = (time.perf_counter() - started) / count
+    shutter = f"rows {images.row_us:g} µs apart" if images.row_us else "all rows at once"
+    said = [f"{len(camera)} images, exposed {images.exposure_us:g} µs, {shutter}"]
+    said += [f"about {np.mean([image.instants for image in taken]):.0f} instants each"]
+    said += [
+        name
+        for name, on in (
+            ("automatic exposure", images.auto_exposure is not None),
+            ("lens", images.lens is not None),
+            ("photon noise", images.photon_noise),
+            ("read noise", images.read_noise > 0),
+            ("vignetting", images.vignetting > 0),
+            (f"filters {images.bayer}", images.bayer is not None),
+            ("beside them " + " and ".join(images.pictures[1:]), len(images.pictures) > 1),
+        )
+        if on
+    ]
+    samples = samples_of(renderer.config.image_antialiasing, "render.image_antialiasing").stored
+    return Pass(
+        "frame camera",
+        ", ".join(said),
+        ("colour",),
+        renderer.width * renderer.height * samples * (16 + DEPTH_BYTES),
+        len(camera),
+        each * len(camera),
+    )
+
+
 def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None:
     add = lambda what, why: result.left_out.append((what, why))
+    images = config.images
     request = asked_for(config.labels)
     there = {LABELS[name].heading for name in request}
     labels = {label.heading: label.off or f"labels.{label.name}: false" for label in LABELS.values()}
@@ -323,9 +377,19 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         *((heading, heading in there, why) for heading, why in labels.items()),
         ("preview", config.preview.enabled, "preview.enabled: false"),
         ("the sensor's read-out", config.readout is not None, "readout: null (no event is late or lost)"),
+        ("frame camera: motion blur, noise, lens", images is not None, "images: null"),
     ):
         if not on:
             add(name, key)
+    if images is not None:
+        for name, on, key in (
+            ("frame camera: rolling shutter", images.row_us > 0, "images.row_us: 0"),
+            ("frame camera: noise", images.noisy, "images.photon_noise: false, images.read_noise: 0"),
+            ("frame camera: defocus", images.lens is not None, "images.lens: null"),
+            ("frame camera: automatic exposure", images.auto_exposure is not None, "images.auto_exposure: null"),
+        ):
+            if not on:
+                add(name, key)
     if config.render.antialiasing == "none":
         add(
             "anti-aliasing of event frames",
@@ -354,4 +418,4 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     for name, value in config.events.model_dump().items():
         if value in (0, 0.0, False) and name != "seed":
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
-    add("shadows, inter-reflection, motion blur, depth of field", "BlinkGL does not model them")
+    add("shadows, inter-reflection", "BlinkGL does not model them")

@@ -17,9 +17,11 @@ from blinkgl.dataset.plan import Plan, check_output, sequence_name
 from blinkgl.dataset.preview import PreviewRecorder
 from blinkgl.dataset.report import Progress, SequenceReport, config_yaml, losses
 from blinkgl.gl import GLContext, create_context
+from blinkgl.imaging.metering import decibels
+from blinkgl.io.frame_camera import ExposureLine
 from blinkgl.io.sequence_dir import SequenceWriter, refuse_existing
 from blinkgl.labels import LABELS
-from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate_sequence
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate_sequence
 from blinkgl.sequence.clock import StageClock
 
 
@@ -87,6 +89,9 @@ def generate_sequence(
                 elif isinstance(item, GroundTruth):
                     with clock("write"):
                         _write_labels(writer, item)
+                elif isinstance(item, CameraImage):
+                    with clock("write"):
+                        writer.image(item.pictures, exposure_line(item))
                 else:
                     preview.show(item)
         report.count(sequence)
@@ -111,6 +116,18 @@ def _write_labels(writer: SequenceWriter, truth: GroundTruth) -> None:
         writer.label(name, truth.k, value, truth.t_ns // 1000, None if to_ns is None else to_ns // 1000)
 
 
+def exposure_line(image: CameraImage) -> ExposureLine:
+    """What the list of exposures says of an image."""
+    return ExposureLine(
+        image.start_ns / 1000,
+        image.end_ns / 1000,
+        image.exposure_ns / 1000,
+        image.row_ns / 1000,
+        decibels(image.gain),
+        image.instants,
+    )
+
+
 def manifest_info(sequence: Simulation) -> dict:
     """What a person needs to know where the sequence came from; no clock times (same seed, same manifest)."""
     import numba
@@ -132,7 +149,7 @@ def manifest_info(sequence: Simulation) -> dict:
         "labels": sequence.labels,
         # between whole microseconds, as every time in the files
         "duration_us": sequence.t1_ns // 1000 - sequence.t0_ns // 1000,
-        **losses(*sequence.losses),
+        **losses(*sequence.losses, sequence.filtered),
         **({"events_by_cause": sequence.causes} if sequence.causes else {}),
         **sequence.facts(),
     }

@@ -15,7 +15,7 @@ from blinkgl.config.sequence import SequenceConfig
 if TYPE_CHECKING:
     from blinkgl.sequence import Simulation
 
-STAGES = ("scene", "render", "read-back", "events", "write", "preview")
+STAGES = ("scene", "render", "read-back", "events", "images", "write", "preview")
 """What the seconds of a sequence are told apart by; the rest is "other"."""
 Progress = Callable[["SequenceReport", float], None]
 """Called now and then with the running report and the fraction done, 0 … 1."""
@@ -55,12 +55,13 @@ class SequenceReport:
         self.causes = sequence.causes
 
 
-def losses(saturated: int, dropped: int, late: int) -> dict[str, int]:
+def losses(saturated: int, dropped: int, late: int, filtered: int | None = None) -> dict[str, int]:
     """The manifest's figures of events that were made and are not in the file; see docs/formats.md."""
     return {
         "events_cut_by_max_events_per_step": saturated,
         "events_lost_in_readout": dropped,
         "events_late_in_readout": late,
+        **({} if filtered is None else {"events_filtered": filtered}),
     }
 
 
@@ -114,7 +115,7 @@ class Totals:
         }
 
 
-_NOT_SAID_AS_NULL = ("frames", "physics", "deform")
+_NOT_SAID_AS_NULL = ("frames", "physics", "deform", "images")
 """Keys of what came later than the first data sets: a sequence without it has the bytes that it had."""
 
 

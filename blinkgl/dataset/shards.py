@@ -7,6 +7,8 @@ One sample per flow label, its files side by side under one key:
     flying_000017_000003.new.npz     events of the label's interval [from, to)
     flying_000017_000003.flow.png    DSEC 16-bit flow; also back.png, image.png, occlusion.png where the data set has
                                      them: every label whose row names a ``shard``
+    flying_000017_000003.camera.png  of a frame camera its last image whose exposure was over at the label's time, and
+                                     beside it camera_sharp.png and camera_clean.png; its exposure stands in the json
 
 The same data set, seed and shard size give the same bytes.
 """
@@ -17,6 +19,7 @@ import io
 import json
 import tarfile
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,7 @@ from blinkgl.errors import AssetError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.io.dsec import DsecEventReader
+from blinkgl.io.frame_camera import EXPOSURES, ExposureLine, picture_file, read_exposures
 from blinkgl.io.index import sequence_folders
 from blinkgl.io.sequence_dir import read_manifest, verify_sequence
 from blinkgl.labels import LABELS
@@ -100,6 +104,9 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
         "emulator": manifest.get("emulator"),
         "seed": manifest.get("seed"),
     }
+    taken = _last_image(folder, manifest, start)
+    if taken is not None:
+        about["camera"] = {"image": taken[0], **asdict(taken[1])}
     with DsecEventReader(folder / "events.h5") as reader:
         windows = {"old": reader.slice(2 * start - end, start), "new": reader.slice(start, end)}
     yield f"{key}.json", json.dumps(about, sort_keys=True).encode()
@@ -110,6 +117,17 @@ def sample(folder: Path, k: int) -> Iterator[tuple[str, bytes]]:
     ):
         if (path := folder / label.forms[0].file(k)).is_file():
             yield f"{key}.{label.shard}", path.read_bytes()
+    for picture in manifest["frame_camera"]["pictures"] if taken is not None else ():
+        ending = "camera.png" if picture == "images" else f"camera_{picture}.png"
+        yield f"{key}.{ending}", (folder / picture_file(picture, taken[0])).read_bytes()
+
+
+def _last_image(folder: Path, manifest: dict[str, Any], t_us: int) -> tuple[int, ExposureLine] | None:
+    """Number and exposure of the frame camera's last image that was there at ``t_us``; None: there was none."""
+    if EXPOSURES not in manifest["files"]:
+        return None
+    there = [(k, line) for k, line in enumerate(read_exposures(folder)) if line.end_us <= t_us]
+    return there[-1] if there else None
 
 
 def _npz(events: Events) -> bytes:

@@ -20,6 +20,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from blinkgl.config.images import exposure_starts
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
 from blinkgl.dataset.generate import generate_sequence
 from blinkgl.dataset.plan import Plan, sequence_name
@@ -28,6 +29,15 @@ from blinkgl.dataset.work import RUN_FOLDER
 from blinkgl.errors import AssetError, BlinkGLError
 from blinkgl.events.types import Cause
 from blinkgl.gl import GLContext, create_context
+from blinkgl.io.frame_camera import (
+    FOLDER as FRAME_CAMERA,
+    STAMPS as IMAGE_STAMPS,
+    files_of,
+    picture_file,
+    problem_of,
+    read_codes,
+    read_exposures,
+)
 from blinkgl.io.hdf5 import dataset, open_hdf5
 from blinkgl.io.index import INDEX, entry, read_index, sequence_folders
 from blinkgl.io.records import open_regular, shown
@@ -169,6 +179,8 @@ def _look(folder: Path, name: str) -> tuple[list[str], _Known | None]:
         )
         problems = [line if line.startswith("events.h5") else f"events.h5: {line}" for line in problems]
         problems += _guarded(lambda: _check_labels(folder, manifest))
+        if config.images is not None:
+            problems += _guarded(lambda: _check_images(folder, manifest, config))
         if not problems:
             found.append(_Known(folder, manifest, config))
         return problems
@@ -222,8 +234,15 @@ def _files_of(config: SequenceConfig) -> Iterator[str]:
             yield label.stamps
         for form in label.written(config.labels):
             yield from form.files(config.time.label_count + label.at_last)
+    if config.images is not None:
+        yield from files_of(config.images, len(_exposures_of(config)))
     if config.preview.enabled:
         yield "preview.mp4"
+
+
+def _exposures_of(config: SequenceConfig) -> list[int]:
+    """When the frame camera's exposures begin, ns."""
+    return exposure_starts(config.images, config.time.t0_ns, config.time.t1_ns, config.camera.height)
 
 
 def check_events(path: Path, manifest: dict[str, Any]) -> list[str]:
@@ -340,6 +359,32 @@ def _check_value(path: Path, manifest: dict[str, Any], label: Label) -> list[str
     return [] if problem is None else [problem]
 
 
+def _check_images(folder: Path, manifest: dict[str, Any], config: SequenceConfig) -> list[str]:
+    """Of the frame camera: as many images as the configuration has exposures, at its times and inside the sequence, and
+    in the first and the last one codes that its settings can give."""
+    images, starts = config.images, _exposures_of(config)
+    lines = read_exposures(folder)
+    stamps = [int(line) for line in (folder / IMAGE_STAMPS).read_text().split()]
+    said = manifest.get("frame_camera")
+    problems = []
+    if not isinstance(said, dict) or said.get("images") != len(lines) or len(lines) != len(starts):
+        count = said.get("images") if isinstance(said, dict) else None
+        return [
+            f"{FRAME_CAMERA}: {len(lines)} exposures, manifest says {shown(count)}, config.yaml asks for {len(starts)}"
+        ]
+    if [round(line.start_us * 1000) for line in lines] != starts or [line.middle_us for line in lines] != stamps:
+        problems.append(f"{FRAME_CAMERA}: exposures are not at the times that config.yaml and the time stamps say")
+    end_us = manifest["t_offset_us"] + manifest["duration_us"] + 1
+    if any(not (line.start_us < line.end_us <= end_us and line.exposure_us > 0) for line in lines):
+        problems.append(f"{FRAME_CAMERA}: an exposure leaves the sequence")
+    for picture in images.pictures:
+        for k in sorted({0, len(lines) - 1}):
+            name = picture_file(picture, k)
+            wrong = problem_of(read_codes(folder / name), images, manifest["height"], manifest["width"])
+            problems += [] if wrong is None else [f"{name}: {wrong}"]
+    return problems
+
+
 # ---- between sequences -----------------------------------------------------------------------------------------------
 
 
@@ -424,7 +469,9 @@ def _noisy(config: SequenceConfig) -> bool:
         "k3",
         "k6",
     )
-    return any(getattr(config.events, key, 0) > 0 for key in drawn)
+    readout = config.readout
+    behind = readout is not None and (readout.pixels is not None or readout.latency is not None)
+    return behind or any(getattr(config.events, key, 0) > 0 for key in drawn)
 
 
 def _against_run(root: Path, folders: list[Path], known: dict[str, _Known], result: Verification) -> list[str]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import importlib
 import os
 import platform
 import resource
@@ -27,7 +28,7 @@ from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 from blinkgl import __version__
 from blinkgl.config.reader import parse_yaml
@@ -53,6 +54,8 @@ class Job:
     base: str
     recipe: str
     num: int | None = None
+    maker: ClassVar[str] = "blinkgl.dataset.work:Maker"
+    """Who makes its tasks, as "module:class": :func:`maker_of` finds it in a worker process."""
 
     def plan(self) -> Plan:
         return Plan.of(RunTemplate(parse_yaml(self.recipe, "recipe"), Path(self.base)), self.num)
@@ -61,13 +64,30 @@ class Job:
         return asdict(self)
 
 
+class Work(Protocol):
+    """What executors want of a job: where its logs go, its sequences, who makes them, itself as plain data."""
+
+    maker: ClassVar[str]
+
+    @property
+    def out(self) -> str: ...
+    def plan(self) -> Plan: ...
+    def to_dict(self) -> dict[str, Any]: ...
+
+
+def maker_of(name: str, job: Mapping[str, Any], device: int | None) -> Maker:
+    """The maker called ``name`` ("module:class", of a job's ``maker``) of a job in plain data."""
+    module, _, kind = name.partition(":")
+    return getattr(importlib.import_module(module), kind).of(job, device)
+
+
 def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Variables of each of ``workers`` processes on ``cores`` cores: cores are divided, not oversubscribed. What the
-    user has set stays. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) as soon as there are two workers:
-    two processes then draw 1.2-1.35 times as fast as one with two threads."""
+    user has set stays. Software OpenGL draws in the calling thread (LP_NUM_THREADS=0) as soon as there are two workers
+    (two processes then draw 1.2-1.35 times as fast as one with two threads), or one on a single core."""
     share = max(1, cores // max(1, workers))
     wanted = {"NUMBA_NUM_THREADS": str(share), "OMP_NUM_THREADS": str(share), "OPENBLAS_NUM_THREADS": str(share)}
-    if workers > 1:
+    if workers > 1 or cores == 1:
         wanted["LP_NUM_THREADS"] = "0" if share == 1 else str(share)
     return {key: value for key, value in wanted.items() if key not in given}
 
@@ -75,10 +95,15 @@ def thread_environment(workers: int, cores: int, given: Mapping[str, str] = os.e
 class Maker:
     """Makes the job's sequences in this process. Use as a context manager; ``open`` before ``make``."""
 
-    def __init__(self, job: Job, device: int | None = None):
+    def __init__(self, job: Work, device: int | None = None):
         self.job, self.device = job, device
         self.plan = job.plan()
         self.gl: GLContext | None = None
+
+    @classmethod
+    def of(cls, job: Mapping[str, Any], device: int | None) -> Maker:
+        """Of a job in plain data."""
+        return cls(Job(**job), device)
 
     def open(self) -> Message:
         """Looks at the assets, makes the OpenGL context, and says hello. Raises BlinkGLError."""
@@ -131,21 +156,10 @@ class Maker:
             log.write("interrupted")
             raise
         except Exception as error:  # noqa: BLE001 - whatever it is, the other sequences go on
-            line = (
-                str(error)
-                if isinstance(error, BlinkGLError)
-                else f"{type(error).__name__}: {' '.join(str(error).split())}"
-            )
-            log.write("failed: " + line)
+            message = failed(number, error)
+            log.write("failed: " + message["error"])
             log.write(traceback.format_exc())
-            return {
-                "kind": "failed",
-                "task": number,
-                "error": line,
-                "expected": isinstance(error, BlinkGLError),
-                "final": not may_pass(error),
-                "stop": _disk_is_full(error),
-            }
+            return message
         size = sum(p.stat().st_size for p in report.path.rglob("*") if p.is_file())
         log.write(
             f"done in {report.total_s:.2f} s: {report.frames} frames, {report.events} events, {report.labels} "
@@ -167,6 +181,19 @@ class Maker:
         if self.gl is not None:
             self.gl.release()
             self.gl = None
+
+
+def failed(number: int, error: Exception) -> Message:
+    """The "failed" of a task that ``error`` ended."""
+    expected = isinstance(error, BlinkGLError)
+    return {
+        "kind": "failed",
+        "task": number,
+        "error": str(error) if expected else f"{type(error).__name__}: {' '.join(str(error).split())}",
+        "expected": expected,
+        "final": not may_pass(error),
+        "stop": _disk_is_full(error),
+    }
 
 
 def report_of(message: Message) -> SequenceReport:

@@ -51,13 +51,13 @@ def _work() -> int:
 
     threading.Thread(target=_pulse, args=(tell,), daemon=True).start()
 
-    from blinkgl.dataset.work import Job, Maker
+    from blinkgl.dataset.work import maker_of
     from blinkgl.errors import BlinkGLError
 
     start = tasks.get()
     if start is None:
         return 0
-    with Maker(Job(**start["job"]), start["device"]) as maker:
+    with maker_of(start["maker"], start["job"], start["device"]) as maker:
         try:
             tell(maker.open())
         except BlinkGLError as error:

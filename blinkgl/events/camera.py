@@ -1,4 +1,4 @@
-"""An event camera, emulator and read-out together, and the one loop that frames go through it in.
+"""An event camera, emulator and what is behind it together, and the one loop that frames go through it in.
 
 Whoever turns frames into events does it here: a generated sequence, converted frames, a video, a reference, a
 benchmark. So what stands between an emulator and the outside (the read-out, a path between frames that is one frame
@@ -14,8 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
+from blinkgl.events.filters import make_filter
+from blinkgl.events.pixels import Latency, PixelNoise
 from blinkgl.events.readout import Readout
 from blinkgl.events.table import make_emulator
 from blinkgl.events.types import Events
@@ -40,7 +42,8 @@ class EventFrame(NamedTuple):
 class EventCamera:
     """``events:`` and ``readout:`` of a configuration: frames in, the events that leave the sensor out.
 
-    readout : None: no limit.   seed : of the emulator's draws.
+    Events go from the emulator through the pixels' defects, their latency, the bus with its clock, and the filters, as
+    far as the configuration has them. readout : None: none of it.   seed : of the draws.
     reconstruction : the path between frames, see :class:`Emulator`.   emulator : the :class:`Emulator` itself.
     Raises EventDataError: size, or a path that the emulator cannot follow."""
 
@@ -54,7 +57,15 @@ class EventCamera:
         reconstruction: str = "linear",
     ):
         self.emulator = make_emulator(config, height, width, seed, reconstruction)
-        self._readout = None if readout is None else Readout(readout)
+        self._pixels, self._latency, self._readout, self._filters = None, None, None, ()
+        self._luminance: np.ndarray | None = None
+        if readout is not None:
+            if readout.pixels is not None:
+                self._pixels = PixelNoise(readout.pixels, height, width, seed, self.emulator.causes)
+            if readout.latency is not None:
+                self._latency = Latency(readout.latency, height, width, seed)
+            self._readout = Readout(readout)
+            self._filters = tuple(make_filter(one, height, width) for one in readout.filters)
 
     @property
     def frames(self) -> int:
@@ -78,8 +89,13 @@ class EventCamera:
 
     @property
     def late(self) -> int:
-        """Events on the read-out's bus that have not left it yet."""
-        return 0 if self._readout is None else self._readout.late
+        """Events under way to the outside: on the bus, or not known yet for their latency."""
+        return sum(stage.late for stage in (self._latency, self._readout) if stage is not None)
+
+    @property
+    def filtered(self) -> int | None:
+        """Events that the filters on the camera have dropped so far; None without filters."""
+        return sum(stage.dropped for stage in self._filters) if self._filters else None
 
     def step(self, frame: EventFrame) -> Events:
         """The events that are out by :attr:`done_ns` and were not before. Raises EventDataError as ``Emulator.step``;
@@ -89,16 +105,26 @@ class EventCamera:
         except EventDataError as error:
             error.t_ns = frame.t_ns
             raise
-        return self._read_out(events)
+        return self._read_out(events, frame.luminance)
 
     def flush(self) -> Events:
         """What a path that lags holds back after the last frame; empty for the others."""
-        return self._read_out(self.emulator.flush())
+        return self._read_out(self.emulator.flush(), self._luminance)
 
-    def _read_out(self, events: Events) -> Events:
+    def _read_out(self, events: Events, luminance: np.ndarray | None) -> Events:
         if self._readout is None or self.done_ns is None:
             return events
-        return self._readout.step(events, self.done_ns // 1000)
+        until_us = self.done_ns // 1000
+        if self._pixels is not None:
+            events = self._pixels.step(events, until_us)
+        if self._latency is not None and luminance is not None:
+            if self.emulator.lags:  # for flush, which has no frame
+                self._luminance = luminance.copy()
+            events = self._latency.step(events, self.emulator.decoded(luminance), until_us)
+        events = self._readout.step(events, until_us)
+        for stage in self._filters:
+            events = stage.step(events)
+        return events
 
 
 def emulate(

@@ -120,6 +120,10 @@ class Emulator(ABC):
         self._decode = table
         self._tables_changed()
 
+    def decoded(self, frame: np.ndarray) -> np.ndarray:
+        """(H, W) float32 linear luminance of a frame as ``step`` takes it."""
+        return self._decode[frame] if frame.dtype == np.uint8 else frame
+
     def _tables_changed(self) -> None:  # noqa: B027 - most emulators keep nothing that depends on the tables
         pass
 

@@ -307,14 +307,20 @@ def to_q25(value: float | np.ndarray) -> np.ndarray:
     return np.floor(np.asarray(value, np.float64) * Q_ONE + 0.5).astype(np.int64)
 
 
+def correlated(a: np.ndarray, b: np.ndarray, correlation: float) -> np.ndarray:
+    """Of independent standard normals a and b a normal that has this correlation with a; b itself for 0."""
+    return correlation * a + np.sqrt(1.0 - correlation * correlation) * b if correlation else b
+
+
 def draw_thresholds(
-    height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64
+    height: int, width: int, on: float, off: float, sigma: float, seed: np.uint64, correlation: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Per-pixel (C+, C-), float64 (H*W,): normal around the nominal values, kept >= 0.01 and <= 10.
 
-    For nominal thresholds under 0.02 the floor is half the nominal one.
+    For nominal thresholds under 0.02 the floor is half the nominal one.   correlation : of C+ with C-.
     """
     a, b = normal2(seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
+    b = correlated(a, b, correlation)
     clip = lambda c, n: np.clip(c + sigma * n, min(MIN_THRESHOLD, c / 2), 10.0)
     return clip(on, a), clip(off, b)
 
@@ -337,6 +343,7 @@ class Esim(Emulator):
             contrast_threshold=config.contrast_threshold,
             contrast_threshold_off=config.contrast_threshold_off,
             threshold_sigma=config.threshold_sigma,
+            threshold_correlation=config.threshold_correlation,
         )
 
     def __init__(
@@ -360,7 +367,9 @@ class Esim(Emulator):
         if config.threshold_sigma:
             self._on, self._off = (
                 to_q25(c).astype(np.int32)
-                for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
+                for c in draw_thresholds(
+                    height, width, on, off, config.threshold_sigma, self.seed, config.threshold_correlation
+                )
             )
             smallest = int(min(self._on.min(), self._off.min()))
         self._floor_on, self._floor_off = (int(to_q25(min(MIN_THRESHOLD, c / 2))) for c in (on, off))

@@ -37,6 +37,9 @@ class Stream(IntEnum):
     HOT = 6
     DIFFUSION = 7  # Voltmeter, index = step * 2^20 + draw within the step
     START = 8  # initial state
+    DEFECT = 9  # dead and hot pixels and their rates, frozen per pixel
+    OWN_NOISE = 10  # noise events of pixels, "pixel" is the event's number
+    LATENCY = 11  # jitter of latency, "pixel" is the event's number
 
 
 @register_jitable

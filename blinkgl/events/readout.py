@@ -6,6 +6,8 @@ the one before. Below the limit events are late by less than a microsecond; abov
 ``queue_events / events_per_second`` and the output rate is the bus's. Events of one microsecond are served in raster
 order, as a row arbiter would, so in overload the upper rows of that microsecond come first.
 
+Behind it stands the clock: a time stamp is the last tick of ``clock_us`` that has passed.
+
 An event exists for the outside when it has left the bus. A recording that ends at time T therefore ends with the last
 event that left by T; those still on the bus then are no part of it, and are counted (``late``).
 """
@@ -17,7 +19,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 
-from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError
 from blinkgl.events.packing import JIT
 from blinkgl.events.types import Events
@@ -59,7 +61,8 @@ class Readout:
     def __init__(self, config: ReadoutConfig):
         self.config = config
         self.dropped = 0
-        self._event_ps = max(1, round(1e12 / config.events_per_second))
+        rate = config.events_per_second
+        self._event_ps = 0 if rate is None else max(1, round(1e12 / rate))
         self._row_ps = round(config.row_ns * 1000)
         self._waiting = np.zeros(config.queue_events, np.int64)
         self._state = np.array([0, -(2**62), -1], np.int64)
@@ -76,12 +79,17 @@ class Readout:
 
         ``until_us`` : the time up to which the emulator has given its events, int µs.
         Raises EventDataError for times beyond 100 days, which picoseconds in int64 cannot hold."""
-        sent = self._serve(events) if len(events) else events
+        sent = self._serve(events) if len(events) and self._event_ps else events
         if self.late:
             sent = Events.concatenate([self._on_bus, sent])
         count = len(sent) if until_us is None else int(np.searchsorted(sent.t, until_us, side="right"))
         self._on_bus = sent.part(slice(count, None)).copy()
-        return sent.part(slice(count))
+        return self._stamped(sent.part(slice(count)))
+
+    def _stamped(self, events: Events) -> Events:
+        """With the last tick of the clock that has passed."""
+        tick = self.config.clock_us
+        return events if tick == 1 else replace(events, t=events.t - events.t % tick)
 
     def _serve(self, events: Events) -> Events:
         """Those that find a place, with the times at which they leave."""

@@ -15,6 +15,7 @@ import numpy as np
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
 from blinkgl.events import v2e_model as v2e, voltmeter
 from blinkgl.events.arith import Q_ONE, log_q25
+from blinkgl.events.esim import correlated
 from blinkgl.events.noise import noise_table
 from blinkgl.events.philox import (
     Stream,
@@ -64,6 +65,7 @@ class ReferenceEsim:
         floor = [min(0.01, c / 2) for c in nominal]
         pixels = pixel_counters(height, width)
         spread = normal2(self.seed, pixels, np.uint64(Stream.THRESHOLD), np.uint64(0))
+        spread = spread[0], correlated(*spread, config.threshold_correlation)
         self.threshold = [
             [q(min(max(c + config.threshold_sigma * n, f), 10.0)) for n in normals]
             for c, f, normals in zip(nominal, floor, spread)
@@ -175,7 +177,8 @@ class ReferenceV2e:
         self.height, self.width, self.config, self.seed = height, width, config, np.uint64(seed)
         self.pixels = height * width
         nominal = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
-        normals = normal2(self.seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
+        a, b = normal2(self.seed, pixel_counters(height, width), np.uint64(Stream.THRESHOLD), np.uint64(0))
+        normals = a, correlated(a, b, config.threshold_correlation)
         self.on, self.off = (
             np.clip(c + config.threshold_sigma * n, min(0.01, c / 2), 10.0).astype(np.float32)
             for c, n in zip(nominal, normals)

@@ -19,7 +19,8 @@ from typing import Any
 
 from blinkgl.config.base import tag_of, validate
 from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.sensor import ReadoutConfig, SensorConfig
+from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.sensor import SensorConfig
 from blinkgl.events.emulator import Emulator
 from blinkgl.events.response import Response
 

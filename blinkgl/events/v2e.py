@@ -516,6 +516,7 @@ class V2e(Emulator):
             contrast_threshold=config.contrast_threshold,
             contrast_threshold_off=config.contrast_threshold_off,
             threshold_sigma=config.threshold_sigma,
+            threshold_correlation=config.threshold_correlation,
         )
 
     def __init__(
@@ -527,7 +528,10 @@ class V2e(Emulator):
         frame = lambda wanted=True: np.zeros(pixels if wanted else 0, np.float32)
         on, off = config.contrast_threshold, config.contrast_threshold_off or config.contrast_threshold
         self._on, self._off = (
-            c.astype(np.float32) for c in draw_thresholds(height, width, on, off, config.threshold_sigma, self.seed)
+            c.astype(np.float32)
+            for c in draw_thresholds(
+                height, width, on, off, config.threshold_sigma, self.seed, config.threshold_correlation
+            )
         )
         self._x, self._upper, self._lower = (frame() for _ in range(3))
         self._intensity = frame(config.cutoff_hz > 0 or config.shot_noise_rate_hz > 0)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 MAX_INDEX = 10_000_000
 Source = Scene | RunTemplate
 EmulatorSettings = str | Mapping[str, Any] | Config
+ImageSettings = str | Mapping[str, Any] | Config
 
 
 class Timeline:
@@ -70,20 +71,23 @@ def generate(
     timeline: Timeline | None = None,
     quality: str | None = None,
     labels: Sequence[str] | None = None,
+    images: ImageSettings | None = None,
 ) -> Outcome:
     """Makes a data set below the folder ``out``, as ``blinkgl generate`` does: the same files, bit for bit.
 
     source : :class:`Scene` or what :func:`load` gave.   num : how many sequences (of each group at
     most).   workers : processes; 1: this one.
     resume : go on where ``out`` holds sequences of this run.   emulator, sensor, timeline,
-    quality, labels : as of :func:`record`.
+    quality, labels, images : as of :func:`record`.
     Returns what was made (``made.events``, ``made.labels`` …) and what was set aside.
     Raises BlinkGLError: ConfigError (also a scene with arrays in it: save them to files
     first), AssetError, GLError, OutputError."""
     from blinkgl.dataset.executor import Inline, Local
     from blinkgl.dataset.run import run_dataset
 
-    template = configured(source, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels)
+    template = configured(
+        source, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels, images=images
+    )
     if isinstance(source, Scene) and not source.on_disk:
         raise ConfigError(
             "the scene holds arrays, which the data set could not be made from again",
@@ -114,6 +118,7 @@ def configured(
     timeline: Timeline | None = None,
     quality: str | None = None,
     labels: Sequence[str] | None = None,
+    images: ImageSettings | None = None,
 ) -> RunTemplate:
     """``source`` as a run, with what is given here laid over it. Raises ConfigError."""
     check.one_of(source, "source", (Scene, RunTemplate), "a Scene, or what load() gives")
@@ -125,6 +130,8 @@ def configured(
         own["timeline"] = check.one_of(timeline, "timeline", Timeline, "a Timeline").tree
     if labels is not None:
         own["labels"] = labels_tree(labels)
+    if images is not None:
+        own["images"] = images_tree(images)
     own = with_sensors(own, Path.cwd())
     if "quality" in own:
         validate_field(SequenceConfig, "quality", own["quality"])
@@ -161,6 +168,26 @@ def events_tree(emulator: EmulatorSettings) -> dict[str, Any]:
         else check.plain(emulator)
     )
     emulator_config(tree)
+    return tree
+
+
+def images_tree(images: ImageSettings) -> dict[str, Any]:
+    """``images:`` of a preset's name, a table, or a configuration. Raises ConfigError."""
+    if not isinstance(images, (str, Mapping, Config)):
+        raise ConfigError(
+            "not a frame camera",
+            where="images",
+            value=images,
+            accepted="a preset's name, or a table such as {'exposure_us': 10000, 'photon_noise': True}",
+        )
+    tree = (
+        images.model_dump(exclude_unset=True)
+        if isinstance(images, Config)
+        else {"preset": images}
+        if isinstance(images, str)
+        else check.plain(images)
+    )
+    validate_field(SequenceConfig, "images", tree)
     return tree
 
 

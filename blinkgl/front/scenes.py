@@ -150,10 +150,14 @@ class Camera(_Piece):
 
 
 class Light(_Piece):
-    """One white sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z).
+    """A sun and a sky: a white surface with normal n has radiance sun * max(0, n . s) + sky * (0.5 + 0.5 n_z); and
+    lights beside them.
 
-    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60,
-    40).   unlit : radiance = albedo everywhere.
+    elevation, azimuth : of the sun, degrees above the horizon and from +x towards +y (default 60, 40).
+    sun_color, sky_color : (3,) linear factors, white by default.
+    lights : tables as under ``light.lights`` of the YAML: ``{"kind": "point", "position": (0, 0, 2), "strength": 3}``,
+    ``{"kind": "spot", "position": …, "look_at": …, "angle": 40}``, ``{"kind": "sun", "elevation": 20}``.
+    unlit : radiance = albedo everywhere.
     Raises ConfigError."""
 
     def __init__(
@@ -163,9 +167,25 @@ class Light(_Piece):
         *,
         elevation: float | None = None,
         azimuth: float | None = None,
+        sun_color: Vector | None = None,
+        sky_color: Vector | None = None,
+        lights: Sequence[Mapping[str, Any]] = (),
         unlit: bool = False,
     ):
-        tree = check.given(sun=sun, sky=sky, sun_elevation=elevation, sun_azimuth=azimuth, unlit=unlit)
+        check.one_of(lights, "Light.lights", (list, tuple), "a list of tables")
+        tree = check.given(
+            sun=sun,
+            sky=sky,
+            sun_elevation=elevation,
+            sun_azimuth=azimuth,
+            sun_color=sun_color,
+            sky_color=sky_color,
+            unlit=unlit,
+        )
+        if lights:
+            for k, one in enumerate(lights):
+                check.one_of(one, f"Light.lights[{k}]", Mapping, "a table")
+            tree["lights"] = [check.given(**one) for one in lights]
         self.tree = self._checked(LightConfig, tree, sun_elevation="elevation", sun_azimuth="azimuth")
 
 

@@ -11,10 +11,10 @@ from blinkgl.config.sequence import SequenceConfig
 from blinkgl.errors import ConfigError
 from blinkgl.events.types import Events
 from blinkgl.front import arguments as check
-from blinkgl.front.runs import MAX_INDEX, EmulatorSettings, Source, Timeline, configured
+from blinkgl.front.runs import MAX_INDEX, EmulatorSettings, ImageSettings, Source, Timeline, configured
 from blinkgl.front.scenes import Scene
 from blinkgl.labels import Flow, LabelFrame
-from blinkgl.sequence import EventChunk, GroundTruth, Simulation, simulate as core
+from blinkgl.sequence import CameraImage, EventChunk, GroundTruth, Simulation, simulate as core
 from blinkgl.srgb import to_srgb8
 
 
@@ -27,6 +27,7 @@ def simulate_sequence(
     timeline: Timeline | None = None,
     quality: str | None = None,
     labels: Sequence[str] | None = None,
+    images: ImageSettings | None = None,
     events: bool = True,
     pictures_hz: float | None = None,
 ) -> Simulation:
@@ -36,20 +37,29 @@ def simulate_sequence(
             match item:
                 case EventChunk(): item.events                        # of about one frame, t in µs
                 case GroundTruth(): item.frame.forward.flow           # (H, W, 2) float32 px
+                case CameraImage(): item.image                        # of `images:`, codes
 
     All events before a label's time come before its :class:`GroundTruth`, and no others. OpenGL is
     held until the loop ends, however it does.
 
     source : :class:`Scene` or what :func:`load` gave, recorded frames (``frames:``)
     included.   index : number of the sequence.
-    emulator, sensor, timeline, quality, labels : as of :func:`record`; what ``labels`` does not name is not drawn.
+    emulator, sensor, timeline, quality, labels, images : as of :func:`record`; what ``labels`` does not name is not
+    drawn.
     events : False leaves them out.
     pictures_hz : gives a :class:`Picture` so many times per second of simulated time, at event frames.
     The iterator has ``config``, ``height``, ``width``, ``t0_ns``, ``t1_ns``, and counts ``frames``, ``events``,
     ``labels``. Iterate over it once, or use it in ``with`` where it may never be. Raises ConfigError, AssetError,
     GLError and, as it goes, EventDataError."""
     config = _configured(
-        source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels
+        source,
+        index,
+        emulator=emulator,
+        sensor=sensor,
+        timeline=timeline,
+        quality=quality,
+        labels=labels,
+        images=images,
     )
     check.one_of(events, "events", bool, "True or False")
     if pictures_hz is not None:
@@ -75,7 +85,8 @@ class Recording:
     labels : K times :class:`LabelFrame`; what was not asked for is None in it.
     images : (K + 1, H, W, 3) uint8 sRGB at ``image_t_us`` (K + 1,) int64 (recorded ones as they are), or None.
     config : every value as drawn.   frames : how many the emulator saw.
-    lost : events that its limit and the read-out swallowed."""
+    lost : events that its limit and the read-out swallowed.
+    camera : :class:`CameraImage` of the frame camera, where ``images:`` asks for one."""
 
     events: Events
     t_us: np.ndarray
@@ -85,6 +96,7 @@ class Recording:
     config: SequenceConfig = field(repr=False)
     frames: int
     lost: int
+    camera: tuple[CameraImage, ...] = ()
 
     @property
     def flow(self) -> np.ndarray:
@@ -118,6 +130,7 @@ def record(
     timeline: Timeline | None = None,
     quality: str | None = None,
     labels: Sequence[str] | None = None,
+    images: ImageSettings | None = None,
 ) -> Recording:
     """Events, images and ground truth of one sequence as arrays: what :func:`generate` writes, held in memory.
 
@@ -128,11 +141,19 @@ def record(
     quality : "fast", "balanced", "accurate" or "reference".
     labels : names of labels, such as images, flow, flow_backward, occlusion, depth
     (docs/configuration.md has all); default: the source's.
+    images : a frame camera: the name of a preset, "deblurring", or a table of ``images:``, ``{"exposure_us": 10000}``.
     Raises ConfigError, AssetError, GLError, EventDataError."""
     config = _configured(
-        source, index, emulator=emulator, sensor=sensor, timeline=timeline, quality=quality, labels=labels
+        source,
+        index,
+        emulator=emulator,
+        sensor=sensor,
+        timeline=timeline,
+        quality=quality,
+        labels=labels,
+        images=images,
     )
-    images, frames, chunks, times = [], [], [], []
+    pictures, frames, chunks, times, taken = [], [], [], [], []
     with _simulation(source, config, index) as sequence:
         for item in sequence:
             if isinstance(item, EventChunk):
@@ -140,17 +161,20 @@ def record(
             elif isinstance(item, GroundTruth):
                 image = item.frame.values.pop("images", None)
                 if image is not None:
-                    images.append(to_srgb8(image) if image.dtype.kind == "f" else image)
+                    pictures.append(to_srgb8(image) if image.dtype.kind == "f" else image)
                 frames.append(item.frame)
                 times.append(item.t_ns // 1000)
+            elif isinstance(item, CameraImage):
+                taken.append(item)
     t_us = np.array(times, np.int64)
     return Recording(
         Events.concatenate(chunks),
         t_us[:-1],
         tuple(frames[:-1]),
         t_us,
-        np.stack(images) if images else None,
+        np.stack(pictures) if pictures else None,
         sequence.config,
         sequence.frames,
         sum(sequence.losses[:2]),
+        tuple(taken),
     )

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from blinkgl.events.types import Events
 from blinkgl.io.colour import count_events, event_colour, flow_colour, flow_wheel
 from blinkgl.io.video import VideoWriter
-from blinkgl.srgb import to_srgb8
+from blinkgl.srgb import to_srgb8, tone_mapped
 from blinkgl.timeline.sampling import Ticks
 
 _BAR = 30
@@ -64,7 +64,7 @@ class PreviewWriter:
         w, h = self._panel
         self._canvas = np.empty((h + _BAR, len(self._names) * (w + _GAP) - _GAP, 3), np.uint8)
         self._canvas[:] = _BACK
-        self._flow_max = 0.0
+        self._flow_max, self._brightest = 0.0, 1.0
         self._has_flow = flow
         self._font, self._small = ImageFont.load_default(14), ImageFont.load_default(11)
         if flow:
@@ -100,11 +100,11 @@ class PreviewWriter:
 
     def frame(self, t_us: int, image: np.ndarray) -> None:
         """Composes and encodes one picture (several times when more than one period has passed). image: (H, W[, 3])
-        float linear light in [0, 1], or uint8 sRGB."""
+        float linear light, whose highlights are compressed where they exceed 1, or uint8 sRGB."""
         if not self.due(t_us):
             return
         small = self._fit(image)  # first: cheaper, and averages linear light where it is given
-        small = to_srgb8(small) if small.dtype.kind == "f" else small
+        small = self._toned(small) if small.dtype.kind == "f" else small
         self._panel_view(0)[:] = small[..., None] if small.ndim == 2 else small
         self._panel_view(1)[:] = self._fit(event_colour(self._counts))
         self._caption(0, f"{(t_us - self._t0_us) / 1000:.1f} ms   slowed {self._slow:g}x")
@@ -126,6 +126,12 @@ class PreviewWriter:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.close() if kind is None else self.abort()
+
+    def _toned(self, image: np.ndarray) -> np.ndarray:
+        """uint8 sRGB in which nothing clips. What counts as the brightest follows the picture's at once when it rises
+        and slowly when it falls, so that a passing light does not make the rest flicker."""
+        self._brightest = max(1.0, 0.95 * self._brightest, float(np.nan_to_num(image, nan=0.0, posinf=0.0).max()))
+        return to_srgb8(tone_mapped(image, self._brightest))
 
     def _panel_view(self, panel: int) -> np.ndarray:
         w, h = self._panel

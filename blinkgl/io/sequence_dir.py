@@ -9,6 +9,7 @@
       flow/backward…                 the same, from > to
       occlusion/{forward,backward}/%06d.png   255 where the point is hidden at the other end
       depth/%06d.npy  velocity/%06d.npy  normals/%06d.npy  ids/%06d.png
+      frame_camera/                  images with exposure and noise (blinkgl.io.frame_camera)   (on request)
       poses.npz  config.yaml  manifest.json  preview.mp4
 
 Images, flow and all that are labels stand where their rows say (``blinkgl.labels``).
@@ -22,7 +23,7 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -37,6 +38,15 @@ from blinkgl.errors import AssetError, BlinkGLError, OutputError
 from blinkgl.events.types import Events
 from blinkgl.io.atomic import fsync, output_errors, remove_stale, temporary_beside
 from blinkgl.io.dsec import DsecEventWriter
+from blinkgl.io.frame_camera import (
+    EXPOSURES,
+    STAMPS,
+    ExposureLine,
+    encode_codes,
+    exposures_csv,
+    picture_file,
+    stamps_txt,
+)
 from blinkgl.io.hdf5 import blosc_dataset, write_rows
 from blinkgl.io.records import InsidePath, entries_below, open_regular, parse, read_text, shown
 from blinkgl.labels import Form, Label, label_of
@@ -101,6 +111,7 @@ class SequenceWriter:
         self._promised = {"events.h5"} if events else set()
         self._timestamps: dict[str, list[str]] = {}
         self._row_files: dict[str, h5py.File] = {}
+        self._exposures: list[ExposureLine] = []
         self._failure: list[BaseException] = []
 
     def __enter__(self) -> SequenceWriter:
@@ -174,6 +185,13 @@ class SequenceWriter:
                 np.savez(file, **arrays)
 
         self.external("poses.npz", save)
+
+    def image(self, pictures: Mapping[str, np.ndarray], exposure: ExposureLine) -> None:
+        """The next image of the frame camera: codes of "images" and what is written beside it
+        (:mod:`blinkgl.io.frame_camera`), which are not to be changed any more."""
+        for picture, codes in pictures.items():
+            self._write(picture_file(picture, len(self._exposures)), partial(encode_codes, codes))
+        self._exposures.append(exposure)
 
     def text(self, name: str, content: str) -> None:
         """A UTF-8 text file at ``name`` inside the sequence."""
@@ -252,6 +270,9 @@ class SequenceWriter:
         self._check()
         for name, lines in self._timestamps.items():
             self.text(name, "\n".join(lines) + "\n")
+        if self._exposures:
+            self.text(STAMPS, stamps_txt(self._exposures))
+            self.text(EXPOSURES, exposures_csv(self._exposures))
         self.text("config.yaml", self.config_yaml)
         if self._events is not None:
             self._events.close(self.t_end_us)

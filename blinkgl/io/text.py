@@ -167,7 +167,7 @@ class TextWriter:
 def _number(buffer, i):
     """(mantissa, decimal exponent, integer?, next index); next index -1: not a number, or
     more digits than int64 holds."""
-    mantissa, exponent, digits, integer = np.int64(0), 0, 0, True
+    mantissa, exponent, digits, integer = np.int64(0), 0, False, True
     negative = buffer[i] == 45
     if buffer[i] == 45 or buffer[i] == 43:
         i += 1
@@ -176,14 +176,12 @@ def _number(buffer, i):
             integer = False
         elif mantissa < 10**16:  # digits beyond 17 are far below a µs once there is a point
             mantissa = mantissa * 10 + (buffer[i] - 48)
-            digits += 1
+            digits = True
             exponent -= 0 if integer else 1
         elif integer:
             return mantissa, exponent, integer, -1
-        else:
-            digits += 1
         i += 1
-    if digits == 0:
+    if not digits:
         return mantissa, exponent, integer, -1
     if buffer[i] == 101 or buffer[i] == 69:
         integer = False

@@ -189,31 +189,28 @@ class VideoReader:
 
 
 def read_exr(path: str | os.PathLike) -> np.ndarray:
-    """(H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR;
-    ffmpeg does. AssetError: undecodable."""
+    """(H, W, 3) or (H, W) float32 linear of an OpenEXR image. OpenCV's wheel has no OpenEXR; ffmpeg does. AssetError:
+    undecodable."""
     if not os.path.isfile(path):
         raise AssetError("no such file", where=str(path))
-    command = [
-        _ffmpeg(AssetError, path),
-        "-loglevel",
-        "error",
-        "-nostdin",
-        "-i",
-        os.fspath(path),
-        "-frames:v",
-        "1",
-        "-c:v",
-        "pfm",
-        "-f",
-        "image2pipe",
-        "-",
-    ]
+    return _exr(path, str(path))
+
+
+def decode_exr(data: bytes, where: str) -> np.ndarray:
+    """:func:`read_exr` of what has been read already; ffmpeg finds no image in a pipe."""
+    with tempfile.TemporaryDirectory(prefix="blinkgl-exr-") as folder:
+        path = Path(folder) / "image.exr"
+        path.write_bytes(data)
+        return _exr(path, where)
+
+
+def _exr(path: str | os.PathLike, where: str) -> np.ndarray:
+    command = [_ffmpeg(AssetError, where), "-loglevel", "error", "-nostdin", "-i", os.fspath(path)]
+    command += ["-frames:v", "1", "-c:v", "pfm", "-f", "image2pipe", "-"]
     result = subprocess.run(command, capture_output=True)
     if result.returncode or not result.stdout:
-        raise AssetError(
-            f"cannot decode OpenEXR image: {_gist(result.stderr.decode(errors='replace'))}", where=str(path)
-        )
-    return decode_pfm(result.stdout, path)
+        raise AssetError(f"cannot decode OpenEXR image: {_gist(result.stderr.decode(errors='replace'))}", where=where)
+    return decode_pfm(result.stdout, where)
 
 
 def _ffmpeg(error: type, where) -> str:

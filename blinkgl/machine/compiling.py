@@ -76,6 +76,7 @@ def compile_ahead(emulators: tuple[str, ...] = ()) -> float:
         "camera": {"width": 64, "height": 48},
         "time": {"duration": 0.02, "label_rate": 50},
         "labels": {"flow": ["forward", "backward"]},
+        "images": {"preset": "raw", "exposure_us": 2000},
         "scene": {"objects": {"count": 3}, "textures": {"variants": 2, "photographs": False, "max_size": 32}},
     }
     with tempfile.TemporaryDirectory() as folder:

@@ -24,7 +24,7 @@ from numpy.typing import DTypeLike
 
 from blinkgl.config.base import validate
 from blinkgl.config.events import EmulatorConfig
-from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError, EventDataError, OutputError
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events, count_causes, named_causes
@@ -55,6 +55,8 @@ class SimulationReport:
     """events that found the queue of the sensor's read-out full"""
     late: int = 0
     """events that were still on the read-out's bus when the last frame came"""
+    filtered: int = 0
+    """events that the filters on the camera dropped"""
     causes: dict[str, int] = field(default_factory=dict)
     """events by what caused them, "signal", "leak", "shot" and "hot"; empty unless ``causes`` of the emulator is set"""
     displacement: between.Displacement | None = None
@@ -90,8 +92,8 @@ def frames_to_events(
     interpolate : "linear": the given frames, between which the emulators are linear themselves; "cubic": ``factor - 1``
         frames in between by monotone cubics; "motion": dense-flow warp with at most ``max_px`` per step (see
         :mod:`blinkgl.timeline.interpolate`).
-    seed : of the emulator. readout : the sensor's bus (``load_sensor(name).readout``); None:
-    no limit. report : filled as it goes.
+    seed : of the emulator. readout : what is behind the pixels (``load_sensor(name).readout``); None:
+    nothing. report : filled as it goes.
 
     Raises
     ------
@@ -220,6 +222,7 @@ def stepped(
         report.events += len(events)
         report.on += int(np.count_nonzero(events.p))
         report.saturated, report.lost, report.late = camera.saturated, camera.dropped, camera.late
+        report.filtered = camera.filtered or 0
         if camera.emulator.causes:
             by_cause += count_causes(events)
             report.causes = named_causes(by_cause)
@@ -270,9 +273,7 @@ def file_to_events(
             yield frame, t_ns, f"{source}: frame {i} ({name})"
 
     with contextlib.ExitStack() as stack:
-        out = stack.enter_context(
-            event_writer(target, height, width, t_offset_us=start_us if kind == "dsec" else 0, overwrite=overwrite)
-        )
+        out = stack.enter_context(event_writer(target, height, width, t_offset_us=start_us, overwrite=overwrite))
         video = None
         if preview is not None:
             rate = min(1e9 / gap_ns, 100.0)

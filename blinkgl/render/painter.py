@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import moderngl
 
 from blinkgl.machine.compiling import working_clock
+from blinkgl.render.lighting import Lighting
 from blinkgl.render.matrices import linear_xyw_bytes
 
 if TYPE_CHECKING:
@@ -31,7 +32,8 @@ class Programs(dict["Kind", Uniforms]):
         self._painter, self._pass = painter, pass_
 
     def __missing__(self, kind: Kind) -> Uniforms:
-        program = self._painter.gl.program(self._pass.program, self._pass.defines(kind) | kind.defines)
+        defines = self._pass.defines(kind) | kind.defines | self._painter.lighting.defines(self._pass, kind)
+        program = self._painter.gl.program(self._pass.program, defines)
         uniforms = self[kind] = self._painter.uniforms(program)
         return uniforms
 
@@ -44,6 +46,7 @@ class Painter:
 
     def __init__(self, gl: GLContext, scene: Scene, resources: SceneResources, stats: RenderStats):
         self.gl, self.scene, self.resources, self.stats = gl, scene, resources, stats
+        self.lighting = Lighting(scene.light)
         self._programs: dict[Pass, Programs] = {}
         self._covers: dict[Pass, tuple[Uniforms, moderngl.VertexArray]] = {}
         self._culling = False
@@ -88,6 +91,7 @@ class Painter:
             R = moment.T_world_obj[index, :3, :3]
             uniforms["sun_direction"].value = tuple(light.sun_direction @ R)
             uniforms["up_direction"].value = tuple(R[2])
+        self.lighting.place(uniforms, item, moment)
 
     def deform(self, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         """Sets what the vertex stage of a shape that changes with time takes besides; to be called after

@@ -34,6 +34,7 @@ from scipy import ndimage
 
 from blinkgl.camera import CameraModel
 from blinkgl.render.raycast import Forest, build_tree, join_trees, nearest_exhaustive, nearest_tree
+from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of
 from blinkgl.scene.shapes.deformer import normals_at
 from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject, Texture
 
@@ -385,16 +386,37 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         normal[rows] = sign * (blend / length) @ thing.path.pose(hits.t_ns)[:3, :3].T
         uv[rows] = np.einsum("nc,nck->nk", bary, part.mesh.uvs[corners].astype(np.float64))
         albedo[rows] = sample_albedo(part.material, uv[rows])
-        colour[rows] = albedo[rows] * (1.0 if part.material.unlit else irradiance(scene, normal[rows])[:, None])
+        colour[rows] = albedo[rows]
+        if not part.material.unlit:
+            pose = thing.path.pose(hits.t_ns)
+            points = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
+            colour[rows] *= received(scene, hits.t_ns, points, normal[rows]).total
     return Surface(normal, uv, albedo, colour, colour @ LUMA)
 
 
-def irradiance(scene: Scene, normal: np.ndarray) -> np.ndarray:
-    """(...) E(n) of the scene's light for (..., 3) unit normals."""
-    light = scene.light
-    return light.sun * np.maximum(0.0, normal @ np.asarray(light.sun_direction)) + light.sky * (
-        0.5 + 0.5 * normal[..., 2]
-    )
+@dataclass(frozen=True, eq=False)
+class Received:
+    """The light that N points of a scene receive, as the radiance of a white Lambert surface there, (N, 3) each.
+
+    direct : (lamps, N, 3) of each of :func:`blinkgl.scene.lights.lamps_of`.   around : from all around."""
+
+    direct: np.ndarray
+    around: np.ndarray
+
+    @property
+    def total(self) -> np.ndarray:
+        """All of it."""
+        return self.direct.sum(axis=0) + self.around
+
+
+def received(scene: Scene, t_ns: int, points: np.ndarray, normal: np.ndarray) -> Received:
+    """What the scene's lights send at t_ns to (N, 3) points with (N, 3) unit normals, world axes."""
+    lamps = lamps_of(scene.light)
+    direct = np.zeros((len(lamps), *points.shape))
+    for k, lamp in enumerate(lamps):
+        towards, strength = beam(lamp, lamp.path.pose(t_ns), points)
+        direct[k] = np.maximum(0.0, (towards * normal).sum(axis=1))[:, None] * strength
+    return Received(direct, ambient(quadric_of(scene.light), normal))
 
 
 def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:

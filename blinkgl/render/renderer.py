@@ -67,7 +67,8 @@ class Renderer:
         self._labels = Labels(self)
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         some_stand = any(o.is_static for o in scene.objects)
-        self.whole = whole or not (scene.camera_path.is_static and some_stand)
+        lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
+        self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand)
 
     def __enter__(self) -> Renderer:
         return self
@@ -116,13 +117,14 @@ class Renderer:
 
     # ---- drawing -------------------------------------------------------------------------------------------------
 
-    def draw(self, pass_: Pass, t_ns: int, ends_ns: Mapping[str, int] | None = None) -> Frame:
-        """The frame of any pass at t_ns; the passes that it reads are drawn before it.
+    def draw(self, pass_: Pass, at: int | Moment, ends_ns: Mapping[str, int] | None = None) -> Frame:
+        """The frame of any pass at a time, ns, or of a moment as it is seen from elsewhere (``moment.from_place``); the
+        passes that it reads are drawn before it.
 
         ends_ns : other times that it looks at, by name: {"forward": t1_ns}."""
         started = working_clock()
         ends = {name: self.moment(t) for name, t in (ends_ns or {}).items()}
-        frame = self._drawn(pass_, self.moment(t_ns), ends, {})
+        frame = self._drawn(pass_, at if isinstance(at, Moment) else self.moment(at), ends, {})
         self.stats.render_s += working_clock() - started
         return frame
 
@@ -160,10 +162,11 @@ class Renderer:
         behind something included: still a bound."""
         return self.draw(Velocity(every, moving_only=not self.whole), t_ns)
 
-    def colour(self, t_ns: int, antialiasing: str | None = None) -> Frame:
-        """Linear radiance at t_ns, (H, W, 3) float32; ``antialiasing`` overrides the configuration's."""
+    def colour(self, at: int | Moment, antialiasing: str | None = None) -> Frame:
+        """Linear radiance at a time, ns, or of a moment, (H, W, 3) float32; ``antialiasing`` overrides the
+        configuration's."""
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
-        return self.draw(filtered(Colour(samples)), t_ns)
+        return self.draw(filtered(Colour(samples)), at)
 
     def labels(
         self, t_ns: int, request: LabelRequest, t_forward_ns: int | None = None, t_backward_ns: int | None = None

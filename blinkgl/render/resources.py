@@ -16,6 +16,7 @@ from blinkgl.errors import AssetError
 from blinkgl.gl import GLContext
 from blinkgl.gl.shader import MADE
 from blinkgl.render.colour import LUMA, linear_image, luminance_image
+from blinkgl.scene.lights import is_coloured
 from blinkgl.scene.shapes.deformer import Deformer
 from blinkgl.scene.shapes.table import define_of, includes
 from blinkgl.scene.types import Material, Mesh, Scene
@@ -28,12 +29,14 @@ _ATTRIBUTES = (("in_position", "3f", 12), ("in_normal", "3f", 12), ("in_uv", "2f
 
 class Kind(NamedTuple):
     """What of a material, and of a shape that changes with time, makes another program. shape : macros of the
-    latter."""
+    latter.   hued : lit, and of several colours under light that is not white, so that its luminance takes three
+    channels."""
 
     textured: bool
     lit: bool
     two_sided: bool
     shape: tuple[tuple[str, int], ...] = ()
+    hued: bool = False
 
     @property
     def defines(self) -> dict[str, int]:
@@ -72,7 +75,7 @@ class DrawItem:
     centre, radius; low, high : bounding sphere and box, object frame; of a shape that changes those of all that it
     sweeps.   corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
-    two_sided : no culling, and the normal is turned towards the camera.
+    two_sided : no culling, and the normal is turned towards the camera.   hued : as of :class:`Kind`.
     """
 
     object_index: int
@@ -88,11 +91,12 @@ class DrawItem:
     moves: bool
     part: int = -1
     number: int = -1
+    hued: bool = False
 
     def __post_init__(self) -> None:
         self.textured = self.material.texture is not None
         self.deformer = self.mesh.deformer
-        self.kind = Kind(self.textured, self.lit, self.two_sided, shape_of(self.deformer))
+        self.kind = Kind(self.textured, self.lit, self.two_sided, shape_of(self.deformer), self.hued)
         self.corners = box_corners(self.low, self.high)
 
 
@@ -163,6 +167,23 @@ class Shape:
             owned.release()
 
 
+class _Greys:
+    """Whether materials are all of one colour: looked at where the light is not white, once per texture."""
+
+    def __init__(self, coloured_light: bool):
+        self._coloured_light = coloured_light
+        self._known: dict[int, bool] = {}
+
+    def hued(self, material: Material) -> bool:
+        if not self._coloured_light or material.texture is None or material.unlit:
+            return False
+        key = id(material.texture)
+        if key not in self._known:
+            image = material.texture.image
+            self._known[key] = all(np.array_equal(image[..., 0], image[..., k]) for k in (1, 2))
+        return not self._known[key]
+
+
 class SceneResources:
     """GL side of one Scene. Release it before the context."""
 
@@ -173,8 +194,9 @@ class SceneResources:
         self._textures: dict[tuple, moderngl.Texture] = {}
         self._vaos: dict[tuple, moderngl.VertexArray] = {}
         self._shapes: dict[int, Shape] = {}
+        grey = _Greys(is_coloured(scene.light))
         self.items = [
-            _draw_item(index, part.mesh, part.material, obj.category, not obj.is_static, scene.t0_ns, scene.t1_ns)
+            _draw_item(index, part.mesh, part.material, obj.category, not obj.is_static, scene.t0_ns, scene.t1_ns, grey)
             for index, obj in enumerate(scene.objects)
             for part in obj.parts
         ]
@@ -217,6 +239,15 @@ class SceneResources:
         if key not in self._textures:
             image = luminance_image(material.texture.image, material.base_color)
             self._textures[key] = self._upload(image[..., None], material.texture.name)
+        return self._textures[key]
+
+    def shares_texture(self, material: Material) -> moderngl.Texture:
+        """RGB32F: what r, g and b of texture * base_color have in its luminance; their sum is
+        :meth:`luminance_texture`."""
+        key = ("shares", id(material.texture), material.base_color)
+        if key not in self._textures:
+            shares = (LUMA * np.asarray(material.base_color, np.float64)).astype(np.float32)
+            self._textures[key] = self._upload(linear_image(material.texture.image) * shares, material.texture.name)
         return self._textures[key]
 
     def colour_texture(self, material: Material) -> moderngl.Texture:
@@ -316,7 +347,7 @@ def _near_zero(uvs: np.ndarray) -> np.ndarray:
 
 
 def _draw_item(
-    index: int, mesh: Mesh, material: Material, category: str, moves: bool, t0_ns: int, t1_ns: int
+    index: int, mesh: Mesh, material: Material, category: str, moves: bool, t0_ns: int, t1_ns: int, grey: _Greys
 ) -> DrawItem:
     if mesh.deformer is None:
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
@@ -345,4 +376,5 @@ def _draw_item(
         two_sided,
         not material.unlit,
         moves,
+        hued=grey.hued(material),
     )

@@ -17,10 +17,11 @@ from blinkgl.dataset.verify import plan_of
 from blinkgl.errors import AssetError, BlinkGLError, ConfigError
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.frame_camera import EXPOSURES, picture_file, read_codes, read_exposures
 from blinkgl.io.images import read_image
 from blinkgl.io.index import entry, sequence_folders
 from blinkgl.io.records import shown
-from blinkgl.io.sequence_dir import verify_sequence
+from blinkgl.io.sequence_dir import read_manifest, verify_sequence
 from blinkgl.labels import LABELS
 
 SAMPLED_SEQUENCES, LABELS_EACH, PIXEL_STEP = 150, 3, 8
@@ -208,8 +209,23 @@ def _example(folder: Path, line: dict[str, Any], flows: list[Path], pairs, k: in
         event_colour(counts),
         flow_colour(flow, top or None, valid),
         caption,
-        _others(folder, int(flows[k].stem)),
+        [*_of_the_camera(folder, line, start), *_others(folder, int(flows[k].stem))],
     )
+
+
+def _of_the_camera(folder: Path, line: dict[str, Any], t_us: int) -> list[tuple[str, np.ndarray]]:
+    """Of a frame camera, the image nearest to a time and what is written beside it, as 8-bit pictures."""
+    if not (folder / EXPOSURES).is_file():
+        return []
+    about, lines = read_manifest(folder)["frame_camera"], read_exposures(folder)
+    k = min(range(len(lines)), key=lambda k: abs(lines[k].middle_us - t_us))
+    pictures = []
+    for name in about["pictures"]:
+        codes = read_codes(folder / picture_file(name, k)).astype(np.uint32) >> (about["bits"] - 8)
+        codes = codes.astype(np.uint8)
+        title = f"frame camera, {lines[k].exposure_us / 1000:g} ms" if name == "images" else f"frame camera, {name}"
+        pictures.append((title, np.repeat(codes[..., None], 3, axis=2) if codes.ndim == 2 else codes))
+    return pictures
 
 
 def _others(folder: Path, index: int) -> list[tuple[str, np.ndarray]]:

@@ -14,7 +14,7 @@ import numpy as np
 from blinkgl.camera import CameraModel
 from blinkgl.config.events import EmulatorConfig
 from blinkgl.config.labels import LabelsConfig
-from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import ConfigError
 from blinkgl.scene.motion.paths import OffsetPath
 from blinkgl.scene.types import PosePath

@@ -10,6 +10,7 @@ Time: int64 nanoseconds. Poses: 4x4 float64, rigid (scale is baked into the vert
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
@@ -135,10 +136,48 @@ class SceneObject:
 
 
 @dataclass(frozen=True)
+class Lamp:
+    """A sun, a point light or a spot light. It shines along the -z axis of its path's poses, as glTF's lights do, and
+    a point light to all sides; what it sends where is :func:`blinkgl.scene.lights.beam`.
+
+    strength : (3,) linear rgb, the radiance of a white surface that faces it: of a point or spot light 1 world unit
+               away, whence it falls with the square of the distance.
+    path     : T_world_lamp.
+    reach    : world units at which a point or spot light has faded to nothing, inf: nowhere. With d the distance its
+               light is multiplied by max(0, 1 - (d / reach)^4).
+    inner, outer : rad, angles from the axis of a spot light up to which it shines fully, and from which on not at all;
+               between them by the square of what goes from 1 to 0 linearly in the cosine (KHR_lights_punctual).
+    size     : what a soft shadow is soft by: a sun's angular diameter, rad; the diameter of others, world units.
+    """
+
+    kind: Literal["sun", "point", "spot"]
+    strength: tuple[float, float, float]
+    path: PosePath
+    reach: float = math.inf
+    inner: float = 0.0
+    outer: float = math.pi / 4
+    size: float = 0.0
+
+    @property
+    def cone(self) -> tuple[float, float]:
+        """(scale, offset): a spot light shines by clamp(scale cos + offset, 0, 1)² at an angle from its axis."""
+        scale = 1.0 / max(1e-3, math.cos(self.inner) - math.cos(self.outer))
+        return scale, -math.cos(self.outer) * scale
+
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
 class Light:
-    """White sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E.
+    """Sun + sky: irradiance factor E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_z); radiance = albedo * E. Both are
+    white unless said otherwise, and all there is unless there are lamps.
 
     sun_direction : unit vector in the world, from the surface towards the sun (s).
+    sun_color, sky_color : (3,) linear factors.   sun_size : rad, as of a lamp.
+    lamps : what shines beside them.
+    around : quadric of what else comes from all around (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers; None:
+        nothing.
 
     The defaults are those of ``light:`` in the configuration, where nothing is random.
     """
@@ -146,6 +185,16 @@ class Light:
     sun_direction: tuple[float, float, float] = LightConfig().sun_direction()
     sun: float = LightConfig().sun
     sky: float = LightConfig().sky
+    sun_color: tuple[float, float, float] = WHITE
+    sky_color: tuple[float, float, float] = WHITE
+    sun_size: float = math.radians(LightConfig().sun_size)
+    lamps: tuple[Lamp, ...] = ()
+    around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether a white sun and sky are all there is: the formula above."""
+        return not self.lamps and self.around is None and self.sun_color == WHITE == self.sky_color
 
 
 @dataclass(frozen=True)

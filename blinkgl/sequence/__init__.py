@@ -1,11 +1,11 @@
 """One sequence as it happens; whoever writes, keeps, judges or counts it lives in another room.
 
 In: the configuration of one sequence, and OpenGL where a scene is drawn.
-Out: its events, ground truth and pictures, in the order of time.
+Out: its events, ground truth, the frame camera's images and pictures, in the order of time.
 Start: simulate.py; rendered.py and recorded.py are its two sources.
 """
 
-from blinkgl.sequence.items import EventChunk, GroundTruth, Item, Picture
+from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
 from blinkgl.sequence.simulate import Simulation, simulate_sequence
 
-__all__ = ["EventChunk", "GroundTruth", "Item", "Picture", "Simulation", "simulate_sequence"]
+__all__ = ["CameraImage", "EventChunk", "GroundTruth", "Item", "Picture", "Simulation", "simulate_sequence"]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from blinkgl.events.types import Events
+from blinkgl.imaging import CameraImage
 from blinkgl.labels import LabelFrame
 
 
@@ -54,4 +55,4 @@ class Picture:
     velocity: np.ndarray | None = None
 
 
-Item = EventChunk | GroundTruth | Picture
+Item = EventChunk | GroundTruth | CameraImage | Picture

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from blinkgl.config.sequence import SequenceConfig
+from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.events.types import Events
 from blinkgl.labels import Flow, LabelFrame, asked_for
@@ -120,6 +121,9 @@ class RecordedSequence(Simulation):
         if self.masks and "occlusion_forward" in request:
             values["occlusion_forward"] = read_mask_of(self.masks[number], size)
         return GroundTruth(k, t_ns, LabelFrame(t_ns, values), forward_ns=self._time_of(number + 1, self._recorded.fps))
+
+    def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
+        raise ConfigError("recorded frames have ground truth at their own times alone", where="frames")
 
     def _picture(self, t_ns: int) -> Picture:
         frame = self._luminance

@@ -16,6 +16,7 @@ from blinkgl.events import emulator_of
 from blinkgl.events.camera import EventCamera, EventFrame, emulate
 from blinkgl.events.types import Events
 from blinkgl.gl import GLContext, create_context
+from blinkgl.imaging import FrameCamera
 from blinkgl.labels import LABELS, LabelRequest, asked_for
 from blinkgl.render.renderer import Renderer
 from blinkgl.rng import Role, kernel_seed
@@ -89,6 +90,9 @@ class RenderedSequence(Simulation):
                 self.timeline = make_timeline(
                     config.timeline, *span_ns, renderer, response, dynamics.impacts_ns if dynamics is not None else ()
                 )
+            if labels and config.images is not None:
+                seed = kernel_seed(config.seed, index, Role.IMAGES)
+                self.frame_camera = FrameCamera(renderer, config.images, seed, span_ns)
             super().__init__(
                 config,
                 index,
@@ -134,9 +138,16 @@ class RenderedSequence(Simulation):
         last = k == self.config.time.label_count
         if last:
             request = LabelRequest(*(name for name in request if LABELS[name].at_last))
-        frame = self.renderer.labels(t_ns, request, t_ns + interval, t_ns - interval)
+        return self._truth_over(k, t_ns, interval, request, last)
+
+    def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
+        self._resume()
+        return self._truth_over(-1, t_ns, span_ns, asked_for(self.sensor.labels), False)
+
+    def _truth_over(self, k: int, t_ns: int, span_ns: int, request: LabelRequest, last: bool) -> GroundTruth:
+        frame = self.renderer.labels(t_ns, request, t_ns + span_ns, t_ns - span_ns)
         camera, objects = poses_at(self.scene, [t_ns])
-        leads_to = (None, None) if last else (t_ns + interval, t_ns - interval)
+        leads_to = (None, None) if last else (t_ns + span_ns, t_ns - span_ns)
         return GroundTruth(k, t_ns, frame, *leads_to, camera[0], objects[:, 0])
 
     def _picture(self, t_ns: int) -> Picture:
@@ -147,7 +158,9 @@ class RenderedSequence(Simulation):
     @property
     def seconds(self) -> dict[str, float]:
         stats, (render_s, readback_s) = self.renderer.stats, self._before
-        return {**self.clock.seconds, "render": stats.render_s - render_s, "read-back": stats.readback_s - readback_s}
+        images = {} if self.frame_camera is None else {"images": self.frame_camera.seconds}
+        drawing = {"render": stats.render_s - render_s, "read-back": stats.readback_s - readback_s}
+        return {**self.clock.seconds, **images, **drawing}
 
     def poses(self) -> dict[str, np.ndarray]:
         """t_ns (M,) int64, the start and every label's time; T_world_cam (M, 4, 4) float64; T_world_obj (n, M, 4, 4)
@@ -184,6 +197,7 @@ class RenderedSequence(Simulation):
             "scene_log": list(scene.log),
             "not_drawn": list(scene.omissions),
             **({} if scene.dynamics is None else {"dynamics": _facts_of(scene.dynamics)}),
+            **({} if self.frame_camera is None else {"frame_camera": self.frame_camera.facts()}),
         }
 
 

@@ -5,11 +5,12 @@
             match item:
                 case EventChunk(t_ns, events): ...
                 case GroundTruth(): ...
+                case CameraImage(): ...
 
-Events come in chunks, one a frame, cut where a label's time lies between two frames; ground truth comes at its time,
-between them. So whoever trains on a window of events and the flow over it holds one window, and nobody holds a
-sequence. (Files would not mind all events first, as it used to be: they are the same, byte for byte. An online consumer
-would then have to keep every event.)
+Events come in chunks, one a frame, cut where the time of a label or of a frame camera's image lies between two frames;
+ground truth comes at its time, between them, and an image when its exposure ends. So whoever trains on a window of
+events and the flow over it holds one window, and nobody holds a sequence. (Files would not mind all events first, as it
+used to be: they are the same, byte for byte. An online consumer would then have to keep every event.)
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ from blinkgl.errors import ConfigError
 from blinkgl.events.camera import EventCamera
 from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.gl import GLContext
+from blinkgl.imaging import FrameCamera
 from blinkgl.render.renderer import Renderer
 from blinkgl.scene.types import Scene
 from blinkgl.sequence.clock import StageClock
-from blinkgl.sequence.items import EventChunk, GroundTruth, Item, Picture
+from blinkgl.sequence.items import CameraImage, EventChunk, GroundTruth, Item, Picture
 from blinkgl.timeline import Ticks, Timeline
 
 
@@ -48,13 +50,13 @@ def simulate_sequence(
     renderer: Renderer | None = None,
     window_ns: tuple[int, int] | None = None,
 ) -> Simulation:
-    """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth` and
-    :class:`Picture` in time order.
+    """Sequence ``index`` of a run, ready to be iterated over: :class:`EventChunk`, :class:`GroundTruth`,
+    :class:`CameraImage` and :class:`Picture` in time order.
 
     gl : context to draw with; None: one of its own, where something is drawn at all.
     base : folder that relative paths in the configuration start from.
-    events, labels : False leaves them out; what ``labels:`` does not ask for is left out
-    anyway. Nothing is drawn that nobody asked for.
+    events, labels : False leaves them out, ``labels`` ground truth and the frame camera's images; what ``labels:`` and
+    ``images:`` do not ask for is left out anyway. Nothing is drawn that nobody asked for.
     pictures_hz : pictures per second of simulated time, at the frames of the event pass; None: none.
     scene : made already, instead of the configuration's.   renderer : made already, and not
     released at the end; its scene is drawn.
@@ -84,7 +86,28 @@ def simulate_sequence(
     return RecordedSequence(config, index, base=base, **wanted)
 
 
-_NO_LABEL = (0, None)
+class _Due:
+    """What comes next besides events: labels at their times, a frame camera's images when they are there."""
+
+    def __init__(self, labels: Iterable[tuple[int, int]], camera: FrameCamera | None):
+        self._labels, self._camera = iter(labels), camera
+        self._next = next(self._labels, None)
+
+    @property
+    def ns(self) -> int | None:
+        """Its time; None: nothing comes any more."""
+        times = [self._next[1]] if self._next is not None else []
+        if self._camera is not None and self._camera.due_ns is not None:
+            times.append(self._camera.due_ns)
+        return min(times, default=None)
+
+    def label(self) -> tuple[int, int] | None:
+        """Number and time of the label that is next, which is then over; None: it is the camera's turn."""
+        label = self._next
+        if label is None or label[1] != self.ns:
+            return None
+        self._next = next(self._labels, None)
+        return label
 
 
 class Simulation(ABC):
@@ -95,6 +118,7 @@ class Simulation(ABC):
     t0_ns, t1_ns : first and last time, ns.   pictures_hz : that it gives, or None.
     clock : wall seconds per stage.   camera : emulator and read-out, None when no events were asked for.
     events, labels : given so far.   triangles : of all that is drawn; 0 for recorded frames.
+    frame_camera : :class:`~blinkgl.imaging.FrameCamera` whose images are given; None: there is none.
     timeline : the :class:`Timeline` that says when event frames are drawn; None for
     recorded frames, and without events.
     omissions : what files of the scene ask for and is not drawn, a line per file.
@@ -102,6 +126,7 @@ class Simulation(ABC):
 
     triangles = 0
     timeline: Timeline | None = None
+    frame_camera: FrameCamera | None = None
     omissions: tuple[str, ...] = ()
     libraries: Mapping[str, str] = MappingProxyType({})
 
@@ -144,6 +169,20 @@ class Simulation(ABC):
         """The events alone."""
         return (item for item in self if isinstance(item, EventChunk))
 
+    def gather(self) -> Events:
+        """All events at once, for whoever cuts windows out of a short sequence. OpenGL stays until :meth:`close`, so
+        that :meth:`truth` can be asked at any time in it: use it in ``with``."""
+        held, self._stack = self._stack, ExitStack()
+        try:
+            return Events.concatenate([chunk.events for chunk in self.chunks()])
+        finally:
+            self._stack = held
+
+    @abstractmethod
+    def truth(self, t_ns: int, span_ns: int) -> GroundTruth:
+        """What is true at any time t_ns, with flow forward to t_ns + span_ns and back to t_ns - span_ns (k is -1).
+        Raises ConfigError for recorded frames, of which nobody knows more than their files say."""
+
     def _items(self) -> Iterator[Item]:
         with self:
             self._resume()
@@ -152,24 +191,28 @@ class Simulation(ABC):
                 self._resume()
 
     def _in_order(self) -> Iterator[Item]:
-        moments = iter(self._label_times() if self._labels else ())
-        k, label_ns = next(moments, _NO_LABEL)
+        due = _Due(self._label_times() if self._labels else (), self.frame_camera)
         ticks = None if self.pictures_hz is None else Ticks(self.t0_ns // 1000, self.pictures_hz)
         for t_ns, events in self._event_pass() if self.camera is not None else ():
             self.events += len(events)
             if events.cause is not None:
                 self._by_cause += count_causes(events)
-            while label_ns is not None and label_ns <= t_ns:
-                before, events = events.split(label_ns // 1000)
-                yield EventChunk(label_ns, before)
-                yield self._counted(k, label_ns)
-                k, label_ns = next(moments, _NO_LABEL)
+            while (due_ns := due.ns) is not None and due_ns <= t_ns:
+                before, events = events.split(due_ns // 1000)
+                yield EventChunk(due_ns, before)
+                yield self._next(due)
             yield EventChunk(t_ns, events)
             if ticks is not None and ticks.passed(t_ns // 1000):
                 yield self._picture(t_ns)
-        while label_ns is not None:
-            yield self._counted(k, label_ns)
-            k, label_ns = next(moments, _NO_LABEL)
+        while due.ns is not None:
+            yield self._next(due)
+
+    def _next(self, due: _Due) -> GroundTruth | CameraImage:
+        label = due.label()
+        if label is not None:
+            return self._counted(*label)
+        assert self.frame_camera is not None
+        return self.frame_camera.take()
 
     def _counted(self, k: int, t_ns: int) -> GroundTruth:
         truth = self._truth(k, t_ns)
@@ -186,6 +229,11 @@ class Simulation(ABC):
         """Events so far that the emulator's ``max_events_per_step`` cut, that found the read-out's
         queue full, and that are on its bus still."""
         return (0, 0, 0) if self.camera is None else (self.camera.saturated, self.camera.dropped, self.camera.late)
+
+    @property
+    def filtered(self) -> int | None:
+        """Events so far that the filters on the camera have dropped; None without filters."""
+        return None if self.camera is None else self.camera.filtered
 
     @property
     def causes(self) -> dict[str, int]:

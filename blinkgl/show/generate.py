@@ -239,6 +239,8 @@ def show_table(console: Console, made: Totals, elapsed_s: float | None = None) -
     table.add_section()
     for name in (*STAGES, "other"):
         seconds = s[f"{name}_s"]
+        if name == "images" and not seconds:  # nobody asked for any
+            continue
         table.add_row(name, f"{seconds:.2f} s  {100 * seconds / s['total_s']:4.0f} %")
     console.print(table)
     folder = first.path

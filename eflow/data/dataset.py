@@ -20,6 +20,8 @@ from eflow.data.representation import Representation
 from eflow.data.sources import Source
 from eflow.data.window import RawSample
 
+ENDLESS = 4096
+"""Samples that an endless source adds to an epoch."""
 MAX_FLOW = 400.0
 """Ground truth at or beyond this many px is not supervised and not scored (BlinkFlow's rule)."""
 
@@ -37,15 +39,19 @@ class Key:
 class Mixture:
     """The order of an endless training run over several sources.
 
+    sizes : samples of each; None: it has no end (:class:`~eflow.data.online.OnlineSource`), its samples come once, in
+    its own order, and :data:`ENDLESS` of them count as an epoch.
     weights : share of each source in an epoch. An epoch has as many samples as the sources together; each source
     contributes in proportion to its weight, going through its own samples in an order
     that is new for every pass over it.
     """
 
-    def __init__(self, sizes: list[int], weights: list[float], seed: int):
+    def __init__(self, sizes: list[int | None], weights: list[float], seed: int):
+        endless = [size is None for size in sizes]
+        sizes = [ENDLESS if size is None else size for size in sizes]
         if not sizes or min(sizes) < 1 or len(sizes) != len(weights) or min(weights) < 0 or sum(weights) <= 0:
             raise ValueError("sizes and weights")
-        self.sizes, self.seed, self.epoch_length = sizes, seed, sum(sizes)
+        self.sizes, self.seed, self.epoch_length, self.endless = sizes, seed, sum(sizes), endless
         share = np.array(weights, float) / sum(weights) * self.epoch_length
         counts = np.floor(share).astype(int)
         for i in np.argsort(counts - share, kind="stable")[: self.epoch_length - counts.sum()]:
@@ -60,17 +66,30 @@ class Mixture:
             for source, (size, count) in enumerate(zip(self.sizes, self.counts, strict=True)):
                 for n in range(epoch * count, (epoch + 1) * count):  # n-th sample ever drawn from this source
                     pass_, place = divmod(n, size)
-                    picks.append((source, int(self._permutation(source, pass_, size)[place])))
+                    picks.append((source, n if self.endless[source] else self._shuffled(source, pass_, size, place)))
             order = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0, epoch))).permutation(
                 len(picks)
             )
-            self._cache = (epoch, [Key(epoch, position, *picks[i]) for position, i in enumerate(order)])
+            picks = [picks[i] for i in order]
+            for source in np.flatnonzero(self.endless):
+                places = [i for i, (picked, _) in enumerate(picks) if picked == source]
+                for i, n in zip(places, sorted(picks[i][1] for i in places), strict=True):
+                    picks[i] = (int(source), n)
+            self._cache = (epoch, [Key(epoch, position, *pick) for position, pick in enumerate(picks)])
         return self._cache[1]
+
+    def first(self, source: int, n: int) -> int:
+        """Number of the sample of an endless ``source`` that comes next when n samples of the run have been taken."""
+        epoch, position = divmod(n, self.epoch_length)
+        return epoch * self.counts[source] + sum(key.source == source for key in self.epoch(epoch)[:position])
 
     def key(self, n: int) -> Key:
         """The n-th sample of the run."""
         epoch, position = divmod(n, self.epoch_length)
         return self.epoch(epoch)[position]
+
+    def _shuffled(self, source: int, pass_: int, size: int, place: int) -> int:
+        return int(self._permutation(source, pass_, size)[place])
 
     def _permutation(self, source: int, pass_: int, size: int) -> np.ndarray:
         wanted = (source, pass_)
@@ -104,7 +123,7 @@ class FlowDataset(Dataset):
     ):
         self.sources, self.representation, self.seed, self.raw = sources, representation, seed, raw
         self.augment, self.crop, self.empty = augment, crop, empty
-        self._starts = np.cumsum([0, *(len(s) for s in sources)])
+        self._starts = np.cumsum([0, *(0 if is_endless(s) else len(s) for s in sources)])
         if augment is not None and augment.time_reversal > 0 and not all(s.has_backward for s in sources):
             raise ConfigError(
                 "time reversal needs backward flow, which a training set lacks",
@@ -129,6 +148,8 @@ class FlowDataset(Dataset):
         return self._tensors(self._raw(source, int(key - self._starts[source])), None)
 
     def _raw(self, source: int, index: int) -> RawSample:
+        if is_endless(self.sources[source]):
+            return self.sources[source][index]
         for step in range(len(self.sources[source])):
             sample = self.sources[source][(index + step) % len(self.sources[source])]
             if len(sample.old) and len(sample.new):
@@ -163,6 +184,11 @@ class FlowDataset(Dataset):
             if self.crop is not None:
                 out = cropped(out, self.crop, rng, s.name)
         return {**out, "name": s.name, "scene": s.scene} | ({"raw": s} if self.raw else {})
+
+
+def is_endless(source: Source) -> bool:
+    """Whether its samples come once, in order (:class:`~eflow.data.online.OnlineSource`)."""
+    return getattr(source, "endless", False)
 
 
 def augmented(sample: RawSample, a: AugmentConfig, rng: np.random.Generator) -> RawSample:
@@ -296,7 +322,11 @@ def batches(dataset: FlowDataset, sampler: StepSampler, workers: int, pin: bool 
         generator=torch.Generator(),  # else each start would draw from torch's global one
         multiprocessing_context="forkserver" if workers else None,
     )
-    for batch in loader:
+    endless = [i for i, source in enumerate(dataset.sources) if is_endless(source)]
+    for keys, batch in zip(sampler, loader, strict=True):
         if isinstance(batch, BlinkGLError):
             raise batch
+        for i in endless:
+            if used := [key.index for key in keys if key.source == i]:
+                dataset.sources[i].taken(max(used) + 1)
         yield batch

@@ -1,6 +1,12 @@
-// Irradiance factor of the white sun-and-sky light (blinkgl/scene/types.py: Light):
+// What light does to a surface: the one place where the two meet, of the event pass, its rate and the colour pass alike
+// (the float64 reference: blinkgl/render/reference.py, received()). Without LIGHTS it is the white sun and sky
+// (blinkgl/scene/types.py: Light):
 //   E(n) = sun * max(0, n.s) + sky * (0.5 + 0.5 * n_up)
 // n, s and up in the object's own frame, so that normals need no matrix.
+#ifdef LIGHTS
+#include "lights.glsl"
+#else
+#define ILLUMINANT float
 uniform vec3 sun_direction;  // s, object frame, unit
 uniform vec3 up_direction;   // world z, object frame, unit
 uniform vec2 light_strength; // (sun, sky)
@@ -28,4 +34,5 @@ float irradiance_rate(vec3 normal, vec3 normal_rate)
     return (facing > 0.0 ? light_strength.x * (dot(turn, sun_direction) + dot(n, sun_rate)) : 0.0)
          + light_strength.y * 0.5 * (dot(turn, up_direction) + dot(n, up_rate));
 }
+#endif
 #endif

@@ -21,17 +21,17 @@ vec2 seen_rate(vec2 value, vec2 v)
 // pixel, and far above the 1/256 texel in which GPUs place a sample.
 const float REACH = 0.25;
 
-// Of the texture's first channel, per second, by a central difference along the motion. every: px of the image per px
+// Of the texture's channels that the pass looks at (CHANNELS), per second, by a central difference along the motion. every: px of the image per px
 // of the target.
-float texture_rate(sampler2D image, vec2 uv, vec2 v, float every)
+ALBEDO texture_rate(sampler2D image, vec2 uv, vec2 v, float every)
 {
     float speed = length(v);
     if (!(speed > 0.0))
-        return 0.0;
+        return ALBEDO(0.0);
     vec2 along_x = seen_rate(uv, vec2(-1.0 / every, 0.0)), along_y = seen_rate(uv, vec2(0.0, -1.0 / every));
     // The surface comes from where the motion points away from: what lies REACH px back is seen next.
     vec2 aside = mat2(along_x, along_y) * (v / speed) * REACH;
-    float ahead = textureGrad(image, uv - aside, along_x, along_y).r;
-    float behind = textureGrad(image, uv + aside, along_x, along_y).r;
+    ALBEDO ahead = textureGrad(image, uv - aside, along_x, along_y).CHANNELS;
+    ALBEDO behind = textureGrad(image, uv + aside, along_x, along_y).CHANNELS;
     return (ahead - behind) * speed * every * (0.5 / REACH);
 }

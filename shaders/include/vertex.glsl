@@ -13,6 +13,7 @@
 //   NEEDS_FORWARD      in vec3 shape_forward   MVP' (q' - q) of the time that forward flow leads to
 //   NEEDS_BACKWARD     in vec3 shape_backward  the same of backward flow
 //   NEEDS_NORMAL_RATE  in vec3 normal_rate     of ``normal``, object frame, per second
+//   NEEDS_LOCAL_RATE   in vec3 local_rate      of ``local``: dq/dt, object frame, per second
 
 #ifdef VERTEX_SHADER
 in vec3 in_position;
@@ -46,6 +47,9 @@ out vec3 shape_backward;
 #endif
 #ifdef NEEDS_NORMAL_RATE
 out vec3 normal_rate;
+#endif
+#ifdef NEEDS_LOCAL_RATE
+out vec3 local_rate;
 #endif
 #endif
 
@@ -83,6 +87,9 @@ void main()
 #ifdef NEEDS_NORMAL_RATE
     normal_rate = deformed_normal_rate(in_position, in_normal);
 #endif
+#ifdef NEEDS_LOCAL_RATE
+    local_rate = deformed_rate(in_position);
+#endif
 #endif
 }
 #endif
@@ -109,6 +116,9 @@ in vec3 shape_backward;
 #endif
 #ifdef NEEDS_NORMAL_RATE
 in vec3 normal_rate;
+#endif
+#ifdef NEEDS_LOCAL_RATE
+in vec3 local_rate;
 #endif
 #endif
 #endif

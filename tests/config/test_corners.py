@@ -117,8 +117,8 @@ MIXED = [
         "timeline.max_px: unknown key",
     ),
     (
-        {"sensor": {"choice": ["davis346", None]}, "readout": {"choice": [None, {"row_ns": 5}]}},
-        "readout.events_per_second: is required",
+        {"sensor": {"choice": [None, "imx636"]}, "readout": {"choice": [None, {"events_per_second": 1}]}},
+        "readout.queue_events: the last event of a full queue would wait for more than an hour",
     ),
     ({"scene": {"objects": {"count": {"uniform": [1, 9]}}}}, "scene.objects.count: not a whole number"),
     ({"labels": {"depth": {"uniform": [0, 1]}}}, "labels.depth: not true or false"),

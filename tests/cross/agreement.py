@@ -22,6 +22,7 @@ from blinkgl.events.types import Events, count_causes, named_causes
 from blinkgl.io.dsec import DsecEventReader
 from blinkgl.io.flo import read_flo
 from blinkgl.io.flow_png import read_flow_png
+from blinkgl.io.frame_camera import read_exposures
 from blinkgl.io.index import read_index
 from blinkgl.io.sequence_dir import read_manifest
 from blinkgl.labels import LABELS, asked_for
@@ -96,7 +97,8 @@ def of_sequence(folder: Path, manifest: dict[str, Any]) -> Findings:
             file=count,
             window=len(reader.slice(manifest["t_offset_us"], end + 1)),
         )
-        found.expect(count > 0, "no events: the row says nothing")
+        dropped = manifest.get("events_filtered", 0)
+        found.expect(count + dropped > 0, "no events: the row says nothing")
         found.expect(
             all((c.t >= manifest["t_offset_us"]).all() and (c.t <= end).all() for c in chunks),
             "events outside the recording",
@@ -108,13 +110,35 @@ def of_sequence(folder: Path, manifest: dict[str, Any]) -> Findings:
         by_cause = named_causes(count_causes(Events.concatenate(chunks)))
         found.same("events by cause", file=by_cause, manifest=manifest["events_by_cause"])
     lost = manifest["events_lost_in_readout"] + manifest["events_late_in_readout"]
-    if config.readout is None or config.readout.events_per_second >= 1e6:
+    behind = config.readout
+    found.same(
+        "filters",
+        configured=behind is not None and bool(behind.filters),
+        manifest=manifest.get("events_filtered") is not None,
+    )
+    if behind is not None and (behind.latency is not None or behind.filters or behind.pixels is not None):
+        pass  # events are under way at the end, dropped, or more than the emulator made
+    elif behind is None or behind.events_per_second is None or behind.events_per_second >= 1e6:
         found.expect(lost == 0, f"{lost} events lost without a limit")
     else:
         found.expect(
-            lost > 0 or 2e6 * count < config.readout.events_per_second * manifest["duration_us"],
+            lost > 0 or 2e6 * count < behind.events_per_second * manifest["duration_us"],
             "a slow bus loses nothing",
         )
+    if config.images is not None:
+        lines, about = read_exposures(folder), manifest["frame_camera"]
+        found.same(
+            "frame camera",
+            manifest=about["images"],
+            exposures=len(lines),
+            files=[len(list((folder / "frame_camera" / name).glob("*.png"))) for name in about["pictures"]][0],
+            times=len(config.images.times) if config.images.times is not None else len(lines),
+        )
+        found.same("pictures", manifest=about["pictures"], configuration=list(config.images.pictures))
+        found.expect(
+            all(manifest["t_offset_us"] <= e.start_us < e.end_us <= end + 1 for e in lines), "an exposure outside"
+        )
+    found.expect((config.images is not None) == (folder / "frame_camera").is_dir(), "frame camera, or none")
     for direction in ("forward", "backward"):
         for path in sorted((folder / f"flow/{direction}").glob("*.png")):
             flow, valid = read_flow_png(path)
@@ -214,6 +238,11 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
         "labels",
         explain=passes["labels"].count if "labels" in passes else 0,
         manifest=manifest["labels"] if wanted else 0,
+    )
+    found.same(
+        "frame camera",
+        explain=passes["frame camera"].count if "frame camera" in passes else 0,
+        files=count("frame_camera/images/", ".png"),
     )
     found.same("preview", explain="preview" in passes, files="preview.mp4" in files)
     found.same("triangles", explain=told.scene["triangles"].split()[0], manifest=f"{manifest['triangles']:,}")

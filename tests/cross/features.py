@@ -109,6 +109,22 @@ def _frames(**more: Any) -> dict[str, Any]:
 
 
 NOTHING: dict[str, Any] = {}
+_SENSOR = {
+    "name": "of one's own",
+    "width": 20,
+    "height": 16,
+    "emulators": {"esim": {"contrast_threshold": 0.25}, "v2e": {"cutoff_hz": 100}, "voltmeter": {"k1": 4}},
+    "readout": {
+        "filters": [
+            {"kind": "trail", "keep": "first", "threshold_us": 5},
+            {"kind": "trail", "keep": "second", "threshold_us": 50_000},
+            {"kind": "trail", "keep": "not_first", "threshold_us": 50_000},
+            {"kind": "rate", "events_per_second": 1e7},
+            {"kind": "flicker", "mode": "stop"},
+            {"kind": "flicker", "mode": "pass", "block": 64},
+        ]
+    },
+}
 FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "source": {
         "random": NOTHING,
@@ -157,11 +173,33 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "hermite": {"timeline": {"reconstruction": "hermite"}},
     },
     "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in QUALITIES}},
-    "sensor": {"unsaid": NOTHING, **{name: {"sensor": name} for name in sensor_names()}},
+    "sensor": {
+        "unsaid": NOTHING,
+        **{name: {"sensor": name} for name in sensor_names()},
+        "a table": {"sensor": _SENSOR},
+    },
     "readout": {
         "unsaid": NOTHING,
         "ample": {"readout": {"events_per_second": 1e9}},
         "slow": {"readout": {"events_per_second": 1e3, "row_ns": 50, "queue_events": 4}},
+        "filters": {
+            "readout": {
+                "filters": [
+                    {"kind": "trail", "keep": "first", "threshold_us": 10},
+                    {"kind": "trail", "keep": "not_first"},
+                    {"kind": "rate", "events_per_second": 1e6},
+                    {"kind": "flicker", "start": 2, "stop_below": 1, "mode": "stop"},
+                ],
+                "clock_us": 10,
+            }
+        },
+        "pixels": {
+            "readout": {
+                "pixels": {"dead_fraction": 0.1, "hot_fraction": 0.02, "hot_rate_hz": 500, "rate_hz": 5},
+                "latency": {"fixed_us": 100, "dark_us": 2000, "jitter_us": 20},
+                "filters": [{"kind": "trail", "keep": "second"}, {"kind": "flicker", "mode": "pass", "block": 256}],
+            }
+        },
     },
     "anti-aliasing": {
         name: {"render": {"antialiasing": name}} for name in ("none", "msaa4", "taps4", "ssaa2", "ssaa4")
@@ -170,13 +208,69 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         **{name: {"render": {"image_antialiasing": name}} for name in ("none", "msaa4", "ssaa2", "ssaa4")},
         "no images": {"labels": {"images": False}},
     },
+    "frame camera": {
+        "none": NOTHING,
+        "plain": {
+            "images": {"preset": "plain", "rate": 100, "max_instants": 4, "response": "srgb", "photon_noise": False}
+        },
+        "raw": {
+            "images": {
+                "preset": "raw",
+                "rate": 50,
+                "response": "linear",
+                "photon_noise": True,
+                "bayer": "bggr",
+                "bits": 16,
+                "max_instants": 2,
+            }
+        },
+        "rolling, low light": {
+            "images": {
+                "preset": "low_light",
+                "times": [0.006, 0.018],
+                "exposure_us": 4000,
+                "row_us": 100,
+                "response": "gamma",
+                "max_instants": 3,
+                "also": ["sharp", "clean"],
+            }
+        },
+        "automatic": {
+            "images": {
+                "preset": "deblurring",
+                "rate": 120,
+                "exposure_us": 2000,
+                "max_instants": 2,
+                "vignetting": 0.5,
+                "bayer": "grbg",
+                "lens": {"aperture": 0.05, "focus": 4.0},
+                "auto_exposure": {"longest_us": 4000},
+            }
+        },
+        "interpolation": {"images": {"preset": "interpolation", "max_instants": 2, "bayer": "gbrg"}},
+        "rolling shutter": {"images": {"preset": "rolling_shutter", "rate": 100, "max_instants": 3, "bayer": "rggb"}},
+    },
     "textures": {
         "plain": NOTHING,
         "sharp": {"render": {"anisotropy": 4, "mip_bias": -1}},
         "drawn": {"render": {"mip_bias": {"uniform": [-1, 0]}}},
     },
     "level of detail": {"off": NOTHING, "on": {"render": {"lod": {"enabled": True, "edge_px": 4}}}},
-    "light": {"lit": NOTHING, "unlit": {"scene": {"light": {"unlit": True}}}},
+    "light": {
+        "lit": NOTHING,
+        "unlit": {"scene": {"light": {"unlit": True}}},
+        "lamps": {
+            "scene": {
+                "light": {
+                    "sky_color": [0.6, 0.8, 1.0],
+                    "lights": [
+                        {"kind": "point", "position": [0.5, 0.5, 2.0], "strength": 4, "color": [1.0, 0.7, 0.4]},
+                        {"kind": "spot", "position": [0, 0, 4], "look_at": [1, 0, 0], "strength": 9},
+                    ],
+                }
+            }
+        },
+    },
     "flow": {
         "forward": NOTHING,
         "both": {"labels": {"flow": ["forward", "backward"]}},
@@ -217,9 +311,17 @@ REFUSED: dict[tuple[Kind, Kind], str] = {
         for curve in ("pchip", "hermite")
         for emulator in _STRAIGHT_ONLY
     },
+    **{
+        (("source", source), ("frame camera", camera)): "images: recorded frames are images already"
+        for source in FEATURES["source"]
+        if source.startswith("frames")
+        for camera in FEATURES["frame camera"]
+        if camera != "none"
+    },
+    (("frame camera", "rolling, low light"), ("time", "late")): "images.times: an exposure outside the sequence",
 }
-"""Pairs that make no sense, and the line that says so. Recorded frames have no timeline: there
-they are no contradiction."""
+"""Pairs that make no sense, and the line that says so. Recorded frames have neither a timeline nor a time: there those
+are no contradiction."""
 
 TOO_SLOW: set[tuple[Kind, Kind]] = {
     (one, ("textures", "sharp")) for one in (("anti-aliasing", "msaa4"), ("images", "msaa4"))
@@ -263,9 +365,15 @@ def configuration(row: dict[str, str]) -> dict[str, Any]:
 
 def refusal(row: dict[str, str]) -> str | None:
     """What is said when this row is given; None: it is accepted."""
-    if row.get("source", "").startswith("frames"):
-        return None
-    return next((line for (a, b), line in REFUSED.items() if row.get(a[0]) == a[1] and row.get(b[0]) == b[1]), None)
+    recorded = row.get("source", "").startswith("frames")
+    return next(
+        (
+            line
+            for (a, b), line in REFUSED.items()
+            if row.get(a[0]) == a[1] and row.get(b[0]) == b[1] and (not recorded or a[0] == "source")
+        ),
+        None,
+    )
 
 
 def fits(row: dict[str, str]) -> bool:

@@ -50,7 +50,9 @@ def job(tmp_path, monkeypatch):
 
     monkeypatch.setattr(executor, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": popen}))
     monkeypatch.setattr(executor, "several_cards", lambda job: None)
-    return lambda how="works": SimpleNamespace(out=str(tmp_path / "out"), to_dict=lambda: {"how": how})
+    return lambda how="works": SimpleNamespace(
+        out=str(tmp_path / "out"), maker="room:Maker", to_dict=lambda: {"how": how}
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -254,11 +256,12 @@ def test_this_process_makes_one_at_a_time(monkeypatch):
         def __exit__(self, *_):
             released.append(self)
 
-    monkeypatch.setattr(executor, "Maker", Maker)
+    monkeypatch.setattr(executor, "maker_of", lambda name, job, device: {"room:Maker": Maker}[name](job))
+    job = SimpleNamespace(maker="room:Maker", to_dict=lambda: "job")
     inline = Inline()
     inline.close()
     inline.listener = said.append
-    assert inline.open("job") == [{"kind": "hello", "job": "job"}] and inline.free() == 1 and inline.poll(0) == []
+    assert inline.open(job) == [{"kind": "hello", "job": "job"}] and inline.free() == 1 and inline.poll(0) == []
     inline.submit(3, 2)
     assert inline.free() == 0 and inline.poll(0) == [{"kind": "done", "task": 3, "attempt": 2}] and inline.free() == 1
     assert said == [{"kind": "progress", "task": 3}] and json.dumps(said)

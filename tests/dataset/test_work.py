@@ -29,7 +29,7 @@ from blinkgl.sequence.clock import StageClock
 
 
 @pytest.mark.parametrize(
-    "workers, cores, share, drawing", [(1, 1, 1, None), (2, 1, 1, "0"), (3, 8, 2, "2"), (8, 8, 1, "0"), (0, 4, 4, None)]
+    "workers, cores, share, drawing", [(1, 1, 1, "0"), (2, 1, 1, "0"), (3, 8, 2, "2"), (8, 8, 1, "0"), (0, 4, 4, None)]
 )
 def test_cores_are_divided(workers, cores, share, drawing):
     names = {name: str(share) for name in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
@@ -126,9 +126,9 @@ def test_a_report_of_many():
     assert totals.summary() == {
         "sequences": 3, "frames": 30, "events": 3000, "labels": 9, "simulated_s": 1.5, "total_s": 6.0,
         "seconds_per_simulated_second": 4.0, "events_per_second": 500.0, "render_s": 3.0, "write_s": 0.75,
-        "scene_s": 0.0, "read-back_s": 0.0, "events_s": 0.0, "preview_s": 0.0, "other_s": 2.25,
+        "scene_s": 0.0, "read-back_s": 0.0, "events_s": 0.0, "images_s": 0.0, "preview_s": 0.0, "other_s": 2.25,
     }  # fmt: skip
-    assert STAGES == ("scene", "render", "read-back", "events", "write", "preview")
+    assert STAGES == ("scene", "render", "read-back", "events", "images", "write", "preview")
     totals.seconds["render"] = 99.0
     assert totals.summary()["other_s"] == 0.0
 

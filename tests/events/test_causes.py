@@ -10,7 +10,7 @@ import pytest
 
 from blinkgl.cli import run as command
 from blinkgl.config.events import EsimConfig, V2eConfig, VoltmeterConfig
-from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.config.readout import ReadoutConfig
 from blinkgl.errors import EventDataError, OutputError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.camera import EventCamera, EventFrame

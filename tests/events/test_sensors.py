@@ -8,7 +8,8 @@ from collections import deque
 import numpy as np
 import pytest
 
-from blinkgl.config.sensor import ReadoutConfig, load_sensor, sensor_names
+from blinkgl.config.readout import ReadoutConfig
+from blinkgl.config.sensor import load_sensor, sensor_names
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.readout import Readout

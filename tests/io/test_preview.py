@@ -101,6 +101,19 @@ def test_frames_and_events_are_enlarged_pixel_by_pixel(image):
     assert (made._video.pictures[1][30:, 124:] == 255).all(), "events are shown once"
 
 
+def test_highlights_are_compressed_and_do_not_clip():
+    """Light above 1 keeps its order; where the light has gone the curve comes back slowly."""
+    made = PreviewWriter("p.mp4", 48, 64, flow=False)
+    steps = np.repeat(np.linspace(0.1, 3.0, 64, dtype=np.float32)[None], 48, axis=0)
+    for k in range(200):
+        made.frame(25_000 * k, steps if k == 0 else np.full((48, 64), 0.9, np.float32))
+    first = made._video.pictures[0][30, :128:2, 0].astype(int)
+    assert first.max() == 255 and (np.diff(first) >= 0).all() and len(set(first)) > 30
+    assert (first == 255).sum() <= 8, "clipped it would be two thirds"
+    later = [int(picture[40, 10, 0]) for picture in made._video.pictures]
+    assert later[1] < later[20] < later[-1] == to_srgb8(np.float32([0.9]))[0]
+
+
 def test_large_frames_are_averaged_in_linear_light():
     made = PreviewWriter("p.mp4", 720, 40, flow=False)
     stripes = np.zeros((720, 40), np.float32)

@@ -19,7 +19,9 @@ from blinkgl.config.sequence import RenderConfig
 from blinkgl.errors import BlinkGLError, ConfigError
 from blinkgl.render import reference
 from blinkgl.render.renderer import Renderer
-from blinkgl.scene.types import Light, Material, Part, SceneObject
+from blinkgl.scene.lights import lamp_pose
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
 from blinkgl.tools import cycles_worker
 from blinkgl.tools.peer_cycles import Cost, CyclesSettings, blender_camera, colours, export, frames
 from render_scenes import LEVEL, cube, mixed_scene, quad, rig, scene, smooth_texture, sphere, still, thing
@@ -256,6 +258,23 @@ def test_light_without_shadows_is_ours(gl, sun, sky):
         assert sun or np.quantile(error[here], 0.99) < 2.5e-3
     # Something of it is lit.
     assert max((true.luminance[(true.instance == k) & ~band] > 0.1).sum() for k in (3, 4, 5)) > 200
+
+
+@needs_blender
+@pytest.mark.parametrize("kind", ["sun", "point", "spot"])
+def test_a_lamp_shines_as_it_does_there(gl, kind):
+    """Each alone, of a colour, at path depth 1 without shadows: strength, place, direction and cone."""
+    pose = lamp_pose((0.4, 3.0, 2.0), (-0.1, 0.4, -1.0))
+    strength, angle = ((0.9, 0.6, 0.3) if kind == "sun" else (9.0, 6.0, 3.0)), 0.6
+    lamp = Lamp(kind, strength, StaticPath(pose), inner=angle * (1 - 1e-6), outer=angle)
+    world = replace(mixed_scene(textured=False), light=Light(sun=0.0, sky=0.0, lamps=(lamp,)))
+    (theirs,) = colours(world, TIMES[:1], CyclesSettings(samples=16, shadows=False, bounces=0))
+    band, true = band_of(world, TIMES[0])
+    with Renderer(gl, world, RenderConfig(image_antialiasing="ssaa4")) as renderer:
+        mine = renderer.colour(TIMES[0]).read()
+    lit = (true.colour.min(axis=-1) > 0.02) & ~band & (true.instance > 1)
+    error = np.abs(theirs / mine - 1)[lit]
+    assert lit.sum() > 1000 and np.median(error) < 0.002 and np.quantile(error, 0.9) < 0.01
 
 
 @needs_blender

@@ -48,6 +48,18 @@ def assert_same(a: Events, b: Events) -> None:
         np.testing.assert_array_equal(getattr(a, column), getattr(b, column))
 
 
+def test_a_budget_is_told_the_frames_that_it_asked_for(tmp_path, gl):
+    """Every one of them: what was achieved is known then, and a smaller allowance takes more frames."""
+    frames = {}
+    for most_us in (20_000, 100):
+        config = config_of(tmp_path, timeline={"kind": "budget", "max_time_error_us": most_us})
+        with simulate_sequence(config, 0, gl, labels=False) as sequence:
+            frames[most_us] = len(list(sequence))
+            said = sequence.timeline.info()["time_error"]
+        assert said["measurements"] > 0 and said["median_us"] > 0
+    assert frames[100] > 1.3 * frames[20_000]
+
+
 # --- order ------------------------------------------------------------------------------------------------------------
 
 

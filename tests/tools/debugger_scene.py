@@ -81,7 +81,7 @@ MISTAKES = {
     "depth off by near": ("include/labels/depth.glsl", "1.0 / gl_FragCoord.w", "1.0 / gl_FragCoord.w - 0.05"),
 }
 
-_UV = "float luminance = texture(albedo, uv).r;"
+_UV = "ALBEDO luminance = texture(albedo, uv).CHANNELS;"
 
 LOOKUP_MISTAKES = {
     # name: ([(file, right, wrong), …], the first buffer that is wrong, words of the suspicion, the objects)

@@ -486,8 +486,8 @@ def test_the_page_in_chromium(served, shader, config, tmp_path):
         good = (folder / "luminance.glsl").read_text()
         edit(
             folder / "luminance.glsl",
-            "float luminance = texture(albedo, uv).r;",
-            "float luminance = texture(albedo, uv, 1.0).r;",
+            "ALBEDO luminance = texture(albedo, uv).CHANNELS;",
+            "ALBEDO luminance = texture(albedo, uv, 1.0).CHANNELS;",
         )
         # The verdict was of other shaders.
         page.wait("return document.querySelector('#verdict').textContent.includes('has changed')")

@@ -198,6 +198,7 @@ class ReferenceMoment(_Lazy):
     that level by the CPU twin in :mod:`mipmaps`, because the reference itself has no mip maps; its own values, at full
     resolution, are albedo_level0, colour_level0 and luminance_level0.   texture_size : (H, W,
     2) texels, 1 where there is no texture.
+    light : of the luminance of what the surface is made of: coloured light takes of each colour as much as it has.
     uv, level, albedo, light : what both passes should look up; luminance_albedo is the luminance of albedo.
     """
 
@@ -263,12 +264,12 @@ class ReferenceMoment(_Lazy):
             np.zeros((*shape, 3)),
             np.ones((*shape, 2)),
         )
+        lit = albedo.copy()
         xy = reference.pixel_grid(scene.camera).reshape(*shape, 2)
         for p, (thing, part) in enumerate(reference.scene_parts(scene)):
             on = frame.part == p
             if not on.any():
                 continue
-            light[on] = 1.0 if part.material.unlit else reference.irradiance(scene, frame.normal[on])
             if part.material.texture is not None:  # else the GPU has no coordinates either
                 uv[on] = frame.uv[on] * part.material.uv_scale
                 size[on] = part.material.texture.image.shape[1::-1]
@@ -285,7 +286,14 @@ class ReferenceMoment(_Lazy):
                     + self.mip_bias
                 )
             albedo[on] = mipmapped_albedo(part.material, uv[on], level[on])
-        colour = np.where(frame.hit[..., None], albedo * light[..., None], frame.colour)
+            lit[on], light[on] = albedo[on], 1.0
+            if not part.material.unlit:
+                pose = thing.path.pose(t_ns)
+                points = frame.local[on] @ pose[:3, :3].T + pose[:3, 3]
+                lit[on] *= (total := reference.received(scene, t_ns, points, frame.normal[on]).total)
+                grey = albedo[on] @ LUMA
+                light[on] = np.where(grey > 0, lit[on] @ LUMA / np.where(grey > 0, grey, 1.0), total @ LUMA)
+        colour = np.where(frame.hit[..., None], lit, frame.colour)
         return {
             "uv": uv,
             "light": light,

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from itertools import product
 from typing import Any
 
+from blinkgl.render.lighting import EXAMPLES
 from blinkgl.render.passes import PASSES, Pass, ScenePass
 from blinkgl.render.resources import Kind
 from blinkgl.scene.shapes.table import DEFORMERS, define_of
@@ -34,11 +35,24 @@ def variants(program: str) -> list[dict[str, Any]] | None:
     return _defines(program, (*PASSES, Inspection)) or None
 
 
+def _lights(pass_: Pass, kind: Kind | None) -> list[dict[str, Any]]:
+    """Of the plain light none, and of all that light can be an example each; of shapes one."""
+    if kind is None or not (kind.lit and pass_.lit):
+        return [{}]
+    if kind.shape:
+        return [{}, EXAMPLES[-1]]
+    hued = (kind.textured or not pass_.one_channel) and not kind.two_sided
+    coloured = [light | {"HUED": 1} for light in EXAMPLES] if hued else []
+    return [{}, *EXAMPLES, *coloured]
+
+
 def _defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]:
     found: dict[tuple, dict[str, Any]] = {}
     for one in passes:
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:
-                defines = pass_.defines(kind) | (kind.defines if kind is not None else {})
-                found.setdefault(tuple(sorted(defines.items())), defines)
+                plain = pass_.defines(kind) | (kind.defines if kind is not None else {})
+                for light in _lights(pass_, kind):
+                    defines = plain | light
+                    found.setdefault(tuple(sorted(defines.items())), defines)
     return list(found.values())

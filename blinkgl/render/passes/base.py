@@ -66,6 +66,8 @@ class Pass:
     outputs : what it writes.   inputs : what it reads, drawn before it.   samples, every : its size beside the image's.
     depth : whether it has a depth buffer; "texture": one that a later pass may read.
     still : whether a camera that stands still has only what moves drawn again.
+    lit : whether its program asks light.glsl for the light.   one_channel : whether one channel of it will do, where
+    the surface is of one colour.
     pointwise : each pixel comes of the inputs' pixel at the same place, so that it does
     not change where they do not."""
 
@@ -76,6 +78,8 @@ class Pass:
     every: int = 1
     depth: ClassVar[bool | str] = True
     still: ClassVar[bool] = False
+    lit: ClassVar[bool] = False
+    one_channel: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
 
     def size(self, width: int, height: int) -> tuple[int, int]:
@@ -89,7 +93,8 @@ class Pass:
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:
         """Of the program variant, for a kind of material (None: no material at all);
-        TEXTURED, LIT and TWO_SIDED come on top."""
+        TEXTURED, LIT and TWO_SIDED come on top,
+        and, of a pass that is ``lit``, those of the scene's light."""
         return {}
 
     def seen(self, moment: Moment) -> Moment:

@@ -20,6 +20,7 @@ class Colour(ScenePass):
 
     samples: Samples = Samples()
     program: ClassVar[str] = "colour.glsl"
+    lit: ClassVar[bool] = True
     outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
 
     def background(self, scene: Scene) -> tuple[float, ...]:

@@ -18,12 +18,16 @@ if TYPE_CHECKING:
 
 class _Luminance(ScenePass):
     program: ClassVar[str] = "luminance.glsl"
+    lit: ClassVar[bool] = True
+    one_channel: ClassVar[bool] = True
 
     def background(self, scene: Scene) -> tuple[float, ...]:
         return scene.background, 0.0
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
-        if item.textured:
+        if item.kind.hued:
+            painter.resources.shares_texture(item.material).use(0)
+        elif item.textured:
             painter.resources.luminance_texture(item.material).use(0)
         else:
             uniforms["albedo"].value = painter.resources.albedo_luminance(item.material)

@@ -17,6 +17,7 @@ import json
 import struct
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -39,8 +40,9 @@ _DRAWN = {"KHR_materials_unlit", "KHR_texture_transform", "KHR_mesh_quantization
 # Not drawn, and yet no reason to refuse a file that requires them: shape, base colour and motion are what they would
 # be, only light is missing from the surface. Everything else that is required (compressed geometry or images,
 # instances, other material models, what nobody has heard of) would be a scene that is not the file's.
+_LIGHTS = "KHR_lights_punctual"
 _LIGHT_ONLY = {
-    "KHR_lights_punctual",
+    _LIGHTS,
     "KHR_materials_emissive_strength",
     "KHR_materials_clearcoat",
     "KHR_materials_sheen",
@@ -155,6 +157,24 @@ class Document:
     @property
     def where(self) -> str:
         return str(self.path)
+
+    def lights(self) -> dict[int, dict[str, Any]]:
+        """Lights of the scene's nodes as KHR_lights_punctual has them, by the node's index, checked, with all that it
+        leaves out filled in."""
+        extension = self.tree.get("extensions", {}).get(_LIGHTS, {})
+        gltf_schema.check(extension, f"{self.where}: {_LIGHTS}", gltf_schema.PunctualLights)
+        table, found = gltf_schema.PunctualLights.model_validate(extension).lights, {}
+        for index in self.nodes:
+            if (reference := self.tree["nodes"][index].get("extensions", {}).get(_LIGHTS)) is not None:
+                number = reference.get("light")
+                if type(number) is not int or not 0 <= number < len(table):
+                    raise AssetError(
+                        "the file is no valid glTF (a reference to lights that does not exist)",
+                        where=self.where,
+                        value=number,
+                    )
+                found[index] = table[number].model_dump()
+        return found
 
     # ---- geometry
     def world(self, node: int) -> np.ndarray:
@@ -538,8 +558,10 @@ def read(
     max_faces: int = 5_000_000,
     max_texture: int = 2048,
     materials: bool = True,
+    lights: bool = False,
 ) -> Document:
-    """Parses a file, checks its shape and its counts. Raises AssetError naming it."""
+    """Parses a file, checks its shape and its counts. lights : whether somebody asks for the file's
+    (:meth:`Document.lights`). Raises AssetError naming it."""
     path = Path(path)
     where = str(path)
     with reading("scene", where):
@@ -556,7 +578,7 @@ def read(
             said_there = name.startswith(("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_"))
             if name not in _DRAWN | _LIGHT_ONLY | _INVISIBLE and not said_there:
                 document.omissions.add(name)
-        if any("KHR_lights_punctual" in tree["nodes"][i].get("extensions", {}) for i in document.nodes):
+        if not lights and any(_LIGHTS in tree["nodes"][i].get("extensions", {}) for i in document.nodes):
             document.omissions.add("lights (the configuration's sun and sky shine)")
     return document
 

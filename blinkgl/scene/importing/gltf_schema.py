@@ -200,6 +200,31 @@ class Animation(_Part):
     samplers: list[AnimationSampler]
 
 
+class Spot(_Part):
+    innerConeAngle: Annotated[float, Field(ge=0, lt=1.5708)] = 0.0
+    outerConeAngle: Annotated[float, Field(gt=0, le=1.5708)] = 0.7853981633974483
+
+    @model_validator(mode="after")
+    def _inside(self):
+        if self.innerConeAngle >= self.outerConeAngle:
+            raise ValueError("a spot light's inner cone is not inside its outer cone")
+        return self
+
+
+class PunctualLight(_Part):
+    """Of KHR_lights_punctual: candela and lux."""
+
+    type: Literal["directional", "point", "spot"]
+    color: Annotated[list[Factor], Field(min_length=3, max_length=3)] = [1, 1, 1]
+    intensity: Factor = 1.0
+    range: Annotated[float, Field(gt=0, le=1e9)] = None
+    spot: Spot = Spot()
+
+
+class PunctualLights(_Part):
+    lights: list[PunctualLight] = []
+
+
 class File(_Part):
     asset: Asset
     extensionsUsed: list[str] = []
@@ -220,10 +245,11 @@ class File(_Part):
     animations: list[Animation] = []
 
 
-def check(tree: Any, where: str) -> None:
-    """AssetError naming the first property that is not as the specification has it, and its value."""
+def check(tree: Any, where: str, model: type[_Part] = File) -> None:
+    """AssetError naming the first property that is not as the specification has it, and its value.
+    model : what it is checked as; an extension has one of its own."""
     try:
-        File.model_validate(tree)
+        model.model_validate(tree)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         path = ".".join(str(step) for step in first["loc"]) or "its JSON"

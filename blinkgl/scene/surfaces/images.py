@@ -23,7 +23,8 @@ from blinkgl.errors import AssetError
 from blinkgl.scene.reading import contents, reading
 from blinkgl.srgb import DECODE_8BIT, to_srgb8
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".hdr", ".exr")
+_EXR = b"v/1\x01"
 MAX_SIDE = 16_384  # what the configuration's max_size allows, and what OpenGL implementations take
 MAX_PIXELS = MAX_SIDE**2
 MAX_HDR_PIXELS = MAX_PIXELS // 2  # 12 bytes each: a panorama of 16384x8192
@@ -67,7 +68,8 @@ def photographs() -> dict[str, Path]:
 
 
 def load_image(path: Path, max_size: int | None = None, where: str | None = None) -> np.ndarray:
-    """(h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr``; the longer side at most ``max_size`` px.
+    """(h, w, 3) uint8 sRGB, or float32 linear light for Radiance ``.hdr`` and OpenEXR; the longer side at most
+    ``max_size`` px.
 
     HDR images are exposed so that their 90th percentile is 0.8 and clipped at :data:`HDR_WHITE`.
     While it is reduced, an image takes at most 7 bytes per pixel of the file (HDR: 25), and some 100 MB beside it.
@@ -79,7 +81,7 @@ def load_image(path: Path, max_size: int | None = None, where: str | None = None
 def decode_image(data: bytes, max_size: int | None, where: str) -> np.ndarray:
     """:func:`load_image` from bytes already read."""
     with reading("image", where):
-        image = _decode_hdr(data, where) if data[:2] == b"#?" else _decode_ldr(data, where)
+        image = _decode_hdr(data, where) if data[:2] == b"#?" or data[:4] == _EXR else _decode_ldr(data, where)
         return shrink(image, max_size)
 
 
@@ -103,7 +105,7 @@ def _open(data: bytes, where: str) -> Image.Image:
     raise AssetError(
         "the image is corrupt or of an unknown format",
         where=where,
-        accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR",
+        accepted="one of " + ", ".join(_FORMATS) + ", Radiance HDR, OpenEXR",
     )
 
 
@@ -140,7 +142,61 @@ def _blocks(height: int, width: int) -> list[slice]:
     return [slice(top, min(top + rows, height)) for top in range(0, height, rows)]
 
 
-def _decode_hdr(data: bytes, where: str) -> np.ndarray:
+def load_panorama(path: Path, where: str | None = None) -> tuple[np.ndarray, float]:
+    """An equirectangular picture as light: (h, w, 3) float32 linear radiance as it is in the file, and the factor by
+    which :func:`load_image` exposes it (1 of a picture of 8 bits, which is as bright as it looks).
+
+    Raises :class:`AssetError` for what :func:`load_image` refuses, and where it is no panorama: not twice as wide as it
+    is high, with pixels that are no radiance (NaN, infinite, negative), or black."""
+    where = where or str(path)
+    data = contents(Path(path), "image", where)
+    with reading("image", where):
+        if data[:2] == b"#?" or data[:4] == _EXR:
+            image = _radiance(data, where)
+            factor = exposure(image)
+        else:
+            image, factor = DECODE_8BIT[shrink(_decode_ldr(data, where), 4096)], 1.0
+    height, width = image.shape[:2]
+    if not 1.9 < width / height < 2.1:
+        raise AssetError(
+            "not a panorama", where=where, value=f"{width}x{height}", accepted="twice as wide as it is high"
+        )
+    if image.min() < 0:
+        raise AssetError("a pixel is no radiance", where=where, value=float(image.min()), accepted="numbers from 0 on")
+    if not image.max() > 0:
+        raise AssetError("the panorama is black", where=where)
+    return image, factor
+
+
+def exposure(image: np.ndarray) -> float:
+    """The factor that takes the 90th percentile of a picture's radiance to 0.8."""
+    level = float(np.percentile(image.max(axis=2), 90))
+    return 0.8 / level if level > 0 else 1.0
+
+
+def _radiance(data: bytes, where: str) -> np.ndarray:
+    """(h, w, 3) float32 of a Radiance or OpenEXR file."""
+    if data[:4] == _EXR:
+        from blinkgl.io.video import decode_exr
+
+        window = re.search(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", data[:8192], re.DOTALL)
+        if window is None:
+            raise AssetError("the image is corrupt (no size in the OpenEXR header)", where=where)
+        x0, y0, x1, y1 = struct.unpack("<4i", window[1])
+        if x1 < x0 or y1 < y0:
+            raise AssetError("the image is corrupt (an empty OpenEXR window)", where=where)
+        _check_size(x1 - x0 + 1, y1 - y0 + 1, where, MAX_HDR_PIXELS)
+        image = decode_exr(data, where)
+        image = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+        if not np.isfinite(image).all():
+            y, x = np.argwhere(~np.isfinite(image).all(axis=2))[0].tolist()
+            raise AssetError(
+                "a pixel is no radiance",
+                where=f"{where}, x={x}, y={y}",
+                value=image[y, x].tolist(),
+                accepted="finite numbers",
+            )
+        return np.ascontiguousarray(image, np.float32)
     size = re.search(rb"\n[-+][XY] (\d{1,9}) [-+][XY] (\d{1,9})\n", data[:8192])
     if size is None:
         raise AssetError("the image is corrupt (no size in the Radiance header)", where=where)
@@ -148,7 +204,11 @@ def _decode_hdr(data: bytes, where: str) -> np.ndarray:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or not np.isfinite(image).all():
         raise AssetError("the image is corrupt or of an unknown format", where=where)
-    image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
+
+
+def _decode_hdr(data: bytes, where: str) -> np.ndarray:
+    image = _radiance(data, where)
     level = float(np.percentile(image.max(axis=2), 90, overwrite_input=True))
     image *= np.float32(0.8 / level if level > 0 else 1.0)
     return np.clip(image, 0, HDR_WHITE, out=image)

@@ -27,6 +27,7 @@ from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import transform_mesh
 from blinkgl.scene.geometry.primitives import BUILDERS
 from blinkgl.scene.importing.mesh_files import Asset, load_asset
+from blinkgl.scene.lights import make_light
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import simulate
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
@@ -40,7 +41,7 @@ from blinkgl.scene.surfaces.images import content_hash, decode_image, photograph
 from blinkgl.scene.surfaces.textures import procedural_texture
 from blinkgl.scene.types import Material, Mesh, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import resolve
-from blinkgl.scene.worlds.random_world import make_light
+from blinkgl.scene.worlds.sky import with_environment
 
 _PROCEDURAL_SIZE = 1024
 # A camera (OpenCV axes) that looks along the world's +x with z up.
@@ -127,12 +128,13 @@ def explicit_scene(
     dynamics = None
     if config.physics is not None:
         objects, dynamics = simulate(objects, bodies, config.physics, t0_ns, t1_ns)
+    light, objects = with_environment(config.light.environment, make_light(config.light), base, objects)
     return Scene(
-        tuple(objects),
+        objects,
         Rig.alone(camera, path),
         t0_ns,
         t1_ns,
-        make_light(config.light),
+        light,
         config.background,
         tuple(log),
         tuple(omissions),

@@ -28,6 +28,7 @@ from blinkgl.scene.geometry.meshes import closed_together, make_mesh
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.animations import Animation, clip_names, play, rest_pieces
 from blinkgl.scene.importing.mesh_files import piece_of_trimesh
+from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import reading
@@ -37,7 +38,7 @@ from blinkgl.scene.surfaces.images import content_hash, shrink
 from blinkgl.scene.types import Light, Material, Part, PosePath, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.explicit import motion_path
 from blinkgl.scene.worlds.pool import resolve
-from blinkgl.scene.worlds.random_world import make_light
+from blinkgl.scene.worlds.sky import with_environment
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,10 +67,13 @@ def scene_from_file(config: FileSceneConfig, camera: CameraModel, t0_ns: int, t1
         animation=config.animation,
         base=base,
         light=make_light(config.light),
+        lights_gain=config.lights_gain if config.lights == "file" else None,
         background=config.background,
         max_faces=config.max_faces,
         max_texture=config.max_texture_size,
     )
+    light, objects = with_environment(config.light.environment, scene.light, base, scene.objects)
+    scene = replace(scene, light=light, objects=objects)
     return unlit(scene) if config.light.unlit else scene
 
 
@@ -85,6 +89,7 @@ def from_gltf(
     animation: str | int | AnimationConfig | None = 0,
     base: Path | str = ".",
     light: Light = Light(),
+    lights_gain: float | None = None,
     background: float = 0.2,
     max_faces: int = 5_000_000,
     max_texture: int = 2048,
@@ -97,11 +102,13 @@ def from_gltf(
     ``base``).
         Translations and rotations of nodes are sampled at 60 Hz and joined by a C2 spline; what a path cannot be
         (scales that change, jumps, skins, morph targets) changes the object's shape instead, exactly.
+    lights_gain : None: ``light`` alone shines. A number: the file's own lights, times it, in the place of its sun.
     What the file asks for and is not drawn is in the scene's ``omissions``.
-    Raises AssetError (file), ConfigError (camera or animation that is not there).
+    Raises AssetError (file), ConfigError (camera, animation or lights that are not there).
     """
     with reading("scene", str(path)):
-        document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture)
+        own = lights_gain is not None
+        document = gltf.read(Path(path), max_faces=max_faces, max_texture=max_texture, lights=own)
         return _from_document(
             document,
             camera,
@@ -112,13 +119,26 @@ def from_gltf(
             intrinsics,
             _animation(document, animation, Path(base)),
             light,
+            lights_gain,
             background,
         )
 
 
 def _from_document(
-    document: gltf.Document, camera, t0_ns, t1_ns, camera_name, camera_path, intrinsics, animation, light, background
+    document: gltf.Document,
+    camera,
+    t0_ns,
+    t1_ns,
+    camera_name,
+    camera_path,
+    intrinsics,
+    animation,
+    light,
+    lights_gain,
+    background,
 ) -> Scene:
+    if lights_gain is not None:
+        light = _with_lights(document, animation, t0_ns, t1_ns, light, lights_gain)
     objects = []
     for index, node in document.nodes.items():
         if node.mesh is None:
@@ -404,6 +424,23 @@ def _motion(
         )
     poses = np.stack(poses)
     return KeyframePath(times, poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]), "spline", document.where), first
+
+
+def _with_lights(
+    document: gltf.Document, animation: Animation | None, t0_ns: int, t1_ns: int, light: Light, gain: float
+) -> Light:
+    """The file's lights in the place of the sun: the strongest, where there are too many."""
+    found = document.lights()
+    if not found:
+        raise ConfigError("the file has no lights", where="scene.lights", value="file", accepted="config")
+    room = MAX_LAMPS - len(light.lamps)
+    kept = sorted(found, key=lambda node: -found[node]["intensity"] * max(found[node]["color"]))[:room]
+    if len(found) > room:
+        document.omissions.add(f"{len(found) - room} of {len(found)} lights (the weakest; at most {room} shine)")
+    lamps = [
+        lamp_of_gltf(found[node], _motion(document, node, animation, t0_ns, t1_ns)[0], gain) for node in sorted(kept)
+    ]
+    return replace(light, sun=0.0, lamps=(*light.lamps, *lamps))
 
 
 def _camera_node(document: gltf.Document, name: str | int | None) -> int:

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,14 +20,15 @@ from blinkgl.camera import CameraModel
 from blinkgl.config.base import tag_of
 from blinkgl.config.deform import AnimationConfig, DeformConfig, RandomDeformConfig
 from blinkgl.config.physics import BodyConfig, RandomPhysicsConfig
-from blinkgl.config.scene import LightConfig, RandomSceneConfig, SkyConfig, WallsConfig
+from blinkgl.config.scene import RandomSceneConfig, SkyConfig, WallsConfig
 from blinkgl.config.sequence import camera_radius
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role, generator
 from blinkgl.scene.geometry.deforming import deforming
 from blinkgl.scene.geometry.meshes import scale_mesh
-from blinkgl.scene.geometry.primitives import cuboid, grid, parameter_hash, square
+from blinkgl.scene.geometry.primitives import cuboid, grid
 from blinkgl.scene.importing.mesh_files import Asset
+from blinkgl.scene.lights import MAX_LAMPS, make_light, random_lamps
 from blinkgl.scene.motion.collision import resolve_collisions
 from blinkgl.scene.motion.dynamics import Barrier, Exploded, simulate
 from blinkgl.scene.motion.paths import StaticPath
@@ -35,15 +37,15 @@ from blinkgl.scene.motion.ways import random_way
 from blinkgl.scene.reading import contents
 from blinkgl.scene.rig import Rig
 from blinkgl.scene.shapes.deformer import filled, gait
-from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, cube_faces, load_image, shrink
-from blinkgl.scene.types import Light, Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.surfaces.images import IMAGE_SUFFIXES, SKY_SIDES, content_hash, load_image, shrink
+from blinkgl.scene.types import Lamp, Material, Mesh, Part, Scene, SceneObject, Texture
 from blinkgl.scene.worlds.pool import Pool, files_below, object_pool, resolve, split_of, texture_pool
+from blinkgl.scene.worlds.sky import PANORAMA_INSET, panorama_light, panorama_textures, sky_box
 
 _PLACEMENTS = 300  # positions tried for an object before it is left out
 _CAMERA_PATHS = 6  # camera paths tried for one that runs into nothing; the last is cut where it does
 _GAP = 0.05  # m between bounding spheres at t0
 _STAND_OFF = 0.8  # m beyond the clearance that way-points keep from the camera: nothing should fill the view
-_PANORAMA_MARGIN = 1 / 16
 
 
 def random_world(
@@ -76,9 +78,9 @@ def random_world(
             accepted=f"at least {clearance:.4g} m (scene.camera_clearance, or the "
             "distance of the near plane's corners: camera.near and camera.fov)",
         )
-    backdrop = []
+    backdrop, panorama = [], None
     if config.sky:
-        parts = _sky(config.sky, textures, rng_texture, split, base, log)
+        parts, panorama = _sky(config.sky, textures, rng_texture, split, base, log)
         backdrop.append(("sky", "sky", parts, StaticPath(_shift(floor), t0_ns, t1_ns)))
     if config.ground:
         size = config.ground.size or (config.sky.size if config.sky else 4 * config.region.width)
@@ -152,12 +154,25 @@ def random_world(
         except Exploded as error:  # squeezed between two that nothing stops
             kept = tuple(o for o in kept if o.name != error.body)
             log.append(f"left out, it came to be faster than scene.physics.max_speed: {error.body}")
+    lamps: tuple[Lamp, ...] = ()
+    if config.lights is not None:
+        lamps = random_lamps(config.lights, generator(seed, sequence, Role.LIGHT), half, floor)
+        if len(lamps) + len(config.light.lights) + 1 > MAX_LAMPS:
+            raise ConfigError(
+                "too many lights",
+                where="scene.lights.count",
+                value=config.lights.count[1],
+                accepted=f"at most {MAX_LAMPS - 1} with those of scene.light.lights",
+            )
+    light = make_light(config.light, rng, lamps)
+    if config.sky is not None and config.sky.lights and panorama is not None:
+        light = panorama_light(panorama.file, panorama.angle, panorama.brightness, light, panorama.where)
     return Scene(
         objects=kept,
         rig=Rig.alone(camera, result.camera_path),
         t0_ns=t0_ns,
         t1_ns=t1_ns,
-        light=make_light(config.light, rng),
+        light=light,
         background=config.background,
         log=tuple(log),
         omissions=tuple(omissions),
@@ -174,12 +189,6 @@ def pools(config: RandomSceneConfig, base: Path) -> tuple[Pool, Pool]:
 
 _object_pool = lru_cache(maxsize=4)(lambda config, base, size: object_pool(config, base, max_texture=max(size, 64)))
 _texture_pool = lru_cache(maxsize=4)(texture_pool)
-
-
-def make_light(config: LightConfig, rng: np.random.Generator | None = None) -> Light:
-    """Sun direction drawn where the configuration leaves it open and ``rng`` is given."""
-    drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
-    return Light(config.sun_direction(*drawn), config.sun, config.sky)
 
 
 def _viewpoint(config: RandomSceneConfig, rng, floor: float) -> tuple[np.ndarray, np.ndarray]:
@@ -365,41 +374,33 @@ def _sides(config: RandomSceneConfig, floor: float) -> list[Barrier]:
     return sides
 
 
-def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[Part, ...]:
-    """Six inward squares around the origin."""
-    half, n = config.size / 2, config.subdivisions
+def _sky(config: SkyConfig, textures: Pool, rng, split, base, log) -> tuple[tuple[Part, ...], _Panorama | None]:
+    """The box around everything, and the panorama that is on it."""
     brightness = float(rng.uniform(*config.brightness))
     repeats, inset = _log_uniform(rng, config.repeat), 1.0
+    panorama = None
     if config.panoramas:
-        images, repeats, inset = (
-            _panorama_faces(config, rng, split, textures.test_fraction, base),
-            1.0,
-            1 / (1 + _PANORAMA_MARGIN),
-        )
+        panorama = _panorama(config, rng, split, textures.test_fraction, base, brightness)
+        images, repeats, inset = panorama.sides, 1.0, PANORAMA_INSET
     elif config.per_face:
         images = [textures.draw(rng, split, log) for _ in SKY_SIDES]
     else:
         images = [textures.draw(rng, split, log)] * len(SKY_SIDES)
-    parts = []
-    for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
-        positions, normals, uvs, faces = square(
-            half * (forward - right + down), 2 * half * right, -2 * half * down, n, n
-        )
-        uvs = 0.5 + (uvs - 0.5) * inset
-        mesh = Mesh(
-            positions,
-            faces.astype(np.int32),
-            np.ascontiguousarray(normals, np.float32),
-            uvs.astype(np.float32),
-            name=f"sky {side}",
-            source_hash=parameter_hash("sky", config.size, n, side, inset),
-        )
-        parts.append(Part(mesh, Material(texture, (brightness,) * 3, (repeats, repeats), unlit=True)))
-    return tuple(parts)
+    return sky_box(config.size, config.subdivisions, images, brightness, repeats, inset), panorama
 
 
-def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[Texture]:
-    """Six textures of one panorama of this split, turned to a random heading."""
+class _Panorama(NamedTuple):
+    """Of a sky. sides : of its box.   angle : rad by which it is turned, from +x towards +y."""
+
+    file: Path
+    where: str
+    sides: list[Texture]
+    angle: float
+    brightness: float
+
+
+def _panorama(config: SkyConfig, rng, split, test_fraction, base, brightness: float) -> _Panorama:
+    """A panorama of this split, turned to a random heading."""
     files = []
     for i, given in enumerate(config.panoramas):
         path, where = resolve(given, base), f"scene.sky.panoramas.{i}"
@@ -421,12 +422,9 @@ def _panorama_faces(config: SkyConfig, rng, split, test_fraction, base) -> list[
         )
     digest, file = mine[int(rng.integers(len(mine)))]
     image = shrink(load_image(file), 4096)
-    image = np.roll(image, int(rng.integers(image.shape[1])), axis=1)
-    sides = cube_faces(image, max(image.shape[1] // 4, 1), _PANORAMA_MARGIN)
-    return [
-        Texture(side, f"{file.stem} side {k}", content_hash(digest.encode(), bytes([k])))
-        for k, side in enumerate(sides)
-    ]
+    columns = int(rng.integers(image.shape[1]))
+    sides = panorama_textures(np.roll(image, columns, axis=1), file.stem, digest)
+    return _Panorama(file, str(file), sides, -2 * math.pi * columns / image.shape[1], brightness)
 
 
 def _walls(walls: WallsConfig, config: RandomSceneConfig, textures, rng, rng_texture, split, floor, log):

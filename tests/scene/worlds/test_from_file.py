@@ -342,6 +342,73 @@ def test_bad_file_scenes(tmp_path, tree, builder, expected):
     assert expected in str(error.value) and "\n" not in str(error.value)
 
 
+def lit(builder=None, lights=None, node=None, **placed):
+    """A scene file with one light on a node of its own."""
+    builder = builder or with_camera(GltfBuilder())
+    builder.node(mesh=triangle(builder))
+    given = [{"type": "spot", "intensity": 68.3, "color": [1, 0.5, 0], "spot": {"innerConeAngle": 0.1}}]
+    builder.tree["extensions"] = {"KHR_lights_punctual": {"lights": given if lights is None else lights}}
+    builder.node(name="lamp", extensions={"KHR_lights_punctual": node or {"light": 0}}, **placed)
+    return builder
+
+
+def test_lights_of_a_file(tmp_path):
+    """Candela and lux, places, directions (along -z of the node) and cones; the sky is the configuration's."""
+    down = Rotation.from_euler("x", -90, degrees=True).as_quat().tolist()
+    scene = file_scene(tmp_path, lit(translation=[1, 2, 3], rotation=down), lights="file", lights_gain=2.0)
+    (lamp,) = scene.light.lamps
+    assert lamp.kind == "spot" and lamp.inner == 0.1 and lamp.outer == pytest.approx(math.pi / 4)
+    assert lamp.strength == pytest.approx([0.2 / math.pi, 0.1 / math.pi, 0.0])  # 68.3 cd / 683 lm/W, twice
+    np.testing.assert_allclose(lamp.path.pose(0)[:3, 3], [1, -3, 2], atol=1e-9)
+    np.testing.assert_allclose(lamp.path.pose(0)[:3, 2], [0, 0, 1], atol=1e-7)  # shines down
+    assert scene.light.sun == 0 and scene.light.sky == 0.6 and not scene.omissions
+    plain = file_scene(tmp_path, lit())
+    assert plain.light.plain and "lights (the configuration's sun and sky shine)" in plain.omissions[0]
+    sun = lit(lights=[{"type": "directional"}, {"type": "point", "range": 4.0}])
+    (lamp,) = file_scene(tmp_path, sun, lights="file").light.lamps
+    assert lamp.kind == "sun" and lamp.strength == pytest.approx([1 / 683 / math.pi] * 3)
+    (lamp,) = file_scene(tmp_path, lit(lights=[{"type": "point", "range": 4.0}]), lights="file").light.lamps
+    assert lamp.kind == "point" and lamp.reach == 4.0
+
+
+def test_a_light_moves_with_its_node(tmp_path):
+    builder = animated()
+    moon = next(n for n in builder.tree["nodes"] if n.get("name") == "moon")
+    moon["extensions"] = {"KHR_lights_punctual": {"light": 0}}
+    builder.tree["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+    scene = file_scene(tmp_path, builder, lights="file")
+    (lamp,), (body,) = scene.light.lamps, scene.objects
+    assert not lamp.path.is_static
+    for t in (0, T1 // 3, T1):
+        np.testing.assert_allclose(lamp.path.pose(t), body.path.pose(t), atol=1e-6)
+
+
+def test_more_lights_than_shine(tmp_path):
+    """The strongest do, and the others are said."""
+    builder = lit(lights=[{"type": "point", "intensity": 10.0 * k} for k in range(40)])
+    for k in range(1, 40):
+        builder.node(extensions={"KHR_lights_punctual": {"light": k}})
+    scene = file_scene(tmp_path, builder, lights="file")
+    assert len(scene.light.lamps) == 32 and min(la.strength[0] for la in scene.light.lamps) > 79 / 683 / math.pi
+    assert "8 of 40 lights (the weakest; at most 32 shine)" in scene.omissions[0]
+
+
+@pytest.mark.parametrize(
+    "builder, tree, expected",
+    [
+        (animated, {}, "scene.lights: the file has no lights .got 'file'.; expected config"),
+        (lit, {"light": {"unlit": True}}, "scene.lights: nothing is lit by them .got 'file'."),
+        (lambda: lit(node={"light": 3}), {}, "reference to lights that does not exist.*got 3"),
+        (lambda: lit(lights=[{"type": "area"}]), {}, "KHR_lights_punctual: .*lights.0.type"),
+        (lambda: lit(lights=[{"type": "point", "intensity": -1}]), {}, "lights.0.intensity.*got -1"),
+        (lambda: lit(lights=[{"type": "spot", "spot": {"innerConeAngle": 1.0}}]), {}, "inner cone is not inside"),
+    ],
+)
+def test_bad_lights_of_a_file(tmp_path, builder, tree, expected):
+    with pytest.raises((AssetError, ConfigError), match=expected):
+        file_scene(tmp_path, builder(), lights="file", **tree)
+
+
 def broken(change):
     builder = with_camera(GltfBuilder())
     builder.node(mesh=triangle(builder))

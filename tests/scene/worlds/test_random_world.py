@@ -20,8 +20,9 @@ from blinkgl.config.scene import (
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene, check_assets
+from blinkgl.scene.lights import make_light
 from blinkgl.scene.types import Light
-from blinkgl.scene.worlds.random_world import make_light, pools
+from blinkgl.scene.worlds.random_world import pools
 from tests.shared_data import shared
 
 CAMERA = CameraConfig(width=96, height=72)

@@ -1,0 +1,262 @@
+"""``images:`` of the YAML: the frame camera beside the event camera (:mod:`blinkgl.imaging`)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from blinkgl.config.base import Config, Refused, rule
+
+NS_PER_S, NS_PER_US = 1_000_000_000, 1000
+MAX_IMAGES = 1_000_000
+"""Files have numbers of six digits."""
+
+
+class LensConfig(Config):
+    """A thin lens: what is nearer or farther than what is in focus is seen as a disc."""
+
+    aperture: float = Field(gt=0, le=1e6, description="diameter of the lens, world units; focal length / f-number")
+    focus: float = Field(gt=0, le=1e9, description="depth along the optical axis that is in focus, world units")
+
+
+class AutoExposureConfig(Config):
+    """Exposure and gain follow the light, one image late and with a lag. The time changes first, the gain beyond it."""
+
+    target: float = Field(
+        0.18, gt=0, lt=1, description="mean of the image that it steers to, linear; 1 is the largest code"
+    )
+    lag: float = Field(0.2, ge=0, le=1e4, description="time constant, s, in which 63 % of the way is gone; 0: at once")
+    shortest_us: float = Field(20.0, ge=1, le=1e9, description="the exposure is never shorter, µs")
+    longest_us: float = Field(20000.0, ge=1, le=1e9, description="the exposure is never longer, µs")
+    max_gain_db: float = Field(24.0, ge=0, le=60, description="the gain is never higher, dB")
+
+    @rule("shortest_us", "longest_us")
+    def _ordered(shortest, longest):
+        if shortest > longest:
+            raise Refused(
+                "the shortest exposure exceeds the longest",
+                where="shortest_us",
+                value=shortest,
+                accepted=f"at most longest_us = {longest:g}",
+            )
+
+
+class ImagesConfig(Config):
+    """A frame camera that looks through the event camera's pixels: images with exposure, shutter, lens and noise, at
+    times of its own. Where it is asked for, `labels.images` is false unless that is said."""
+
+    presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "plain": {},
+        "deblurring": {
+            "rate": 24.0,
+            "exposure_us": 33000.0,
+            "photon_noise": True,
+            "read_noise": 2.0,
+            "also": ["sharp"],
+        },
+        "interpolation": {"rate": 240.0, "exposure_us": 500.0, "photon_noise": True, "read_noise": 2.0},
+        "low_light": {
+            "rate": 20.0,
+            "exposure_us": 15000.0,
+            "gain_db": 30.0,
+            "photon_noise": True,
+            "read_noise": 4.0,
+            "also": ["clean"],
+        },
+        "rolling_shutter": {"rate": 30.0, "exposure_us": 2000.0, "row_us": 60.0, "also": ["sharp"]},
+        "raw": {
+            "photon_noise": True,
+            "read_noise": 2.5,
+            "bits": 12,
+            "response": "linear",
+            "black": 0.0625,
+            "bayer": "rggb",
+            "also": ["clean"],
+        },
+    }
+
+    preset: Literal["plain", "deblurring", "interpolation", "low_light", "rolling_shutter", "raw"] = Field(
+        "plain", description="gives the other keys the values of a use (docs/images.md); what is said beside it wins"
+    )
+    rate: float = Field(
+        30.0, gt=0, le=1e5, description="images per second, Hz, the first exposed from the sequence's start on"
+    )
+    times: tuple[float, ...] | None = Field(
+        None, min_length=1, max_length=MAX_IMAGES, description="when exposures begin instead, s on the sequence's clock"
+    )
+    exposure_us: float = Field(5000.0, ge=1, le=1e9, description="exposure time of each pixel, µs")
+    row_us: float = Field(
+        0.0, ge=0, le=1e6, description="rolling shutter: each row is exposed so much later than the one above, µs"
+    )
+    max_px: float = Field(
+        0.5,
+        gt=0,
+        le=1e3,
+        description="an image is the mean of so many instants that nothing moves farther from one to the next, px",
+    )
+    max_instants: int = Field(256, ge=1, le=65536, description="but of no more than this")
+    white: float = Field(
+        1.0, gt=0, le=1e9, description="linear radiance of the largest code, with the exposure and gain given here"
+    )
+    gain_db: float = Field(
+        0.0,
+        ge=0,
+        le=60,
+        description="gain, dB: white then takes full_well / gain electrons, so more gain is more noise",
+    )
+    full_well: float = Field(10000.0, ge=1, le=1e9, description="electrons that a pixel holds; more light adds none")
+    photon_noise: bool = Field(False, description="electrons are Poisson distributed")
+    read_noise: float = Field(0.0, ge=0, le=1e6, description="standard deviation of the read-out, electrons")
+    black: float = Field(0.0, ge=0, le=0.5, description="what no light reads as, a fraction of the linear scale")
+    bits: int = Field(8, ge=8, le=16, description="of a code; more than 8 are written as 16-bit PNG, codes as they are")
+    response: Literal["srgb", "gamma", "linear"] = Field("srgb", description="how linear light becomes codes")
+    gamma: float = Field(2.2, ge=0.1, le=10, description="of `response: gamma`: code = light ^ (1 / gamma)")
+    bayer: Literal["rggb", "bggr", "grbg", "gbrg"] | None = Field(
+        None,
+        description="one colour per pixel by this pattern (row by row from the top left): one channel, as read out",
+    )
+    vignetting: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of the natural fall-off, cos^4 of the angle to the optical axis; 1: all of it",
+    )
+    lens: LensConfig | None = Field(None, description="null: a pin-hole, everything is sharp")
+    auto_exposure: AutoExposureConfig | None = Field(None, description="null: exposure and gain stay")
+    also: tuple[Literal["sharp", "clean"], ...] = Field(
+        (),
+        description="written side by side with each image. sharp: as seen at the middle of the exposure, all rows at "
+        "once, through a pin-hole, without noise. clean: the same image without noise",
+    )
+
+    @rule(
+        "auto_exposure.shortest_us", "auto_exposure.longest_us", "auto_exposure.max_gain_db", "exposure_us", "gain_db"
+    )
+    def _begins_inside(shortest, longest, most_db, exposure, gain):
+        if shortest is None:
+            return
+        if not shortest <= exposure <= longest:
+            raise Refused(
+                "automatic exposure begins with an exposure outside its limits",
+                where="exposure_us",
+                value=exposure,
+                accepted=f"from {shortest:g} to {longest:g} (auto_exposure)",
+            )
+        if gain > most_db:
+            raise Refused(
+                "automatic exposure begins with a gain above its limit",
+                where="gain_db",
+                value=gain,
+                accepted=f"at most {most_db:g} (auto_exposure.max_gain_db)",
+            )
+
+    @rule("rate", "times", "exposure_us", "auto_exposure.longest_us")
+    def _one_at_a_time(rate: float, times: tuple[float, ...] | None, exposure: float, longest: float | None):
+        key = "exposure_us" if longest is None else "auto_exposure.longest_us"
+        exposure = exposure if longest is None else longest
+        if times is None and exposure * rate > 1e6 * (1 + 1e-9):
+            raise Refused(
+                "an exposure lasts into the next image's",
+                where=key,
+                value=exposure,
+                accepted=f"at most {1e6 / rate:g}, or a lower rate",
+            )
+        for before, after in pairwise(times or ()):
+            if after - before < 1e-6 * exposure * (1 - 1e-9):
+                raise Refused(
+                    "times of exposures are out of order, or nearer to one another than an exposure lasts",
+                    where="times",
+                    value=[before, after],
+                    accepted=f"increasing, {1e-6 * exposure:g} s apart at least",
+                )
+
+    @rule("response", "gamma")
+    def _gamma_is_used(response, gamma):
+        if response != "gamma" and gamma != 2.2:
+            raise Refused("only `response: gamma` has a gamma", where="gamma", value=gamma, accepted="response: gamma")
+
+    @rule("also")
+    def _each_once(also: tuple[str, ...]):
+        if len(set(also)) < len(also):
+            raise Refused("named twice", where="also", value=list(also), accepted="sharp and clean, each once")
+
+    @property
+    def pictures(self) -> tuple[str, ...]:
+        """What is written of each image: "images", and those of ``also``."""
+        return ("images", *(name for name in ("sharp", "clean") if name in self.also))
+
+    @property
+    def longest_us(self) -> float:
+        """Longest that a pixel is exposed, µs."""
+        return self.exposure_us if self.auto_exposure is None else self.auto_exposure.longest_us
+
+    @property
+    def noisy(self) -> bool:
+        """Whether two seeds give two images."""
+        return self.photon_noise or self.read_noise > 0
+
+
+def readout_us(rows: int, row_us: float) -> float:
+    """From the first row's exposure to the last one's, µs."""
+    return (rows - 1) * row_us
+
+
+def exposure_starts(images: ImagesConfig, t0_ns: int, t1_ns: int, rows: int) -> list[int]:
+    """When exposures of the first row begin, ns: all whose last row's ends within [t0, t1] however long they become."""
+    lasts_ns = round(NS_PER_US * (images.longest_us + readout_us(rows, images.row_us)))
+    if images.times is not None:
+        return [round(NS_PER_S * t) for t in images.times]
+    count = int(((t1_ns - t0_ns - lasts_ns) * images.rate) / NS_PER_S + 1e-9) + 1
+    return [t0_ns + round(k * NS_PER_S / images.rate) for k in range(count)]
+
+
+def check_images(
+    rate: float,
+    times: tuple[float, ...] | None,
+    lasts_us: float,
+    rows_us: float,
+    start: float,
+    seconds: float,
+) -> None:
+    """Of a sequence from ``start`` on, s, that lasts so many: raises Refused, where ``images:`` stands."""
+    whole_us = lasts_us + rows_us
+    if times is None:
+        if rows_us * rate > 1e6 * (1 + 1e-9):
+            raise Refused(
+                "the rows are not read before the next image begins",
+                where="images.row_us",
+                value=rows_us,
+                accepted=f"at most {1e6 / rate:g} µs for all rows together, or a lower rate",
+            )
+        if whole_us > 1e6 * seconds:
+            raise Refused(
+                "no exposure fits into the sequence",
+                where="images.exposure_us",
+                value=lasts_us,
+                accepted=f"at most {1e6 * seconds - rows_us:g}, or a longer time.duration",
+            )
+        if seconds * rate > MAX_IMAGES:
+            raise Refused(
+                f"{seconds * rate:.0f} images",
+                where="images.rate",
+                value=rate,
+                accepted=f"a sequence of at most {MAX_IMAGES} of them",
+            )
+    for before, after in pairwise(times or ()):
+        if 1e6 * (after - before) < rows_us * (1 - 1e-9):
+            raise Refused(
+                "the rows are not read before the next image begins",
+                where="images.times",
+                value=[before, after],
+                accepted=f"{1e-6 * rows_us:g} s apart at least, or a smaller images.row_us",
+            )
+    for t in times or ():
+        if not start - 1e-9 <= t <= start + seconds - 1e-6 * whole_us + 1e-9:
+            raise Refused(
+                "an exposure outside the sequence",
+                where="images.times",
+                value=t,
+                accepted=f"from {start:g} to {start + seconds - 1e-6 * whole_us:g}",
+            )

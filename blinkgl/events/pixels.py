@@ -1,0 +1,157 @@
+"""What single pixels do by themselves, whatever the emulator: dead ones, noise of their own, and how late they are.
+
+Stages between the emulator and the bus, as :mod:`blinkgl.config.readout` describes them. Noise is a process in
+continuous time that the steps only look at: its events are numbered, and number n is drawn from the seed and n alone.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from blinkgl.config.readout import LatencyConfig, PixelsConfig
+from blinkgl.errors import EventDataError
+from blinkgl.events.arith import exp_f64, log_f64
+from blinkgl.events.packing import JIT
+from blinkgl.events.philox import Stream, normal2, pixel_counters, uniform2
+from blinkgl.events.types import Cause, Events
+
+_BATCH, _MOST_HZ = 1024, 1e6
+_DEFECT, _OWN, _LATE = np.uint64(Stream.DEFECT), np.uint64(Stream.OWN_NOISE), np.uint64(Stream.LATENCY)
+
+
+class PixelNoise:
+    """Events of an emulator -> those of pixels of which some are dead and some fire by themselves.
+
+    ``rates`` : (H*W,) float64, events per second of each pixel's own.   ``dead``, ``hot`` : (H*W,) bool."""
+
+    def __init__(self, config: PixelsConfig, height: int, width: int, seed: int, causes: bool = False):
+        self.config, self._width, self._causes = config, width, causes
+        self._seed = np.uint64(int(seed) & (2**64 - 1))
+        pixels = pixel_counters(height, width)
+        which, other = uniform2(self._seed, pixels, _DEFECT, np.uint64(0))
+        spread, _ = normal2(self._seed, pixels, _DEFECT, np.uint64(1))
+        self.hot = which < config.hot_fraction
+        self.dead = other < config.dead_fraction
+        median = np.where(self.hot, config.hot_rate_hz, config.rate_hz)
+        decades = np.where(self.hot, config.hot_spread_decades, config.spread_decades)
+        rates = np.minimum(median * exp_f64(np.log(10.0) * decades * spread), _MOST_HZ)
+        self.rates = np.where(self.dead, 0.0, rates)
+        self._sums = np.cumsum(self.rates)
+        self._batch = 0  # next to be drawn
+        self._t_ns: int | None = None  # where the last batch ended
+        self._drawn = Events.empty()  # and not given yet
+
+    def step(self, events: Events, until_us: int) -> Events:
+        """``events`` without those of dead pixels, with the noise up to ``until_us`` (that microsecond included); of
+        one microsecond the noise comes last. The first step says when the noise begins."""
+        if self.dead.any() and len(events):
+            events = events.part(~self.dead[events.y.astype(np.int64) * self._width + events.x])
+        if not (self._sums.size and self._sums[-1] > 0):
+            return events
+        if self._t_ns is None:
+            self._t_ns = 1000 * until_us
+            return events
+        while self._t_ns // 1000 <= until_us:
+            self._drawn = Events.concatenate([self._drawn, self._more()])
+        count = int(np.searchsorted(self._drawn.t, until_us, side="right"))
+        own, self._drawn = self._drawn.part(slice(count)), self._drawn.part(slice(count, None))
+        if not count:
+            return events
+        if not len(events):
+            return own
+        both = Events.concatenate([events, own])
+        return both.part(np.argsort(both.t, kind="stable"))
+
+    def _more(self) -> Events:
+        """The next batch of a Poisson process of the sensor as a whole; pixels in proportion to their rates."""
+        index = np.uint64(self._batch * _BATCH) + np.arange(_BATCH, dtype=np.uint64)
+        self._batch += 1
+        wait, pick = uniform2(self._seed, index, _OWN, np.uint64(0))
+        polarity, _ = uniform2(self._seed, index, _OWN, np.uint64(1))
+        total = self._sums[-1]
+        gaps = np.minimum(-log_f64(wait) * (1e9 / total), 2.0**55).astype(np.int64)
+        t_ns = self._t_ns + np.cumsum(gaps)
+        self._t_ns = int(t_ns[-1])
+        pixel = np.minimum(np.searchsorted(self._sums, pick * total, side="right"), len(self._sums) - 1)
+        cause = np.where(self.hot[pixel], np.uint8(Cause.HOT), np.uint8(Cause.SHOT)) if self._causes else None
+        return Events(
+            (pixel % self._width).astype(np.uint16),
+            (pixel // self._width).astype(np.uint16),
+            t_ns // 1000,
+            (polarity < self.config.on_share).astype(np.uint8),
+            cause,
+        )
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        clock = [self._t_ns is not None, self._t_ns or 0, self._batch]
+        return {"clock": np.array(clock, np.int64), **_columns("drawn", self._drawn)}
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        self._drawn = _events("drawn", state, {"clock"})
+        started, t_ns, self._batch = (int(v) for v in state["clock"])
+        self._t_ns = t_ns if started else None
+
+
+@numba.njit(**JIT)
+def _delay(pixel, t_us, delay, last, out):
+    for i in range(t_us.size):
+        out[i] = max(t_us[i] + np.int64(delay[i]), last[pixel[i]])  # no event overtakes another of its pixel
+        last[pixel[i]] = out[i]
+
+
+class Latency:
+    """Events as they happen -> events when they are known outside, in order from step to step."""
+
+    def __init__(self, config: LatencyConfig, height: int, width: int, seed: int):
+        self.config, self._width = config, width
+        self._seed = np.uint64(int(seed) & (2**64 - 1))
+        self._last = np.full(height * width, -(2**62), np.int64)
+        self._count = 0
+        self._held = Events.empty()
+
+    @property
+    def late(self) -> int:
+        """Events that no step has given out yet."""
+        return len(self._held)
+
+    def step(self, events: Events, luminance: np.ndarray, until_us: int) -> Events:
+        """The events that are known until ``until_us`` (that microsecond included).
+
+        luminance : (H, W) float32, linear."""
+        if len(events):
+            c = self.config
+            pixel = events.y.astype(np.int64) * self._width + events.x
+            intensity = luminance.reshape(-1)[pixel].astype(np.float64) * c.full_scale
+            delay = c.fixed_us + c.dark_us / (intensity + 1.0)
+            if c.jitter_us:
+                index = np.uint64(self._count) + np.arange(len(events), dtype=np.uint64)
+                normal, _ = normal2(self._seed, index, _LATE, np.uint64(0))
+                delay += c.jitter_us * np.clip(normal, -6.0, 6.0)
+            self._count += len(events)
+            t = np.empty(len(events), np.int64)
+            _delay(pixel, events.t, np.maximum(delay, 0.0), self._last, t)
+            late = Events(events.x, events.y, t, events.p, events.cause)
+            self._held = Events.concatenate([self._held, late])
+            self._held = self._held.part(np.argsort(self._held.t, kind="stable"))
+        count = int(np.searchsorted(self._held.t, until_us, side="right"))
+        known, self._held = self._held.part(slice(count)), self._held.part(slice(count, None)).copy()
+        return known
+
+    def state_dict(self) -> dict[str, np.ndarray]:
+        return {"last": self._last.copy(), "count": np.array([self._count], np.int64), **_columns("held", self._held)}
+
+    def load_state_dict(self, state: dict[str, np.ndarray]) -> None:
+        self._held = _events("held", state, {"last", "count"})
+        self._last[...], self._count = state["last"], int(state["count"][0])
+
+
+def _columns(name: str, events: Events) -> dict[str, np.ndarray]:
+    return {f"{name}_{k}": getattr(events, k).copy() for k in events.columns}
+
+
+def _events(name: str, state: dict[str, np.ndarray], others: set[str]) -> Events:
+    columns = [f"{name}_{k}" for k in ("x", "y", "t", "p", *(["cause"] if f"{name}_cause" in state else []))]
+    if set(state) != {*others, *columns}:
+        raise EventDataError("saved state is of another camera", value=sorted(state))
+    return Events(*(state[k].copy() for k in columns))

@@ -1,0 +1,66 @@
+"""When pixels are exposed, and which instants an image is the mean of.
+
+Row r collects light over [start + r * row, start + r * row + exposure). The time from the first row's start to the last
+row's end is cut into n cells of one length; each is drawn once, at its middle, and a row weighs it by how much of the
+cell lies inside its own exposure: the midpoint rule, the same for a global and a rolling shutter.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """start_ns : of the first row's.   exposure_ns : how long every row's lasts.   row_ns : by how much each
+    begins after the one above (0: global shutter).   rows : of the image."""
+
+    start_ns: int
+    exposure_ns: int
+    row_ns: float
+    rows: int
+
+    @property
+    def end_ns(self) -> int:
+        """Of the last row's."""
+        return self.start_ns + self.exposure_ns + round((self.rows - 1) * self.row_ns)
+
+    @property
+    def middle_ns(self) -> int:
+        """Of the image: the middle of the middle row's."""
+        return (self.start_ns + self.end_ns) // 2
+
+    def cells(self, count: int) -> tuple[list[int], np.ndarray]:
+        """Times, ns, of ``count`` instants, and (count, rows) float64 weights: each row's sum to 1."""
+        span = float(self.end_ns - self.start_ns)
+        edges = np.linspace(0.0, span, count + 1)
+        times = [self.start_ns + math.floor(middle) for middle in (edges[1:] + edges[:-1]) / 2]
+        begins = np.linspace(0.0, span - self.exposure_ns, self.rows) if self.rows > 1 else np.zeros(1)
+        overlap = np.minimum(edges[1:, None], begins + self.exposure_ns) - np.maximum(edges[:-1, None], begins)
+        weights = np.maximum(overlap, 0.0)
+        return times, weights / weights.sum(axis=0)
+
+
+def instants(exposure: Exposure, speed: float, max_px: float, lens: int, most: int) -> int:
+    """How many instants an image takes: while nothing moves farther than ``max_px`` from one to the next at ``speed``
+    px/s, and with ``lens`` of them in every row's exposure; ``most`` at most, 1 at least."""
+    span_ns = exposure.end_ns - exposure.start_ns
+    moving = speed * span_ns * 1e-9 / max_px
+    focusing = lens * span_ns / exposure.exposure_ns if lens > 1 else 1.0
+    return int(min(most, max(1.0, math.ceil(min(moving, 1e9) - 1e-6), math.ceil(focusing - 1e-6))))
+
+
+@numba.njit(cache=True, nogil=True)
+def accumulate(total: np.ndarray, image: np.ndarray, weights: np.ndarray) -> None:
+    """Adds weights[row] * image to total, (H, W, 3) float64 each, image float32 (H, W, 3 or more)."""
+    height, width, channels = total.shape
+    for y in range(height):
+        weight = weights[y]
+        if weight > 0.0:
+            for x in range(width):
+                for c in range(channels):
+                    total[y, x, c] += weight * image[y, x, c]

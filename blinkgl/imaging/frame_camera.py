@@ -1,0 +1,238 @@
+"""A frame camera: draws the instants of each exposure, adds up their light, and reads it out.
+
+    camera = FrameCamera(renderer, config.images, seed, (t0_ns, t1_ns))
+    while camera.due_ns is not None:
+        image = camera.take()                  # a CameraImage
+
+It knows the renderer through which it looks and nothing of sequences or files; several may look at one scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from blinkgl.config.images import NS_PER_US, ImagesConfig, exposure_starts
+from blinkgl.imaging import lens as thin_lens
+from blinkgl.imaging.exposure import Exposure, accumulate, instants
+from blinkgl.imaging.metering import Setting, factor, next_setting
+from blinkgl.imaging.response import encode
+from blinkgl.imaging.sensor import mosaic, readings
+from blinkgl.machine.compiling import working_clock
+from blinkgl.render.colour import LUMA
+from blinkgl.render.moment import View
+from blinkgl.render.passes import Geometry
+from blinkgl.timeline.speed import largest_speed
+
+if TYPE_CHECKING:
+    from blinkgl.render.renderer import Renderer
+
+SPEED_EVERY, SPEED_TIMES = 4, 3
+"""The speeds that decide how many instants there are: of every n-th pixel, at so many times of the exposure."""
+
+
+LENS_SPACING = 2.0
+"""What is out of focus is sampled so many ``max_px`` apart: a pixel by default, of which each sample is the mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraImage:
+    """What a frame camera has taken.
+
+    k : number, from 0.   start_ns, end_ns : from the first row's exposure to the end of the last one's.
+    exposure_ns : of each row.   row_ns : between the starts of two rows.   gain : a factor.
+    instants : of which it is the mean.   step_px : at most so far things move from one to the next, by the speeds at a
+    few times.
+    pictures : name -> codes, (H, W, 3) RGB or (H, W) of one colour per pixel, uint8 of 8 bits, else uint16: "images",
+    as the camera gives it, and those of ``images.also``."""
+
+    k: int
+    start_ns: int
+    end_ns: int
+    exposure_ns: int
+    row_ns: float
+    gain: float
+    instants: int
+    step_px: float
+    pictures: Mapping[str, np.ndarray]
+
+    @property
+    def t_ns(self) -> int:
+        """When it is there: the end of the last row's exposure."""
+        return self.end_ns
+
+    @property
+    def middle_ns(self) -> int:
+        """The middle of the exposure, of the middle row where they differ."""
+        return (self.start_ns + self.end_ns) // 2
+
+    @property
+    def image(self) -> np.ndarray:
+        """As the camera gives it."""
+        return self.pictures["images"]
+
+
+class FrameCamera:
+    """Takes images with a renderer that somebody else holds.
+
+    config : ``images:``.   seed : 64-bit, of its noise.   span_ns : first and last time of the sequence.
+    due_ns : when the next image is there; None: there are no more.   taken : images so far.   drawn : instants so far.
+    largest_step_px : of all images, as of :class:`CameraImage`.   seconds : wall time beside the drawing."""
+
+    def __init__(self, renderer: Renderer, config: ImagesConfig, seed: int, span_ns: tuple[int, int]):
+        camera = renderer.scene.camera
+        self.renderer, self.config, self._seed = renderer, config, np.uint64(seed)
+        self._starts = exposure_starts(config, *span_ns, camera.height)
+        self._first = Setting(round(NS_PER_US * config.exposure_us), factor(config.gain_db))
+        self._vignette = thin_lens.vignette(camera, config.vignetting)[..., None] if config.vignetting else None
+        self.rewind()
+
+    def rewind(self) -> None:
+        """Back to before the first image."""
+        self._setting = self._first
+        self.taken, self.drawn, self.largest_step_px, self.seconds = 0, 0, 0.0, 0.0
+
+    def __len__(self) -> int:
+        """Images in all."""
+        return len(self._starts)
+
+    @property
+    def due_ns(self) -> int | None:
+        return None if self.taken == len(self._starts) else self._exposure().end_ns
+
+    def take(self) -> CameraImage:
+        """The next image. Raises GLError."""
+        started, drawing = working_clock(), self._drawing_s
+        image = self._take()
+        self.seconds += working_clock() - started - (self._drawing_s - drawing)
+        return image
+
+    @property
+    def _drawing_s(self) -> float:
+        return self.renderer.stats.render_s + self.renderer.stats.readback_s
+
+    def _take(self) -> CameraImage:
+        k, setting, exposure = self.taken, self._setting, self._exposure()
+        light, count, step_px = self._light(exposure)
+        clean = self._reading(light, setting)
+        pictures = {"images": self._codes(self._noisy(light, setting, k) if self.config.noisy else clean)}
+        if "sharp" in self.config.also:
+            sharp = self._at(self.renderer.colour(exposure.middle_ns).read())
+            pictures["sharp"] = self._codes(self._reading(sharp, setting))
+        if "clean" in self.config.also:
+            pictures["clean"] = self._codes(clean)
+        self.taken, self.drawn = k + 1, self.drawn + count
+        self.largest_step_px = max(self.largest_step_px, step_px)
+        if self.config.auto_exposure is not None and self.taken < len(self._starts):
+            dt_s = (self._starts[k + 1] - self._starts[k]) * 1e-9
+            self._setting = next_setting(self.config.auto_exposure, setting, _mean(clean), dt_s)
+        return CameraImage(
+            k,
+            exposure.start_ns,
+            exposure.end_ns,
+            exposure.exposure_ns,
+            exposure.row_ns,
+            setting.gain,
+            count,
+            step_px,
+            pictures,
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """Plain values for a manifest."""
+        return {
+            "images": self.taken,
+            "pictures": list(self.config.pictures),
+            "bits": self.config.bits,
+            "instants": self.drawn,
+            "largest_step_px": float(f"{self.largest_step_px:.4g}"),
+        }
+
+    # ---- light ---------------------------------------------------------------------------------------------------
+
+    def _exposure(self) -> Exposure:
+        return Exposure(
+            self._starts[self.taken],
+            self._setting.exposure_ns,
+            NS_PER_US * self.config.row_us,
+            self.renderer.height,
+        )
+
+    def _light(self, exposure: Exposure) -> tuple[np.ndarray, int, float]:
+        """Mean over the exposure, (H, W, 3) float64, 1 being white; of how many instants; how far things move between
+        two of them, px."""
+        config, draw = self.config, self.renderer
+        times = np.linspace(exposure.start_ns, exposure.end_ns, SPEED_TIMES)
+        speed = max(largest_speed(draw.velocity(int(t), SPEED_EVERY).view()) for t in times)
+        points = self._points_needed(exposure.middle_ns)
+        count = instants(exposure, speed, config.max_px, points, config.max_instants)
+        lens = config.lens if points > 1 else None
+        aperture = None if lens is None else thin_lens.points(count, lens.aperture)
+        total = np.zeros((draw.height, draw.width, 3))
+        cells, weights = exposure.cells(count)
+        for i, t_ns in enumerate(cells):
+            moment = draw.moment(t_ns)
+            if lens is not None and aperture is not None:
+                seen = thin_lens.through(draw.scene.camera, aperture[i], lens.focus)
+                moment = moment.from_place(View.of(seen), thin_lens.at_point(moment.T_world_cam, aperture[i]))
+            accumulate(total, draw.colour(moment).view(), weights[i])
+        return self._at(total), count, speed * (exposure.end_ns - exposure.start_ns) * 1e-9 / count
+
+    def _points_needed(self, t_ns: int) -> int:
+        """Of the lens, for the discs that the depths in view become; 1 where nothing is spread over a pixel."""
+        lens = self.config.lens
+        if lens is None:
+            return 1
+        depth = self.renderer.draw(Geometry(("depth",)), t_ns).read("depth")
+        depth = np.where(depth > 0, depth, np.inf)
+        largest = float(thin_lens.blur_px(lens, self.renderer.scene.camera, depth).max())
+        return thin_lens.samples(largest, LENS_SPACING * self.config.max_px)
+
+    def _at(self, radiance: np.ndarray) -> np.ndarray:
+        """The light that arrives at the pixels, 1 being white."""
+        light = np.asarray(radiance, np.float64) / self.config.white
+        return light if self._vignette is None else light * self._vignette
+
+    # ---- read-out ------------------------------------------------------------------------------------------------
+
+    def _seen(self, light: np.ndarray, setting: Setting) -> tuple[np.ndarray, float, float]:
+        """The light that the filters let through, the electrons that light 1 gives, and the gain of an electron."""
+        light = light if self.config.bayer is None else mosaic(light, self.config.bayer)
+        # of white, with the setting that the configuration gives, full_well / gain
+        electrons = self.config.full_well * setting.exposure_ns / self._first.product
+        return light, electrons, setting.gain / self.config.full_well
+
+    def _reading(self, light: np.ndarray, setting: Setting) -> np.ndarray:
+        """What the converter is given, 1 being the largest code, without noise."""
+        light, electrons, gain = self._seen(light, setting)
+        return np.minimum(light * electrons, self.config.full_well) * gain
+
+    def _noisy(self, light: np.ndarray, setting: Setting, k: int) -> np.ndarray:
+        """The same with the noise of image ``k``."""
+        config, (light, electrons, gain) = self.config, self._seen(light, setting)
+        out, light = np.empty(light.shape), np.ascontiguousarray(light)
+        readings(
+            light.ravel(),
+            electrons,
+            gain,
+            config.full_well,
+            config.photon_noise,
+            config.read_noise,
+            self._seed,
+            np.uint64(k),
+            out.reshape(-1),
+        )
+        return out
+
+    def _codes(self, reading: np.ndarray) -> np.ndarray:
+        config = self.config
+        return encode(config.black + (1.0 - config.black) * reading, config.response, config.gamma, config.bits)
+
+
+def _mean(reading: np.ndarray) -> float:
+    """Of an image as it comes out, linear; of a colour image its luminance's."""
+    seen = np.clip(reading, 0.0, 1.0)
+    return float((seen @ LUMA).mean() if seen.ndim == 3 else seen.mean())

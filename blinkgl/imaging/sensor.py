@@ -1,0 +1,131 @@
+"""From light to what the converter reads: photons, full well, read noise, gain, black level, colour filters.
+
+The electrons of a pixel are Poisson distributed around its light, cut at the full well; the read-out adds normal noise;
+gain brings full_well / gain electrons to 1. So with light far from both ends the variance of a reading is mean * gain /
+full_well plus that of the read noise: in codes mean / (electrons per code).
+
+Noise is a function of (seed, image, pixel, channel) by the counter-based generator of :mod:`blinkgl.events.philox`,
+so that it is the same whoever draws it, in whatever order.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+from blinkgl.events.arith import exp_f64, log_f64
+from blinkgl.events.philox import normal2, uniform2
+
+PATTERNS = {
+    "rggb": ((0, 1), (1, 2)),
+    "bggr": ((2, 1), (1, 0)),
+    "grbg": ((1, 0), (2, 1)),
+    "gbrg": ((1, 2), (0, 1)),
+}
+"""Channel of the pixel at (row % 2, column % 2)."""
+
+
+class Stream(IntEnum):
+    """What a draw is for. Append only: the numbers are part of every published data set."""
+
+    PHOTONS = 0  # index = image * 2^16 + try
+    READ_OUT = 1
+
+
+_U = np.uint64
+_PHOTONS, _READ_OUT = _U(Stream.PHOTONS), _U(Stream.READ_OUT)
+_TRIES = _U(1 << 16)
+_FEW = 10.0  # electrons up to which they are counted one by one
+_LN_ROOT_2PI = 0.5 * np.log(2.0 * np.pi)
+
+
+@register_jitable
+def _log_factorial(k):
+    """ln k! of k >= 9, float64: Stirling's series, error < 1e-12 there."""
+    x = k + 1.0
+    inverse = 1.0 / x
+    z = inverse * inverse
+    tail = inverse * (1.0 / 12.0 - z * (1.0 / 360.0 - z * (1.0 / 1260.0 - z / 1680.0)))
+    return (x - 0.5) * log_f64(x) - x + _LN_ROOT_2PI + tail
+
+
+@register_jitable
+def poisson(mean: float, seed: int, pixel: int, index: int) -> float:
+    """Whole number >= 0, float64, Poisson distributed with mean >= 0; of (seed, pixel, index) alone.
+
+    Counted along the distribution where the mean is small, and otherwise by transformed rejection with squeeze
+    (Hoermann, "The transformed rejection method for generating Poisson random variables", 1993, algorithm PTRS)."""
+    if mean <= 0.0:
+        return 0.0
+    first = index * _TRIES
+    if mean < _FEW:
+        u, _ = uniform2(seed, pixel, _PHOTONS, first)
+        k, p = 0.0, exp_f64(-mean)
+        while u > p and k < 200.0:
+            u -= p
+            k += 1.0
+            p *= mean / k
+        return k
+    b = 0.931 + 2.53 * np.sqrt(mean)
+    a = -0.059 + 0.02483 * b
+    inverse_alpha = 1.1239 + 1.1328 / (b - 3.4)
+    v_r = 0.9277 - 3.6224 / (b - 2.0)
+    ln_mean = log_f64(mean)
+    for number in range(65535):
+        u, v = uniform2(seed, pixel, _PHOTONS, first + _U(number))
+        u -= 0.5
+        us = 0.5 - abs(u)
+        k = np.floor((2.0 * a / us + b) * u + mean + 0.43)
+        if us >= 0.07 and v <= v_r:
+            return k
+        if k < 0.0 or (us < 0.013 and v > us):
+            continue
+        if k < 9.0:
+            ln_k = 0.0
+            for factor in range(2, int(k) + 1):
+                ln_k += log_f64(float(factor))
+        else:
+            ln_k = _log_factorial(k)
+        if log_f64(v * inverse_alpha / (a / (us * us) + b)) <= k * ln_mean - mean - ln_k:
+            return k
+    return np.floor(mean)
+
+
+@numba.njit(cache=True, nogil=True)
+def readings(
+    light: np.ndarray,
+    electrons_of_light: float,
+    gain: float,
+    full_well: float,
+    photon_noise: bool,
+    read_noise: float,
+    seed: np.uint64,
+    image: np.uint64,
+    out: np.ndarray,
+) -> None:
+    """What the converter is given: out (N,), 1 being the largest code, not yet cut there, of (N,) light, float64 both.
+
+    electrons_of_light : that light 1 gives with this exposure.   gain : of an electron.   full_well, read_noise :
+    electrons.   image : number of the image."""
+    flood = 4.0 * full_well + 1000.0  # fills the well whatever is drawn
+    for i in range(light.size):
+        electrons = min(light[i] * electrons_of_light, flood)
+        if photon_noise:
+            electrons = poisson(electrons, seed, _U(i), image)
+        electrons = min(electrons, full_well)
+        if read_noise > 0.0:
+            n, _ = normal2(seed, _U(i), _READ_OUT, image)
+            electrons += read_noise * n
+        out[i] = electrons * gain
+
+
+def mosaic(image: np.ndarray, pattern: str) -> np.ndarray:
+    """(H, W) of (H, W, 3): of each pixel the channel that its filter lets through."""
+    out = np.empty(image.shape[:2], image.dtype)
+    for y, row in enumerate(PATTERNS[pattern]):
+        for x, channel in enumerate(row):
+            out[y::2, x::2] = image[y::2, x::2, channel]
+    return out

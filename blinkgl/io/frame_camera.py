@@ -1,0 +1,118 @@
+"""Files of a frame camera, in a folder of its own below the sequence:
+
+frame_camera/
+  images/%06d.png   as the camera gives them: RGB, or one channel of colour filters; 8 bits, or 16-bit PNG of codes
+  sharp/%06d.png, clean/%06d.png   side by side with them, on request
+  images/timestamps.txt   middle of each exposure, one µs per line
+  exposures.csv           a line per image, times of the first row's start and the last row's end (µs)
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.config.images import ImagesConfig
+from blinkgl.errors import AssetError
+from blinkgl.io.flow_png import encode_png
+from blinkgl.io.images import read_image
+
+FOLDER = "frame_camera"
+STAMPS = f"{FOLDER}/images/timestamps.txt"
+EXPOSURES = f"{FOLDER}/exposures.csv"
+
+
+@dataclass(frozen=True)
+class ExposureLine:
+    """A line of ``exposures.csv``.
+
+    start_us : of the first row.   end_us : of the last row's exposure.   exposure_us : of each row.
+    row_us : between two rows' starts.   gain_db.   instants : of which the image is the mean."""
+
+    start_us: float
+    end_us: float
+    exposure_us: float
+    row_us: float
+    gain_db: float
+    instants: int
+
+    @property
+    def middle_us(self) -> int:
+        """The middle of the exposure, of the middle row where they differ."""
+        return round((self.start_us + self.end_us) / 2)
+
+
+def picture_file(picture: str, k: int) -> str:
+    """Name of the k-th "images", "sharp" or "clean" below the sequence."""
+    return f"{FOLDER}/{picture}/{k:06d}.png"
+
+
+def files_of(images: ImagesConfig, count: int) -> Iterator[str]:
+    """Names of all files of ``count`` images."""
+    yield from (STAMPS, EXPOSURES)
+    for picture in images.pictures:
+        yield from (picture_file(picture, k) for k in range(count))
+
+
+def encode_codes(codes: np.ndarray) -> bytes:
+    """PNG of (H, W, 3) RGB or (H, W), uint8 or uint16, as they are."""
+    return encode_png(codes[..., ::-1] if codes.ndim == 3 else codes)
+
+
+def read_codes(path: str | os.PathLike) -> np.ndarray:
+    """What :func:`encode_codes` wrote. Raises AssetError."""
+    return read_image(path)
+
+
+def exposures_csv(lines: Iterable[ExposureLine]) -> str:
+    """The text of ``exposures.csv``: a heading, then a line per image. Times to the nanosecond."""
+    rows = [",".join(f.name for f in fields(ExposureLine))]
+    rows += [
+        f"{e.start_us:.3f},{e.end_us:.3f},{e.exposure_us:.3f},{e.row_us:.6g},{e.gain_db:.6g},{e.instants}"
+        for e in lines
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def stamps_txt(lines: Iterable[ExposureLine]) -> str:
+    """The text of ``images/timestamps.txt``."""
+    return "".join(f"{e.middle_us}\n" for e in lines)
+
+
+def read_exposures(sequence: str | os.PathLike) -> list[ExposureLine]:
+    """Of a sequence's frame camera. Raises AssetError: there is none, or its list is damaged."""
+    path = Path(sequence) / EXPOSURES
+    heading = [f.name for f in fields(ExposureLine)]
+    try:
+        with open(path, encoding="utf-8", newline="") as file:
+            first, *rows = csv.reader(file)
+        if first != heading or any(len(row) != len(heading) for row in rows):
+            raise ValueError("not the columns " + ", ".join(heading))
+        lines = []
+        for row in rows:
+            start, end, exposure, row_us, gain_db = (float(v) for v in row[:5])
+            if not math.isfinite(start + end + exposure + row_us + gain_db):
+                raise ValueError("a number that is not finite")
+            lines.append(ExposureLine(start, end, exposure, row_us, gain_db, int(row[5])))
+        return lines
+    except FileNotFoundError:
+        raise AssetError("no frame camera here", where=str(path), accepted="a sequence made with images:") from None
+    except (OSError, ValueError, csv.Error) as error:
+        raise AssetError(f"damaged list of exposures: {' '.join(str(error).split())[:120]}", where=str(path)) from None
+
+
+def problem_of(codes: np.ndarray, images: ImagesConfig, height: int, width: int) -> str | None:
+    """What cannot be in a picture of this camera; None: nothing."""
+    shape = (height, width) if images.bayer is not None else (height, width, 3)
+    kind = np.dtype(np.uint8 if images.bits == 8 else np.uint16)
+    if codes.shape != shape or codes.dtype != kind:
+        return f"{codes.shape} {codes.dtype} and not {shape} {kind}"
+    if codes.size and int(codes.max()) >= 1 << images.bits:
+        return f"a code of {int(codes.max())}, beyond {images.bits} bits"
+    return None

@@ -1,0 +1,187 @@
+"""What light does to a white surface, in float64: the numbers that the renderer hands to its shaders.
+
+Every strength is the radiance that a white surface gives back which faces the light: of a sun anywhere, of a point or
+spot light 1 world unit away from it (there it falls with the square of the distance). An irradiance of E (W/m²) is
+therefore a strength of E / pi, an intensity of I (W/sr) one of I / pi.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from blinkgl.config.scene import (
+    LightConfig,
+    PointLampConfig,
+    RandomLightsConfig,
+    SpotLampConfig,
+    SunLampConfig,
+    direction_of,
+)
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.surfaces.environment import Environment
+from blinkgl.scene.types import Lamp, Light
+
+if TYPE_CHECKING:
+    from blinkgl.scene.types import PosePath
+
+MAX_LAMPS = 32
+"""Of a scene: each is looked at by every lit pixel."""
+NEAREST = 1e-3
+"""World units; what is nearer to a point or spot light than this is lit as if it were this far."""
+
+
+def lamp_pose(position: ArrayLike = (0.0, 0.0, 0.0), shines: ArrayLike = (0.0, 0.0, -1.0)) -> np.ndarray:
+    """(4, 4) T_world_lamp of a lamp at ``position`` that shines in the direction (3,), of any length."""
+    z = -np.asarray(shines, np.float64)
+    z = z / np.linalg.norm(z)
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), position
+    return T
+
+
+def _scaled(color: Sequence[float] | np.ndarray, factor: float) -> tuple[float, float, float]:
+    r, g, b = (float(factor * c) for c in color)
+    return r, g, b
+
+
+def lamps_of(light: Light) -> tuple[Lamp, ...]:
+    """The sun, where there is one, and the lamps, in the order in which shaders have them: suns, point lights, spot
+    lights."""
+    lamps = light.lamps
+    if light.sun:
+        strength = _scaled(light.sun_color, light.sun)
+        towards = lamp_pose(shines=-np.asarray(light.sun_direction))
+        lamps = (Lamp("sun", strength, StaticPath(towards), size=light.sun_size), *lamps)
+    order = ("sun", "point", "spot")
+    return tuple(sorted(lamps, key=lambda lamp: order.index(lamp.kind)))
+
+
+def quadric_of(light: Light) -> np.ndarray:
+    """(3, 4, 4) what comes from all around, per channel, for :func:`ambient`; world axes."""
+    one = np.zeros((4, 4))
+    one[3, 3] = 0.5
+    one[2, 3] = one[3, 2] = 0.25  # 0.5 + 0.5 n_z
+    sky = light.sky * np.asarray(light.sky_color, np.float64)[:, None, None] * one
+    return sky if light.around is None else sky + np.asarray(light.around, np.float64)
+
+
+def is_coloured(light: Light) -> bool:
+    """Whether any of it is not white, so that a surface's luminance is not its albedo's times a number."""
+    quadric = quadric_of(light)
+    return any(len(set(lamp.strength)) > 1 for lamp in lamps_of(light)) or bool((quadric != quadric[:1]).any())
+
+
+def ambient(quadric: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """(..., 3) radiance of a white surface with (..., 3) unit normals, of light from all around: (n, 1) Q (n, 1) per
+    channel, not below 0. quadric : (3, 4, 4), symmetric, in the axes of the normals."""
+    n = np.concatenate([normal, np.ones((*normal.shape[:-1], 1))], axis=-1)
+    return np.maximum(np.einsum("...i,cij,...j->...c", n, quadric, n), 0.0)
+
+
+def beam(lamp: Lamp, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What a lamp sends to (N, 3) points, both in world axes: (N, 3) unit vectors towards it, and (N, 3) strength,
+    the radiance of a white surface that faces it, in nobody's shadow. pose : (4, 4) T_world_lamp."""
+    axis, strength = pose[:3, 2], np.asarray(lamp.strength, np.float64)
+    if lamp.kind == "sun":
+        return np.broadcast_to(axis, points.shape), np.broadcast_to(strength, points.shape)
+    way = pose[:3, 3] - points
+    distance = np.maximum(np.linalg.norm(way, axis=-1), NEAREST)
+    towards = way / distance[:, None]
+    fall = distance**-2.0
+    if math.isfinite(lamp.reach):
+        fall = fall * np.maximum(0.0, 1.0 - (distance / lamp.reach) ** 4)
+    if lamp.kind == "spot":
+        scale, offset = lamp.cone
+        fall = fall * np.clip(towards @ axis * scale + offset, 0.0, 1.0) ** 2
+    return towards, fall[:, None] * strength
+
+
+# ---- from the configuration ---------------------------------------------------------------------------------------
+
+
+def make_light(config: LightConfig, rng: np.random.Generator | None = None, further: Sequence[Lamp] = ()) -> Light:
+    """The light of a scene. Sun direction drawn where the configuration leaves it open and ``rng`` is given.
+    further : lamps beside those of the configuration."""
+    drawn = () if rng is None else (float(rng.uniform(25, 80)), float(rng.uniform(-180, 180)))
+    return Light(
+        config.sun_direction(*drawn),
+        config.sun,
+        config.sky,
+        config.sun_color,
+        config.sky_color,
+        math.radians(config.sun_size),
+        (*(_lamp(one) for one in config.lights), *further),
+    )
+
+
+def _lamp(config: SunLampConfig | PointLampConfig | SpotLampConfig) -> Lamp:
+    strength = _scaled(config.color, config.strength)
+    if isinstance(config, SunLampConfig):
+        shines = -np.asarray(direction_of(config.elevation, config.azimuth))
+        return Lamp("sun", strength, StaticPath(lamp_pose(shines=shines)), size=math.radians(config.size))
+    reach = math.inf if config.reach is None else config.reach
+    if not isinstance(config, SpotLampConfig):
+        return Lamp("point", strength, StaticPath(lamp_pose(config.position)), reach)
+    outer = math.radians(config.angle / 2)
+    pose = lamp_pose(config.position, np.subtract(config.look_at, config.position))
+    return Lamp("spot", strength, StaticPath(pose), reach, outer * (1 - config.edge), outer, config.size)
+
+
+def lit_by(panorama: Environment, factor: float, light: Light) -> Light:
+    """A panorama's light in the place of the light's sun and sky. factor : on its radiance."""
+    suns = [
+        Lamp("sun", _scaled(sun.strength, factor), StaticPath(lamp_pose(shines=-sun.towards)), size=sun.size)
+        for sun in panorama.suns
+    ]
+    around = tuple(tuple(tuple(float(factor * v) for v in row) for row in one) for one in panorama.quadric)
+    return replace(light, sun=0.0, sky=0.0, lamps=(*suns, *light.lamps), around=around)
+
+
+LUMENS_PER_WATT = 683.0
+"""What photometric units of files are divided by; Blender's exporter multiplies by it."""
+
+
+def lamp_of_gltf(light: Mapping[str, Any], path: PosePath, gain: float) -> Lamp:
+    """Of an entry of KHR_lights_punctual: lux of a directional light, candela of others."""
+    strength = _scaled(light["color"], gain * light["intensity"] / (LUMENS_PER_WATT * math.pi))
+    if light["type"] == "directional":
+        return Lamp("sun", strength, path)
+    reach = light["range"] or math.inf
+    if light["type"] == "point":
+        return Lamp("point", strength, path, reach)
+    return Lamp("spot", strength, path, reach, light["spot"]["innerConeAngle"], light["spot"]["outerConeAngle"])
+
+
+def random_lamps(
+    config: RandomLightsConfig, rng: np.random.Generator, half_width: float, floor: float
+) -> tuple[Lamp, ...]:
+    """Lamps of a random world. half_width : of the region, m.   floor : z of the ground."""
+    lamps = []
+    for _ in range(int(rng.integers(config.count[0], config.count[1] + 1))):
+        kind = config.kinds[int(rng.integers(len(config.kinds)))]
+        low, high = np.log(config.sun_strength if kind == "sun" else config.strength)
+        hue, saturation = rng.uniform(0, 2 * math.pi), rng.uniform(0, config.saturation)
+        color = 0.5 + 0.5 * np.cos(hue + np.array([0.0, 2.0, 4.0]) * math.pi / 3)
+        color = 1 - saturation * (1 - color / color.max())
+        strength = _scaled(color, np.exp(rng.uniform(low, high)))
+        place = np.array([*rng.uniform(-half_width, half_width, 2), floor + rng.uniform(*config.height)])
+        target = np.array([*(place[:2] * rng.uniform(0, 1)), floor])
+        elevation, azimuth, angle = rng.uniform(25, 80), rng.uniform(-180, 180), rng.uniform(*config.angle)
+        if kind == "sun":
+            pose = lamp_pose(shines=-np.asarray(direction_of(elevation, azimuth)))
+            lamps.append(Lamp("sun", strength, StaticPath(pose), size=math.radians(0.53)))
+        elif kind == "point":
+            lamps.append(Lamp("point", strength, StaticPath(lamp_pose(place))))
+        else:
+            outer = math.radians(angle / 2)
+            pose = lamp_pose(place, target - place)
+            lamps.append(Lamp("spot", strength, StaticPath(pose), inner=0.8 * outer, outer=outer, size=0.1))
+    return tuple(lamps)

@@ -1,0 +1,135 @@
+"""Panoramas that light a scene: what a matt surface receives of a picture of everything around it, in closed form.
+
+Diffuse light of an environment is its spherical harmonics up to order 2 (Ramamoorthi and Hanrahan, "An Efficient
+Representation for Irradiance Environment Maps", SIGGRAPH 2001): nine numbers per channel, which are a quadratic form of
+the normal. What is small and very bright is not smooth enough for that: a sun is found in the picture, taken out of it,
+and shines as a lamp, which casts shadows besides.
+
+Directions are those of :func:`blinkgl.scene.surfaces.images.cube_faces`: the middle column is seen in direction +x, and
+longitude grows to the right, clockwise from above.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+_WIDTH = 1024  # of what is integrated: harmonics of order 2 do not see more
+_BRIGHTER = 30.0  # times the mean radiance: the least that a sun is
+_EDGE = 0.1  # of a sun's brightest: where its disc ends
+_LARGEST = math.radians(12.0)  # radius of what may be a sun; a photograph's glare is several times its disc
+MOST_SUNS = 4
+"""A room has lamps, not one sun: so many are taken out of a picture, the brightest first."""
+_SHARE = 0.05  # of the light on a surface that faces it: less is not worth a lamp
+
+
+class Sun(NamedTuple):
+    """towards : (3,) unit vector.   strength : (3,) radiance of a white surface that faces it.   size : rad, of its
+    disc's diameter."""
+
+    towards: np.ndarray
+    strength: np.ndarray
+    size: float
+
+
+class Environment(NamedTuple):
+    """What a panorama sends: the quadric of :func:`blinkgl.scene.lights.ambient`, (3, 4, 4), and its sun, if there is
+    one, or its brightest lamps, which are not in the quadric."""
+
+    quadric: np.ndarray
+    suns: tuple[Sun, ...]
+
+
+def environment(radiance: np.ndarray, suns: int = MOST_SUNS) -> Environment:
+    """Of an equirectangular picture (h, w, 3) float32, linear radiance. suns : that are looked for, at most."""
+    image = np.asarray(radiance, np.float32)
+    height, width = image.shape[:2]
+    if width > _WIDTH:
+        image = cv2.resize(image, (_WIDTH, max(1, round(height * _WIDTH / width))), interpolation=cv2.INTER_AREA)
+    directions, solid = pixel_directions(*image.shape[:2])
+    found: list[Sun] = []
+    while len(found) < suns:
+        sun, image = _without_sun(image, directions, solid)
+        if sun is None:
+            break
+        found.append(sun)
+    return Environment(quadric_of_harmonics(harmonics(image, directions, solid)), tuple(found))
+
+
+def turned(given: Environment, angle: float) -> Environment:
+    """By an angle, rad, about the vertical, from +x towards +y."""
+    T = np.eye(4)
+    T[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    suns = tuple(sun._replace(towards=T[:3, :3] @ sun.towards) for sun in given.suns)
+    return Environment(T @ given.quadric @ T.T, suns)
+
+
+def pixel_directions(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w, 3) float64 unit vectors of a panorama's pixels, and (h,) sr that a pixel of each row covers."""
+    edges = np.pi / 2 - np.arange(height + 1) * (np.pi / height)
+    latitude = 0.5 * (edges[1:] + edges[:-1])
+    azimuth = np.pi - (np.arange(width) + 0.5) * (2 * np.pi / width)
+    flat = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(width)], axis=1)
+    directions = np.cos(latitude)[:, None, None] * flat
+    directions[..., 2] = np.sin(latitude)[:, None]
+    return directions, (np.sin(edges[:-1]) - np.sin(edges[1:])) * (2 * np.pi / width)
+
+
+def harmonics(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> np.ndarray:
+    """(9, 3) coefficients of the radiance: 1; y, z, x; xy, yz, 3 z² - 1, xz, x² - y²."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    c = 0.282094792, 0.488602512, 1.092548431, 0.315391565, 0.546274215
+    basis = (
+        np.full_like(x, c[0]), c[1] * y, c[1] * z, c[1] * x,
+        c[2] * x * y, c[2] * y * z, c[3] * (3 * z * z - 1), c[2] * x * z, c[4] * (x * x - y * y),
+    )  # fmt: skip
+    weighted = image.astype(np.float64) * solid[:, None, None]
+    return np.stack([np.tensordot(b, weighted, axes=2) for b in basis])
+
+
+def quadric_of_harmonics(L: np.ndarray) -> np.ndarray:
+    """(3, 4, 4) of (9, 3) coefficients: the radiance of a white surface with unit normal n is (n, 1) Q (n, 1)."""
+    c1, c2, c3, c4, c5 = 0.429042738, 0.511663354, 0.743123868, 0.886226925, 0.247707956
+    one, y, z, x, xy, yz, zz, xz, xxyy = L
+    rows = [
+        [c1 * xxyy, c1 * xy, c1 * xz, c2 * x],
+        [c1 * xy, -c1 * xxyy, c1 * yz, c2 * y],
+        [c1 * xz, c1 * yz, c3 * zz, c2 * z],
+        [c2 * x, c2 * y, c2 * z, c4 * one - c5 * zz],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0) / np.pi
+
+
+def _without_sun(image: np.ndarray, directions: np.ndarray, solid: np.ndarray) -> tuple[Sun | None, np.ndarray]:
+    """The sun, and the picture with the sky around it in its place. None where nothing is small and bright enough."""
+    grey = image.max(axis=2)
+    mean = float((grey * solid[:, None]).sum() / (solid.sum() * image.shape[1]))
+    peak = np.unravel_index(int(grey.argmax()), grey.shape)
+    if not grey[peak] > _BRIGHTER * mean:
+        return None, image
+    wide = np.concatenate([grey, grey, grey], axis=1) > _EDGE * grey[peak]  # what the seam cuts is one
+    parts, _ = ndimage.label(wide)
+    middle = slice(grey.shape[1], 2 * grey.shape[1])
+    disc = (parts == parts[peak[0], peak[1] + grey.shape[1]])[:, middle]
+    centre = (directions * (grey * solid[:, None])[..., None])[disc].sum(axis=0)
+    angle = np.arccos(np.clip(directions @ (centre / np.linalg.norm(centre)), -1.0, 1.0))
+    if angle[disc].max() > _LARGEST:
+        return None, image
+    glare = (angle < max(2.0 * angle[disc].max(), 2 * np.pi / image.shape[1] * 3)) & (angle < _LARGEST)
+    ring = (angle < 1.5 * angle[glare].max()) & ~glare
+    around = np.median(image[ring], axis=0) if ring.any() else np.zeros(3, np.float32)
+    weight = np.broadcast_to(solid[:, None], grey.shape)[glare]
+    excess = np.maximum(image[glare] - around, 0.0).astype(np.float64) * weight[:, None]
+    towards = (excess.sum(axis=1)[:, None] * directions[glare]).sum(axis=0)
+    towards /= np.linalg.norm(towards)
+    strength = excess.sum(axis=0) / np.pi
+    rest = image.copy()
+    rest[glare] = np.minimum(image[glare], around)
+    if strength.max() < _SHARE * mean:
+        return None, image
+    area = float(np.broadcast_to(solid[:, None], grey.shape)[disc].sum())
+    return Sun(towards, strength, 2.0 * math.sqrt(area / np.pi)), rest

@@ -1,0 +1,85 @@
+"""The sky as a box of pictures around everything, and a panorama as both picture and light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from blinkgl.config.scene import EnvironmentConfig
+from blinkgl.errors import ConfigError
+from blinkgl.scene.geometry.primitives import parameter_hash, square
+from blinkgl.scene.lights import lit_by
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.reading import contents
+from blinkgl.scene.surfaces.environment import environment, turned
+from blinkgl.scene.surfaces.images import SKY_SIDES, content_hash, cube_faces, load_image, load_panorama, shrink
+from blinkgl.scene.types import Light, Material, Mesh, Part, SceneObject, Texture
+from blinkgl.scene.worlds.pool import resolve
+
+_MARGIN = 1 / 16
+PANORAMA_INSET = 1 / (1 + _MARGIN)
+"""Share of a side's texture that is on its side of the box: the rest is there for the filters."""
+
+
+def sky_box(
+    size: float, subdivisions: int, images: Sequence[Texture], brightness: float, repeats: float, inset: float = 1.0
+) -> tuple[Part, ...]:
+    """Six inward squares around the origin. images : of the sides +x, -x, +y, -y, +z, -z.   inset : share of each
+    texture that the side shows."""
+    half, n, parts = size / 2, subdivisions, []
+    for (forward, right, down), texture, side in zip(SKY_SIDES, images, ("+x", "-x", "+y", "-y", "+z", "-z")):
+        positions, normals, uvs, faces = square(
+            half * (forward - right + down), 2 * half * right, -2 * half * down, n, n
+        )
+        uvs = 0.5 + (uvs - 0.5) * inset
+        mesh = Mesh(
+            positions,
+            faces.astype(np.int32),
+            np.ascontiguousarray(normals, np.float32),
+            uvs.astype(np.float32),
+            name=f"sky {side}",
+            source_hash=parameter_hash("sky", size, n, side, inset),
+        )
+        parts.append(Part(mesh, Material(texture, (brightness,) * 3, (repeats, repeats), unlit=True)))
+    return tuple(parts)
+
+
+def panorama_textures(image: np.ndarray, name: str, digest: str) -> list[Texture]:
+    """Six textures for :func:`sky_box` of an equirectangular image, to be shown with :data:`PANORAMA_INSET`."""
+    sides = cube_faces(image, max(image.shape[1] // 4, 1), _MARGIN)
+    return [
+        Texture(side, f"{name} side {k}", content_hash(digest.encode(), bytes([k]))) for k, side in enumerate(sides)
+    ]
+
+
+def panorama_light(file: Path, angle: float, brightness: float, light: Light, where: str) -> Light:
+    """``light`` with a panorama's in the place of its sun and sky, as bright as :func:`load_image` shows it times
+    ``brightness``. angle : rad by which it is turned, from +x towards +y. Raises AssetError."""
+    radiance, exposure = load_panorama(file, where)
+    return lit_by(turned(environment(radiance), angle), exposure * brightness, light)
+
+
+def with_environment(
+    config: EnvironmentConfig | None, light: Light, base: Path, objects: Sequence[SceneObject]
+) -> tuple[Light, tuple[SceneObject, ...]]:
+    """(light, objects) of a scene that a panorama lights; as they are, where none does. Raises ConfigError and
+    AssetError."""
+    objects = tuple(objects)
+    if config is None:
+        return light, objects
+    where = "scene.light.environment.map"
+    file = resolve(config.map, base)
+    if not file.is_file():
+        raise ConfigError("no such file", where=where, value=config.map, accepted="an equirectangular image")
+    angle = np.radians(config.heading)
+    light = panorama_light(file, angle, config.strength, light, f"{where}: {config.map}")
+    if config.visible:
+        image = shrink(load_image(file), 4096)
+        image = np.roll(image, -round(config.heading / 360 * image.shape[1]), axis=1)
+        textures = panorama_textures(image, file.stem, content_hash(contents(file, "image"), repr(config).encode()))
+        parts = sky_box(config.size, 4, textures, config.strength, 1.0, PANORAMA_INSET)
+        number = 1 + max((thing.instance_id for thing in objects), default=0)
+        objects = (*objects, SceneObject("sky", number, parts, StaticPath(), "sky"))
+    return light, objects

@@ -1,0 +1,159 @@
+"""Weights that others have published: the checkpoints of E-RAFT (``dsec.tar``, ``mvsec_20.tar``, …) and of RAFT, which
+have one layout, to a safetensors file of :class:`~eflow.models.eraft.Eraft`.
+
+Such files are pickles. Tensors and plain containers are all that is taken from them, by torch's restricted reader,
+which executes nothing. Names are others here, the gates of the GRU are joined, and the taps of a look-up stand in
+another order; the numbers are the same, and so is the flow, with E-RAFT's own padding and border, which the file is
+marked with.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from blinkgl.errors import AssetError, ConfigError
+from blinkgl.io.atomic import atomic_file
+from eflow.checkpoint import load_weights, metadata_of, write_tensors
+from eflow.models import FlowModel, build_model, model_config
+
+COLOURS = 3
+_IGNORED = ("norm3.", "num_batches_tracked")
+"""Parts of published names that say nothing new: a shortcut's norm stands there twice, and counters of batches."""
+
+
+def import_published(path: str | os.PathLike, out: str | os.PathLike, *, bins: int | None = None) -> FlowModel:
+    """Writes the weights in ``path`` to the new safetensors file ``out``; returns the network.
+
+    bins : only for RAFT's, which see images: time bins that the first layers' three colours are spread over, as a start
+    for training (they know no events).
+    Raises AssetError: not a checkpoint of this layout, truncated, anything but tensors. ConfigError: ``bins``.
+    OutputError: ``out`` exists or cannot be written."""
+    path = Path(path)
+    model = from_published(read_published(path), str(path), bins=bins)
+    with atomic_file(out, overwrite=False) as temporary:
+        write_tensors(temporary, model.state_dict(), metadata_of(model))
+    return model
+
+
+def read_published(path: Path) -> dict[str, Tensor]:
+    """Tensors by name of a checkpoint of torch's: the whole of it, or its entry ``model`` or ``state_dict``.
+    Raises AssetError."""
+    try:
+        tree = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise AssetError("no such file", where=str(path)) from None
+    except pickle.UnpicklingError as error:
+        if "GLOBAL" in str(error):  # a class or function that it would have to call; torch says at length how
+            raise AssetError(
+                "holds more than tensors, which could run any code when loaded; refused",
+                where=str(path),
+                accepted="a checkpoint of tensors",
+            ) from error
+        raise AssetError("truncated or not a checkpoint of PyTorch", where=str(path)) from error
+    except OSError as error:
+        reason = os.strerror(error.errno).lower() if error.errno else str(error)
+        raise AssetError(f"cannot be read: {reason}", where=str(path)) from error
+    except (RuntimeError, EOFError, ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
+        raise AssetError("truncated or not a checkpoint of PyTorch", where=str(path)) from error
+    for key in ("model", "state_dict"):
+        if isinstance(tree, dict) and isinstance(tree.get(key), dict):
+            tree = tree[key]
+    if not isinstance(tree, dict) or not tree or not all(isinstance(k, str) for k in tree):
+        raise AssetError("holds no tensors by name", where=str(path), accepted="E-RAFT's or RAFT's checkpoint")
+    tensors = {k.removeprefix("module."): v for k, v in tree.items()}
+    for name, value in tensors.items():
+        if not isinstance(value, Tensor):
+            raise AssetError(f"'{name}' is no tensor", where=str(path), value=type(value).__name__)
+    return tensors
+
+
+def from_published(tensors: dict[str, Tensor], where: str, *, bins: int | None = None) -> FlowModel:
+    """The network that published tensors are of. Raises AssetError, ConfigError, as :func:`import_published`."""
+    first = _tensor(tensors, "fnet.conv1.weight", where)
+    channels = first.shape[1] if first.ndim == 4 else 0
+    if channels == COLOURS and bins is None:
+        raise ConfigError(
+            "RAFT sees images of three colours",
+            where="--bins",
+            accepted="time bins to spread them over, as a start for training (--bins 15)",
+        )
+    if channels != COLOURS and bins not in (None, channels):
+        raise ConfigError("the network has its own", where="--bins", value=bins, accepted=str(channels))
+    if not 2 <= channels <= 64:
+        raise AssetError("tensor 'fnet.conv1.weight' has another shape", where=where, value=tuple(first.shape))
+    events = {"bins": bins or channels, "normalise": "nonzero", "bounds": "events"}
+    config: dict[str, Any] = {"name": "eraft", "input": events, "border": "zero", "padding": "start"}
+    model = build_model(model_config(config))
+    ours = model.state_dict()
+    found = {}
+    for name, wanted in ours.items():
+        if name.endswith("num_batches_tracked"):
+            found[name] = wanted
+            continue
+        sources = published_names(name)
+        parts = [_tensor(tensors, source, where) for source in sources]
+        value = torch.cat(parts) if all(p.ndim for p in parts) else parts[0]
+        if name in ("features.0.weight", "context.0.weight") and channels == COLOURS:
+            value = value.mean(1, keepdim=True).expand(-1, events["bins"], -1, -1) * (COLOURS / events["bins"])
+        if value.shape != wanted.shape or not value.is_floating_point():
+            raise AssetError(
+                f"tensor '{' and '.join(sources)}' has another shape or type",
+                where=where,
+                value=(tuple(value.shape), str(value.dtype).removeprefix("torch.")),
+                accepted=f"{tuple(wanted.shape)}, floating point",
+            )
+        found[name] = (_reordered(value) if name == "update.motion.corr1.weight" else value).float()
+    used = {source for name in ours for source in published_names(name)}
+    left = [k for k in sorted(set(tensors) - used) if not any(part in k for part in _IGNORED)]
+    if left:
+        raise AssetError(
+            f"holds a tensor '{left[0]}' that E-RAFT has not", where=where, accepted="E-RAFT's or RAFT's checkpoint"
+        )
+    load_weights(model, found, where)
+    return model.eval()
+
+
+def published_names(name: str) -> tuple[str, ...]:
+    """Where E-RAFT's code keeps what is ``name`` here: ``features.3.conv1.weight`` is ``fnet.layer1.0.conv1.weight``;
+    the update and the reset gate are one convolution here and two there."""
+    part, _, rest = name.partition(".")
+    if part in ("features", "context"):
+        index, _, rest = rest.partition(".")
+        at = int(index)
+        if 3 <= at <= 8:
+            where = f"layer{(at - 3) // 2 + 1}.{(at - 3) % 2}.{rest.replace('shortcut', 'downsample')}"
+        else:
+            where = f"{ {0: 'conv1', 1: 'norm1', 9: 'conv2'}[at] }.{rest}"
+        return (f"{'fnet' if part == 'features' else 'cnet'}.{where}",)
+    part, _, rest = rest.partition(".")
+    if part == "motion":
+        layer, _, rest = rest.partition(".")
+        names = {"corr1": "convc1", "corr2": "convc2", "flow1": "convf1", "flow2": "convf2", "join": "conv"}
+        return (f"update_block.encoder.{names[layer]}.{rest}",)
+    if part == "gru":
+        kind, index, rest = rest.split(".", 2)
+        letters = "zr" if kind == "gates" else "q"
+        return tuple(f"update_block.gru.conv{letter}{int(index) + 1}.{rest}" for letter in letters)
+    index, _, rest = rest.partition(".")
+    if part == "flow_head":
+        return (f"update_block.flow_head.conv{ {'0': 1, '2': 2}[index] }.{rest}",)
+    return (f"update_block.mask.{index}.{rest}",)
+
+
+def _reordered(weight: Tensor) -> Tensor:
+    """(C, taps, 1, 1) over taps of which the column goes slower than the row, to rows slower than columns."""
+    levels, side = 4, 9
+    grid = weight.view(weight.shape[0], levels, side, side, 1, 1)
+    return grid.transpose(2, 3).reshape(weight.shape)
+
+
+def _tensor(tensors: dict[str, Tensor], name: str, where: str) -> Tensor:
+    if name not in tensors:
+        raise AssetError(f"lacks the tensor '{name}'", where=where, accepted="E-RAFT's or RAFT's checkpoint")
+    return tensors[name]

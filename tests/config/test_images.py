@@ -1,0 +1,107 @@
+"""``images:`` of a configuration: presets, what contradicts, what does not fit into the sequence."""
+
+import pytest
+import yaml
+
+from blinkgl.config.images import ImagesConfig
+from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run
+from blinkgl.dataset.report import config_yaml
+from blinkgl.errors import ConfigError
+
+
+def read(tmp_path, **changes):
+    path = tmp_path / "run.yaml"
+    path.write_text(yaml.safe_dump(changes))
+    return load_run(path)
+
+
+@pytest.mark.parametrize(
+    ("images", "said"),
+    [
+        ({"exposure_us": 0}, "images.exposure_us: too small (got 0); expected a number from 1 to 1e+09"),
+        ({"exposure_us": 0.5}, "images.exposure_us: too small"),
+        ({"exposure_us": -5}, "images.exposure_us: too small"),
+        (
+            {"exposure_us": 2e6, "rate": 0.1},
+            "images.exposure_us: no exposure fits into the sequence (got 2000000.0); expected at most 1.1e+06",
+        ),
+        (
+            {"exposure_us": 40_000, "rate": 30},
+            (
+                "images.exposure_us: an exposure lasts into the next image's (got 40000.0); expected at most 33333.3, "
+                "or a lower rate"
+            ),
+        ),
+        ({"row_us": 200, "rate": 30}, "images.row_us: the rows are not read before the next image begins"),
+        ({"row_us": 10_000, "rate": 0.1}, "images.exposure_us: no exposure fits into the sequence"),
+        ({"times": [0.1, 1.2]}, "images.times: an exposure outside the sequence (got 1.2); expected from 0 to 1.095"),
+        ({"times": [-0.1]}, "images.times: an exposure outside the sequence (got -0.1)"),
+        ({"times": [0.2, 0.1]}, "images.times: times of exposures are out of order"),
+        ({"times": [0.2, 0.201]}, "images.times: times of exposures are out of order, or nearer"),
+        ({"times": []}, "images.times: too few entries"),
+        ({"times": [0.2, 0.21], "row_us": 100}, "images.times: the rows are not read before the next image begins"),
+        ({"bits": 7}, "images.bits: too small (got 7); expected a whole number from 8 to 16"),
+        ({"bits": 17}, "images.bits: too large"),
+        ({"response": "log"}, "images.response: unknown choice (got 'log')"),
+        ({"gamma": 1.8}, "images.gamma: only `response: gamma` has a gamma (got 1.8); expected response: gamma"),
+        ({"bayer": "rgbg"}, "images.bayer: unknown choice"),
+        ({"also": ["sharp", "sharp"]}, "images.also: named twice"),
+        ({"lens": {"aperture": 0.1}}, "images.lens.focus: is required"),
+        ({"lens": {"aperture": 0.1, "focus": 0}}, "images.lens.focus: too small"),
+        ({"preset": "night"}, "images.preset: unknown choice (got 'night')"),
+        ({"exposure": 5}, "images.exposure: unknown key; expected 'exposure_us' (nearest)"),
+        (
+            {"auto_exposure": {"longest_us": 1000}},
+            (
+                "images.exposure_us: automatic exposure begins with an exposure outside its limits (got 5000.0); "
+                "expected from 20 to 1000 (auto_exposure)"
+            ),
+        ),
+        (
+            {"auto_exposure": {"longest_us": 40_000}},
+            "images.auto_exposure.longest_us: an exposure lasts into the next image's (got 40000.0)",
+        ),
+        ({"auto_exposure": {"shortest_us": 9e4}}, "images.auto_exposure.shortest_us: the shortest exposure exceeds"),
+        ({"auto_exposure": {}, "gain_db": 30}, "images.gain_db: automatic exposure begins with a gain above its limit"),
+    ],
+)
+def test_what_cannot_be_is_one_line(tmp_path, images, said):
+    with pytest.raises(ConfigError) as error:
+        read(tmp_path, images=images)
+    assert str(error.value).startswith(said) and "\n" not in str(error.value)
+
+
+def test_recorded_frames_have_no_frame_camera(tmp_path):
+    with pytest.raises(ConfigError, match="images: recorded frames are images already"):
+        read(tmp_path, images={}, frames={"folders": ["x"], "fps": 10})
+
+
+def test_distributions_are_tried_at_their_ends(tmp_path):
+    with pytest.raises(ConfigError, match="lasts into the next image's"):
+        read(tmp_path, images={"rate": {"uniform": [10, 50]}, "exposure_us": {"uniform": [1000, 30_000]}})
+    template = read(tmp_path, images={"rate": {"uniform": [10, 30]}, "exposure_us": {"uniform": [1000, 30_000]}})
+    assert len({template.sequence(k).images.exposure_us for k in range(5)}) == 5
+
+
+@pytest.mark.parametrize("name", ImagesConfig.presets)
+def test_every_preset_is_accepted_and_what_is_said_beside_it_wins(name):
+    given = ImagesConfig(preset=name)
+    for key, value in ImagesConfig.presets[name].items():
+        assert getattr(given, key) == (tuple(value) if isinstance(value, list) else value)
+    assert ImagesConfig(preset=name, exposure_us=777).exposure_us == 777
+    SequenceConfig(images=given)  # with everything else as it is by default
+
+
+def test_images_stand_in_the_place_of_the_instantaneous_ones(tmp_path):
+    assert read(tmp_path).sequence(0).labels.images
+    assert not read(tmp_path, images={"preset": "raw"}).sequence(0).labels.images
+    assert read(tmp_path, images={"preset": "raw"}, labels={"images": True}).sequence(0).labels.images
+    assert read(tmp_path, images=None).sequence(0).labels.images
+
+
+def test_a_configuration_says_again_what_it_was(tmp_path):
+    for images in (None, {"preset": "raw", "lens": {"aperture": 0.1, "focus": 3}, "auto_exposure": {}}):
+        config = RunTemplate({"images": images}, tmp_path).sequence(0)
+        text = config_yaml(config, 0)
+        assert ("\nimages:" in text) == (images is not None), "a sequence without it has the bytes that it had"
+        assert RunTemplate(yaml.safe_load(text), tmp_path).sequence(0).images == config.images

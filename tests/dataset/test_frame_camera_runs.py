@@ -1,0 +1,226 @@
+"""A frame camera from the configuration to the files and those who read them."""
+
+import json
+import os
+import tarfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import blinkgl
+from blinkgl.config.sequence import RunTemplate
+from blinkgl.dataset.executor import Local
+from blinkgl.dataset.explain import explain
+from blinkgl.dataset.generate import generate_run
+from blinkgl.dataset.run import run_dataset
+from blinkgl.dataset.shards import export_shards
+from blinkgl.dataset.verify import differences, verify_dataset
+from blinkgl.errors import AssetError
+from blinkgl.imaging import CameraImage
+from blinkgl.io.frame_camera import encode_codes, read_codes, read_exposures
+from blinkgl.io.frames import open_frames
+from blinkgl.report.collect import collect
+from blinkgl.sequence import EventChunk, GroundTruth, simulate_sequence
+
+RUN = {
+    "seed": 5,
+    "camera": {"width": 40, "height": 30},
+    "time": {"duration": 0.1, "label_rate": 20, "start": 0.5},
+    "scene": {
+        "objects": {"count": 2, "distance": [2, 4]},
+        "pool": {"primitives": ["sphere", "cuboid"], "variants": 2, "urdfs": False},
+        "textures": {"procedural": ["checks", "fbm"], "variants": 2, "photographs": False, "max_size": 32},
+        "camera_motion": {"speed": [2, 5], "rotation_rate": [60, 200]},
+    },
+    "images": {
+        "rate": 70,
+        "exposure_us": 6000,
+        "row_us": 50,
+        "bits": 12,
+        "photon_noise": True,
+        "gain_db": 12,
+        "read_noise": 3,
+        "max_instants": 3,
+        "also": ["clean", "sharp"],
+        "auto_exposure": {"lag": 0.05, "longest_us": 9000},
+    },
+    "preview": {"enabled": False},
+}
+
+
+def template(**images):
+    return RunTemplate({**RUN, "images": {**RUN["images"], **images}}, Path("."))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    out = tmp_path_factory.mktemp("camera") / "out"
+    (report,) = generate_run(template(), out)
+    return report, out
+
+
+def test_images_are_written_beside_everything_else_and_verified(made):
+    report, out = made
+    lines = read_exposures(report.path)
+    assert len(lines) == 10 and [round(e.start_us) for e in lines[:3]] == [500_000, 514_286, 528_571]
+    assert not (report.path / "images").exists(), "in the place of the instantaneous ones"
+    for name in ("images", "clean", "sharp"):
+        assert len(list((report.path / "frame_camera" / name).glob("*.png"))) == 10
+        codes = read_codes(report.path / f"frame_camera/{name}/000009.png")
+        assert codes.shape == (30, 40, 3) and codes.dtype == np.uint16 and 300 < codes.max() < 4096
+    manifest = json.loads((report.path / "manifest.json").read_text())
+    assert manifest["frame_camera"]["images"] == 10 and manifest["frame_camera"]["bits"] == 12
+    assert report.seconds["images"] > 0
+    assert verify_dataset(out, deep=1).clean
+
+
+def test_the_same_seed_gives_the_same_bytes_with_workers(made, tmp_path, monkeypatch):
+    report, _ = made
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "1")
+    outcome = run_dataset(template(), tmp_path / "out", Local(2), num=2)
+    assert not outcome.set_aside
+    assert differences(report.path, tmp_path / "out/train/sequence_000000") == []
+    other = tmp_path / "out/train/sequence_000001"
+    assert not np.array_equal(
+        read_codes(other / "frame_camera/images/000000.png"), read_codes(report.path / "frame_camera/images/000000.png")
+    )
+
+
+def test_images_come_in_time_between_events_and_labels(made):
+    config = template().sequence(0)
+    seen, times = [], []
+    for item in simulate_sequence(config, 0):
+        if isinstance(item, EventChunk):
+            assert not len(item.events) or item.events.t[0] >= (times[-1] // 1000 if times else 0)
+            done_us = item.t_ns // 1000
+            assert not len(item.events) or item.events.t[-1] <= done_us
+        elif isinstance(item, (CameraImage, GroundTruth)):
+            assert item.t_ns // 1000 == done_us, "every event before it has come, and no other"
+            times.append(item.t_ns)
+            seen.append(item)
+    assert times == sorted(times)
+    images = [item for item in seen if isinstance(item, CameraImage)]
+    assert [item.k for item in images] == list(range(10)) and len(seen) == 10 + 3
+    for k in (0, 9):
+        for name, codes in images[k].pictures.items():
+            np.testing.assert_array_equal(codes, read_codes(made[0].path / f"frame_camera/{name}/{k:06d}.png"))
+    alone = [item for item in simulate_sequence(config, 0, events=False) if isinstance(item, CameraImage)]
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(images, alone, strict=True)), (
+        "whoever else is drawn for"
+    )
+    assert not any(isinstance(item, CameraImage) for item in simulate_sequence(config, 0, labels=False))
+
+
+def test_events_and_labels_are_what_they_are_without_it(made, tmp_path):
+    report, _ = made
+    (plain,) = generate_run(RunTemplate({**RUN, "images": None, "labels": {"images": False}}, Path(".")), tmp_path)
+    for name in ("events.h5", "flow/forward/000001.png", "poses.npz"):
+        assert (plain.path / name).read_bytes() == (report.path / name).read_bytes(), name
+    assert not (plain.path / "frame_camera").exists()
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda f: (f / "images/000000.png").write_bytes(b"x"), "bytes, manifest says"),
+        (lambda f: os.remove(f / "clean/000003.png"), "missing"),
+    ],
+)
+def test_what_is_damaged_is_found(made, tmp_path, damage, said):
+    import shutil
+
+    shutil.copytree(made[1], tmp_path / "out")
+    damage(tmp_path / "out/train/sequence_000000/frame_camera")
+    found = verify_dataset(tmp_path / "out")
+    assert not found.clean and said in str(found.problems)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda csv: "\n".join(csv.splitlines()[:-1]) + "\n", "9 exposures, manifest says 10"),
+        (lambda csv: csv.replace("500000.000", "500001.000"), "not at the times"),
+        (lambda csv: csv.replace("start_us", "begin_us"), "damaged list of exposures"),
+        (lambda csv: csv.replace("500000.000", "nan"), "damaged list of exposures"),
+    ],
+)
+def test_exposures_that_say_otherwise_are_found(made, tmp_path, change, said):
+    """With a manifest that knows the altered file: its contents are looked at, not its checksum alone."""
+    import hashlib
+    import shutil
+
+    folder = tmp_path / "sequence_000000"
+    shutil.copytree(made[0].path, folder)
+    path, manifest = folder / "frame_camera/exposures.csv", json.loads((folder / "manifest.json").read_text())
+    data = change(path.read_text()).encode()
+    path.write_bytes(data)
+    manifest["files"]["frame_camera/exposures.csv"] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    found = verify_dataset(folder)
+    assert said in str(found.problems)
+
+
+def test_explain_says_what_is_taken_and_what_is_left_out():
+    told = explain(template())
+    (camera,) = [p for p in told.passes if p.name == "frame camera"]
+    assert camera.count == 10 and "10 images, exposed 6000 µs, rows 50 µs apart" in camera.why
+    assert "photon noise" in camera.why and "beside them sharp and clean" in camera.why
+    out = dict(told.left_out)
+    assert "frame camera: defocus" in out and "frame camera: noise" not in out
+    none = dict(explain(RunTemplate({**RUN, "images": None}, Path("."))).left_out)
+    assert none["frame camera: motion blur, noise, lens"] == "images: null"
+
+
+def test_the_report_and_the_shards_have_them(made, tmp_path):
+    report, out = made
+    (example,) = collect(out).examples
+    titles = [title for title, _ in example.others[:3]]
+    assert titles[0] in {f"frame camera, {e.exposure_us / 1000:g} ms" for e in read_exposures(report.path)}
+    assert titles[1:] == ["frame camera, sharp", "frame camera, clean"]
+    assert all(p.dtype == np.uint8 and p.shape == (30, 40, 3) for _, p in example.others[:3])
+    export_shards(out, tmp_path / "shards")
+    with tarfile.open(tmp_path / "shards/train-000000.tar") as tar:
+        files = {member.name: tar.extractfile(member).read() for member in tar}
+    about = json.loads(files["sequence_000000_000001.json"])
+    line = read_exposures(report.path)[about["camera"]["image"]]
+    following = read_exposures(report.path)[about["camera"]["image"] + 1]
+    assert line.end_us <= about["from_us"] < following.end_us and about["camera"]["gain_db"] == line.gain_db
+    for ending, name in (("camera", "images"), ("camera_sharp", "sharp"), ("camera_clean", "clean")):
+        path = report.path / f"frame_camera/{name}/{about['camera']['image']:06d}.png"
+        assert files[f"sequence_000000_000001.{ending}.png"] == path.read_bytes()
+
+
+def test_its_folder_of_images_is_a_video_with_times(made):
+    times = [t_ns for _, t_ns, _ in open_frames(made[0].path / "frame_camera/images")]
+    lines = read_exposures(made[0].path)
+    assert times == [1000 * e.middle_us for e in lines] and len(times) == 10
+    assert lines[0].middle_us == 500_000 + round((6000 + 29 * 50) / 2)
+
+
+def test_from_python(made):
+    recording = blinkgl.record(template(), images={"preset": "raw", "rate": 20, "exposure_us": 4000})
+    assert len(recording.camera) == 3 and recording.camera[0].image.shape == (30, 40) and recording.images is None
+    with pytest.raises(blinkgl.ConfigError, match=r"images.preset: unknown choice \(got 'night'\)"):
+        blinkgl.record(template(), images="night")
+    with pytest.raises(blinkgl.ConfigError, match="images: not a frame camera"):
+        blinkgl.record(template(), images=3)
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 3), (5, 7)])
+def test_sixteen_bits_are_read_back_exactly(tmp_path, shape):
+    codes = np.random.default_rng(0).integers(0, 65536, shape).astype(np.uint16)
+    codes.flat[:2] = 0, 65535
+    path = tmp_path / "x.png"
+    path.write_bytes(encode_codes(codes))
+    again = read_codes(path)
+    assert again.dtype == np.uint16
+    np.testing.assert_array_equal(again, codes)
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)  # and by somebody else
+    np.testing.assert_array_equal(stored[..., ::-1] if stored.ndim == 3 else stored, codes)
+
+
+def test_no_list_of_exposures_is_said(tmp_path):
+    with pytest.raises(AssetError, match="no frame camera here"):
+        read_exposures(tmp_path)

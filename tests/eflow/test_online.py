@@ -1,0 +1,232 @@
+"""Samples that are rendered while they are trained on: the same ones whoever makes them, each once, bounded ahead."""
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+torch = pytest.importorskip("torch")
+
+from blinkgl.errors import ConfigError, EventDataError  # noqa: E402
+from eflow.checkpoint import newest  # noqa: E402
+from eflow.cli import run  # noqa: E402
+from eflow.config import SourceConfig, load_train_config  # noqa: E402
+from eflow.data.dataset import ENDLESS, Mixture  # noqa: E402
+from eflow.data.online import MIX, drawn_spans, open_online  # noqa: E402
+from eflow.train import train  # noqa: E402
+
+RECIPE = {
+    "seed": 3,
+    "camera": {"width": 32, "height": 32},
+    "time": {"duration": 0.05, "label_rate": 20},
+    "timeline": {"kind": "displacement", "max_px": 2.0},
+    "scene": {
+        "objects": {"count": 2},
+        "textures": {"photographs": False, "procedural": ["checks"], "variants": 2, "max_size": 32},
+        "pool": {"primitives": ["cuboid"], "variants": 2, "test_fraction": 0.5},
+        "object_motion": {"kind": "static"},
+        "camera_motion": {"speed": 2, "rotation_rate": 90},
+    },
+    "labels": {"images": False, "flow": ["forward", "backward"], "occlusion": False},
+    "preview": {"enabled": False},
+    "groups": {
+        "one": {"output": {"sequences": 3}},
+        "two": {"output": {"sequences": 1}, "events": {"contrast_threshold": {"uniform": [0.1, 0.3]}}},
+        "judge": {"output": {"split": "test", "sequences": 1}},
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("online") / "recipe.yaml"
+    path.write_text(yaml.safe_dump(RECIPE))
+    return path
+
+
+def asked(recipe: Path, **keys) -> SourceConfig:
+    return SourceConfig(**{"recipe": str(recipe), "online": True, "workers": 0, "samples": 2, **keys})
+
+
+def said(sample) -> tuple:
+    """Everything of a sample, comparable."""
+    columns = [getattr(w, c).tobytes() for w in (sample.old, sample.new) for c in "xytp"]
+    return sample.name, sample.flow.tobytes(), sample.valid.tobytes(), sample.backward.tobytes(), *columns
+
+
+def test_the_same_samples_whoever_renders_them_though_a_worker_is_killed(recipe):
+    """Inline, from another beginning, and by two processes, one of which is killed: the n-th sample is the n-th."""
+    count = 2 * MIX * 2  # two blocks of eight sequences, two samples each
+    with open_online(asked(recipe, window_ms=(5, 30)), 0) as source:
+        alone = [said(source[n]) for n in range(count + 4)]
+    assert len({sample[0] for sample in alone}) == len(alone)
+    with open_online(asked(recipe, window_ms=(5, 30)), 0, first=count + 3) as source:
+        assert said(source[count + 3]) == alone[count + 3]
+    with open_online(asked(recipe, window_ms=(5, 30), workers=2), 0) as source:
+        spool = source._spool
+        os.kill(source._executor._processes[0].popen.pid, signal.SIGKILL)
+        for n in range(count + 4):
+            assert said(source[n]) == alone[n], n
+            source.taken(n + 1)
+            slots = {int(p.name[:9]) for p in spool.glob("*.npz")}
+            assert len(slots) <= 2 * MIX  # no further ahead than a block
+        assert source.stats.replaced == 1 and source.stats.failures == 0 and source.stats.cpu_s > 0
+        with pytest.raises(EventDataError, match="taken"):
+            source[0]
+    assert not spool.exists()
+
+
+def test_another_seed_another_split_other_sequences(recipe):
+    names = lambda seed, split: {s[0] for s in samples(seed, split)}
+    flows = lambda seed, split: {s[1] for s in samples(seed, split)}
+
+    def samples(seed, split):
+        with open_online(asked(recipe), seed, split=split) as source:
+            return [said(source[n]) for n in range(4)]
+
+    assert flows(0, "train") == flows(0, "train") and not flows(0, "train") & flows(1, "train")
+    assert {name.split("_")[0] for name in names(0, "train")} <= {"one", "two"}
+    assert {name.split("_")[0] for name in names(0, "test")} == {"judge"}
+
+
+def test_windows_lie_inside_and_lengths_are_log_uniform():
+    spans = drawn_spans(np.random.default_rng(0), 1_000, 301_000, 20_000, (5_000, 100_000))
+    t, span = np.array(spans).T
+    assert (t - span >= 1_000).all() and (t + span <= 301_000).all()
+    assert (span >= 5_000).all() and (span <= 100_000).all()
+    share = np.log(span / 5_000) / np.log(20)
+    assert np.abs(np.histogram(share, 4, (0, 1))[0] / len(share) - 0.25).max() < 0.02
+    assert max(s for _, s in drawn_spans(np.random.default_rng(0), 0, 40_001, 100, (20_000, 100_000))) == 20_000
+    with pytest.raises(ConfigError, match="holds no two windows of 50 ms"):
+        drawn_spans(np.random.default_rng(0), 0, 99_000, 1, (50_000, 60_000))
+
+
+def test_flow_is_over_the_windows_own_length(tmp_path):
+    """A camera that slides along a wall at 1 m/s, 1 m away, focal length 32 px: 32 px/s, forwards and back."""
+    slides = [{"time": t, "position": [t, 0, 0], "quaternion": [1, 0, 0, 0]} for t in (0.0, 1.0)]
+    wall = {"mesh": "wall", "material": "checks", "position": [0, 0, 1.05], "scale": [20, 20, 0.1]}
+    scene = {
+        "kind": "explicit",
+        "meshes": {"wall": {"primitive": "cuboid"}},
+        "materials": {"checks": {"procedural": "checks", "uv_scale": [40, 40], "max_size": 64, "unlit": True}},
+        "objects": [wall],
+        "camera": {"keyframes": slides, "interpolation": "linear"},
+    }
+    tree = {**{k: v for k, v in RECIPE.items() if k != "groups"}, "scene": scene}
+    tree["camera"] = {"width": 32, "height": 32, "focal": 32}
+    (tmp_path / "wall.yaml").write_text(yaml.safe_dump(tree))
+    with open_online(asked(tmp_path / "wall.yaml", window_ms=(5, 45), samples=MIX), 0) as source:
+        found = [source[n] for n in range(MIX)]
+    spans = [sample.new.t1 - sample.new.t0 for sample in found]
+    assert max(spans) > 2 * min(spans)
+    for sample, span in zip(found, spans, strict=True):
+        assert sample.valid.all() and sample.old.t1 == sample.new.t0 and sample.old.t1 - sample.old.t0 == span
+        for flow, sign in ((sample.flow, -1), (sample.backward, 1)):
+            truth = [sign * 32e-6 * span, 0]
+            np.testing.assert_allclose(flow[sample.valid], np.broadcast_to(truth, (sample.valid.sum(), 2)), atol=1e-4)
+
+
+def test_a_recipe_that_makes_no_sample_is_one_line(tmp_path, capsys):
+    tree = {**RECIPE, "scene": {**RECIPE["scene"], "camera_motion": {"kind": "static"}}}
+    (tmp_path / "still.yaml").write_text(yaml.safe_dump(tree))
+    path = run_file(tmp_path, {"recipe": "still.yaml", "online": True, "workers": 0})
+    assert run(["train", str(path), "-o", str(tmp_path / "out"), "-q"]) == 2
+    line = capsys.readouterr().err.strip()
+    assert line.count("\n") == 0 and "gave 0 of 8 samples" in line and "too few windows with 1 events" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_failing_sequences_are_replaced_and_counted(tmp_path):
+    """Two of three draws hold no two windows: others of the same slot stand in; it ends when that is the rule."""
+    tree = {**RECIPE, "time": {"duration": {"choice": [0.05, 0.001, 0.001]}, "label_rate": 1000}}
+    (tmp_path / "some.yaml").write_text(yaml.safe_dump(tree))
+    with open_online(asked(tmp_path / "some.yaml", window_ms=(10, 20)), 0) as source:
+        assert source[0].flow.shape == (32, 32, 2)
+        assert source.stats.failures >= 0
+        with pytest.raises(ConfigError, match=r"sequences failed, the last: .*holds no two windows|sequences gave"):
+            for n in range(200):
+                source[n], source.taken(n)
+        assert source.stats.failures > 10
+
+
+def run_file(folder: Path, *sets: dict, **keys) -> Path:
+    tree = {
+        "seed": 5,
+        "model": {"name": "ev_flownet", "input": "voxel", "bins": 3, "width": 4},
+        "data": {
+            "train": list(sets),
+            "batch": 2,
+            "crop": [32, 32],
+            "augment": {"time_reversal": 0.3, "scale_probability": 0},
+            **keys,
+        },
+        "optim": {"steps": 12},
+        "run": {"device": "cpu", "log_every": 1},
+    }
+    path = folder / "train.yaml"
+    path.write_text(yaml.safe_dump(tree))
+    return path
+
+
+def test_trains_without_files_and_resumes_exactly(tmp_path, recipe):
+    live = {"recipe": str(recipe), "online": True, "workers": 0, "samples": 2}
+    validate_on = [live]
+    config = load_train_config(run_file(tmp_path, live, validate_on=validate_on, validate_samples=3))
+    train(config, tmp_path / "whole", quiet=True)
+    train(config, tmp_path / "parts", stop_after=9, quiet=True)  # inside the second block
+    train(config, tmp_path / "parts", resume=True, quiet=True)
+    logs = [[json.loads(line) for line in (tmp_path / d / "log.jsonl").open()] for d in ("whole", "parts")]
+    steps = [[(r["step"], r["loss"]) for r in log if r["kind"] == "train"] for log in logs]
+    assert steps[0] == steps[1] and len(steps[0]) == 12
+    assert [r["recipe/zero"] for r in logs[0] if r["kind"] == "validation"] == [logs[1][-1]["recipe/zero"]]
+    last = logs[0][-2]
+    assert last["rendered"] >= 24 and last["render_ms"] > 0 and 0 < last["waited"] <= 1
+    files = [sorted(p.name for p in newest(tmp_path / d).iterdir()) for d in ("whole", "parts")]
+    assert files[0] == files[1]
+
+
+def test_folders_and_streams_in_one_mixture():
+    mixture = Mixture([100, None], [1, 3], seed=0)
+    keys = [mixture.key(n) for n in range(2 * mixture.epoch_length)]
+    live = [key.index for key in keys if key.source == 1]
+    assert live == list(range(len(live))) and abs(len(live) / len(keys) - 0.75) < 1e-3
+    assert mixture.epoch_length == 100 + ENDLESS
+    for n in (0, 1, 17, mixture.epoch_length, mixture.epoch_length + 5):
+        assert mixture.first(1, n) == sum(key.source == 1 for key in keys[:n])
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ({}, "give a folder (path) or a recipe"),
+        ({"path": "a", "recipe": "b", "online": True}, "give a folder (path) or a recipe"),
+        ({"recipe": "b"}, "online: true says so"),
+        ({"path": "a", "online": True}, "a folder is not rendered"),
+        ({"recipe": "b", "online": True, "window_ms": [100, 5]}, "window_ms"),
+        ({"recipe": "b.yaml", "online": True, "workers": 0}, "loader processes do not render"),
+    ],
+)
+def test_sources_that_make_no_sense(tmp_path, source, said):
+    with pytest.raises(ConfigError) as caught:
+        load_train_config(run_file(tmp_path, source, workers=1))
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "where", "said"),
+    [
+        ({"labels.flow": []}, "labels.flow", "no flow to learn from"),
+        ({"groups.one.enabled": False, "groups.two.enabled": False}, "output.split", "nothing of split 'train'"),
+        ({"scene.objects.count": -1}, "scene.objects.count", "count"),
+        ({"frames": {"folders": ["x"], "images": "i", "fps": 10}}, "frames", "recorded frames are not rendered"),
+    ],
+)
+def test_recipes_that_cannot_be_rendered_are_refused_at_once(tmp_path, recipe, changes, where, said):
+    overrides = [f"{key}={json.dumps(value)}" for key, value in changes.items()]
+    with pytest.raises(ConfigError) as caught:
+        open_online(asked(recipe, set=tuple(overrides)), 0)
+    assert said in str(caught.value) and where in (caught.value.where or "")

@@ -1,0 +1,203 @@
+"""What is before the bus: dead, hot and noisy pixels, latency; the bus against queue theory; the camera as a whole."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from blinkgl.config.events import EsimConfig, V2eConfig
+from blinkgl.config.readout import LatencyConfig, PixelsConfig, RateFilter, ReadoutConfig, TrailFilter
+from blinkgl.events import Events, make_emulator
+from blinkgl.events.camera import EventCamera, EventFrame
+from blinkgl.events.esim import draw_thresholds
+from blinkgl.events.pixels import Latency, PixelNoise
+from blinkgl.events.readout import Readout
+from blinkgl.events.reference import ReferenceEsim, ReferenceV2e
+from blinkgl.events.types import Cause
+from tests.events.clips import assert_same, run
+
+H, W = 60, 80
+NOISY = PixelsConfig(hot_fraction=0.02, hot_rate_hz=200.0, hot_spread_decades=0.3, rate_hz=2.0, spread_decades=0.5,
+                     dead_fraction=0.05, on_share=0.7)  # fmt: skip
+
+
+def noise_of(config, edges_us, seed=5, causes=False):
+    stage = PixelNoise(config, H, W, seed, causes)
+    return stage, Events.concatenate([stage.step(Events.empty(), t) for t in edges_us])
+
+
+def test_rates_of_pixels_are_the_stated_laws():
+    stage = PixelNoise(NOISY, 300, 400, seed=1)
+    n = 300 * 400
+    assert abs(stage.hot.mean() - 0.02) < 4 * np.sqrt(0.02 / n) and abs(stage.dead.mean() - 0.05) < 4 * np.sqrt(
+        0.05 / n
+    )
+    assert (stage.rates[stage.dead] == 0).all()
+    for hot, median, decades in ((True, 200.0, 0.3), (False, 2.0, 0.5)):
+        rates = stage.rates[(stage.hot == hot) & ~stage.dead]
+        law = stats.lognorm(s=decades * np.log(10), scale=median)
+        assert stats.kstest(rates, law.cdf).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("step_us", [200, 20_000, None])
+def test_noise_is_poisson_at_each_pixels_rate_at_any_frame_rate(step_us):
+    rng = np.random.default_rng(0)
+    end = 4_000_000
+    edges = np.arange(0, end + 1, step_us) if step_us else np.unique(rng.integers(0, end, 300))
+    edges = np.concatenate([[0], edges[edges > 0], [end]])
+    stage, events = noise_of(NOISY, edges)
+    pixel = events.y.astype(int) * W + events.x
+    counts, expected = np.bincount(pixel, minlength=H * W), stage.rates * end * 1e-6
+    assert counts[expected == 0].sum() == 0
+    busy = expected > 20
+    z = (counts[busy] - expected[busy]) / np.sqrt(expected[busy])
+    assert busy.sum() > 100 and stats.kstest(z, "norm").pvalue > 1e-3
+    gaps = np.concatenate([np.diff(events.t[pixel == p]) * 1e-6 * stage.rates[p] for p in np.flatnonzero(busy)])
+    assert stats.kstest(gaps, "expon").statistic < 0.03
+    assert abs(events.p.mean() - 0.7) < 4 * 0.5 / np.sqrt(len(events)) and (np.diff(events.t) >= 0).all()
+
+
+def test_noise_does_not_depend_on_the_steps_and_resumes():
+    _, whole = noise_of(NOISY, [0, 1_000_000], causes=True)
+    stage, parts = PixelNoise(NOISY, H, W, 5, True), []
+    for t in (0, 1, 77, 20_000, 20_001, 600_000, 1_000_000):
+        parts.append(stage.step(Events.empty(), t))
+        again = PixelNoise(NOISY, H, W, 5, True)
+        again.load_state_dict(stage.state_dict())
+        stage = again
+    assert_same(Events.concatenate(parts), whole)
+    assert set(np.unique(whole.cause)) == {Cause.SHOT, Cause.HOT}
+    hot = stage.hot[whole.y.astype(int) * W + whole.x]
+    assert ((whole.cause == Cause.HOT) == hot).all()
+
+
+def test_dead_pixels_are_silent_and_others_untouched():
+    stage = PixelNoise(PixelsConfig(dead_fraction=0.3), H, W, 2)
+    rng = np.random.default_rng(1)
+    events = Events(rng.integers(0, W, 5000).astype(np.uint16), rng.integers(0, H, 5000).astype(np.uint16),
+                    np.sort(rng.integers(0, 1000, 5000)), rng.integers(0, 2, 5000).astype(np.uint8))  # fmt: skip
+    stage.step(Events.empty(), 0)
+    alive = ~stage.dead[events.y.astype(int) * W + events.x]
+    assert_same(stage.step(events, 1000), events.part(alive))
+    assert 0.25 < 1 - alive.mean() < 0.35
+
+
+def test_latency_depends_on_light_as_stated():
+    config = LatencyConfig(fixed_us=40.0, dark_us=4000.0, jitter_us=30.0)
+    frame = np.tile(np.linspace(0, 1, W, dtype=np.float32), (H, 1))
+    y, x = (c.ravel().astype(np.uint16) for c in np.mgrid[:H, :W])
+    events = Events(x, y, np.full(H * W, 1000, np.int64), np.ones(H * W, np.uint8))
+    late = Latency(config, H, W, 3).step(events, frame, 10_000)
+    assert (np.diff(late.t) >= 0).all() and len(late) == H * W
+    for column in (0, 1, 20, 79):
+        mean = 40 + 4000 / (frame[0, column] * 255 + 1)
+        delays = late.t[late.x == column] - 1000
+        assert abs(delays.mean() + 0.5 - mean) < 4 * 30 / np.sqrt(H) + 0.5, column
+        assert column == 79 or abs(delays.std() / 30 - 1) < 0.4
+
+
+def test_latency_keeps_a_pixels_order_and_any_chunking():
+    config, rng, n = LatencyConfig(fixed_us=50, dark_us=300, jitter_us=200), np.random.default_rng(4), 4000
+    frame = np.full((H, W), 0.01, np.float32)
+    events = Events(rng.integers(0, 3, n).astype(np.uint16), rng.integers(0, 2, n).astype(np.uint16),
+                    np.sort(rng.integers(0, 30_000, n)), (np.arange(n) % 2).astype(np.uint8))  # fmt: skip
+    whole = Latency(config, H, W, 1).step(events, frame, 10**9)
+    stage, parts = Latency(config, H, W, 1), []
+    for a, b in itertools.pairwise([0, 100, 7000, 7001, 30_000]):
+        parts.append(stage.step(events.window(a, b), frame, b - 1))
+        assert not len(parts[-1]) or parts[-1].t[-1] < b
+        again = Latency(config, H, W, 1)
+        again.load_state_dict(stage.state_dict())
+        stage = again
+    held = stage.late
+    parts.append(stage.step(Events.empty(), frame, 10**9))
+    assert held == len(parts[-1]) > 0 and stage.late == 0
+    assert_same(Events.concatenate(parts), whole)
+    for pixel in range(3):  # events of one pixel come out in the order in which they went in
+        mine, before = whole.part(whole.x == pixel), events.part(events.x == pixel)
+        assert (mine.part(mine.y == 0).p == before.part(before.y == 0).p).all()
+
+
+@pytest.mark.parametrize("load", [0.3, 0.6, 0.9])
+def test_the_bus_waits_as_an_m_d_1_queue(load):
+    """Poisson arrivals, one server of fixed time s: the wait W before service has the mean s load / (2 (1 - load))
+    (Pollaczek, Khinchine) and the square 2 E[W]^2 + load s^2 / (3 (1 - load)) (Takacs)."""
+    service_us, n = 50.0, 400_000
+    rng = np.random.default_rng(int(load * 10))
+    t = np.cumsum(rng.exponential(service_us / load, n)).astype(np.int64)
+    events = Events(np.zeros(n, np.uint16), np.zeros(n, np.uint16), t, np.zeros(n, np.uint8))
+    bus = Readout(ReadoutConfig(events_per_second=1e6 / service_us, queue_events=2**20))
+    out = bus.step(events)
+    assert len(out) == n and bus.dropped == 0
+    wait = out.t - t - service_us
+    mean = service_us * load / (2 * (1 - load))
+    square = 2 * mean**2 + load * service_us**2 / (3 * (1 - load))
+    blocks = wait[: n // 200 * 200].reshape(200, -1).mean(1)  # for the error of means of what is correlated
+    assert abs(wait.mean() - mean) < 4 * blocks.std() / np.sqrt(200) + 0.5
+    assert abs(wait.std() / np.sqrt(square - mean**2) - 1) < 0.12
+    assert abs((wait == 0).mean() - (1 - load)) < 0.02, "the bus is idle for a share 1 - load of the time"
+
+
+def test_rows_share_their_arbitration():
+    """A row arbiter is paid once for all events of a row that wait together: k events cost k + r, not k (1 + r)."""
+    events = Events(
+        np.arange(40, dtype=np.uint16), np.full(40, 3, np.uint16), np.zeros(40, np.int64), np.zeros(40, np.uint8)
+    )
+    bus = Readout(ReadoutConfig(events_per_second=1e6, row_ns=5000))
+    assert bus.step(events).t.tolist() == [6 + k for k in range(40)]
+
+
+def test_clock_is_the_last_tick_that_has_passed():
+    events = Events(*(np.zeros(6, np.uint16),) * 2, np.array([0, 9, 10, 11, 29, 30]), np.zeros(6, np.uint8))
+    assert Readout(ReadoutConfig(clock_us=10)).step(events).t.tolist() == [0, 0, 10, 10, 20, 30]
+    free = Readout(ReadoutConfig())
+    assert_same(free.step(events), events)
+    assert free.dropped == free.late == 0, "without a rate there is no bus"
+
+
+def test_thresholds_of_a_pixel_are_correlated_as_asked():
+    for rho in (-0.8, 0.0, 0.5, 1.0):
+        on, off = draw_thresholds(200, 200, 0.3, 0.4, 0.03, np.uint64(1), rho)
+        assert abs(np.corrcoef(on, off)[0, 1] - rho) < 0.02
+        assert abs(off.mean() - 0.4) < 1e-3 and abs(off.std() / 0.03 - 1) < 0.02
+    one = make_emulator(V2eConfig(threshold_sigma=0.03, threshold_correlation=-1.0), 20, 30, 4)
+    assert np.allclose(one._on + one._off, 0.4, atol=1e-6) and one._on.std() > 0.02
+
+
+@pytest.mark.parametrize("config", [EsimConfig, V2eConfig])
+def test_correlated_thresholds_equal_the_slow_twin(config):
+    made = config(threshold_sigma=0.05, threshold_correlation=0.7)
+    rng = np.random.default_rng(2)
+    frames = [rng.random((9, 11)).astype(np.float32) for _ in range(6)]
+    times = np.arange(6) * 3_000_000
+    slow = {EsimConfig: ReferenceEsim, V2eConfig: ReferenceV2e}[config](9, 11, made, 3)
+    assert_same(run(make_emulator(made, 9, 11, 3), frames, times), run(slow, frames, times))
+
+
+def test_a_camera_with_all_of_it():
+    """Stages in order, whatever the steps: nothing late or dropped is lost to the counts."""
+    readout = ReadoutConfig(
+        events_per_second=2e6, queue_events=4096, clock_us=5, pixels=NOISY,
+        latency=LatencyConfig(fixed_us=100, dark_us=1000, jitter_us=20),
+        filters=(TrailFilter(threshold_us=2000), RateFilter(events_per_second=5e5, period_us=200)),
+    )  # fmt: skip
+    rng = np.random.default_rng(0)
+    frames = [rng.random((H, W)).astype(np.float32) for _ in range(8)]
+    cameras = [EventCamera(EsimConfig(causes=True), r, H, W, seed=3) for r in (None, readout)]
+    free, full = (
+        Events.concatenate([c.step(EventFrame(10_000_000 * k, f)) for k, f in enumerate(frames)]) for c in cameras
+    )
+    assert (full.t % 5 == 0).all() and (np.diff(full.t) >= 0).all() and full.t[-1] <= 70_000
+    assert np.bincount(full.t // 200).max() <= 100 + 40  # stamps are floored to the clock, periods are not
+    assert set(np.unique(full.cause)) >= {Cause.SIGNAL, Cause.HOT}
+    noise = PixelNoise(NOISY, H, W, 3)
+    dead = noise.dead[full.y.astype(int) * W + full.x]
+    assert not dead.any()
+    camera = cameras[1]
+    assert camera.filtered > 0 and camera.late > 0 and cameras[0].filtered is None
+    alive = (~noise.dead[free.y.astype(int) * W + free.x]).sum()
+    own = len(full) + camera.late + camera.dropped + camera.filtered - alive
+    assert abs(own - noise.rates.sum() * 0.07) < 6 * np.sqrt(noise.rates.sum() * 0.07)

@@ -1,0 +1,295 @@
+"""A frame camera's images against what they stand for: means of instants, rows at their own times, a thin lens."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from blinkgl.camera import PinHole
+from blinkgl.config.images import ImagesConfig, exposure_starts
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.imaging import FrameCamera
+from blinkgl.imaging.lens import blur_px, points, samples
+from blinkgl.imaging.response import decode
+from blinkgl.render.reference import sample_bilinear
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.rig import Rig
+from blinkgl.scene.types import Light, Material
+from tests.render.render_scenes import LEVEL, SECOND, cube, drift, quad, scene, smooth_texture, still, thing
+
+MS = 1_000_000
+PLAIN = RenderConfig(image_antialiasing="none")
+FINE = RenderConfig(image_antialiasing="ssaa2")
+LINEAR = {"bits": 16, "response": "linear"}
+STEP = 1 / 255
+"""Of 8 bits, linear."""
+
+
+TOWARDS = Rotation.from_euler("x", 90, degrees=True)
+"""+z of a quad to world -y, where the camera is."""
+
+
+def rig(width=48, height=36, focal=60.0, path=None):
+    return Rig.alone(PinHole.centred(width, height, focal), path or still(rotation=LEVEL))
+
+
+def moving(speed=(1.0, 0.0, 0.4), **of_rig):
+    """A smooth wall behind a hard-edged box that passes before it; world +y is the way the camera looks."""
+    wall = thing("wall", 1, quad(8, 6), still((0, 8, 0), TOWARDS), Material(smooth_texture(1), unlit=True))
+    box = thing(
+        "box", 2, cube(0.5), drift((0, 4, 0), tuple(np.add((0, 4, 0), speed))), Material(smooth_texture(2), unlit=True)
+    )
+    return scene([wall, box], rig(**of_rig), Light(), 0.1)
+
+
+def camera_of(renderer, seed=1, span=(0, SECOND), **config):
+    return FrameCamera(renderer, ImagesConfig(**config), seed, span)
+
+
+def light_of(image, bits=16):
+    return decode(image, "linear", 2.2, bits)
+
+
+# --- motion blur ------------------------------------------------------------------------------------------------------
+
+
+def test_an_image_is_the_mean_of_the_instants_of_its_exposure(gl):
+    with Renderer(gl, moving(), FINE) as renderer:
+        image = camera_of(renderer, exposure_us=200_000, rate=5, max_px=1e-3, max_instants=256, **LINEAR).take()
+        times = [(k + 0.5) / 256 * 0.2 * SECOND for k in range(256)]
+        mean = np.mean([renderer.colour(int(t)).read().astype(np.float64) for t in times], axis=0)
+    assert image.instants == 256 and image.start_ns == 0 and image.end_ns == 200 * MS
+    np.testing.assert_allclose(light_of(image.image), np.clip(mean, 0, 1), atol=0.51 / 65535)
+    assert np.ptp(mean) > 0.5
+
+
+def test_displacement_asks_for_enough_instants(gl):
+    """3 px of motion in an exposure: as many instants as asked for give what 256 give, within half a step of 8 bits
+    where surfaces are smooth, and but for few pixels where a hard edge passes; half the spacing, half the error."""
+    with Renderer(gl, moving(), FINE) as renderer:
+        take = lambda **how: camera_of(renderer, exposure_us=200_000, rate=5, **how, **LINEAR).take()
+        truth = light_of(take(max_px=1e-3, max_instants=256).image)
+        found = [take(max_px=px) for px in (0.5, 0.25, 0.125)]
+        still_wall = moving(speed=(0, 0, 0))
+    assert [image.instants for image in found] == sorted(image.instants for image in found)
+    assert all(image.step_px <= px for image, px in zip(found, (0.5, 0.25, 0.125)))
+    errors = [np.abs(light_of(image.image) - truth) / STEP for image in found]
+    assert all((error <= 0.5).mean() > share for error, share in zip(errors, (0.9, 0.93, 0.96)))
+    assert errors[0].mean() > 1.6 * errors[1].mean() > 2.5 * errors[2].mean()
+    # a camera that turns past smooth surfaces alone: everywhere
+    turning = still_wall.with_path(drift((0, 0, 0), (0.4, 0, 0), LEVEL, LEVEL))
+    with Renderer(gl, turning.__class__(turning.objects[:1], turning.rig, 0, SECOND), FINE) as renderer:
+        take = lambda **how: camera_of(renderer, exposure_us=500_000, rate=2, **how, **LINEAR).take()
+        truth, image = take(max_px=1e-3, max_instants=256), take()
+    assert 2 <= image.instants <= 8 and np.ptp(light_of(truth.image)) > 0.3
+    assert (np.abs(light_of(image.image) - light_of(truth.image)) <= 0.5 * STEP).all()
+
+
+def test_what_stands_still_is_drawn_once(gl):
+    with Renderer(gl, moving(speed=(0, 0, 0)), FINE) as renderer:
+        camera = camera_of(renderer, exposure_us=100_000, rate=5, also=("sharp", "clean"))
+        image = camera.take()
+    assert image.instants == 1
+    np.testing.assert_array_equal(image.image, image.pictures["sharp"])
+    np.testing.assert_array_equal(image.image, image.pictures["clean"])
+
+
+def test_sharp_is_the_middle_and_blurred_is_not(gl):
+    with Renderer(gl, moving(), FINE) as renderer:
+        image = camera_of(renderer, exposure_us=200_000, rate=5, also=("sharp",), photon_noise=True, **LINEAR).take()
+        middle = renderer.colour(image.middle_ns).read()
+    np.testing.assert_allclose(light_of(image.pictures["sharp"]), np.clip(middle, 0, 1), atol=0.51 / 65535)
+    assert np.abs(light_of(image.image) - np.clip(middle, 0, 1)).max() > 20 * STEP
+
+
+# --- rolling shutter --------------------------------------------------------------------------------------------------
+
+
+def test_rows_of_a_rolling_shutter_are_rendered_at_their_own_times(gl):
+    """With an exposure as short as the time between two rows, each row is the picture at its own middle."""
+    rows, row_us = 36, 5000.0
+    with Renderer(gl, moving(speed=(2.0, 0, 0)), FINE) as renderer:
+        camera = camera_of(
+            renderer, exposure_us=row_us, row_us=row_us, rate=2, max_px=1e-4, max_instants=rows, **LINEAR
+        )
+        image = camera.take()
+        own = np.stack([renderer.colour(int((y + 0.5) * row_us * 1000)).read()[y] for y in range(rows)])
+        first = renderer.colour(int(0.5 * row_us * 1000)).read()
+    assert image.end_ns - image.start_ns == round(rows * row_us * 1000) and image.row_ns == row_us * 1000
+    np.testing.assert_allclose(light_of(image.image), np.clip(own, 0, 1), atol=0.51 / 65535)
+    assert np.abs(own - first).max() > 0.1, "it moves while it is read"
+
+
+def test_a_longer_exposure_blurs_each_row_over_its_own_time(gl):
+    with Renderer(gl, moving(speed=(2.0, 0, 0)), FINE) as renderer:
+        how = dict(exposure_us=60_000.0, row_us=2000.0, rate=2, **LINEAR)
+        image = camera_of(renderer, max_px=1e-3, max_instants=650, **how).take()  # cells of 200 us
+        for y in (0, 17, 35):
+            times = (2000.0 * y + 60_000.0 * (np.arange(100) + 0.5) / 100) * 1000
+            own = np.mean([renderer.colour(int(t)).read()[y].astype(np.float64) for t in times], axis=0)
+            assert np.abs(light_of(image.image)[y] - np.clip(own, 0, 1)).max() < 1.5 * STEP
+    assert image.instants == 650
+
+
+# --- the lens ---------------------------------------------------------------------------------------------------------
+
+
+def thin_lens(x, y, camera, aperture, focus, planes, count):
+    """Radiance, float64, of pixels through a thin lens: rays from points spread over the aperture to where the pixel's
+    own ray meets the plane in focus, and the nearest of the ``planes`` (depth, half width, half height, texture,
+    its repeats)."""
+    rng = np.random.default_rng(7)
+    r, angle = np.sqrt(rng.random(count)) * aperture / 2, 2 * math.pi * rng.random(count)
+    lens = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+    aim = np.array([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy]) * focus
+    colour, hit = np.full((count, 3), 0.1), np.zeros(count, bool)
+    for depth, half_x, half_y, texture, repeats in sorted(planes, key=lambda p: p[0]):
+        at = lens + (aim - lens) * (depth / focus)
+        inside = (np.abs(at) <= [half_x, half_y]).all(axis=1) & ~hit
+        uv = np.stack([0.5 + 0.5 * at[:, 0] / half_x, 0.5 + 0.5 * at[:, 1] / half_y], axis=1)
+        colour[inside] = sample_bilinear(texture, uv[inside] * repeats)
+        hit |= inside
+    return colour.mean(axis=0), colour.std(axis=0) / math.sqrt(count)
+
+
+@pytest.mark.parametrize(("focus", "aperture"), [(4.0, 0.5), (8.0, 0.5), (2.5, 0.2)])
+def test_defocus_agrees_with_rays_through_a_thin_lens(gl, focus, aperture):
+    walls = [(8.0, 8.0, 6.0, smooth_texture(1), (6.0, 4.0)), (4.0, 0.8, 0.7, smooth_texture(2), (1.0, 1.0))]
+    things = [
+        thing(f"{d}", k + 1, quad(w, h), still((0, d, 0), TOWARDS), Material(texture, uv_scale=repeats, unlit=True))
+        for k, (d, w, h, texture, repeats) in enumerate(walls)
+    ]
+    camera = PinHole.centred(48, 36, 60.0)
+    with Renderer(gl, scene(things, Rig.alone(camera, still(rotation=LEVEL)), Light(), 0.1), FINE) as renderer:
+        lens = {"aperture": aperture, "focus": focus}
+        image = camera_of(renderer, lens=lens, max_px=0.125, max_instants=4096, also=("sharp",), **LINEAR).take()
+    largest = float(blur_px(renderer_lens(lens), camera, np.array([4.0, 8.0])).max())
+    assert image.instants == samples(largest, 0.25)
+    seen, sharp = light_of(image.image), light_of(image.pictures["sharp"])
+    edge = 60.0 * 0.8 / 4.0  # of the box, px from the middle
+    for x, y in [(5, 5), (23, 17), (30, 20), (round(23.5 + edge), 17), (round(23.5 - edge) + 1, 20), (40, 30), (24, 8)]:
+        # the mean over the pixel, which anti-aliasing takes too
+        sub = [
+            thin_lens(x + a, y + b, camera, aperture, focus, walls, 3000) for a in (-0.25, 0.25) for b in (-0.25, 0.25)
+        ]
+        true = np.mean([m for m, _ in sub], axis=0)
+        noise = np.mean([s for _, s in sub], axis=0) / 2
+        assert (np.abs(seen[y, x] - true) < 4 * noise + 0.012).all(), (x, y, seen[y, x], true, sharp[y, x])
+    assert np.abs(seen - sharp).max() > 0.05
+
+
+def renderer_lens(lens):
+    return ImagesConfig(lens=lens).lens
+
+
+def test_what_is_in_focus_stays_sharp_and_a_pin_hole_costs_nothing(gl):
+    material = Material(smooth_texture(1), uv_scale=(6.0, 4.0), unlit=True)
+    wall = thing("wall", 1, quad(8, 6), still((0, 5, 0), TOWARDS), material)
+    with Renderer(gl, scene([wall], rig()), FINE) as renderer:
+        focused = camera_of(renderer, lens={"aperture": 0.4, "focus": 5.0}, also=("sharp",), **LINEAR).take()
+        assert focused.instants == 1
+        np.testing.assert_array_equal(focused.image, focused.pictures["sharp"])
+        through = camera_of(renderer, lens={"aperture": 0.8, "focus": 8.0}, also=("sharp",), **LINEAR).take()
+        assert (
+            through.instants >= 4 and np.abs(light_of(through.image) - light_of(through.pictures["sharp"])).max() > STEP
+        )
+
+
+def test_points_of_the_lens_are_spread_evenly_in_every_stretch():
+    p = points(256, 2.0)
+    assert np.hypot(*p.T).max() <= 1.0 and len({tuple(x) for x in p.round(9)}) == 256
+    for part in (p, p[:64], p[64:128], p[100:164]):
+        assert np.abs(part.mean(axis=0)).max() < 0.12
+        assert (np.hypot(*part.T) ** 2).mean() == pytest.approx(0.5, abs=0.03), "as a disc has it"
+
+
+# --- vignetting, exposure, filters ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("strength", [0.4, 1.0])
+def test_vignetting_is_the_fourth_power_of_the_cosine(gl, strength):
+    with Renderer(gl, scene([], rig(focal=20.0), background=0.8), PLAIN) as renderer:
+        image = camera_of(renderer, vignetting=strength, **LINEAR).take()
+    y, x = np.mgrid[:36, :48]
+    squared = ((x - 23.5) / 20.0) ** 2 + ((y - 17.5) / 20.0) ** 2
+    expected = 0.8 * (1 - strength * (1 - 1 / (1 + squared) ** 2))
+    np.testing.assert_allclose(light_of(image.image), np.repeat(expected[..., None], 3, axis=2), atol=0.51 / 65535)
+
+
+def test_automatic_exposure_approaches_its_end_as_its_lag_says(gl):
+    """A uniform scene that clips nowhere: the product of exposure and gain over the images, against the closed form."""
+    auto = {"target": 0.2, "lag": 0.15, "shortest_us": 1, "longest_us": 20_000, "max_gain_db": 40}
+    with Renderer(gl, scene([], rig(), background=0.6), PLAIN) as renderer:
+        camera = camera_of(renderer, rate=20, exposure_us=1500, white=2.0, auto_exposure=auto, **LINEAR)
+        images = [camera.take() for _ in range(len(camera))]
+    products = np.array([image.exposure_ns * image.gain for image in images])
+    mean = 0.6 / 2.0 / 1.5e6  # per ns at gain 1
+    t = np.array([image.start_ns for image in images]) * 1e-9
+    end = 0.2 / mean
+    expected = np.log(end) + (np.log(1.5e6) - np.log(end)) * np.exp(-t / 0.15)
+    np.testing.assert_allclose(np.log(products), expected, atol=2e-4)  # codes of the readings are not rounded
+    seen = np.array([light_of(image.image).mean() for image in images])
+    np.testing.assert_allclose(seen, mean * products, rtol=1e-4)
+    assert seen[-1] == pytest.approx(0.2, rel=0.01) and camera.due_ns is None
+
+
+def test_gain_keeps_white_white_and_takes_fewer_photons_for_it(gl):
+    with Renderer(gl, scene([], rig(), background=0.5), PLAIN) as renderer:
+        found = {}
+        for gain_db in (0.0, 20.0):
+            image = camera_of(renderer, gain_db=gain_db, photon_noise=True, full_well=10_000, **LINEAR).take()
+            found[gain_db] = light_of(image.image)
+    for gain_db, x in found.items():
+        electrons = 10_000 / 10 ** (gain_db / 20)
+        assert x.mean() == pytest.approx(0.5, rel=5 / math.sqrt(0.5 * electrons * x.size))
+        assert x.var() == pytest.approx(x.mean() / electrons, rel=0.08)
+
+
+def test_noisy_and_clean_side_by_side(gl):
+    with Renderer(gl, moving(), FINE) as renderer:
+        how = dict(
+            photon_noise=True, read_noise=5.0, gain_db=12.0, also=("clean",), exposure_us=100_000, rate=5, **LINEAR
+        )
+        image = camera_of(renderer, **how).take()
+        alone = camera_of(renderer, **{**how, "also": (), "photon_noise": False, "read_noise": 0.0}).take()
+        again, other = camera_of(renderer, **how).take(), camera_of(renderer, seed=2, **how).take()
+    np.testing.assert_array_equal(image.pictures["clean"], alone.image)
+    np.testing.assert_array_equal(image.image, again.image)
+    assert (image.image != other.image).mean() > 0.9
+    difference = light_of(image.image) - light_of(alone.image)
+    inside = (light_of(alone.image) > 0.15) & (light_of(alone.image) < 0.8)
+    assert abs(difference[inside].mean()) < 0.002 and difference[inside].std() > 0.005
+
+
+def test_black_level_bits_and_filters(gl):
+    with Renderer(gl, moving(), FINE) as renderer:
+        full = camera_of(renderer, bits=12, response="linear", black=0.0625).take()
+        raw = camera_of(renderer, bits=12, response="linear", black=0.0625, bayer="grbg").take()
+        light = renderer.colour(full.middle_ns).read()
+    assert full.image.dtype == np.uint16 and full.image.shape == (36, 48, 3) and raw.image.shape == (36, 48)
+    for y, x, channel in ((0, 0, 1), (0, 1, 0), (1, 0, 2), (1, 1, 1)):
+        np.testing.assert_array_equal(raw.image[y::2, x::2], full.image[y::2, x::2, channel])
+    assert full.image.min() >= round(0.0625 * 4095) and full.image.max() <= 4095
+    still_image = np.floor((0.0625 + 0.9375 * np.clip(light, 0, 1)) * 4095 + 0.5)
+    assert np.median(np.abs(still_image - full.image)) <= 3
+
+
+# --- times ------------------------------------------------------------------------------------------------------------
+
+
+def test_images_are_taken_while_their_exposure_fits(gl):
+    assert exposure_starts(ImagesConfig(rate=10, exposure_us=50_000), 0, SECOND, 36) == [
+        k * 100 * MS for k in range(10)
+    ]
+    assert len(exposure_starts(ImagesConfig(rate=10, exposure_us=100_000), 0, SECOND, 36)) == 10
+    assert len(exposure_starts(ImagesConfig(rate=10, exposure_us=100_000, row_us=1), 0, SECOND, 36)) == 9
+    assert exposure_starts(ImagesConfig(times=(0.5, 0.6)), 0, SECOND, 36) == [500 * MS, 600 * MS]
+    with Renderer(gl, moving(), PLAIN) as renderer:
+        camera = camera_of(renderer, times=(0.25, 0.5), exposure_us=10_000)
+        due = []
+        while camera.due_ns is not None:
+            due.append(camera.due_ns)
+            image = camera.take()
+            assert image.t_ns == due[-1] and image.k == len(due) - 1
+    assert due == [260 * MS, 510 * MS] and camera.facts()["images"] == 2

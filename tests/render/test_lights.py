@@ -1,0 +1,222 @@
+"""Suns, point and spot lights: against closed form, the float64 reference, and the plain light beside them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.deform import TwistConfig
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.render import reference
+from blinkgl.render.colour import LUMA
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.lights import lamp_pose
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.shapes.table import deformer_of
+from blinkgl.scene.types import Lamp, Light, Material
+from render_scenes import (
+    LEVEL,
+    SECOND,
+    cube,
+    drift,
+    mixed_scene,
+    moved_scene,
+    quad,
+    rig,
+    scene,
+    smooth_texture,
+    sphere,
+    still,
+    thing,
+)
+
+PLAIN = RenderConfig()
+SUN = Lamp("sun", (0.2, 0.1, 0.4), StaticPath(lamp_pose(shines=(1, 1, -1))))
+POINT = Lamp("point", (6.0, 2.0, 1.0), StaticPath(lamp_pose((0.3, 3.0, 1.0))), reach=9.0)
+SPOT = Lamp("spot", (8.0, 8.0, 20.0), StaticPath(lamp_pose((0, 2, 2), (0.1, 1.2, -2))), inner=0.3, outer=0.6)
+LAMPS = (SUN, POINT, SPOT)
+
+
+def grey(lamp):
+    return replace(lamp, strength=(lamp.strength[1],) * 3)
+
+
+def wall_at(distance=2.0):
+    """A white wall across the camera's axis, and where each pixel's point of it is, (H, W, 3)."""
+    wall = thing("wall", 1, quad(9, 9), still((0, distance, 0), Rotation.from_euler("x", 90, degrees=True)))
+    world = scene([wall])
+    xy = reference.pixel_grid(world.camera)
+    points = world.camera.rays(xy) * distance @ np.asarray(LEVEL.as_matrix()).T
+    return world, points.reshape(world.camera.height, world.camera.width, 3)
+
+
+def luminance(gl, world, t=0):
+    with Renderer(gl, world, PLAIN) as renderer:
+        return renderer.luminance(t).read().astype(np.float64)
+
+
+@pytest.mark.parametrize("reach", [math.inf, 1.8])
+def test_a_point_light_falls_with_the_square_of_the_distance(gl, reach):
+    world, points = wall_at()
+    place = np.array([0.2, 0.5, -0.3])
+    lamp = Lamp("point", (3.0, 3.0, 3.0), StaticPath(lamp_pose(place)), reach)
+    world = replace(world, light=Light(sun=0, sky=0, lamps=(lamp,)))
+    distance = np.linalg.norm(points - place, axis=-1)
+    expected = 3.0 * (2.0 - 0.5) / distance**3 * np.maximum(0.0, 1.0 - (distance / reach) ** 4)
+    np.testing.assert_allclose(luminance(gl, world), expected, rtol=2e-5, atol=2e-6)
+    assert (expected == 0).any() == math.isfinite(reach)
+
+
+def test_a_spot_light_shines_in_its_cone(gl):
+    world, points = wall_at()
+    place, axis = np.array([-0.1, 0.2, 0.1]), np.array([0.1, 1.0, 0.05])
+    inner, outer = math.radians(8), math.radians(17)
+    lamp = Lamp("spot", (5.0, 5.0, 5.0), StaticPath(lamp_pose(place, axis)), inner=inner, outer=outer)
+    world = replace(world, light=Light(sun=0, sky=0, lamps=(lamp,)))
+    way = points - place
+    distance = np.linalg.norm(way, axis=-1)
+    cosine = way @ axis / np.linalg.norm(axis) / distance
+    share = np.clip((cosine - math.cos(outer)) / (math.cos(inner) - math.cos(outer)), 0, 1) ** 2
+    expected = 5.0 * 1.8 / distance**3 * share
+    np.testing.assert_allclose(luminance(gl, world), expected, rtol=1e-4, atol=2e-6)
+    assert (share == 1).any() and (share == 0).any() and ((share > 0) & (share < 1)).sum() > 100
+
+
+def test_behind_the_surface_and_far_away_nothing_is_lit(gl):
+    world, _ = wall_at()
+    behind = Lamp("point", (3.0, 3.0, 3.0), StaticPath(lamp_pose((0, 3, 0))))
+    touching = replace(behind, path=StaticPath(lamp_pose((0, 2, 0))))
+    for lamp in (behind, touching):
+        seen = luminance(gl, replace(world, light=Light(sun=0, sky=0, lamps=(lamp,))))
+        assert np.isfinite(seen).all() and seen.max() < 0.1
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e5])
+def test_every_light_is_the_references(gl, offset):
+    """Of moving things, textured and not, and far from the origin."""
+    light = Light(sun_color=(1.0, 0.9, 0.6), sky_color=(0.4, 0.6, 1.0), lamps=LAMPS)
+    for textured in (True, False):
+        world = mixed_scene(textured=textured)
+        if offset:
+            world = moved_scene(world, np.full(3, offset))
+            moved = [np.add(lamp_pose(), 0) for _ in LAMPS]
+            for T, lamp in zip(moved, LAMPS):
+                T[:] = lamp.path.pose(0)
+                T[:3, 3] += offset
+            light = replace(light, lamps=tuple(replace(la, path=StaticPath(T)) for la, T in zip(LAMPS, moved)))
+        world = replace(world, light=light)
+        for t in (0, SECOND // 3):
+            ref = reference.render(world, t)
+            with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
+                seen, colour = renderer.luminance(t).read(), renderer.colour(t).read()
+            off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth)
+            error, error_colour = np.abs(seen - ref.luminance)[off], np.abs(colour - ref.colour)[off]
+            assert np.median(error) < 2e-6 and np.median(error_colour) < (2e-4 if textured else 2e-6)
+            if not textured:
+                assert np.quantile(error, 0.999) < 1e-4
+
+
+def test_light_of_a_panorama_is_the_references(gl):
+    """Nine numbers per channel, turned into each object's axes; and their rate."""
+    quadric = np.random.default_rng(1).normal(size=(3, 4, 4)) * 0.1
+    quadric = quadric + quadric.swapaxes(1, 2) + np.diag([0, 0, 0, 1.0])
+    light = Light(sun=0, sky=0, around=tuple(tuple(map(tuple, one)) for one in quadric.tolist()))
+    world, t, h = replace(mixed_scene(textured=False), light=light), SECOND // 3, 1_000_000
+    ref = reference.render(world, t)
+    with Renderer(gl, world, RenderConfig(image_antialiasing="none"), whole=True) as renderer:
+        seen, colour = renderer.luminance(t).read(), renderer.colour(t).read()
+        before, after = (renderer.luminance(t + dt).read().astype(np.float64) for dt in (-h, h))
+        rate = renderer.luminance(t, rate=True).read("rate").astype(np.float64)
+    off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth, width=3) & (ref.instance > 2)
+    assert (
+        np.quantile(np.abs(seen - ref.luminance)[off], 0.999) < 1e-4
+        and np.median(np.abs(colour - ref.colour)[off]) < 1e-6
+    )
+    true = (after - before) / (2e-9 * h)
+    assert np.quantile(np.abs(rate - true)[off], 0.9) < 0.03 * np.abs(true[off]).max()
+
+
+def test_one_channel_does_where_a_surface_has_one_colour(gl):
+    """And three are taken where it has several; both give the luminance of the picture."""
+    light = Light(lamps=LAMPS, sky_color=(0.5, 0.8, 1.0))
+    grey_image = replace(smooth_texture(), image=np.repeat(smooth_texture().image[..., :1], 3, axis=2))
+    quick = {"untextured": None, "grey": grey_image, "of several colours": smooth_texture()}
+    for name, texture in quick.items():
+        paint = Material(texture, base_color=(0.9, 0.3, 0.1))
+        world = scene([thing("ball", 1, sphere(1.0), still((0, 4, 0)), paint)], light=light)
+        gl.shaders.clear()
+        with Renderer(gl, world, RenderConfig(image_antialiasing="none")) as renderer:
+            seen, colour = renderer.luminance(0).read(), renderer.colour(0).read()
+            rates = renderer.luminance(0, rate=True).read()
+        hued = {dict(defines).get("HUED") for program, defines in gl.shaders.compiled if program == "luminance.glsl"}
+        assert hued == ({"1"} if name == "of several colours" else {None}), name
+        np.testing.assert_allclose(seen, colour @ LUMA, rtol=1e-5, atol=1e-6)
+        np.testing.assert_array_equal(rates, seen)
+
+
+def test_white_light_is_the_same_through_either_program(gl):
+    """The plain formula, and lamps that say the same."""
+    world = mixed_scene()
+    white = Lamp("sun", (Light().sun,) * 3, StaticPath(lamp_pose(shines=-np.array(Light().sun_direction))))
+    as_lamp = replace(world, light=Light(sun=0.0, lamps=(white,)))
+    faint = replace(world, light=Light(lamps=(replace(SUN, strength=(1e-12, 0.0, 0.0)),)))  # takes three channels
+    for t in (0, SECOND // 2):
+        plain = luminance(gl, world, t)
+        np.testing.assert_allclose(luminance(gl, as_lamp, t), plain, atol=1e-6)
+        np.testing.assert_allclose(luminance(gl, faint, t), plain, atol=1e-5)
+
+
+def test_who_asks_for_no_lights_gets_the_programs_without(gl):
+    gl.shaders.clear()
+    with Renderer(gl, mixed_scene(), PLAIN) as renderer:
+        renderer.luminance(0), renderer.luminance(0, rate=True), renderer.colour(0), renderer.brightness(0, 4)
+    for _, defines in gl.shaders.compiled:
+        assert not {"LIGHTS", "HUED", "SUNS", "LAMPS", "AMBIENT"} & {name for name, _ in defines}
+
+
+MOVING = replace(POINT, path=drift((0.3, 3, 1), (0.8, 2.5, 0.4)))
+TURNING = replace(
+    SPOT,
+    path=drift((0, 2, 2), (0.4, 2, 1.8), *(Rotation.from_euler(a, v, degrees=True) for a, v in (("x", 25), ("y", 20)))),
+)
+
+
+@pytest.mark.parametrize("lamp", [SUN, POINT, SPOT, MOVING, TURNING], ids=["sun", "point", "spot", "moving", "turning"])
+@pytest.mark.parametrize("shape", ["rigid", "twist"])
+def test_rate_of_luminance_under_a_lamp(gl, lamp, shape):
+    """dL/dt of what moves and turns, under what stands and moves, is the frames' difference quotient."""
+    egg, h = sphere(1.0, 4), 1_000_000
+    if shape == "twist":
+        egg = replace(egg, deformer=deformer_of(TwistConfig(angle=90), egg.vertices.min(0), egg.vertices.max(0)))
+    path = drift((0.2, 4, 0.1), (-0.1, 4.2, 0.3), Rotation.identity(), Rotation.from_rotvec([0.1, -0.2, 0.3]))
+    world = scene(
+        [thing("body", 1, egg, path, Material(base_color=(0.9, 0.5, 0.3)))],
+        rig(path=drift((0, 0, 0), (0.2, 0.1, -0.1), LEVEL)),
+        Light(sun=0.3, sky=0.2, sky_color=(0.2, 0.5, 1.0), lamps=(lamp,)),
+    )
+    t = SECOND // 2
+    ref = reference.render(world, t)
+    with Renderer(gl, world, PLAIN, whole=True) as renderer:
+        before, after = (renderer.luminance(t + dt).read().astype(np.float64) for dt in (-h, h))
+        rate = renderer.luminance(t, rate=True).read("rate").astype(np.float64)
+    off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth, width=3)
+    true = (after - before) / (2e-9 * h)
+    error = np.abs(rate - true)[off]
+    assert np.abs(true[off]).max() > 0.1
+    assert np.quantile(error, 0.9) < 0.03 * np.abs(true[off]).max()
+
+
+def test_a_moving_lamp_has_all_drawn_again(gl):
+    """A camera that stands still keeps no picture of what a moving lamp lights."""
+    world = scene(
+        [thing("wall", 1, quad(9, 9), still((0, 6, 0), Rotation.from_euler("x", 90, degrees=True))),
+         thing("box", 2, cube(0.4), drift((-0.5, 4, 0.2), (0.5, 4, 0.2)))],
+        light=Light(lamps=(MOVING,)),
+    )  # fmt: skip
+    with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, world, PLAIN, whole=True) as whole:
+        for t in (0, SECOND // 4, SECOND // 2):
+            np.testing.assert_array_equal(renderer.luminance(t).read(), whole.luminance(t).read())

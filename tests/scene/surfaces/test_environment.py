@@ -1,0 +1,164 @@
+"""Panoramas as light: harmonics against sums over all pixels, the sun that is taken out, what is no panorama."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+
+import cv2
+import imageio_ffmpeg
+import numpy as np
+import pytest
+
+from blinkgl.errors import AssetError
+from blinkgl.scene.lights import ambient
+from blinkgl.scene.surfaces.environment import environment, pixel_directions, turned
+from blinkgl.scene.surfaces.images import MAX_HDR_PIXELS, cube_faces, load_image, load_panorama
+from tests.shared_data import shared
+
+
+def normals(count=200, seed=0):
+    n = np.random.default_rng(seed).normal(size=(count, 3))
+    return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def summed(image, n):
+    """(N, 3) radiance of a white surface: the sum over all pixels of the panorama."""
+    directions, solid = pixel_directions(*image.shape[:2])
+    flux = (image * solid[:, None, None]).reshape(-1, 3).astype(np.float64)
+    return np.stack([np.maximum(0.0, directions.reshape(-1, 3) @ one) @ flux for one in n]) / np.pi
+
+
+def received(found, n):
+    around = ambient(found.quadric, n)
+    return around + sum(np.maximum(0.0, n @ sun.towards)[:, None] * sun.strength for sun in found.suns)
+
+
+def sky(height=64, sun=None, radius=0.02, brightness=0.0):
+    """Blue above, brown below, and a disc."""
+    directions, _ = pixel_directions(height, 2 * height)
+    up = directions[..., 2:]
+    image = np.where(up > 0, [0.3, 0.5, 0.9], [0.2, 0.15, 0.1]) * (1 + 0.3 * directions[..., :1])
+    if sun is not None:
+        image[directions @ sun > math.cos(radius)] = brightness
+    return image.astype(np.float32)
+
+
+def test_pixels_cover_the_sphere_and_lie_where_the_sky_box_shows_them():
+    directions, solid = pixel_directions(48, 96)
+    assert solid.sum() * 96 == pytest.approx(4 * np.pi)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0, atol=1e-12)
+    image = (directions * 0.5 + 0.5).astype(np.float32)
+    for face, axis in zip(cube_faces(image, 9), ([1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1])):
+        seen = face[4, 4] * 2 - 1
+        assert seen @ np.array(axis) > 0.98 * np.linalg.norm(seen), axis
+
+
+def test_the_same_light_from_everywhere_is_white_furnace():
+    """A white surface under constant radiance is as bright as that."""
+    found = environment(np.full((32, 64, 3), 0.7, np.float32))
+    assert not found.suns
+    np.testing.assert_allclose(ambient(found.quadric, normals()), 0.7, atol=1e-3)
+
+
+def test_a_smooth_sky_is_its_harmonics():
+    image = sky()
+    true = summed(image, normals())
+    error = np.abs(received(environment(image), normals()) - true)
+    assert error.mean() < 0.01 * true.mean()
+
+
+def test_a_sun_is_found_and_taken_out():
+    towards = np.array([0.3, -0.6, 0.74])
+    towards /= np.linalg.norm(towards)
+    image = sky(256, towards, 0.03, 5000.0)
+    found = environment(image)
+    (sun,) = found.suns
+    assert math.degrees(math.acos(min(1.0, sun.towards @ towards))) < 0.3
+    assert sun.size == pytest.approx(0.06, rel=0.2)
+    np.testing.assert_allclose(sun.strength, 5000.0 * 0.03**2, rtol=0.1)  # radiance times pi r² of the disc, / pi
+    true = summed(image, normals())
+    assert np.abs(received(found, normals()) - true).mean() < 0.01 * true.mean()
+    without = environment(sky(256))
+    np.testing.assert_allclose(found.quadric, without.quadric, atol=0.01)
+    assert not environment(image, suns=0).suns
+
+
+@pytest.mark.parametrize("column", [0.0, math.pi])
+def test_a_sun_on_the_seam_is_one(column):
+    towards = np.array([math.cos(column), math.sin(column), 0.1])
+    found = environment(sky(128, towards / np.linalg.norm(towards), 0.05, 3000.0))
+    assert len(found.suns) == 1 and found.suns[0].towards @ towards > 0.999
+
+
+def test_turned_is_what_turning_the_picture_gives():
+    towards = np.array([0.8, 0.0, 0.6])
+    image = sky(128, towards, 0.05, 3000.0)
+    quarter = np.roll(image, -64, axis=1)  # a quarter of 256 columns to the left: from +x towards +y
+    one, other = turned(environment(image), math.pi / 2), environment(quarter)
+    np.testing.assert_allclose(one.quadric, other.quadric, atol=1e-6)
+    np.testing.assert_allclose(one.suns[0].towards, other.suns[0].towards, atol=1e-9)
+    assert one.suns[0].towards[1] > 0.7
+
+
+@pytest.mark.parametrize("name, most", [("city", 0.01), ("park", 0.005), ("warehouse", 0.0135)])
+def test_real_panoramas(name, most):
+    """Mean error over directions, of the mean. A hall's many lamps are not smooth: nine numbers and four suns leave
+    1.2 %."""
+    image, _ = load_panorama(shared(f"data/assets/hdri/{name}.hdr"))
+    few = normals(60)
+    true = summed(image, few)
+    found = environment(image)
+    assert bool(found.suns) == (name != "city")
+    assert np.abs(received(found, few) - true).mean() <= most * true.mean()
+
+
+def written(path, image):
+    assert cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1]))
+    return path
+
+
+def exr(path, image):
+    height, width = image.shape[:2]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "gbrpf32le"]
+    command += ["-s", f"{width}x{height}", "-i", "-", "-y", str(path)]
+    subprocess.run(command, input=np.ascontiguousarray(np.moveaxis(image[..., [1, 2, 0]], -1, 0)).tobytes(), check=True)
+    return path
+
+
+def test_hdr_exr_and_eight_bits_are_read(tmp_path):
+    image = sky(16, np.array([0, 0, 1.0]), 0.3, 50.0)
+    read, factor = load_panorama(written(tmp_path / "a.hdr", image))
+    np.testing.assert_allclose(read, image, rtol=0.02, atol=0.01)
+    assert np.percentile((read * factor).max(axis=2), 90) == pytest.approx(0.8, rel=1e-4)
+    read, _ = load_panorama(exr(tmp_path / "a.exr", image))
+    np.testing.assert_array_equal(read, image)
+    np.testing.assert_allclose(load_image(tmp_path / "a.exr"), np.clip(read * factor, 0, 1.5), rtol=0.02, atol=0.01)
+    read, factor = load_panorama(written(tmp_path / "a.png", np.full((4, 8, 3), 188, np.uint8)))
+    assert factor == 1.0 and read == pytest.approx(np.float32(0.503), rel=0.01)
+
+
+def test_what_is_no_panorama(tmp_path):
+    image = sky(16)
+    bad = image.copy()
+    bad[3, 5, 0] = np.nan
+    negative = image.copy()
+    negative[2, 2] = -1
+    endless = image.copy()
+    endless[7, 1, 1] = np.inf
+    huge = written(tmp_path / "huge.hdr", image).read_bytes().replace(b"-Y 16 +X 32", b"-Y 15000 +X 30000")
+    (tmp_path / "huge.hdr").write_bytes(huge)
+    for path, expected in (
+        (exr(tmp_path / "nan.exr", bad), "x=5, y=3: a pixel is no radiance .got .nan"),
+        (exr(tmp_path / "inf.exr", endless), "x=1, y=7: a pixel is no radiance .got .*inf"),
+        (exr(tmp_path / "minus.exr", negative), "a pixel is no radiance .got -1"),
+        (written(tmp_path / "square.hdr", image[:, :16]), "not a panorama .got '16x16'.; expected twice as wide"),
+        (written(tmp_path / "black.hdr", 0 * image), "the panorama is black"),
+        (
+            tmp_path / "huge.hdr",
+            f"the image is too large .got '30000x15000'.; expected at most {MAX_HDR_PIXELS / 1e6:.0f}",
+        ),
+    ):
+        with pytest.raises(AssetError, match=expected) as error:
+            load_panorama(path)
+        assert "\n" not in str(error.value), path

@@ -123,8 +123,11 @@ def predict(
     events: Annotated[str, typer.Argument(help="Event file: DSEC h5, EVT2/EVT3 raw, AEDAT4, text, npz …")],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for flow and pictures.")] = None,
     window_ms: Annotated[
-        float, typer.Option("--window-ms", min=0.001, help="Δ: length of each of the two windows.")
-    ] = 100.0,
+        str,
+        typer.Option(
+            "--window-ms", help="Δ: length of each of the two windows; auto: as things move by about 5 px in it."
+        ),
+    ] = "100",
     start_ms: Annotated[float | None, typer.Option("--start-ms", help="From this time after the first event.")] = None,
     end_ms: Annotated[float | None, typer.Option("--end-ms", help="Up to this time after the first event.")] = None,
     whole: Annotated[
@@ -135,6 +138,7 @@ def predict(
     ] = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Sensor size, where the file does not say.")] = None,
     npy: Annotated[bool, typer.Option("--npy", help="Also float32 .npy.")] = False,
+    video: Annotated[str | None, typer.Option(help="Also a video of events and flow, .mp4.")] = None,
     warm_start: Annotated[
         bool, typer.Option("--warm-start", help="Start each window's refinement from the last flow.")
     ] = False,
@@ -148,26 +152,20 @@ def predict(
     """Flow from any event file, by a network or by a method that needs no training.
 
     FWL is how much sharper the new window's events are when the flow takes them back to its start: above 1 it helps."""
+    import contextlib
+
     import numpy as np
 
     from eflow import infer
     from eflow.methods.iwe import flow_warp_loss
     from eflow.metrics import frame_metrics
+    from eflow.pictures import FlowVideo, events_of
 
     _one_of("--empty", empty, ("error", "zero"))
+    milliseconds = _milliseconds(window_ms)
     method = _method(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     model = None if method is not None else _model(checkpoint, device, raw, precision, iterations)
     file = infer.open_sized(events, _size(size))
-    if whole:
-        window, factor = infer.whole_file(file)
-        stream, span = [window], window.new.t1 - window.old.t0
-    else:
-        first = next((int(c.t[0]) for c in file.chunks()), None)
-        if first is None:
-            raise BlinkGLError("holds no events", where=events)
-        at = lambda ms: None if ms is None else first + round(ms * 1000)
-        span, factor = round(window_ms * 1000), 1.0
-        stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
     if method is not None:
         predictor = infer.MethodPredictor(method, file.height, file.width, empty=empty)
@@ -180,11 +178,22 @@ def predict(
             precision=_precision(model, precision),
             empty=empty,
         )
-    writer = infer.FlowWriter(out, npy=npy) if out else None
+    if whole:
+        window, factor = infer.whole_file(file)
+        stream, span = [window], window.new.t1 - window.old.t0
+    else:
+        first = next((int(c.t[0]) for c in file.chunks()), None)
+        if first is None:
+            raise BlinkGLError("holds no events", where=events)
+        at = lambda ms: None if ms is None else first + round(ms * 1000)
+        span, factor = infer.likely_span(file, predictor) if milliseconds is None else round(milliseconds * 1000), 1.0
+        if milliseconds is None:
+            typer.echo(f"windows of {span / 1000:g} ms")
+        stream = infer.windows(file, span, start_us=at(start_ms), end_us=at(end_ms))
     count = 0
-    if writer:
-        writer.__enter__()
-    try:
+    with contextlib.ExitStack() as opened:
+        writer = opened.enter_context(infer.FlowWriter(out, npy=npy)) if out else None
+        shown = opened.enter_context(FlowVideo(video, file.height, file.width, _fps(span))) if video else None
         for window in stream:
             flow, tensor = predictor(window)
             sharper = flow_warp_loss(window.new, flow)
@@ -209,19 +218,35 @@ def predict(
             typer.echo(line)
             if writer:
                 writer.add(window, flow, tensor, gt)
+            if shown:
+                caption = f"{(window.t_us - window.old.t0) / 1000:g} ms at {window.t_us / 1e6:.3f} s"
+                shown.add(caption, events_of(tensor), flow)
         if not count:
             raise BlinkGLError(
                 f"shorter than two windows of {span / 1000:g} ms",
                 where=events,
                 accepted="a smaller --window-ms, or --whole",
             )
-    except BaseException as error:
-        if writer:
-            writer.__exit__(type(error), error, None)
-        raise
-    if writer:
-        writer.__exit__(None, None, None)
-        typer.echo(f"written: {out}")
+    for path in filter(None, (out, video)):
+        typer.echo(f"written: {path}")
+
+
+def _fps(span_us: int) -> float:
+    """Windows a second of video: as fast as it happened, but no more than 20."""
+    return min(20.0, 1e6 / span_us)
+
+
+def _milliseconds(text: str) -> float | None:
+    """Of --window-ms; None for "auto"."""
+    if text == "auto":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.001 <= value < 1e9:
+        raise ConfigError("not a length", where="--window-ms", value=text, accepted="milliseconds, or auto")
+    return value
 
 
 @app.command()

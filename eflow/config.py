@@ -54,6 +54,13 @@ class _Refined(Config):
         description="at most so many iterations before those, without gradients (none in half of the steps, else a "
         "random number), so that further iterations converge; null: iterations - train_iterations",
     )
+    damping: float = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="in evaluation, the step of iteration k beyond train_iterations and burn_in is multiplied by this "
+        "to the power of k, so that what nothing was trained for stands still",
+    )
     context_norm: Literal["batch", "instance"] = Field(
         "batch", description="norm of the context CNN; instance for batches of one or two"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,6 +106,37 @@ def windows(
             return
     if t is not None and last + 1 >= t + span_us and (end_us is None or t + span_us <= end_us):
         yield _pair(pending, t, span_us)
+
+
+LIKELY_PX = 5.0
+"""Displacement in a window that :func:`likely_span` looks for: networks are trained on 2 to 8 px."""
+
+
+def likely_span(file: EventFile, predictor: Callable[[StreamWindow], tuple[np.ndarray, np.ndarray]]) -> int:
+    """Δ, µs, at which things in the recording move by about :data:`LIKELY_PX`: ``predictor``'s own flow where there are
+    events, at three places of the recording, tells how fast they are; tried with shorter and longer windows until it
+    stands. From 1 ms to a third of the recording. Raises EventDataError: no events."""
+    ends = [(int(c.t[0]), int(c.t[-1])) for c in file.chunks() if len(c)]
+    if not ends:
+        raise EventDataError("holds no events", where=str(file.path))
+    first, last = ends[0][0], ends[-1][1]
+    longest = max((last - first) // 3, 1000)
+    span = min(30_000, longest)
+    for _ in range(4):
+        speeds = []
+        for place in (0.25, 0.5, 0.75):
+            start = max(first, min(round(first + place * (last - first)) - span, last + 1 - 2 * span))
+            pair = next(windows(file, span, start_us=start), None)
+            if pair is None or not (len(pair.old) and len(pair.new)):
+                continue
+            flow, _ = predictor(pair)
+            speeds.append(float(np.median(np.hypot(*flow[pair.new.y, pair.new.x].T))))
+        speed = float(np.median(speeds)) if speeds else 0.0
+        factor = min(max(LIKELY_PX / max(speed, 1e-3), 0.4), 2.5)
+        span = int(min(max(span * factor, 1000), longest))
+        if 0.8 < factor < 1.25:
+            break
+    return span
 
 
 def whole_file(file: EventFile) -> tuple[StreamWindow, float]:

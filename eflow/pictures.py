@@ -1,17 +1,22 @@
-"""Events, ground truth, prediction and error side by side."""
+"""Events, ground truth, prediction and error side by side, with what their colours mean; pictures and a video."""
 
 from __future__ import annotations
 
 import os
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from blinkgl.io.atomic import atomic_file
 from blinkgl.io.colour import INVALID, event_colour, flow_colour
 from blinkgl.io.images import encode_image
+from blinkgl.io.video import VideoWriter
 
-_GAP = 4
+_GAP, BAR = 4, 18
+"""Pixels between panels, and of the captions' bar above them."""
+_STEADY = 0.95
 _HEAT = np.array([[0, 0, 0], [70, 0, 90], [190, 40, 60], [250, 150, 30], [255, 250, 190]], np.float32)
 
 
@@ -33,26 +38,78 @@ def events_of(tensor: np.ndarray) -> np.ndarray:
 
 
 def comparison(
-    events: np.ndarray, predicted: np.ndarray, truth: np.ndarray | None = None, valid: np.ndarray | None = None
+    events: np.ndarray,
+    predicted: np.ndarray,
+    truth: np.ndarray | None = None,
+    valid: np.ndarray | None = None,
+    *,
+    largest: float | None = None,
+    caption: str = "events",
 ) -> np.ndarray:
-    """One RGB strip: events | ground truth | prediction | error (without truth: events | prediction). Flow panels share
-    one scale: the 99th percentile of the true speed. events : (H, W, 3) uint8; flows (H, W, 2) px."""
+    """One RGB strip: events | ground truth | prediction | error (without truth: events | prediction), with a bar of
+    :data:`BAR` px above that says what is shown and at what length a colour is full. Flow panels share
+    one scale: ``largest`` px, or the 99th percentile of the true speed (of the predicted one without truth).
+    events : (H, W, 3) uint8; flows (H, W, 2) px. caption : of the events."""
+    panels = [(caption, events)]
     if truth is None or valid is None or not valid.any():
-        panels = [events, flow_colour(predicted)]
+        largest = largest or full_colour(predicted)
+        panels.append((f"flow, full colour {largest:.3g} px", flow_colour(predicted, largest)))
     else:
-        largest = float(np.percentile(np.hypot(*truth[valid].T), 99)) or 1.0
-        error = np.hypot(*(np.moveaxis(predicted - truth, -1, 0)))
-        panels = [
-            events,
-            flow_colour(truth, largest, valid),
-            flow_colour(predicted, largest),
-            error_colour(error, max(3.0, largest / 2), valid),
+        largest = largest or full_colour(truth[valid])
+        error, pale = np.hypot(*(np.moveaxis(predicted - truth, -1, 0))), max(3.0, largest / 2)
+        panels += [
+            (f"truth, full colour {largest:.3g} px", flow_colour(truth, largest, valid)),
+            ("network", flow_colour(predicted, largest)),
+            (f"error, pale {pale:.3g} px", error_colour(error, pale, valid)),
         ]
     height, width = events.shape[:2]
-    strip = np.full((height, len(panels) * (width + _GAP) - _GAP, 3), 255, np.uint8)
-    for i, panel in enumerate(panels):
-        strip[:, i * (width + _GAP) : i * (width + _GAP) + width] = panel
+    strip = np.full((height + BAR, len(panels) * (width + _GAP) - _GAP, 3), 255, np.uint8)
+    font = ImageFont.load_default(11)
+    for i, (text, panel) in enumerate(panels):
+        left = i * (width + _GAP)
+        bar = Image.new("RGB", (width, BAR), (255, 255, 255))
+        ImageDraw.Draw(bar).text((2, 2), text, (40, 40, 40), font=font)
+        strip[:BAR, left : left + width], strip[BAR:, left : left + width] = np.asarray(bar), panel
     return strip
+
+
+def full_colour(flow: np.ndarray) -> float:
+    """The speed, px, that flow (..., 2) has full colour at: its 99th percentile."""
+    speed = np.hypot(flow[..., 0], flow[..., 1])
+    speed = speed[np.isfinite(speed)]
+    return (float(np.percentile(speed, 99)) if speed.size else 0.0) or 1.0
+
+
+class FlowVideo:
+    """Events and flow of successive windows as a video that appears whole or not at all. Its scale grows at once and
+    falls slowly, so that colours do not flicker; each panel is captioned. Small sensors are shown twice as large.
+
+    fps : windows a second of video.   Raises OutputError: it cannot be written."""
+
+    def __init__(self, path: str | os.PathLike, height: int, width: int, fps: float):
+        self._path, self._fps, self._factor, self._largest = path, fps, 2 if height < 200 else 1, 0.0
+        blank = comparison(np.zeros((height, width, 3), np.uint8), np.zeros((height, width, 2), np.float32))
+        self._shape = self._fit(blank).shape
+
+    def __enter__(self) -> FlowVideo:
+        with ExitStack() as opened:
+            final = opened.enter_context(atomic_file(self._path, overwrite=False))
+            self._video = opened.enter_context(VideoWriter(final, *self._shape[:2], self._fps))
+            self._opened = opened.pop_all()
+        return self
+
+    def add(self, caption: str, events: np.ndarray, flow: np.ndarray) -> None:
+        """caption : above the events, e.g. their time. events (H, W, 3) uint8; flow (H, W, 2) px."""
+        self._largest = max(_STEADY * self._largest, full_colour(flow))
+        self._video.write(self._fit(comparison(events, flow, largest=self._largest, caption=caption)))
+
+    def _fit(self, strip: np.ndarray) -> np.ndarray:
+        """Enlarged, and of even height and width as the codec wants."""
+        strip = strip.repeat(self._factor, 0).repeat(self._factor, 1)
+        return np.pad(strip, ((0, strip.shape[0] % 2), (0, strip.shape[1] % 2), (0, 0)), constant_values=255)
+
+    def __exit__(self, *error) -> bool | None:
+        return self._opened.__exit__(*error)
 
 
 def write_picture(path: str | os.PathLike, image: np.ndarray) -> None:

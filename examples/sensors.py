@@ -16,9 +16,10 @@ def main(out: Path) -> None:
     for name in ("davis240c", "davis346", "dvxplorer", "gen31_vga", "imx636"):
         sensor, emulator = load_sensor(name), Esim(120, 160, sensor=name, seed=1)
         counts[name] = sum(len(emulator.step(frame, t_ns)) for frame, t_ns in frames)
+        pixel = emulator.config
         print(
-            f"{sensor.name:27} {sensor.width:4} x {sensor.height:<4} threshold {sensor.contrast_threshold:.2f}, "
-            f"dead time {sensor.refractory_us:5.0f} µs: {counts[name]} events of 160 x 120 px"
+            f"{sensor.name:27} {sensor.width:4} x {sensor.height:<4} threshold {pixel.contrast_threshold:.2f}, "
+            f"dead time {pixel.refractory_us:5.0f} µs: {counts[name]} events of 160 x 120 px"
         )
     (out / "counts.json").write_text(json.dumps(counts))
 

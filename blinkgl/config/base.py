@@ -133,7 +133,13 @@ class Config(BaseModel):
     def _fill_preset(cls, data: Any) -> Any:
         if cls.presets and isinstance(data, dict):
             name = data.get("preset", cls.model_fields["preset"].default)
-            return {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **data}
+            data = {**(cls.presets.get(name, {}) if isinstance(name, str) else {}), **data}
+        return cls.completed(data) if isinstance(data, dict) else data
+
+    @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        """``data`` with keys that follow from others that are given; what cannot be used is left as it is, for the
+        validation that comes next."""
         return data
 
     @model_validator(mode="after")

@@ -5,6 +5,7 @@ the drawn value is what the sequence's own ``config.yaml`` records:
 
     contrast_threshold: {uniform: [0.18, 0.25]}     # float in [a, b)
     log_eps: {log_uniform: [1.0e-4, 1.0e-2]}        # float, uniform in log
+    contrast_threshold: {normal: [0.18, 0.03, 0.1, 0.3]}  # float: mean, standard deviation, cut at both ends
     count: {integer: [8, 16]}                       # integer, both ends included
     emulator: {choice: [esim, v2e]}                 # one of the list, equal chances
     emulator: {weighted: {esim: 3, v2e: 1}}         # one of the keys, chances in proportion
@@ -28,7 +29,7 @@ import numpy as np
 from blinkgl.errors import ConfigError
 from blinkgl.rng import Role
 
-_KINDS = ("uniform", "log_uniform", "integer", "choice", "weighted", "shares")
+_KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "weighted", "shares")
 _GOLDEN = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: k times this, modulo 2^64, is the most even sequence there is
 
 
@@ -53,7 +54,7 @@ def options(path: tuple[str, ...], node: dict[str, Any], between: bool = False) 
         return [part["value"] for part in spec]
     if kind in ("choice", "weighted"):
         return list(spec)
-    low, high = (_number(x) for x in spec)
+    low, high = (_number(x) for x in (spec[2:] if kind == "normal" else spec))
     if kind == "integer":
         return list(dict.fromkeys((int(low), int(high))))
     return list(dict.fromkeys((low, high, low + 0.381966 * (high - low)) if between else (low, high)))
@@ -77,6 +78,8 @@ def _middle(path: tuple[str, ...], kind: str, spec: Any) -> Any:
             dealt += _number(chance)
             if dealt >= half and _number(chance) > 0:
                 return value
+    if kind == "normal":
+        return _number(spec[0])
     low, high = (_number(x) for x in spec)
     if kind == "integer":
         return (int(low) + int(high)) // 2
@@ -142,6 +145,20 @@ def _check(path: tuple[str, ...], kind: str, spec: Any) -> None:
         if abs(total - 1) > 1e-9:
             raise ConfigError("the shares do not sum to 1", where=where, value=total, accepted="shares that sum to 1")
         return
+    if kind == "normal":
+        try:
+            mean, deviation, low, high = (_number(x) for x in spec)
+            ok = low <= mean <= high and deviation > 0 and math.isfinite(high - low)
+        except (TypeError, ValueError):
+            ok = False
+        if not ok:
+            raise ConfigError(
+                "not a normal distribution",
+                where=where,
+                value=spec,
+                accepted="[mean, standard deviation > 0, lowest, highest], the mean between the last two",
+            )
+        return
     try:
         low, high = (_number(x) for x in spec)
     except (TypeError, ValueError):
@@ -172,6 +189,13 @@ def _draw_one(path: tuple[str, ...], kind: str, spec: Any, seed: int, sequence: 
     if kind == "weighted":
         weights = np.array([_number(w) for w in spec.values()])
         return list(spec)[int(rng.choice(len(weights), p=weights / weights.sum()))]
+    if kind == "normal":
+        mean, deviation, low, high = (_number(x) for x in spec)
+        for _ in range(1000):  # what is cut off is drawn again
+            value = float(rng.normal(mean, deviation))
+            if low <= value <= high:
+                return value
+        return mean
     low, high = (_number(x) for x in spec)
     if kind == "integer":
         return int(rng.integers(int(low), int(high), endpoint=True))

@@ -7,6 +7,7 @@ table of both, in :mod:`blinkgl.events.table`.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -60,6 +61,20 @@ def followers(reconstruction: str) -> list[str]:
     return [kind for kind, model in EmulatorConfig.members.models.items() if reconstruction in model.reconstructions]
 
 
+def _with_both_thresholds(data: dict[str, Any], default: float) -> dict[str, Any]:
+    """The threshold that is not given, from the one that is and ``threshold_ratio``."""
+    ratio, off = data.get("threshold_ratio"), data.get("contrast_threshold_off")
+    if ratio is None or (off is not None and "contrast_threshold" in data):
+        return data
+    given, other = "contrast_threshold", "contrast_threshold_off"
+    if off is not None:
+        given, other = other, given
+    try:
+        return {**data, other: float(data.get(given, default)) * float(ratio)}
+    except (TypeError, ValueError, OverflowError):
+        return data
+
+
 def _pixel(sensor: SensorConfig) -> dict[str, Any]:
     return dict(
         contrast_threshold=sensor.contrast_threshold,
@@ -81,6 +96,13 @@ class EsimConfig(EmulatorConfig):
     )
     contrast_threshold_off: float | None = Field(
         None, **_THRESHOLD, description="C-, for OFF events; default: equal to contrast_threshold."
+    )
+    threshold_ratio: float | None = Field(
+        None,
+        ge=0.01,
+        le=100,
+        description="OFF threshold over contrast_threshold, instead of contrast_threshold_off; or, where only that is "
+        "given, ON over OFF.",
     )
     threshold_sigma: float = Field(
         0.021,
@@ -118,6 +140,20 @@ class EsimConfig(EmulatorConfig):
     )
     max_events_per_step: int = _MAX_EVENTS
     causes: bool = _CAUSES
+
+    @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
+
+    @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
+    def _the_ratio_is_theirs(ratio, on, off):
+        if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
+            raise Refused(
+                "is not the ratio of the two thresholds that are given beside it",
+                where="threshold_ratio",
+                value=ratio,
+                accepted=f"one of them, or {off / on:.6g}",
+            )
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:
@@ -158,6 +194,13 @@ class V2eConfig(EmulatorConfig):
     )
     contrast_threshold: float = Field(0.2, **_THRESHOLD, description="ON threshold, ln units (v2e: 0.2).")
     contrast_threshold_off: float | None = Field(None, **_THRESHOLD, description="OFF threshold; default: equal.")
+    threshold_ratio: float | None = Field(
+        None,
+        ge=0.01,
+        le=100,
+        description="OFF threshold over contrast_threshold, instead of contrast_threshold_off; or, where only that is "
+        "given, ON over OFF.",
+    )
     threshold_sigma: float = Field(
         0.03,
         ge=0,
@@ -228,6 +271,20 @@ class V2eConfig(EmulatorConfig):
     def _noise_needs_bandwidth(noise, cutoff_hz):
         if noise and cutoff_hz == 0:
             raise Refused("photoreceptor_noise needs cutoff_hz > 0 and not infinite bandwidth")
+
+    @classmethod
+    def completed(cls, data: dict[str, Any]) -> dict[str, Any]:
+        return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
+
+    @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
+    def _the_ratio_is_theirs(ratio, on, off):
+        if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
+            raise Refused(
+                "is not the ratio of the two thresholds that are given beside it",
+                where="threshold_ratio",
+                value=ratio,
+                accepted=f"one of them, or {off / on:.6g}",
+            )
 
     @classmethod
     def from_sensor(cls, sensor: SensorConfig) -> dict[str, Any]:

@@ -31,6 +31,7 @@ from blinkgl.config.lod import LodConfig
 from blinkgl.config.quality import Quality, fill_quality
 from blinkgl.config.reader import parse_yaml, read_table
 from blinkgl.config.readout import ReadoutConfig, drain_us
+from blinkgl.config.recipes import with_recipes
 from blinkgl.config.scene import RandomSceneConfig, SceneConfig
 from blinkgl.config.sensor import (
     SensorConfig,
@@ -457,7 +458,7 @@ def load_run(path: str | Path, overrides: Sequence[str] = (), *, seed: int | Non
 
     Raises ConfigError: missing or unreadable file, bad YAML (with line and column), unknown key, bad value."""
     base = Path(path).parent
-    tree = with_sensors(apply_overrides(_with_scenes(read_table(path), base), overrides), base)
+    tree = with_recipes(with_sensors(apply_overrides(_with_scenes(read_table(path), base), overrides), base))
     if seed is not None:
         tree["seed"] = seed
     if "seed" in tree and not is_distribution(tree["seed"]):  # which check() refuses

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from blinkgl.config.base import Config, validate_field
 from blinkgl.config.draw import middle
 from blinkgl.config.recipe import merge
+from blinkgl.config.recipes import with_recipes
 from blinkgl.config.sequence import RunTemplate, SequenceConfig, load_run, with_sensors
 from blinkgl.errors import ConfigError
 from blinkgl.front import arguments as check
@@ -132,7 +133,7 @@ def configured(
         own["labels"] = labels_tree(labels)
     if images is not None:
         own["images"] = images_tree(images)
-    own = with_sensors(own, Path.cwd())
+    own = with_recipes(with_sensors(own, Path.cwd()))
     if "quality" in own:
         validate_field(SequenceConfig, "quality", own["quality"])
     if "sensor" in own:

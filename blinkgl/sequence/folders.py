@@ -124,10 +124,10 @@ def _flow_and_masks(folder: Path, first: int, images: list[Path]) -> tuple[list[
 def _check_in_step(files: list[Path], images: list[Path], shifted: bool) -> None:
     """The first numbers in the names of ``files`` are those of ``images``, or, where they may be ``shifted`` (frames
     from 0, flow from 1), go up with them. Names without numbers say nothing. Raises AssetError."""
-    steps = [(_number(file), _number(image)) for file, image in zip(files, images)]
-    if any(of_file is None or of_image is None for of_file, of_image in steps):
+    numbers = [(_number(file), _number(image)) for file, image in zip(files, images)]
+    offsets = [of_file - of_image for of_file, of_image in numbers if of_file is not None and of_image is not None]
+    if len(offsets) < len(numbers):
         return
-    offsets = [of_file - of_image for of_file, of_image in steps]
     for file, image, offset in zip(files, images, offsets):
         if offset != (offsets[0] if shifted else 0):
             raise AssetError(

@@ -8,7 +8,9 @@ from typing import Any
 
 from rich.progress import BarColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
+from blinkgl.config.draw import middle
 from blinkgl.config.reader import parse_yaml, read_table
+from blinkgl.config.recipes import with_recipes
 from blinkgl.errors import ConfigError
 from blinkgl.show.terminal import causes_line, plain_column, plain_console, say
 
@@ -28,6 +30,8 @@ def emulator_options(
         if not equals:
             raise ConfigError("not key=value", where="--set", value=item)
         data[key.strip()] = parse_yaml(value, f"--set {key.strip()}")
+    if "recipe" in data:  # a video is one camera: the middle of what the recipe draws
+        data = middle(with_recipes({"events": data})["events"])
     if sensor is None:
         return {"emulator": data, "readout": None}
     from blinkgl.config.sensor import load_sensor

@@ -178,6 +178,8 @@ class Eraft(FlowModel):
         self.divisor, self.least = 8, 8 * 2**w.levels
         if config.padding == "start":
             self.pad_to, self.pad_start = 32, True
+        unseen = max(config.iterations - config.train_iterations, 0)
+        self._most = unseen if config.burn_in is None else config.burn_in
         self.representation = VoxelGrid(config.input.bins, config.input.normalise, config.input.bounds)
         self.features = Trunk(config.input.bins, w.trunk, w.features, "instance")
         self.context = Trunk(config.input.bins, w.trunk, 2 * w.hidden, config.context_norm)
@@ -210,8 +212,9 @@ class Eraft(FlowModel):
                 h, delta, mask = checkpoint(step, h, flow, use_reentrant=False)
             else:
                 h, delta, mask = step(h, flow)
+            beyond = 0 if self.training else max(i + 1 - self._most - self.config.train_iterations, 0)
             with fp32(flow):
-                flow = flow + delta.float()
+                flow = flow + self.config.damping**beyond * delta.float()
             if wanted:
                 flows.append(upsample(flow, mask, self.config.border))
         return FlowPrediction(
@@ -226,8 +229,7 @@ class Eraft(FlowModel):
         """State and flow after a number of refinements that nothing is learnt from, so that those that follow learn to
         go on from any, and to stand still where nothing is left to do. (Half of the steps have none: every answer
         begins with the first refinement.) The draw is of torch's generator, whose state checkpoints hold."""
-        most = self.config.burn_in
-        most = max(self.config.iterations - self.config.train_iterations, 0) if most is None else most
+        most = self._most
         if not most:
             return h, flow
         draw = int(torch.randint(2 * most, ()))

@@ -117,7 +117,10 @@ MIXED = [
         "timeline.max_px: unknown key",
     ),
     (
-        {"sensor": {"choice": [None, "imx636"]}, "readout": {"choice": [None, {"events_per_second": 1}]}},
+        {
+            "sensor": {"choice": [None, {"name": "x", "width": 9, "height": 9, "readout": {"queue_events": 16384}}]},
+            "readout": {"choice": [None, {"events_per_second": 1}]},
+        },
         "readout.queue_events: the last event of a full queue would wait for more than an hour",
     ),
     ({"scene": {"objects": {"count": {"uniform": [1, 9]}}}}, "scene.objects.count: not a whole number"),

@@ -310,7 +310,7 @@ def test_a_named_sensor_fills_in_what_is_not_said(tmp_path):
     config = load_run(write(tmp_path, "sensor: DAVIS346\nevents: {emulator: v2e, contrast_threshold: 0.3}")).sequence(0)
     assert (config.camera.width, config.camera.height) == (346, 260)
     assert config.events.contrast_threshold == 0.3, "what is said wins"
-    assert config.events.refractory_us == 500 and config.events.leak_rate_hz == 0.1
+    assert config.events.refractory_us == 500 and config.events.cutoff_hz == 300
     assert config.readout.events_per_second == 12e6
     bare = load_run(
         write(tmp_path, "sensor: imx636\ncamera: {width: 320, height: 180, fov: 50}\nreadout: null")

@@ -19,6 +19,7 @@ from blinkgl.io.formats import write_events  # noqa: E402
 from eflow import checkpoint as ckpt, submit  # noqa: E402
 from eflow.cli import run  # noqa: E402
 from eflow.models import build_model, model_config  # noqa: E402
+from eflow.pictures import BAR, FlowVideo, comparison  # noqa: E402
 from flow_data import SPAN, blinkflow_set, blinkgl_set, dsec_set, moving_events, mvsec_set  # noqa: E402
 
 
@@ -60,7 +61,7 @@ def test_evaluate_writes_table_json_and_pictures(network, data, tmp_path, capsys
     assert 0.2 < result["methods"]["median of the set"]["total"]["AEE"] < 1
     assert 0 < result["methods"]["network"]["total"]["AEE"] < 20 and result["samples"] == 6
     pictures = sorted((out / "pictures").glob("*.png"))
-    assert len(pictures) == 2 and cv2.imread(str(pictures[0])).shape == (128, 4 * 144 + 12, 3)
+    assert len(pictures) == 2 and cv2.imread(str(pictures[0])).shape == (128 + BAR, 4 * 144 + 12, 3)
     assert run(["evaluate", network, str(data), "--out", str(out)]) == 2  # nothing is overwritten
     assert "output folder exists" in capsys.readouterr().err
 
@@ -111,6 +112,53 @@ def test_predict_streams_the_same_windows_as_a_slice(tmp_path):
                 and np.array_equal(part.t, expected.t)
                 and np.array_equal(part.x, expected.x)
             )
+
+
+def test_a_video_of_the_flow(network, tmp_path, capsys):
+    write_events(tmp_path / "e.h5", moving_events(130, 145, 0, 4 * SPAN, n=8000), 130, 145)
+    video = tmp_path / "flow.mp4"
+    assert run(["predict", network, str(tmp_path / "e.h5"), "--window-ms", "70", "--video", str(video)]) == 0
+    assert f"written: {video}" in capsys.readouterr().out
+    shown = cv2.VideoCapture(str(video))
+    frames = [frame for ok, frame in iter(shown.read, (False, None)) if ok]
+    assert len(frames) == 4 and frames[0].shape[:2] == (2 * (130 + BAR), 2 * (2 * 145 + 4))
+    assert run(["predict", network, str(tmp_path / "e.h5"), "--video", str(video)]) == 2
+    assert "output file exists" in capsys.readouterr().err
+    with pytest.raises(ZeroDivisionError), FlowVideo(tmp_path / "half.mp4", 130, 145, 10) as half:
+        half.add("", np.zeros((130, 145, 3), np.uint8), np.ones((130, 145, 2), np.float32))
+        1 / 0  # noqa: B018
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["e.h5", "flow.mp4"]
+
+
+def test_captions_stand_above_what_is_shown():
+    events, flow = np.full((40, 120, 3), 7, np.uint8), np.ones((40, 120, 2), np.float32)
+    strip = comparison(events, flow, flow, np.ones((40, 120), bool))
+    assert (strip[BAR:, :120] == 7).all() and strip.shape == (40 + BAR, 4 * 120 + 12, 3)
+    bars = [strip[:BAR, i * 124 : i * 124 + 120] for i in range(4)]
+    assert all((bar < 128).any() for bar in bars) and len({bar.tobytes() for bar in bars}) == 4
+    assert not np.array_equal(comparison(events, flow)[:BAR], comparison(events, 3 * flow)[:BAR]), "the scale is told"
+
+
+@pytest.mark.parametrize("speed", [20.0, 800.0])
+def test_a_window_as_long_as_things_need_to_move_by_five_pixels(speed, tmp_path, capsys):
+    """Points at a known velocity, found again by contrast."""
+    span = round(1e6 * 5 / speed)
+    events = moving_events(128, 144, 0, 10 * span, (speed * 0.8, -speed * 0.6), n=20000)
+    write_events(tmp_path / "e.h5", events, 128, 144)
+    command = ["predict", "contrast-translation", str(tmp_path / "e.h5"), "--window-ms", "auto"]
+    assert run(command) == 0
+    found = float(re.search(r"windows of (\S+) ms", capsys.readouterr().out).group(1))
+    assert 0.7 * span < 1000 * found < 1.4 * span
+    assert run([*command[:-1], "soon"]) == 2
+    assert "--window-ms: not a length (got 'soon'); expected milliseconds, or auto" in capsys.readouterr().err
+
+
+def test_from_eflow_import_load_model(network):
+    import eflow
+
+    assert eflow.load_model(network).config.name == "ev_flownet" and eflow.Predictor.__name__ == "Predictor"
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        eflow.nothing  # noqa: B018
 
 
 def test_predict_whole_file_with_truth(refined, tmp_path, capsys):

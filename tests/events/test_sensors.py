@@ -8,8 +8,9 @@ from collections import deque
 import numpy as np
 import pytest
 
+from blinkgl.config.events import V2eConfig
 from blinkgl.config.readout import ReadoutConfig
-from blinkgl.config.sensor import load_sensor, sensor_names
+from blinkgl.config.sensor import load_sensor, sensor_names, sensor_table
 from blinkgl.errors import ConfigError
 from blinkgl.events import Events, make_emulator
 from blinkgl.events.readout import Readout
@@ -125,9 +126,22 @@ def test_five_sensors_serve_every_emulator():
         for emulator in ("esim", "v2e", "voltmeter"):
             make_emulator(sensor.emulator(emulator), 4, 5, 0)
     assert (load_sensor("Davis-346").width, load_sensor("DAVIS346").height) == (346, 260)
-    assert load_sensor("imx636").emulator("voltmeter").k1 == pytest.approx(1 / 0.22)
+    assert load_sensor("dvxplorer").emulator("voltmeter").k1 == pytest.approx(1 / 0.24)
+    assert load_sensor("gen31_vga").emulator("v2e") == V2eConfig(), "what has no source is the emulator's own"
     assert load_sensor("davis240c").emulator("voltmeter").k1 == 4.424
     assert load_sensor("davis346").emulator("v2e", cutoff_hz=50).cutoff_hz == 50
+
+
+def test_every_value_of_every_shipped_sensor_has_a_source():
+    for name in sensor_names():
+        table = sensor_table(name)
+        said = [
+            *(key for key in table if key not in ("name", "emulators", "readout", "sources", "uncertainty")),
+            *(f"emulators.{emulator}" for emulator in table.get("emulators", {})),
+            *(f"readout.{key}" for key in table.get("readout", {})),
+        ]
+        assert set(said) == set(table["sources"]), name
+        assert all(len(text) > 3 and "memory" not in text for text in table["sources"].values())
 
 
 def test_unknown_names_are_told():

@@ -160,6 +160,8 @@ def test_every_place_of_a_gltf_may_hold_anything(tmp_path):
             lambda t: t["images"][0].update(uri="data:image/png;base64,AAAA"),
             "the image is corrupt or of an unknown format",
         ),
+        (lambda t: t["images"][0].update(uri="data:image/png;base64,A%"), "the embedded image is corrupt"),
+        (lambda t: t["images"][0].update(uri="https://host/a.png"), "the image is on a network"),
     ],
 )
 def test_wrong_shapes_are_named(tmp_path, change, problem):

@@ -349,6 +349,9 @@ def compare(
     frame_delay_ms: Annotated[float, typer.Option(help="Added to the frame times, ms.")] = 0.0,
     interval_ms: Annotated[float, typer.Option(min=0.001, help="Interval where there are no frames, ms.")] = 20.0,
     zero_time: Annotated[bool, typer.Option("--zero-time", help="Count both from their first event.")] = False,
+    judge: Annotated[
+        bool, typer.Option("--judge", help="Also say how well a classifier tells A from B, and the halves of each.")
+    ] = False,
 ) -> int:
     """Describe a recording, or compare it with another or with frames: counts, rates,
     intervals, polarity against brightness."""
@@ -365,6 +368,63 @@ def compare(
         frame_delay_ms=frame_delay_ms,
         interval_ms=interval_ms,
         zero_time=zero_time,
+        judge=judge,
+    )
+
+
+@app.command()
+def calibrate(
+    recording: Annotated[str, typer.Argument(metavar="RECORDING", help="Event file of a camera.")],
+    out: Annotated[
+        str, typer.Option("--out", "-o", help="The sensor file, .yaml; a page goes beside it, .html.")
+    ] = "sensor.yaml",
+    frames: Annotated[
+        str | None,
+        typer.Option(help="What the camera saw, of its size (default: the recording's own frames)."),
+    ] = None,
+    still: Annotated[
+        bool, typer.Option("--still", help="No frames: a scene that stands still in constant light. Noise alone.")
+    ] = False,
+    emulator: Annotated[str, typer.Option("--emulator", "-e", help="esim, v2e or voltmeter.")] = "esim",
+    sensor: Annotated[str | None, typer.Option("--sensor", help="A sensor whose values the fit begins with.")] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="key=value", help="Emulator parameter that is not fitted; may be repeated."),
+    ] = None,
+    fps: Annotated[float | None, typer.Option(help="Frame rate of the frames.")] = None,
+    timestamps: Annotated[str | None, typer.Option(help="Frame times.")] = None,
+    gamma: Annotated[str, typer.Option(help="Of the frames: linear, srgb or an exponent.")] = "linear",
+    interpolate: Annotated[str, typer.Option(help="Between frames: motion (dense-flow warp) or linear.")] = "motion",
+    max_px: Annotated[float, typer.Option(min=0.01, help="motion: largest displacement per step, px.")] = 1.0,
+    frame_delay_ms: Annotated[
+        float | None, typer.Option(help="Added to the frame times, ms (default: found from both).")
+    ] = None,
+    starts: Annotated[int, typer.Option(min=1, max=20, help="Of the search.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Of the simulations and of the search.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace existing output.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress and no summary.")] = False,
+) -> int:
+    """Fit an emulator to a camera's own recording: a sensor file, and a page that says how near it comes."""
+    from blinkgl.show import calibrate as command
+
+    return command.run(
+        recording,
+        frames,
+        out,
+        still=still,
+        emulator=emulator,
+        sensor=sensor,
+        overrides=overrides or [],
+        fps=fps,
+        timestamps=timestamps,
+        gamma=gamma,
+        interpolate=interpolate,
+        max_px=max_px,
+        frame_delay_ms=frame_delay_ms,
+        starts=starts,
+        seed=seed,
+        overwrite=overwrite,
+        quiet=quiet,
     )
 
 

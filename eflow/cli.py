@@ -76,8 +76,21 @@ def train(
 @app.command()
 def evaluate(
     checkpoint: Answer,
-    dataset: Annotated[str, typer.Argument(help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences.")],
+    dataset: Annotated[
+        str,
+        typer.Argument(
+            help="Folder of BlinkGL, DSEC, MVSEC or BlinkFlow sequences; or a recipe (.yaml), whose groups of split "
+            "test are rendered for it."
+        ),
+    ],
     out: Annotated[str | None, typer.Option("--out", "-o", help="New folder for results.json and pictures.")] = None,
+    by_density: Annotated[
+        bool, typer.Option("--by-density", help="How long the flow is where events are few, and where they are many.")
+    ] = False,
+    window_ms: Annotated[
+        str | None,
+        typer.Option(metavar="LOW-HIGH", help="Of a recipe: lengths of windows; default: its label interval."),
+    ] = None,
     format: Annotated[str, typer.Option(help="auto, blinkgl, dsec, mvsec or blinkflow.")] = "auto",
     dt: Annotated[int, typer.Option(help="MVSEC: 1 or 4 images.")] = 1,
     pictures: Annotated[int, typer.Option(min=0, help="Number of pictures.")] = 12,
@@ -99,8 +112,14 @@ def evaluate(
     if model is None:
         model = _model(checkpoint, device, raw, precision, iterations)
         precision = _precision(model, precision)
-    source = open_source(dataset, _format(format), dt=dt)
     console = plain_console(stderr=True)
+    if dataset.endswith((".yaml", ".yml")):
+        with console.status("rendering"):
+            source = _rendered(dataset, window_ms, limit)
+    elif window_ms is not None:
+        raise ConfigError("only of a recipe", where="--window-ms", value=window_ms, accepted="a dataset FILE.yaml")
+    else:
+        source = open_source(dataset, _format(format), dt=dt)
     with console.status("evaluating") as status:
         result = score(
             model,
@@ -112,7 +131,7 @@ def evaluate(
             limit=limit,
             progress=lambda i, n, aee: status.update(f"{i}/{n} samples, AEE {aee:.3f} px"),
         )
-    show(result)
+    show(result, by_density=by_density)
     if out:
         typer.echo(f"written: {out}/results.json")
 
@@ -156,7 +175,9 @@ def predict(
 
     import numpy as np
 
+    from blinkgl.events.types import Events
     from eflow import infer
+    from eflow.doubts import doubts
     from eflow.methods.iwe import flow_warp_loss
     from eflow.metrics import frame_metrics
     from eflow.pictures import FlowVideo, events_of
@@ -166,6 +187,8 @@ def predict(
     method = _method(checkpoint, focal, iterations=iterations, raw=raw, warm_start=warm_start)
     model = None if method is not None else _model(checkpoint, device, raw, precision, iterations)
     file = infer.open_sized(events, _size(size))
+    for line in doubts(next(iter(file.chunks()), Events.empty()), file.height, file.width):
+        typer.echo(f"{events}: {line}", err=True)
     gt = infer.read_truth(truth, file.height, file.width) if truth else None
     if method is not None:
         predictor = infer.MethodPredictor(method, file.height, file.width, empty=empty)
@@ -412,6 +435,25 @@ def _format(name: str) -> str:
 def _one_of(option: str, value: str, accepted: tuple[str, ...]) -> None:
     if value not in accepted:
         raise ConfigError("unknown choice", where=option, value=value, accepted=", ".join(accepted))
+
+
+def _rendered(recipe: str, window_ms: str | None, limit: int | None):
+    """Samples of a recipe, held in memory."""
+    from blinkgl.config.base import validate
+    from eflow.config import SourceConfig
+    from eflow.data.online import held
+
+    tree: dict = {"recipe": recipe, "online": True, "samples": 4, "min_events": 40, "max_flow": 40}
+    if window_ms is not None:
+        ends = window_ms.split("-")
+        try:
+            tree["window_ms"] = tuple(float(end) for end in (ends if len(ends) > 1 else 2 * ends))
+            validate(SourceConfig, tree)
+        except (ValueError, ConfigError):
+            raise ConfigError(
+                "not lengths of windows", where="--window-ms", value=window_ms, accepted="LOW-HIGH in ms, such as 5-100"
+            ) from None
+    return held(validate(SourceConfig, tree), limit or 128)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -20,6 +20,7 @@ from blinkgl.io.sequence_dir import refuse_existing
 from blinkgl.show.terminal import plain_console
 from eflow.data.dataset import FlowDataset, collate
 from eflow.data.sources import Source
+from eflow.density import LengthByDensity
 from eflow.infer import PICTURED, predict
 from eflow.methods import Method
 from eflow.metrics import NAMES, Tally, frame_metrics
@@ -49,8 +50,8 @@ def evaluate(
     out : new folder for ``results.json`` and ``pictures/`` (evenly spaced samples: events, truth, prediction, error
     map); None: nothing is written. limit : score only so many samples, evenly spaced.
     progress : called with (done, of, AEE so far).
-    Returns {"methods": {name: {"total": …, "scenes": …}}, "ms", "samples", "skipped", "model", "parameters"}; metrics
-    as in :mod:`eflow.metrics`.
+    Returns {"methods": {name: {"total": …, "scenes": …}}, "lengths": rows of :class:`~eflow.density.LengthByDensity`,
+    "ms", "samples", "skipped", "model", "parameters"}; metrics as in :mod:`eflow.metrics`.
 
     Raises AssetError: no ground truth, unreadable files. EventDataError: a window without events
     (unless ``empty="skip"``)."""
@@ -59,7 +60,7 @@ def evaluate(
     out = Path(out) if out is not None else None
     method = None if isinstance(model, FlowModel) else model
     representation = model.representation if method is None else PICTURED
-    dataset = FlowDataset([source], representation, empty=empty, raw=method is not None)
+    dataset = FlowDataset([source], representation, empty=empty, raw=True)
     indices = [int(i) for i in np.linspace(0, len(dataset) - 1, min(limit or len(dataset), len(dataset))).round()]
     shown = (
         {indices[int(i)] for i in np.linspace(0, len(indices) - 1, min(pictures, len(indices))).round()}
@@ -68,14 +69,15 @@ def evaluate(
     )
     median = _set_median(dataset, indices)
     tallies = {name: Tally() for name in ("network", *BASELINES)}
+    lengths = LengthByDensity()
     spent, sum_aee, scored = 0.0, 0.0, 0
     for done, i in enumerate(indices, 1):
         batch = collate([dataset[i]])
+        raw = batch["raw"][0]
         began = time.perf_counter()
         if method is None:
             flow = predict(model, batch, precision=precision).flow[0].permute(1, 2, 0).cpu().numpy()
         else:
-            raw = batch["raw"][0]
             flow = method(raw.old, raw.new, raw.height, raw.width)
         spent += time.perf_counter() - began
         truth, valid = batch["flow"][0].permute(1, 2, 0).numpy(), (batch["valid"] & batch["mask"])[0].numpy()
@@ -88,6 +90,7 @@ def evaluate(
             strict=True,
         ):
             tallies[name].add(scene, frame_metrics(np.broadcast_to(constant, truth.shape), truth, valid))
+        lengths.add(flow, truth, valid, len(raw.new), raw.hit)
         if metrics:
             sum_aee, scored = sum_aee + metrics["AEE"], scored + 1
         if progress is not None:
@@ -107,10 +110,27 @@ def evaluate(
         "ms": 1000 * spent / len(indices),
         "device": _device_name(model) if method is None else "cpu",
         "methods": {name: {"total": t.total(), "scenes": t.scenes()} for name, t in tallies.items()},
+        "lengths": lengths.rows(),
     }
     if out is not None:
         write_json(out / "results.json", result)
     return result
+
+
+def _lengths(rows: list[dict[str, Any]]) -> Table:
+    table = Table(title="predicted / true length, median of the samples")
+    for name in ("events per px of flow", "samples", "all pixels", "at events", "quartiles"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        above = row["to"] is None
+        table.add_row(
+            f"above {row['from']:g}" if above else f"{row['from']:g} to {row['to']:g}",
+            str(row["samples"]),
+            f"{row['all']:.2f}",
+            f"{row['events']:.2f}",
+            "{:.2f} to {:.2f}".format(*row["quartiles"]),
+        )
+    return table
 
 
 def _from_truth(truth: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,8 +167,9 @@ def write_json(path: Path, tree: dict) -> None:
         Path(temporary).write_text(json.dumps(tree, indent=1) + "\n", encoding="utf-8")
 
 
-def show(result: dict[str, Any], console: Console | None = None) -> None:
-    """Two tables: all metrics of the network and the baselines; the network scene by scene. Fits 80 columns."""
+def show(result: dict[str, Any], console: Console | None = None, by_density: bool = False) -> None:
+    """Two tables: all metrics of the network and the baselines; the network scene by scene, or (``by_density``) how
+    long its flow is where events are few and many. Fits 80 columns."""
     console = console or plain_console()
     units = {"AEE": "px", "cosine": "", "AE2D": "deg", "AE3D": "deg"}
     table = Table(
@@ -165,7 +186,9 @@ def show(result: dict[str, Any], console: Console | None = None) -> None:
         )
     console.print(table)
     scenes = result["methods"]["network"]["scenes"]
-    if len(scenes) > 1:
+    if by_density:
+        console.print(_lengths(result["lengths"]))
+    elif len(scenes) > 1:
         columns = ("AEE", "outlier", "3PE", "AE2D")
         table = Table(title="by scene")
         for name in ("", "frames", *columns):

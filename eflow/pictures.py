@@ -59,7 +59,7 @@ def comparison(
         error, pale = np.hypot(*(np.moveaxis(predicted - truth, -1, 0))), max(3.0, largest / 2)
         panels += [
             (f"truth, full colour {largest:.3g} px", flow_colour(truth, largest, valid)),
-            ("network", flow_colour(predicted, largest)),
+            ("predicted", flow_colour(predicted, largest)),
             (f"error, pale {pale:.3g} px", error_colour(error, pale, valid)),
         ]
     height, width = events.shape[:2]

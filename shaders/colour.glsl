@@ -25,6 +25,9 @@ uniform sampler2D albedo;
 #ifdef LIT
 #include "light.glsl"
 #endif
+#ifdef FOG
+#include "fog.glsl"
+#endif
 #include "guard.glsl"
 
 void main()
@@ -54,6 +57,9 @@ void main()
 #endif
 #ifdef LIT
     radiance *= light;
+#endif
+#ifdef FOG
+    radiance = in_fog(radiance);
 #endif
     colour = vec4(radiance, 1.0);
     drop_artefact();

@@ -8,11 +8,12 @@
 //            RATE       (luminance, its rate of change per second at this pixel) into an RG32F target
 //            EVERY n    the target holds every n-th pixel of the image: textures are filtered for the whole image's
 //                       pixels
+//            FOG        seen through fog, see fog.glsl
 //            LIGHTS     more light than that, see lights.glsl; HUED: the albedo is r, g, b, each times its share of the
 //                       luminance, since coloured light takes of each as much as it has
 //            SHOW_LOOKUP  the shader debugger's: also writes what was looked up, see lookup.glsl
 
-#if defined(RATE) && (defined(TEXTURED) || defined(LIT))
+#if defined(RATE) && (defined(TEXTURED) || defined(LIT) || defined(FOG))
 #define CHANGES
 #endif
 
@@ -57,6 +58,9 @@ uniform vec2 image_size;
 uniform mat4x3 rate;
 #include "motion.glsl"
 #include "rate.glsl"
+#endif
+#ifdef FOG
+#include "fog.glsl"
 #endif
 #ifdef EVERY
 const float every = float(EVERY);
@@ -167,6 +171,12 @@ void main()
 #else
 #define seen luminance
 #define seen_change change
+#endif
+#ifdef FOG
+#ifdef CHANGES
+    seen_change = in_fog_rate(seen, seen_change, motion);
+#endif
+    seen = in_fog(seen);
 #endif
 #ifdef RATE
     result = vec2(seen, finite(seen_change));

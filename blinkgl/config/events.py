@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
@@ -35,6 +37,47 @@ _CAUSES = Field(
 _THRESHOLD = dict(ge=0.001, le=10.0)
 
 
+class Fitted(NamedTuple):
+    """Ends of what a calibration tries for a key, more than 0; it goes in steps of a ratio. The lower end of a noise is
+    as good as none."""
+
+    low: float
+    high: float
+
+
+_ESIM_FITTED = {
+    "contrast_threshold": Fitted(0.05, 2.0),
+    "contrast_threshold_off": Fitted(0.05, 2.0),
+    "threshold_sigma": Fitted(0.003, 0.5),
+    "log_eps": Fitted(1e-4, 1.0),
+    "refractory_us": Fitted(10.0, 20_000.0),
+}
+
+_V2E_FITTED = {
+    "contrast_threshold": Fitted(0.05, 2.0),
+    "contrast_threshold_off": Fitted(0.05, 2.0),
+    "threshold_sigma": Fitted(0.003, 0.5),
+    "full_scale": Fitted(20.0, 3000.0),
+    "cutoff_hz": Fitted(3.0, 3000.0),
+    "leak_rate_hz": Fitted(1e-3, 30.0),
+    "leak_cov_decades": Fitted(0.02, 1.5),
+    "shot_noise_rate_hz": Fitted(1e-3, 100.0),
+    "refractory_us": Fitted(10.0, 20_000.0),
+    "hot_pixel_fraction": Fitted(1e-5, 0.05),
+    "hot_pixel_rate_hz": Fitted(1.0, 10_000.0),
+}
+
+_VOLTMETER_FITTED = {
+    "k1": Fitted(0.5, 20.0),
+    "k2": Fitted(1.0, 300.0),
+    "k3": Fitted(1e-6, 0.1),
+    "k4": Fitted(1e-9, 1e-5),
+    "k5": Fitted(1e-10, 1e-6),
+    "k6": Fitted(1e-6, 1e-2),
+    "refractory_us": Fitted(10.0, 20_000.0),
+}
+
+
 class EmulatorConfig(Family):
     """The configuration of any emulator; a field is ``events: EmulatorConfig = EsimConfig()``. A member declares its
     name, ``emulator: Literal["..."] = "..."``, takes no argument without a default, and says what stands here."""
@@ -49,6 +92,8 @@ class EmulatorConfig(Family):
 
     reconstructions: ClassVar[tuple[str, ...]]
     """Paths between frames that the emulator can follow; "linear" is one of them."""
+    fitted: ClassVar[Mapping[str, Fitted]] = MappingProxyType({})
+    """Keys that `blinkgl calibrate` finds from a recording."""
 
     @classmethod
     @abstractmethod
@@ -88,6 +133,7 @@ class EsimConfig(EmulatorConfig):
     """ESIM (Rebecq, Gehrig, Scaramuzza, CoRL 2018): log intensity against per-pixel levels, linear in time."""
 
     reconstructions = ("linear", "pchip", "hermite")
+    fitted = _ESIM_FITTED
     emulator: Literal["esim"] = "esim"
     contrast_threshold: float = Field(
         0.2,
@@ -146,7 +192,7 @@ class EsimConfig(EmulatorConfig):
         return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
 
     @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
-    def _the_ratio_is_theirs(ratio, on, off):
+    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
         if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
             raise Refused(
                 "is not the ratio of the two thresholds that are given beside it",
@@ -188,6 +234,7 @@ class V2eConfig(EmulatorConfig):
 
     reconstructions = ("linear",)
     presets = V2E_PRESETS
+    fitted = _V2E_FITTED
     emulator: Literal["v2e"] = "v2e"
     preset: Literal["default", "clean", "noisy"] = Field(
         "default", description="v2e's command-line defaults, or its `clean` and `noisy` parameter sets."
@@ -277,7 +324,7 @@ class V2eConfig(EmulatorConfig):
         return _with_both_thresholds(data, cls.model_fields["contrast_threshold"].default)
 
     @rule("threshold_ratio", "contrast_threshold", "contrast_threshold_off")
-    def _the_ratio_is_theirs(ratio, on, off):
+    def _the_ratio_is_theirs(ratio: float | None, on: float, off: float):
         if ratio is not None and not any(math.isclose(off, on * r, rel_tol=1e-6) for r in (ratio, 1 / ratio)):
             raise Refused(
                 "is not the ratio of the two thresholds that are given beside it",
@@ -308,6 +355,7 @@ class VoltmeterConfig(EmulatorConfig):
 
     reconstructions = ("linear",)
     presets = VOLTMETER_PRESETS
+    fitted = _VOLTMETER_FITTED
     emulator: Literal["voltmeter"] = "voltmeter"
     preset: Literal["DVS346", "DVS240"] = Field(
         "DVS346", description="Camera whose calibrated k1...k6 are the defaults."

@@ -370,6 +370,16 @@ class RandomLightsConfig(Config):
             raise Refused("out of range", where="angle", value=list(angle), accepted="0.5 to 170 degrees")
 
 
+class FogConfig(Config):
+    """A medium that swallows light and sends its own, for event frames and images alike."""
+
+    density: float = Field(gt=0, le=1e6, description="per world unit: light from 1 / density away has faded to 37 %")
+    radiance: Radiance = Field(0.7, description="linear radiance of fog alone, which is what the background becomes")
+
+
+FOG = Field(None, description="null: clear air")
+
+
 class RandomSceneConfig(Config):
     """A random world, as in the paper: objects from a pool between sky and ground."""
 
@@ -384,6 +394,7 @@ class RandomSceneConfig(Config):
         Field(WallsConfig(), description="true: four walls")
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     lights: RandomLightsConfig | None = Field(
         None, description="null: none but those of light.lights; {} is enough for one to three point and spot lights"
     )
@@ -674,6 +685,7 @@ class ExplicitSceneConfig(Config):
         "[physics]",
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     background: float = Field(0.2, ge=0, le=1e9, description="linear radiance where nothing is hit")
     max_faces: int = Field(5_000_000, ge=1, description="a mesh with more triangles is refused")
 
@@ -728,6 +740,7 @@ class FileSceneConfig(Config):
         0, description="name or index of the animation played, at the file's own times; null: none"
     )
     light: LightConfig = LightConfig()
+    fog: FogConfig | None = FOG
     lights: Literal["config", "file"] = Field(
         "config",
         description="file: the file's own lights (KHR_lights_punctual) shine in the place of light.sun, beside "

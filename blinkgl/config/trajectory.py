@@ -10,6 +10,7 @@ camera_motion: {kind: static}
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -37,6 +38,9 @@ SpeedRange = Annotated[tuple[_Speed, _Speed], BeforeValidator(as_pair), AfterVal
 RateRange = Annotated[tuple[_Rate, _Rate], BeforeValidator(as_pair), AfterValidator(ordered)]
 
 
+_MOST_POINTS = 10_000
+
+
 class MotionConfig(Config):
     """Motion of one body through random way-points; ranges are drawn anew for each body."""
 
@@ -44,6 +48,19 @@ class MotionConfig(Config):
         "spline", description="spline: through random way-points; static: stands still"
     )
     waypoints: int = Field(6, ge=2, le=1000, description="way-points over the sequence (about: see rotation_rate)")
+    waypoints_per_s: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="way-points per second, in place of waypoints: a short sequence is then a piece of a smooth "
+        "motion, as recordings are, and not six turns in a fraction of a second",
+    )
+    pauses: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="share of the bodies that stop once, for 10 to 50 % of the sequence, softly, and go on",
+    )
     speed: SpeedRange = Field(
         (0.2, 1.5), description="mean speed of the body's origin, world units/s: a number or [low, high]"
     )
@@ -55,6 +72,12 @@ class MotionConfig(Config):
     smoothness: float = Field(
         0.5, ge=0, le=1, description="0: each leg starts in a fresh random direction, 1: it keeps the last one's"
     )
+
+    def points(self, seconds: float) -> int:
+        """Way-points of a sequence that lasts so long, >= 2."""
+        if self.waypoints_per_s is None:
+            return self.waypoints
+        return min(max(math.ceil(self.waypoints_per_s * seconds) + 1, 2), _MOST_POINTS)
 
 
 class ObjectMotion(MotionConfig):
@@ -74,6 +97,11 @@ class CameraMotion(MotionConfig):
     )
     view_cone: float = Field(
         20.0, ge=1, le=180, description="largest angle at the way-points between viewing direction and target, deg"
+    )
+    heading: Literal["any", "view", "across"] = Field(
+        "any",
+        description="where it sets out to: view: along its line of sight, forwards or backwards (a zoom); across: at "
+        "right angles to it. How long it keeps to that says smoothness",
     )
     roll: float = Field(20.0, ge=0, le=180, description="largest roll of the horizon at the way-points, deg")
     shake: float = Field(

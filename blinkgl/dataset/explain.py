@@ -194,9 +194,16 @@ def _describe(scene: Scene, renderer: Renderer) -> dict[str, str]:
         "light": f"{_shining(scene.light)} on {lit} of {len(parts)} parts, the others unlit"
         if lit
         else "none: every surface is unlit",
+        **_fog(scene),
         "notes": "; ".join(scene.log) or "–",
         **({"not drawn": "; ".join(scene.omissions)} if scene.omissions else {}),
     }
+
+
+def _fog(scene: Scene) -> dict[str, str]:
+    if scene.fog is None:
+        return {}
+    return {"fog": f"{scene.fog.density:g} per unit, radiance {scene.fog.radiance:g}, in event frames and images"}
 
 
 def _shining(light: Light) -> str:
@@ -411,6 +418,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
         add("anisotropic filtering", "render.anisotropy: 1")
     if all(p.material.unlit for o in scene.objects for p in o.parts):
         add("light", "every material is unlit: no normals in the vertex stream, no light in the shader")
+    if scene.fog is None:
+        add("fog", "scene.fog: null")
     if config.timeline.kind == "uniform":
         add("velocity pass", "timeline: uniform does not look at motion")
     if config.timeline.reconstruction != "hermite":

@@ -150,12 +150,14 @@ def compare(
     fps: float | None = None,
     interval_ms: float = 20.0,
     zero_time: bool = False,
+    judge: bool = False,
 ) -> Comparison:
     """How alike two event files are, over the time they share: ``rows()`` is a table, ``to_dict()`` numbers.
 
     b : event file; None: ``a`` is described.
     frames : video or folder of images both are compared with.   fps : of the frames, Hz.
     interval_ms : ms, of rates and correlations.   zero_time : count both from their first event.
+    judge : also how well a classifier tells b from a, and the halves of each: ``told_apart``, ``halves``.
     Raises AssetError, EventDataError, ConfigError."""
     from blinkgl.recordings import comparison
 
@@ -166,6 +168,7 @@ def compare(
         fps=_fps(fps),
         interval_ms=check.number(interval_ms, "interval_ms", above=0, most=1e7),
         zero_time=bool(zero_time),
+        judge=bool(judge),
     )
 
 

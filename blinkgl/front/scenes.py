@@ -504,7 +504,8 @@ class Scene(_Piece):
     """Bodies before a camera, for a time. ``scene + body`` is a scene with one more.
 
     camera : :class:`Camera`.   objects : :class:`Primitive` and :class:`Mesh`; ids count from 1 in this order.
-    light : :class:`Light`.   background : linear radiance where nothing is hit.
+    light : :class:`Light`.   background : linear radiance where nothing is hit.   fog : density per metre and linear
+    radiance of fog between the camera and everything; None: clear air.
     duration, label_rate, start : s, Hz, s, as ``time:`` of a YAML: labels at ``label_rate``, the first one label
     interval after ``start``, so that a recording runs from ``start`` to ``start + duration + 1 / label_rate``.
     collisions : stop what collides where it does.   gravity : (3,) m/s², of no effect while no object is a dynamic
@@ -518,6 +519,7 @@ class Scene(_Piece):
         *,
         light: Light | None = None,
         background: float = 0.2,
+        fog: tuple[float, float] | None = None,
         duration: float = 1.0,
         label_rate: float = 10.0,
         start: float = 0.0,
@@ -530,6 +532,9 @@ class Scene(_Piece):
         self.objects = tuple(check.one_of(objects, "Scene.objects", (list, tuple), "a list of Primitive and Mesh"))
         for k, body in enumerate(self.objects):
             check.one_of(body, f"Scene.objects[{k}]", _Object, "a Primitive or a Mesh")
+        self.fog = None if fog is None else tuple(check.one_of(fog, "Scene.fog", (list, tuple), "(density, radiance)"))
+        if self.fog is not None and len(self.fog) != 2:
+            raise ConfigError("not two numbers", where="Scene.fog", value=fog, accepted="(density, radiance)")
         self._plain = {"background": check.plain(background), "collisions": check.plain(collisions)}
         self._gravity = self._checked(PhysicsConfig, {"gravity": check.plain(gravity)})
         self._run = {
@@ -569,6 +574,11 @@ class Scene(_Piece):
             "camera": self.camera.motion,
             "light": self.light.tree,
             **self._plain,
+            **(
+                {}
+                if self.fog is None
+                else {"fog": {"density": check.plain(self.fog[0]), "radiance": check.plain(self.fog[1])}}
+            ),
             **({"physics": self._gravity} if falls else {}),
         }
         if named:
@@ -580,6 +590,7 @@ class Scene(_Piece):
             self.camera,
             (*self.objects, body),
             light=self.light,
+            fog=self.fog,
             gravity=self._gravity["gravity"],
             seed=self._run["seed"],
             **self._plain,
@@ -605,6 +616,8 @@ class Scene(_Piece):
 
     def build(self, config: SequenceConfig) -> data.Scene:
         """What the renderer draws. Raises ConfigError and AssetError: files."""
-        return explicit_scene(
-            config.scene, config.camera.model, config.time.t0_ns, config.time.t1_ns, Path.cwd(), self._memory
-        )
+        from blinkgl.scene.build import in_fog
+
+        span_ns = config.time.t0_ns, config.time.t1_ns
+        made = explicit_scene(config.scene, config.camera.model, *span_ns, Path.cwd(), self._memory)
+        return in_fog(made, config.scene)

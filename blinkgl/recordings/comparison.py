@@ -10,7 +10,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numba
@@ -20,6 +20,9 @@ from blinkgl.errors import AssetError, EventDataError
 from blinkgl.events.types import Events
 from blinkgl.io.formats import ENDINGS, EventFile, open_events
 from blinkgl.io.images import NpzReader, npy_header, numpy_errors
+
+if TYPE_CHECKING:
+    from blinkgl.recordings.judge import Judgement
 
 IEI_EDGES_US = np.logspace(0, 7, 71)
 """Bins of the inter-event interval of a pixel: 1 µs to 10 s, ten per decade."""
@@ -78,6 +81,10 @@ class Comparison:
     """Pearson correlation over the pixels of the event counts of a and b"""
     polarity_correlation: np.ndarray | None = None
     """(K,) Pearson correlation over the pixels of the blurred polarity sums of a and b in each interval"""
+    told_apart: Judgement | None = None
+    """how well a judge tells b from a; None: nobody asked for it, or there is no b"""
+    halves: tuple[Judgement, ...] = ()
+    """how well it tells the halves of each recording from one another, a's first"""
 
     @property
     def same_size(self) -> bool:
@@ -127,6 +134,11 @@ class Comparison:
                     ("event counts per pixel A : B, correlation", "", f"{self.pixel_correlation:.3f}"),
                 ]
             rows += [("interval distribution, KS distance", "", f"{self.iei_distance:.3f}")]
+        if self.halves:
+            cells = [f"{j.auc:.3f} ± {j.spread:.3f}" for j in self.halves]
+            rows += [("judge: a recording's own halves, AUC", cells[0], cells[1] if self.b else "")]
+        if self.told_apart:
+            rows += [("judge: A from B, AUC", "", f"{self.told_apart.auc:.3f} ± {self.told_apart.spread:.3f}")]
         return rows
 
     def to_dict(self) -> dict[str, Any]:
@@ -154,6 +166,8 @@ class Comparison:
             "edges_us": _plain(self.edges_us),
             "duration_s": self.duration_s,
             "iei_edges_us": _plain(IEI_EDGES_US),
+            "told_apart": None if self.told_apart is None else asdict(self.told_apart),
+            "halves": [asdict(one) for one in self.halves],
             "a": side(self.a),
             **pair,
         }
@@ -170,6 +184,7 @@ def compare(
     frame_delay_ms: float = 0.0,
     interval_ms: float = 20.0,
     zero_time: bool = False,
+    judge: bool = False,
 ) -> Comparison:
     """Compares event file ``a`` with event file ``b``, with ``frames``, or with both, over the
     time they share; alone, ``a`` is described.
@@ -180,9 +195,11 @@ def compare(
     folder, video, .npy of frames): anything that is no event file. gamma : of the frames; "linear" takes the codes as
     intensities, as fits a DAVIS's frames.
     frame_delay_ms : added to the frames' times; a stamp of the exposure's start lags its centre. zero_time : count both
-    recordings from their first event.
+    recordings from their first event. judge : also train a classifier to tell them apart
+    (:mod:`~blinkgl.recordings.judge`), which holds their events in memory.
 
-    Raises EventDataError: frames of another size than a recording, no common time. AssetError: unreadable.
+    Raises EventDataError: frames of another size than a recording, no common time, too few events for a judge.
+    AssetError: unreadable.
     """
     if b is not None and frames is None and not _is_event_file(b):
         b, frames = None, b
@@ -206,7 +223,29 @@ def compare(
             value=[tuple(round((t - d) / 1e6, 6) for t in s) for s, d in zip(spans, shifts)],
             accepted="recordings that overlap (seconds shown), or --zero-time",
         )
-    return _accumulate(files, shifts, edges, changes)
+    result = _accumulate(files, shifts, edges, changes)
+    if judge:
+        result.halves, result.told_apart = _judged(files, shifts, (int(edges[0]), int(edges[-1])))
+    return result
+
+
+def _judged(
+    files: list[EventFile], shifts: list[int], span_us: tuple[int, int]
+) -> tuple[tuple[Judgement, ...], Judgement | None]:
+    """The halves of each, and of two the one against the other: patch by patch where they are of one size."""
+    from blinkgl.recordings import judge
+
+    events = [
+        _joined([chunk.window(span_us[0] + d, span_us[1] + d) for chunk in f.chunks()], d)
+        for f, d in zip(files, shifts)
+    ]
+    sizes = [(int(f.height or 0), int(f.width or 0)) for f in files]
+    halves = tuple(judge.judge_halves(e, size, span_us) for e, size in zip(events, sizes))
+    if len(files) < 2:
+        return halves, None
+    if sizes[0] == sizes[1]:
+        return halves, judge.judge(*events, sizes[0], span_us)
+    return halves, judge.judge_unlike(*events, *sizes, span_us)
 
 
 def _accumulate(

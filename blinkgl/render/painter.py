@@ -32,7 +32,8 @@ class Programs(dict["Kind", Uniforms]):
         self._painter, self._pass = painter, pass_
 
     def __missing__(self, kind: Kind) -> Uniforms:
-        defines = self._pass.defines(kind) | kind.defines | self._painter.lighting.defines(self._pass, kind)
+        foggy = {"FOG": 1} if self._pass.lit and self._painter.scene.fog is not None else {}
+        defines = self._pass.defines(kind) | kind.defines | self._painter.lighting.defines(self._pass, kind) | foggy
         program = self._painter.gl.program(self._pass.program, defines)
         uniforms = self[kind] = self._painter.uniforms(program)
         return uniforms
@@ -108,6 +109,19 @@ class Painter:
                 shape.put(towards, (t_ns, there.t_ns), partial(deformer.changes, t_ns, there.t_ns))
                 uniforms[f"clip_{towards}"].write(linear_xyw_bytes(there.mvp[index]))
         shape.use(uniforms[""], FREE_UNIT)
+
+    def fog(self, uniforms: Uniforms, shot: Shot) -> None:
+        """Sets what fog.glsl takes: the fog, and how a fragment's place in the target becomes its ray (X, Y) / Z."""
+        fog, P = self.scene.fog, shot.moment.view.projection
+        assert fog is not None
+        width, height = shot.size
+        uniforms["fog"].value = fog.density, fog.radiance
+        uniforms["fog_ray"].value = (
+            2 / (width * P[0, 0]),
+            2 / (height * P[1, 1]),
+            -(1 + P[0, 2]) / P[0, 0],
+            -(1 + P[1, 2]) / P[1, 1],
+        )
 
     def draw(self, uniforms: Uniforms, item: DrawItem) -> None:
         cull = not item.two_sided

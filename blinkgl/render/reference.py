@@ -374,7 +374,7 @@ def surface(scene: Scene, hits: Hits) -> Surface:
     """Normals, texture coordinates, albedo and radiance at every hit."""
     n = len(hits.hit)
     normal, uv = np.full((n, 3), np.nan), np.full((n, 2), np.nan)
-    albedo, colour = np.zeros((n, 3)), np.full((n, 3), float(scene.background))
+    albedo, colour = np.zeros((n, 3)), np.full((n, 3), float(scene.backdrop))
     parts = scene_parts(scene)
     for p, rows in _by_part(hits.part):
         thing, part = parts[p]
@@ -391,7 +391,18 @@ def surface(scene: Scene, hits: Hits) -> Surface:
             pose = thing.path.pose(hits.t_ns)
             points = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
             colour[rows] *= received(scene, hits.t_ns, points, normal[rows]).total
+    colour = seen_through_fog(scene, hits, colour)
     return Surface(normal, uv, albedo, colour, colour @ LUMA)
+
+
+def seen_through_fog(scene: Scene, hits: Hits, colour: np.ndarray) -> np.ndarray:
+    """(N, 3) radiance at the hits as it arrives at the camera; where nothing is hit as it is."""
+    if scene.fog is None:
+        return colour
+    rays = _rays(scene.camera, hits.xy)
+    distance = hits.depth * np.linalg.norm(rays / rays[:, 2:], axis=1)
+    arrives = np.exp(-scene.fog.density * distance)[:, None]
+    return np.where(hits.hit[:, None], colour * arrives + scene.fog.radiance * (1 - arrives), colour)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 In:    the folder of a data set.
 Out:   report.html.
 Start: page.py (``build_report``) and templates/data_set.html; collect.py gathers, charts.py
-counts. markup.py fills in any room's templates.
+counts. calibration.py is the page of a fitted emulator. markup.py fills in any room's templates.
 """
 
 from blinkgl.report.page import build_report, write_report

@@ -8,7 +8,7 @@ from pathlib import Path
 from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSceneConfig, SceneConfig
 from blinkgl.config.sequence import CameraConfig, SequenceConfig
 from blinkgl.errors import ConfigError
-from blinkgl.scene.types import Scene
+from blinkgl.scene.types import Fog, Scene
 from blinkgl.scene.worlds.explicit import check_primitive, explicit_scene
 from blinkgl.scene.worlds.from_file import scene_from_file
 from blinkgl.scene.worlds.pool import SPLITS, resolve
@@ -40,10 +40,18 @@ def build_scene(
         raise ValueError("build_scene: t0_ns must be before t1_ns")
     base = Path(base)
     if isinstance(config, RandomSceneConfig):
-        return random_world(config, camera.model, t0_ns, t1_ns, split, seed, sequence, base)
-    if isinstance(config, ExplicitSceneConfig):
-        return explicit_scene(config, camera.model, t0_ns, t1_ns, base)
-    return scene_from_file(config, camera.model, t0_ns, t1_ns, base)
+        scene = random_world(config, camera.model, t0_ns, t1_ns, split, seed, sequence, base)
+    elif isinstance(config, ExplicitSceneConfig):
+        scene = explicit_scene(config, camera.model, t0_ns, t1_ns, base)
+    else:
+        scene = scene_from_file(config, camera.model, t0_ns, t1_ns, base)
+    return in_fog(scene, config)
+
+
+def in_fog(scene: Scene, config: SceneConfig) -> Scene:
+    """The scene with the fog that ``scene.fog`` of its configuration asks for."""
+    fog = config.fog
+    return scene if fog is None else replace(scene, fog=Fog(fog.density, fog.radiance))
 
 
 def sequence_scene(config: SequenceConfig, index: int, base: Path | str = ".") -> Scene:

@@ -198,6 +198,15 @@ class Light:
 
 
 @dataclass(frozen=True)
+class Fog:
+    """A medium that swallows light and sends its own: at a distance d from the camera L becomes
+    L e^(-density d) + radiance (1 - e^(-density d)). density : per world unit.   radiance : linear, of fog alone."""
+
+    density: float
+    radiance: float
+
+
+@dataclass(frozen=True)
 class Dynamics:
     """How the paths of a scene's falling bodies came about.
 
@@ -224,6 +233,7 @@ class Scene:
     omissions  : one line per file that asks for what is not drawn (:mod:`blinkgl.scene.omissions`), for the user and
     the manifest.
     dynamics   : of the objects that an engine moves; None: there are none.
+    fog        : between the camera and everything; None: clear air.
     """
 
     objects: tuple[SceneObject, ...]
@@ -235,6 +245,12 @@ class Scene:
     log: tuple[str, ...] = field(default=())
     omissions: tuple[str, ...] = field(default=())
     dynamics: Dynamics | None = None
+    fog: Fog | None = None
+
+    @property
+    def backdrop(self) -> float:
+        """Linear radiance that is seen where nothing is hit: the background, or fog without end."""
+        return self.background if self.fog is None else self.fog.radiance
 
     @property
     def sensors(self) -> tuple[Sensor, ...]:

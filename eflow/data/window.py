@@ -75,6 +75,16 @@ class RawSample:
     backward_valid: np.ndarray | None = None
     mask: np.ndarray | None = None
 
+    @property
+    def hit(self) -> np.ndarray:
+        """(H, W) bool: pixels that have an event in either window."""
+        found = np.zeros((self.height, self.width), bool)
+        for w in (self.old, self.new):
+            x, y = (np.rint(c).astype(np.int64) for c in (w.x, w.y))
+            inside = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+            found[y[inside], x[inside]] = True
+        return found
+
     def flip(self, axis: str) -> RawSample:
         """Mirror image: horizontal for axis "x", vertical for "y"."""
         size, image_axis, component = (self.width, 1, 0) if axis == "x" else (self.height, 0, 1)

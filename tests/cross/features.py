@@ -19,7 +19,6 @@ from pydantic import BaseModel
 
 from blinkgl.config.base import is_model, members
 from blinkgl.config.quality import QUALITIES
-from blinkgl.config.sensor import sensor_names
 from blinkgl.config.sequence import LabelsConfig, SequenceConfig
 
 WIDTH, HEIGHT, FPS = 32, 24, 100
@@ -175,7 +174,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "quality": {"unsaid": NOTHING, **{name: {"quality": name} for name in QUALITIES}},
     "sensor": {
         "unsaid": NOTHING,
-        **{name: {"sensor": name} for name in sensor_names()},
+        **{name: {"sensor": name} for name in ("davis346", "dvxplorer")},
         "a table": {"sensor": _SENSOR},
     },
     "readout": {
@@ -210,9 +209,6 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     },
     "frame camera": {
         "none": NOTHING,
-        "plain": {
-            "images": {"preset": "plain", "rate": 100, "max_instants": 4, "response": "srgb", "photon_noise": False}
-        },
         "raw": {
             "images": {
                 "preset": "raw",
@@ -247,8 +243,6 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
                 "auto_exposure": {"longest_us": 4000},
             }
         },
-        "interpolation": {"images": {"preset": "interpolation", "max_instants": 2, "bayer": "gbrg"}},
-        "rolling shutter": {"images": {"preset": "rolling_shutter", "rate": 100, "max_instants": 3, "bayer": "rggb"}},
     },
     "textures": {
         "plain": NOTHING,
@@ -261,13 +255,14 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
         "unlit": {"scene": {"light": {"unlit": True}}},
         "lamps": {
             "scene": {
+                "fog": {"density": 0.02},
                 "light": {
                     "sky_color": [0.6, 0.8, 1.0],
                     "lights": [
                         {"kind": "point", "position": [0.5, 0.5, 2.0], "strength": 4, "color": [1.0, 0.7, 0.4]},
                         {"kind": "spot", "position": [0, 0, 4], "look_at": [1, 0, 0], "strength": 9},
                     ],
-                }
+                },
             }
         },
     },
@@ -333,6 +328,7 @@ adds up every texel of it)."""
 ELSEWHERE = {
     "scene": "tests/scene: what a scene is made of; here only where it comes from, whether it is lit, whether the "
     "camera moves, and what moves by itself",
+    "images": "tests/config/test_images.py, tests/imaging: every preset, every choice; here what is written and read",
     "gl": RUN_LEVEL["gl"],
 }
 _SCENE_HERE = {"scene.kind", "scene.light.unlit", "scene.camera_motion.kind"}

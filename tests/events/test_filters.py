@@ -127,11 +127,29 @@ def test_flicker_drops_what_flickers_in_the_band_after_its_start():
 def test_flicker_ends_with_the_light_and_is_of_a_block():
     config = FlickerFilter(low_hz=90, high_hz=130)
     lamp = flickering(100, 20)
-    after = [(lamp[-1][0] + 30_000, 5, 6, 1), (lamp[-1][0] + 31_000, 6, 6, 0)]
+    end = lamp[-1][0]
+    after = [(end + 30_000, 5, 6, 0), (end + 31_000, 6, 6, 1), (end + 31_500, 6, 6, 0)]
     elsewhere = [(150_000 + k, 8, 6, k % 2) for k in range(5)]  # x = 8: the next block of four
     passed = make_filter(config, HEIGHT, WIDTH).step(stream(lamp + after + elsewhere))
     assert (passed.x == 8).sum() == 5
-    assert (passed.t > lamp[-1][0]).sum() == 2, "a pause longer than the lowest frequency's period ends it"
+    assert (passed.t > end).sum() == 3, "a pause longer than the lowest frequency's period ends it"
+
+
+def test_flicker_counts_back_for_bursts_that_come_too_soon():
+    config = FlickerFilter(low_hz=90, high_hz=130, start=6, stop_below=4)
+
+    def bursts(distances_ms):
+        """One ON event, 400 us later one OFF event, at these distances; whether each ON event passes."""
+        onsets = np.cumsum([1000, *(1000 * d for d in distances_ms)]).astype(int)
+        events = stream([(1, 5, 6, 0), *((t + 400 * half, 5, 6, 1 - half) for t in onsets for half in (0, 1))])
+        passed = make_filter(config, HEIGHT, WIDTH).step(events)
+        return np.isin(onsets, passed.t[passed.p == 1]).tolist()
+
+    long_ago = [True]  # the first burst has none before it
+    assert bursts([10] * 7) == long_ago + [True] * 5 + [False] * 2, "the sixth distance in the band starts it"
+    assert bursts([10] * 4 + [1] * 2 + [10] * 3) == long_ago + [True] * 9, "4 less 2 and 3 are 5"
+    stops = bursts([10] * 6 + [1] * 3 + [10] * 2)
+    assert stops == long_ago + [True] * 5 + [False] * 3 + [True] * 3, "6 less 3 are below 4; 5 do not start it again"
 
 
 STAGES = (

@@ -52,7 +52,8 @@ def _defines(program: str, passes: Iterable[type[Pass]]) -> list[dict[str, Any]]
         for pass_ in one.every_kind() if one.program == program else ():
             for kind in kinds() if isinstance(pass_, ScenePass) else [None]:
                 plain = pass_.defines(kind) | (kind.defines if kind is not None else {})
-                for light in _lights(pass_, kind):
-                    defines = plain | light
+                foggy = pass_.lit and kind in (KINDS[0], KINDS[-1])
+                for more in (*_lights(pass_, kind), *([{"FOG": 1}] if foggy else [])):
+                    defines = plain | more
                     found.setdefault(tuple(sorted(defines.items())), defines)
     return list(found.values())

@@ -66,8 +66,8 @@ class Pass:
     outputs : what it writes.   inputs : what it reads, drawn before it.   samples, every : its size beside the image's.
     depth : whether it has a depth buffer; "texture": one that a later pass may read.
     still : whether a camera that stands still has only what moves drawn again.
-    lit : whether its program asks light.glsl for the light.   one_channel : whether one channel of it will do, where
-    the surface is of one colour.
+    lit : whether its program asks light.glsl for the light, and fog.glsl for what of it arrives.
+    one_channel : whether one channel of it will do, where the surface is of one colour.
     pointwise : each pixel comes of the inputs' pixel at the same place, so that it does
     not change where they do not."""
 
@@ -141,6 +141,8 @@ class ScenePass(Pass):
             painter.place(uniforms, item, shot.moment)
             if item.deformer is not None:
                 painter.deform(uniforms, item, shot)
+            if "fog" in uniforms:
+                painter.fog(uniforms, shot)
             self.bind(uniforms, shot)
             self.set(painter, uniforms, item, shot)
             painter.draw(uniforms, item)

@@ -24,7 +24,7 @@ class Colour(ScenePass):
     outputs: ClassVar[tuple[Output, ...]] = (Output("colour", "RGBA32F", components=3),)
 
     def background(self, scene: Scene) -> tuple[float, ...]:
-        return (scene.background,) * 3
+        return (scene.backdrop,) * 3
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         uniforms["base_color"].value = tuple(item.material.base_color)

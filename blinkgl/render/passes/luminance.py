@@ -22,7 +22,7 @@ class _Luminance(ScenePass):
     one_channel: ClassVar[bool] = True
 
     def background(self, scene: Scene) -> tuple[float, ...]:
-        return scene.background, 0.0
+        return scene.backdrop, 0.0
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
         if item.kind.hued:

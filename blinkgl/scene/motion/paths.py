@@ -228,6 +228,51 @@ class CutPath:
         return self.path.speed_bound(ta_ns, min(tb_ns, self.t_cut_ns))
 
 
+class PausedPath:
+    """``path``, standing still for ``hold_ns`` from ``stop_ns`` + ``ramp_ns`` on: it slows down and sets out again over
+    ``ramp_ns`` each (> 0), with a velocity that is continuous and never higher than ``path``'s. All that comes after is
+    later by ``hold_ns`` + ``ramp_ns``."""
+
+    is_static = False
+
+    def __init__(self, path: KeyframePath, stop_ns: int, hold_ns: int, ramp_ns: int):
+        self.path, self.t0_ns, self.t1_ns = path, path.t0_ns, path.t1_ns + int(hold_ns) + int(ramp_ns)
+        self.stop_ns, self.hold_ns, self.ramp_ns = int(stop_ns), int(hold_ns), int(ramp_ns)
+
+    def _clock(self, t_ns: int) -> tuple[int, float]:
+        """Time on ``path``'s clock, ns, and how fast that runs, in [0, 1]."""
+        ramp, since = self.ramp_ns, t_ns - self.stop_ns
+        if since <= 0:
+            return t_ns, 1.0
+        if since < ramp:  # the rate is 1 - smoothstep, of which this is the integral
+            u = since / ramp
+            return self.stop_ns + round(ramp * (u - u**3 + u**4 / 2)), 1 - u * u * (3 - 2 * u)
+        if since <= ramp + self.hold_ns:
+            return self.stop_ns + round(ramp / 2), 0.0
+        u = (since - ramp - self.hold_ns) / ramp
+        if u < 1:
+            return self.stop_ns + round(ramp * (0.5 + u**3 - u**4 / 2)), u * u * (3 - 2 * u)
+        return t_ns - self.hold_ns - ramp, 1.0
+
+    def pose(self, t_ns: int) -> np.ndarray:
+        return self.path.pose(self._clock(int(t_ns))[0])
+
+    def derivative(self, t_ns: int) -> np.ndarray:
+        at, rate = self._clock(int(t_ns))
+        return self.path.derivative(at) * rate
+
+    def poses(self, t_ns: np.ndarray) -> np.ndarray:
+        return self.path.poses(np.array([self._clock(int(t))[0] for t in np.asarray(t_ns)], np.int64))
+
+    def speed_bound(self, ta_ns: int, tb_ns: int) -> tuple[float, float]:
+        (a, before), (b, after) = self._clock(int(ta_ns)), self._clock(int(tb_ns))
+        return (0.0, 0.0) if a == b and before == after == 0 else self.path.speed_bound(a, b)
+
+    def approach_bound(self, normal: np.ndarray, reach: float, ta_ns: int, tb_ns: int) -> float:
+        """As :meth:`KeyframePath.approach_bound`."""
+        return self.path.approach_bound(normal, reach, self._clock(int(ta_ns))[0], self._clock(int(tb_ns))[0])
+
+
 class OffsetPath:
     """A body fixed to another: T_world_offset(t) = T_world_body(t) @ T_body_offset (a stereo camera, a part)."""
 

@@ -29,12 +29,13 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from blinkgl.config.trajectory import CameraMotion, MotionConfig, ObjectMotion
 from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import SplinePath, StaticPath, rigid
+from blinkgl.scene.motion.paths import PausedPath, SplinePath, StaticPath, rigid
 from blinkgl.scene.types import PosePath
 
 _REDRAWS = 6  # whole paths; the one that leaves free space least is kept
 _TRIES = 40  # directions per leg, after which the leg is halved
 _MAX_TURN = 2.0  # rad between key frames: RotationSpline needs less than pi
+_RAMP = 0.05  # of the sequence, in which a body that pauses comes to rest, and sets out again
 _SAMPLES = 16  # per leg, for arc length, mean rate and the check of the curve
 
 
@@ -127,7 +128,8 @@ def random_path(
     times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=on_ground)
     times, positions = _refined(times, positions, rate)
     turns = _random_turns(rng, config, rate, times, start[:3, :3].T[:, 2] if on_ground else None)
-    return SplinePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
+    path = SplinePath(times, positions, _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate))
+    return _pausing(rng, config, path, t0_ns, t1_ns)
 
 
 def random_camera_path(
@@ -165,14 +167,34 @@ def random_camera_path(
     speed, rate = rng.uniform(*config.speed), math.radians(rng.uniform(*config.rotation_rate))
     if config.kind == "static" or (speed == 0 and rate == 0 and config.shake == 0):
         return StaticPath(start, t0_ns, t1_ns)
-    times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=False)
+    ahead = _heading(rng, config, start)
+    times, positions = waypoints(rng, t0_ns, t1_ns, config, space, radius, start[:3, 3], speed, flat=False, ahead=ahead)
     times, positions = _refined(times, positions, rate)
     aims = np.array([look_at(int(t)) for t in times]) - positions
     turns = _camera_turns(rng, config, rate, times, start[:3, :3], aims)
     rotations = _rotations(start[:3, :3], turns, times, t0_ns, t1_ns, rate)
     if config.shake > 0:
         times, positions, rotations = _shaken(rng, config, times, positions, rotations)
-    return SplinePath(times, positions, rotations)
+    return _pausing(rng, config, SplinePath(times, positions, rotations), t0_ns, t1_ns)
+
+
+def _heading(rng, config: CameraMotion, start: np.ndarray) -> np.ndarray | None:
+    """(3,) unit direction that the camera sets out to; None: any, and nothing is drawn."""
+    if config.heading == "any":
+        return None
+    if config.heading == "view":
+        return start[:3, 2] * rng.choice([-1.0, 1.0])
+    angle = rng.uniform(0, 2 * math.pi)
+    return start[:3, 0] * math.cos(angle) + start[:3, 1] * math.sin(angle)
+
+
+def _pausing(rng, config: MotionConfig, path: SplinePath, t0_ns: int, t1_ns: int) -> PosePath:
+    """The path, which now and then stops for a while. Nothing is drawn where nothing ever stops."""
+    if config.pauses == 0 or rng.random() >= config.pauses:
+        return path
+    stop, share = rng.uniform(0.1, 0.8), rng.uniform(0.1, 0.5)
+    span = t1_ns - t0_ns
+    return PausedPath(path, t0_ns + round(stop * span), round(share * span), max(round(_RAMP * span), 1))
 
 
 def look_rotation(direction: ArrayLike) -> np.ndarray:
@@ -221,14 +243,17 @@ def waypoints(
     start: np.ndarray,
     speed: float,
     flat: bool,
+    ahead: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (K,) int64 and positions (K, 3), K >= 2, of a walk whose mean speed over [t0, t1] is ``speed``."""
+    """Times (K,) int64 and positions (K, 3), K >= 2, of a walk whose mean speed over [t0, t1] is ``speed``.
+    ahead : (3,) unit direction that it sets out from, as far as ``smoothness`` keeps to it; None: any."""
     duration = (t1_ns - t0_ns) * 1e-9
     if duration <= 0:
         raise ValueError("a path needs t0_ns < t1_ns")
+    count = config.points(duration)
     if speed == 0.0:
-        times = np.linspace(0, t1_ns - t0_ns, config.waypoints).round().astype(np.int64) + t0_ns
-        return times, np.tile(start, (config.waypoints, 1))
+        times = np.linspace(0, t1_ns - t0_ns, count).round().astype(np.int64) + t0_ns
+        return times, np.tile(start, (count, 1))
     if flat:
         space = FreeSpace(
             np.r_[space.low[:2], -np.inf], np.r_[space.high[:2], np.inf], None, space.centres, space.radii
@@ -236,7 +261,7 @@ def waypoints(
     entangled = np.linalg.norm(space.centres - start, axis=1) < space.radii + radius
     best, least = None, math.inf
     for _ in range(_REDRAWS):
-        points = _walk(rng, config, space, radius, start, speed * duration, flat)
+        points = _walk(rng, config, space, radius, start, speed * duration, flat, count, ahead)
         times = _timed(points, t0_ns, t1_ns, speed)
         used = int(np.searchsorted(times, t1_ns)) + 1
         curve = CubicSpline((times - t0_ns) * 1e-9, points)(np.linspace(0, duration, _SAMPLES * used))
@@ -248,11 +273,11 @@ def waypoints(
     return best
 
 
-def _walk(rng, config, space, radius, start, length, flat) -> np.ndarray:
-    """(K, 3) way-points from ``start``, legs of about length / (waypoints - 1), until ``length`` is covered."""
-    leg = length / (config.waypoints - 1)
-    points, covered, direction = [start], 0.0, None
-    while covered < length and len(points) <= 16 * config.waypoints:
+def _walk(rng, config, space, radius, start, length, flat, count, ahead) -> np.ndarray:
+    """(K, 3) way-points from ``start``, legs of about length / (count - 1), until ``length`` is covered."""
+    leg = length / (count - 1)
+    points, covered, direction = [start], 0.0, ahead
+    while covered < length and len(points) <= 16 * count:
         step = leg * rng.uniform(0.6, 1.4)
         for attempt in range(4 * _TRIES):
             # Hemmed in: shorter legs, and no more insisting on the last direction.

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from blinkgl.config.base import validate
 from blinkgl.config.trajectory import CameraMotion, ObjectMotion
 from blinkgl.errors import ConfigError
-from blinkgl.scene.motion.paths import SplinePath, StaticPath
+from blinkgl.scene.motion.paths import PausedPath, SplinePath, StaticPath
 from blinkgl.scene.motion.trajectories import FreeSpace, look_rotation, random_camera_path, random_path
 from tests.scene.motion.rates import statistics
 
@@ -276,3 +276,64 @@ def test_looking_up_and_down():
     R = look_rotation([1e-10, 0, 1.0])
     assert np.allclose(R @ R.T, np.eye(3), atol=1e-15) and abs(R[:, 0] @ R[:, 2]) < 1e-15
     assert look_rotation([0, 2, 0]).tolist() == [[1, 0, 0], [0, 0, 1], [0, -1, 0]] == look_rotation([0, 0, 0]).tolist()
+
+
+# --- pieces of smooth motion, headings, pauses ------------------------------------------------------------------------
+
+
+def unevenness(path, t_ns: int, span_ns: int) -> float:
+    """|F + B| / |F| of the origin's displacement to the next and the last window: 0 for constant velocity."""
+    before, now, after = path.poses(np.array([t_ns - span_ns, t_ns, t_ns + span_ns]))[:, :3, 3]
+    return float(np.linalg.norm(after - 2 * now + before) / np.linalg.norm(after - now))
+
+
+def test_way_points_per_second_make_short_sequences_smooth():
+    """A fifth of a second is a piece of a motion and not six turns; a long sequence has as many turns per second."""
+    fifth, uneven = SECOND // 5, {}
+    for name, config in (("six", ObjectMotion()), ("per second", ObjectMotion(waypoints_per_s=2))):
+        paths = [random_path(rng(s), 0, fifth, config, SPACE, 0.1) for s in range(30)]
+        uneven[name] = np.median([unevenness(p, fifth // 2, fifth // 4) for p in paths])
+    assert uneven["per second"] < 0.1 < 0.3 < uneven["six"]
+    assert [ObjectMotion(waypoints_per_s=2).points(s) for s in (0.01, 0.5, 0.51, 10)] == [2, 2, 3, 21]
+    assert ObjectMotion(waypoints_per_s=1000).points(1e6) == 10_000 and ObjectMotion().points(1e6) == 6
+
+
+@pytest.mark.parametrize("heading, low, high", [("view", 0.99, 1.01), ("across", 0.0, 0.02)])
+def test_a_camera_sets_out_along_its_view_or_across_it(heading, low, high):
+    config = CameraMotion(heading=heading, waypoints_per_s=1, smoothness=1, rotation_rate=0, speed=1)
+    signs = set()
+    for seed in range(12):
+        path = random_camera_path(rng(seed), 0, SECOND // 5, config, FreeSpace((-9, -9, 0), (9, 9, 9)), 0.1, TARGET)
+        start, end = path.poses(np.array([0, SECOND // 5]))
+        moved = (end - start)[:3, 3] / np.linalg.norm((end - start)[:3, 3])
+        assert low <= abs(moved @ start[:3, 2]) <= high
+        np.testing.assert_allclose(start[:3, :3], end[:3, :3], atol=1e-9)
+        signs.add(np.sign(moved @ start[:3, 2]))
+    assert signs == {-1.0, 1.0}, "there and back"
+
+
+def test_a_pause_stands_still_and_goes_on_without_a_jump():
+    config = ObjectMotion(pauses=1, waypoints_per_s=2, speed=1, rotation_rate=50)
+    path = random_path(rng(4), 0, SECOND, config, SPACE, 0.1)
+    other = random_path(rng(4), 0, SECOND, config.model_copy(update={"pauses": 0.0}), SPACE, 0.1)
+    assert isinstance(path, PausedPath) and not path.is_static and path.t1_ns > other.t1_ns
+    t = np.arange(0, SECOND, 10**6)
+    poses, speeds = path.poses(t), np.array([np.linalg.norm(path.derivative(int(s))) for s in t])
+    still = speeds == 0
+    assert 0.1 <= still.mean() <= 0.5 and np.ptp(poses[still], axis=0).max() == 0
+    assert np.abs(np.diff(speeds)).max() < 0.05 * speeds.max()  # softly
+    begin, end, late = t[still][0], t[still][-1], path.hold_ns + path.ramp_ns
+    assert path.speed_bound(begin, end) == (0.0, 0.0) and path.speed_bound(0, SECOND)[0] >= speeds.max() * 0.2
+    for at in (10**7, int(begin) - 10**7, path.stop_ns + late + 10**7):  # the derivative is that of the pose
+        step = 10**5
+        differences = (path.pose(at + step) - path.pose(at - step)) / (2e-9 * step)
+        np.testing.assert_allclose(path.derivative(at), differences, atol=2e-4)
+    # and then it is where it would have been, later
+    after = path.stop_ns + late + 2 * path.ramp_ns
+    np.testing.assert_array_equal(path.pose(after), other.pose(after - late))
+    share = [
+        isinstance(random_path(rng(s), 0, SECOND, ObjectMotion(pauses=0.3), SPACE, 0.2), PausedPath) for s in range(60)
+    ]
+    assert 0.1 < np.mean(share) < 0.5
+    camera = random_camera_path(rng(1), 0, SECOND, CameraMotion(pauses=1), SPACE, 0.1, TARGET)
+    assert isinstance(camera, PausedPath)

@@ -1,0 +1,298 @@
+"""A piece of a recording with what it saw: the pixels and times that a calibration looks at, the same for the camera's
+events and for those that an emulator makes of the frames.
+
+A clip may hold some tiles of the sensor only, stacked on one another: emulators know no neighbours.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+
+from blinkgl.config.events import EmulatorConfig
+from blinkgl.config.sensor import ReadoutConfig
+from blinkgl.errors import EventDataError
+from blinkgl.events.camera import EventCamera, EventFrame, emulate
+from blinkgl.events.types import Events
+from blinkgl.io.formats import open_events
+from blinkgl.io.frames import RECORDING, open_frames
+from blinkgl.recordings.comparison import BLUR_PX, LOG_OFFSET
+from blinkgl.recordings.simulation import Decoder
+from blinkgl.timeline.interpolate import Displacement, motion
+
+TILE_PX = 32
+MOST_PIXEL_STEPS = 24_000_000
+"""Pixels times frames that a clip holds at most, float32: what a fit of a minute or two has time for."""
+STILL = 0.04
+"""Largest change of ln(I + 10) between two frames, blurred by a pixel, of a pixel that saw nothing."""
+MOST_SATURATED = 0.3
+MOST_SHIFT_US = 100_000
+LEAST_CORRELATION = 0.25
+"""Of polarity sums with the frames' change: below, events and frames are not of one scene or not on one clock."""
+DARK_BACKGROUND = 0.2
+"""Luminance of the scene of a recording without frames: the middle of the scale, about."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """frames : what the emulator is shown, (t_ns, (h, w) float32 luminance), the warm-up first.   clock_us : (K + 1,)
+    int64, the recorded frames' times.   edges_us : the same, but that the first interval begins with the first event
+    and the last ends with the last.   events : the camera's of [edges_us[0], edges_us[-1]), on the clip's pixels.
+    used : (h, w) bool, pixels that count.   still : (h, w) bool, those of them that saw no change.
+    light : (h, w) uint8, eighth of the brightness, 0 the darkest.   change : (K, h, w) float32, of ln(I + 10).
+    sensor : (height, width) of the camera.   share : of its pixels that are in the clip.
+    facts : what was found out on the way, by name."""
+
+    frames: list[tuple[int, np.ndarray]]
+    clock_us: np.ndarray
+    edges_us: np.ndarray
+    events: Events
+    used: np.ndarray
+    still: np.ndarray
+    light: np.ndarray
+    change: np.ndarray
+    sensor: tuple[int, int]
+    share: float = 1.0
+    facts: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.used.shape
+
+    @property
+    def intervals(self) -> int:
+        return len(self.edges_us) - 1
+
+    def simulate(
+        self, config: EmulatorConfig, seed: int = 0, *, stop: int | None = None, readout: ReadoutConfig | None = None
+    ) -> Events:
+        """What an emulator makes of the first ``stop`` intervals (default: all), on the pixels that count."""
+        stop = self.intervals if stop is None else stop
+        end_ns = int(self.clock_us[stop]) * 1000
+        shown = (EventFrame(t, luminance) for t, luminance in self.frames if t <= end_ns)
+        camera = EventCamera(config, readout, *self.size, seed)
+        chunks = [events for _, events in emulate(shown, camera)]
+        events = Events.concatenate(chunks).window(int(self.edges_us[0]), int(self.edges_us[stop]))
+        return events.part(self.used[events.y, events.x])
+
+    def with_events(self, events: Events) -> Clip:
+        """The same scene with other events."""
+        return replace(self, events=events)
+
+
+def clip_of_frames(
+    events: Events,
+    frames: Iterable[tuple[np.ndarray, int, str]],
+    size: tuple[int, int],
+    *,
+    gamma: str | float = "linear",
+    interpolate: str = "motion",
+    max_px: float = 1.0,
+    delay_us: int | None = None,
+    where: str = "frames",
+    most: int = MOST_PIXEL_STEPS,
+    seed: int = 0,
+) -> Clip:
+    """Of a recording that saw something.
+
+    frames : (array, t_ns, name), at the middle of their exposures.   size : (height, width) of the events' sensor.
+    gamma : of the frames' codes.   interpolate : "motion" or "linear", what is shown between two frames.
+    delay_us : of the frames' clock against the events'; None: found from both.
+    Raises EventDataError: frames of another size, no common time, saturated frames, clocks that do not match."""
+    decode = Decoder(gamma)
+    grey, times, full = [], [], np.zeros(size, bool)
+    for frame, t_ns, name in frames:
+        if frame.shape[:2] != size:
+            raise EventDataError(
+                "frames are of another size than the recording",
+                where=where,
+                value=f"{frame.shape[1]}x{frame.shape[0]}",
+                accepted=f"{size[1]}x{size[0]}, as its events",
+            )
+        if frame.dtype.kind == "u":
+            top = frame >= np.iinfo(frame.dtype).max
+            full |= top.any(axis=2) if top.ndim == 3 else top
+        grey.append(decode(frame, name))
+        times.append(t_ns)
+    saturated = float(full.mean())
+    if saturated > MOST_SATURATED:
+        raise EventDataError(
+            "too many pixels of the frames are saturated to say what the light did there",
+            where=where,
+            value=f"{100 * saturated:.0f} %",
+            accepted=f"at most {100 * MOST_SATURATED:.0f} % (a shorter exposure)",
+        )
+    logs = [cv2.GaussianBlur(np.log(g.astype(np.float64) * 255 + LOG_OFFSET), (0, 0), BLUR_PX) for g in grey]
+    clock = np.array(times, np.int64) // 1000
+    facts: dict[str, float] = {"saturated": saturated}
+    change = np.diff(np.stack(logs), axis=0).astype(np.float32)
+    found, correlation = clock_offset(events, change, clock, size)
+    if delay_us is None:
+        if not correlation >= LEAST_CORRELATION:
+            raise EventDataError(
+                "events and frames do not match: no clock offset within "
+                f"{MOST_SHIFT_US // 1000} ms makes polarity sums follow the frames' change",
+                where=where,
+                value=f"best correlation {correlation:.2f}",
+                accepted=f"at least {LEAST_CORRELATION}, frames of the same scene, clock and orientation",
+            )
+        delay_us = found
+    facts |= {"delay_us": delay_us, "found_delay_us": found, "delay_correlation": correlation}
+    clock = clock + delay_us
+    # The first interval may begin a little before the first event, the last end a little after the last.
+    slack = (clock[1:] - clock[:-1]) // 4
+    inside = np.flatnonzero((clock[:-1] >= events.t[0] - slack) & (clock[1:] <= events.t[-1] + 1 + slack))
+    if len(inside) < 2:
+        raise EventDataError(
+            "the recording spans fewer than two intervals between frames",
+            where=where,
+            value=[tuple(round(t / 1e6, 6) for t in (a[0], a[-1])) for a in (events.t, clock)],
+            accepted="two or more, on one clock (seconds of events and of frames shown)",
+        )
+    first, last = int(inside[0]), int(inside[-1]) + 1
+    grey, logs, clock = grey[first : last + 1], logs[first : last + 1], clock[first : last + 1]
+    edges = clock.copy()
+    edges[0], edges[-1] = max(clock[0], events.t[0]), min(clock[-1], events.t[-1] + 1)
+    given = zip(grey, (clock * 1000).tolist())
+    # Before the first frame the pixels have seen something else, and stand anywhere between their levels: another
+    # part of the same picture, from which the light goes over to the first frame.
+    other = np.roll(grey[0], (size[0] // 3, size[1] // 3), (0, 1))
+    displacement = Displacement()
+    if interpolate == "motion":
+        given = motion(given, max_px, displacement=displacement)
+        path = [(g.astype(np.float32, copy=False), t) for g, t in given]
+        facts |= {"displacement_px": displacement.p99, "inserted": displacement.inserted}
+    else:
+        path = list(given)
+    path.insert(0, (other, int(2 * clock[0] - clock[1]) * 1000))
+    change = change[first:last]
+    still = np.abs(change).max(axis=0) < STILL
+    mean = np.mean(logs, axis=0)
+    light = np.searchsorted(np.quantile(mean, np.arange(1, 8) / 8), mean).astype(np.uint8)
+    events = events.window(int(edges[0]), int(edges[-1]))
+    whole = _cut(path, events, ~full, still, light, change, size, most, seed)
+    return replace(whole, clock_us=clock, edges_us=edges, facts=facts)
+
+
+def clip_of_still(events: Events, size: tuple[int, int], *, luminance: float = DARK_BACKGROUND, parts: int = 8) -> Clip:
+    """Of a recording of a scene that stands still in constant light: noise alone. Time is cut into ``parts``."""
+    begin, end = int(events.t[0]), int(events.t[-1]) + 1
+    edges = begin + (end - begin) * np.arange(parts + 1) // parts
+    frame = np.full(size, luminance, np.float32)
+    path = [(frame, int(edges[0]) * 1000 - 1000), *((frame, int(t) * 1000) for t in edges)]
+    everywhere = np.ones(size, bool)
+    return Clip(
+        [(t, f) for f, t in path],
+        edges,
+        edges,
+        events.window(begin, end),
+        everywhere,
+        everywhere,
+        np.zeros(size, np.uint8),
+        np.zeros((parts, *size), np.float32),
+        size,
+    )
+
+
+_NO_TIMES = (np.empty(0, np.int64),) * 2
+
+
+def _cut(path, events: Events, used, still, light, change, size, most: int, seed: int) -> Clip:
+    """As much of the sensor as fits into ``most`` pixels times frames: all of it, or tiles drawn at random."""
+    height, width = size
+    rows, columns = height // TILE_PX, width // TILE_PX
+    wanted = most // (len(path) * TILE_PX * TILE_PX)
+    if len(path) * height * width <= most or wanted >= rows * columns:
+        return Clip([(t, g) for g, t in path], *_NO_TIMES, events.part(used[events.y, events.x]), used, used & still,
+                    light, change, size)  # fmt: skip
+    chosen = np.sort(np.random.default_rng(seed).choice(rows * columns, max(wanted, 1), replace=False))
+    place = np.full((rows, columns), -1)
+    place.flat[chosen] = np.arange(len(chosen))
+    corners = [(int(i) // columns * TILE_PX, int(i) % columns * TILE_PX) for i in chosen]
+    cut = lambda a: np.concatenate([a[..., y : y + TILE_PX, x : x + TILE_PX] for y, x in corners], axis=-2)
+    y, x = events.y.astype(np.int64), events.x.astype(np.int64)
+    here = (y < rows * TILE_PX) & (x < columns * TILE_PX)
+    here[here] = place[y[here] // TILE_PX, x[here] // TILE_PX] >= 0
+    here &= used[events.y, events.x]
+    tile = place[y[here] // TILE_PX, x[here] // TILE_PX]
+    moved = Events(
+        (x[here] % TILE_PX).astype(np.uint16), (tile * TILE_PX + y[here] % TILE_PX).astype(np.uint16),
+        events.t[here], events.p[here],
+    )  # fmt: skip
+    return Clip([(t, cut(g)) for g, t in path], *_NO_TIMES, moved, cut(used), cut(used & still), cut(light),
+                cut(change), size, len(chosen) * TILE_PX**2 / (height * width))  # fmt: skip
+
+
+def clock_offset(events: Events, changes: np.ndarray, clock_us: np.ndarray, size: tuple[int, int]) -> tuple[int, float]:
+    """What has to be added to the frames' times, µs, so that polarity sums follow ``changes`` (K, H, W), of the
+    frames' blurred logarithms, best, and the mean correlation over the intervals there; looked for within
+    ``MOST_SHIFT_US`` and half a frame interval."""
+    pairs = list(range(len(clock_us) - 1))
+    if not pairs:
+        return 0, float("nan")
+    reach = int(min(MOST_SHIFT_US, np.median(np.diff(clock_us)) * 0.75))
+    at = lambda shifts: [_match(events, changes, clock_us + s, pairs, size) for s in shifts]
+    coarse = np.linspace(-reach, reach, 25).astype(np.int64)
+    values = np.array(at(coarse))
+    if not np.isfinite(values).any():
+        return 0, float("nan")
+    best = int(coarse[np.nanargmax(values)])
+    step = int(coarse[1] - coarse[0])
+    fine = best + np.linspace(-step, step, 9).astype(np.int64)
+    values = np.array(at(fine))
+    k = int(np.nanargmax(values))
+    if 0 < k < len(fine) - 1 and np.isfinite(values[k - 1 : k + 2]).all():
+        # The top of the parabola through the best and its neighbours.
+        a, b, c = values[k - 1 : k + 2]
+        bend = a - 2 * b + c
+        shift = 0.5 * (a - c) / bend if bend < 0 else 0.0
+        return int(fine[k] + shift * (fine[1] - fine[0])), float(b)
+    return int(fine[k]), float(values[k])
+
+
+def _match(events: Events, changes: np.ndarray, clock_us: np.ndarray, pairs: list[int], size: tuple[int, int]) -> float:
+    found = []
+    for k in pairs:
+        if clock_us[k] < events.t[0] - 1000 or clock_us[k + 1] > events.t[-1] + 1000:
+            continue
+        part = events.window(int(clock_us[k]), int(clock_us[k + 1]))
+        sums = polarity_sums(part, size)
+        if sums.any():
+            found.append(np.corrcoef(cv2.GaussianBlur(sums, (0, 0), BLUR_PX).ravel(), changes[k].ravel())[0, 1])
+    return float(np.mean(found)) if found else float("nan")
+
+
+def polarity_sums(events: Events, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) float64, ON minus OFF."""
+    where = events.y.astype(np.int64) * size[1] + events.x
+    return np.bincount(where, 2.0 * events.p - 1.0, minlength=size[0] * size[1]).reshape(size)
+
+
+def read_recording(path: str | os.PathLike, *, least: int = 0) -> tuple[Events, tuple[int, int]]:
+    """All events of a file, and the (height, width) of its sensor. EventDataError: fewer than ``least``."""
+    with open_events(path) as file:
+        file = file.sized()
+        events = file.read()
+    if len(events) < least:
+        raise EventDataError(
+            "too few events to tell an emulator's parameters",
+            where=str(path),
+            value=len(events),
+            accepted=f"{least:,} or more",
+        )
+    assert file.height is not None and file.width is not None
+    return events, (file.height, file.width)
+
+
+def timed_frames(
+    path: str | os.PathLike, *, fps: float | None = None, timestamps: str | os.PathLike | None = None
+) -> tuple[Iterator[tuple[np.ndarray, int, str]], bool]:
+    """Frames as :func:`~blinkgl.io.frames.open_frames` gives them, and whether their times are known to be the middles
+    of exposures."""
+    source = open_frames(path, fps=fps, timestamps=timestamps)
+    exposures = source.path.suffix.lower() in RECORDING and fps is None and timestamps is None
+    return iter(source), exposures

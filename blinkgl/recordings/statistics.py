@@ -1,0 +1,250 @@
+"""What a calibration compares of two streams of events of one scene: sums that add up over the pixels, and from them a
+vector of numbers, each with what it may be off by.
+
+Sums are kept by groups of pixels, so that leaving each group out in turn (the jackknife, Quenouille 1956; Tukey 1958)
+says how far every number, and whatever is computed of them, would be another in another recording of the same kind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numba
+import numpy as np
+
+from blinkgl.events.types import Events
+from blinkgl.recordings.clip import TILE_PX, Clip
+from blinkgl.recordings.comparison import BLUR_PX
+
+GROUPS = 16
+"""Of tiles of pixels, for the jackknife."""
+ISI_PER_DECADE = 40
+ISI_BINS = 7 * ISI_PER_DECADE
+"""Of the interval between two events of a pixel, from 1 µs on."""
+COUNTS = np.array([0, 1, 2, 3, 4, 6, 9, 14, 21, 31, 101, 1001])
+"""Lower ends of the bins of a pixel's number of events."""
+LIGHTS = 8
+PROBES = np.array([0.005, 0.01, 0.02, 0.05, *np.arange(0.1, 0.95, 0.1), 0.95, 0.98])
+"""Quantiles of the recording's intervals at which the two distributions are compared."""
+LEAST_STILL = 400
+"""px; fewer say nothing of noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Of the intervals [first, stop) of a clip; the first axis is the group.
+
+    rates : (G, K, 2) events by interval and polarity (OFF, ON), of pixels that saw a change.   lights : (G, 8, 2), by
+    brightness.   isi : (G, 2, bins), by whether the second event is of the other polarity.   counts : (G, C) pixels and
+    intervals by number of events.   still, still_counts : (G, 2), (G, C) of pixels that saw none, over all intervals.
+    products : (G, 3) sums of a*b, a*a, b*b of polarity sums with the recording's.   pixels : (G, 2) that moved, and
+    did not.   polarity : (K, H*W) float32, polarity sums,
+    blurred by a pixel."""
+
+    rates: np.ndarray
+    lights: np.ndarray
+    isi: np.ndarray
+    counts: np.ndarray
+    still: np.ndarray
+    still_counts: np.ndarray
+    products: np.ndarray
+    pixels: np.ndarray
+    polarity: np.ndarray
+    seconds: np.ndarray
+
+    def without(self, group: int | None) -> list[np.ndarray]:
+        """The totals over the groups, but for one."""
+        keep = np.arange(GROUPS) != (-1 if group is None else group)
+        parts = (self.rates, self.lights, self.isi, self.counts, self.still, self.still_counts, self.products,
+                 self.pixels)  # fmt: skip
+        return [part[keep].sum(axis=0) for part in parts]
+
+
+def sums(events: Events, clip: Clip, first: int, stop: int, against: np.ndarray | None = None) -> Sums:
+    """Of a stream of events of the clip's scene in its intervals [first, stop).
+
+    against : polarity sums to correlate with; None: the stream's own."""
+    height, width = clip.size
+    count = stop - first
+    group = groups(clip.size)
+    total = np.zeros((count, height * width, 2), np.int16)
+    isi = np.zeros((GROUPS, 2, ISI_BINS), np.int64)
+    part = events.window(int(clip.edges_us[first]), int(clip.edges_us[stop]))
+    where = part.y.astype(np.int64) * width + part.x
+    _collect(where, part.t, part.p, clip.edges_us[first : stop + 1], group, total, isi)
+    used, still = clip.used.ravel(), clip.still.ravel()
+    moving = used & ~still
+    on_group = np.where(moving, group, GROUPS)
+    per_pixel = total.sum(axis=2)
+    rates = np.stack([_by(on_group, total[k, :, p]) for k in range(count) for p in (0, 1)], 1).reshape(GROUPS, count, 2)
+    both = total.sum(axis=0, dtype=np.int64)
+    lights = np.zeros((GROUPS, LIGHTS, 2))
+    for part_of in range(LIGHTS):
+        here = np.where(clip.light.ravel() == part_of, on_group, GROUPS)
+        lights[:, part_of] = np.stack([_by(here, both[:, p]) for p in (0, 1)], 1)
+    counts = _histogram(per_pixel[:, moving], np.broadcast_to(group[moving], (count, int(moving.sum()))))
+    still_counts = _histogram(both.sum(axis=1)[still], group[still])
+    quiet = np.stack([_by(np.where(still, group, GROUPS), both[:, p]) for p in (0, 1)], 1)
+    raw = (total[..., 1] - total[..., 0]).reshape(count, height, width).astype(np.float32)
+    # Quantisation and shifts of less than a pixel are not what is asked about, as in `compare`.
+    polarity = np.stack([cv2.GaussianBlur(one, (0, 0), BLUR_PX).ravel() for one in raw])
+    other = polarity if against is None else against
+    products = np.stack(
+        [
+            _by(on_group, np.einsum("kn,kn->n", x, y))
+            for x, y in ((polarity, other), (polarity, polarity), (other, other))
+        ],
+        1,
+    )
+    pixels = np.stack([_by(on_group, np.ones(len(group))), _by(np.where(still, group, GROUPS), np.ones(len(group)))], 1)
+    seconds = np.diff(clip.edges_us[first : stop + 1]) * 1e-6
+    return Sums(rates, lights, isi, counts, quiet, still_counts, products, pixels, polarity, seconds)
+
+
+def groups(size: tuple[int, int]) -> np.ndarray:
+    """(H*W,) int64, the group of every pixel: tiles dealt out as cards are, neither rows nor columns."""
+    y, x = np.divmod(np.arange(size[0] * size[1]), size[1])
+    side = TILE_PX // 2
+    return ((y // side) * 7 + (x // side) * 3) % GROUPS
+
+
+def _by(group: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return np.bincount(group, values, minlength=GROUPS + 1)[:GROUPS]
+
+
+def _histogram(counts: np.ndarray, group: np.ndarray) -> np.ndarray:
+    bins = np.searchsorted(COUNTS, counts, side="right") - 1
+    flat = np.bincount((group * len(COUNTS) + bins).ravel(), minlength=GROUPS * len(COUNTS))
+    return flat.reshape(GROUPS, len(COUNTS)).astype(np.float64)
+
+
+@numba.njit(cache=True, nogil=True)
+def _collect(where, t, p, edges, group, total, isi):
+    """Counts by interval, pixel and polarity, and the histogram of the intervals between a pixel's events."""
+    pixels = total.shape[1]
+    last = np.full(pixels, -1, np.int64)
+    before = np.zeros(pixels, np.uint8)
+    k = 0
+    for i in range(len(t)):
+        while t[i] >= edges[k + 1]:
+            k += 1
+        j = where[i]
+        total[k, j, p[i]] += 1
+        now = t[i] - edges[0]
+        if last[j] >= 0:
+            b = min(int(ISI_PER_DECADE * np.log10(max(now - last[j], 1)) + 1e-9), ISI_BINS - 1)
+            isi[group[j], int(before[j] != p[i]), b] += 1
+        last[j], before[j] = now, p[i]
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A recording's numbers, with which those of a simulation are compared.
+
+    values : (N,).   chance : (N,), what each may be off by, of the recording and of a simulation.
+    floor : (N,), by which a model is off besides.   weight : (N,), of the block a number belongs to.
+    jackknife : (G, N), differences without each group.   block : (N,) of names."""
+
+    sums: Sums
+    probes: np.ndarray
+    values: np.ndarray
+    chance: np.ndarray
+    floor: np.ndarray
+    weight: np.ndarray
+    jackknife: np.ndarray
+    block: np.ndarray
+
+    @property
+    def error(self) -> np.ndarray:
+        return np.hypot(self.chance, self.floor)
+
+    def residual(self, simulated: Sums) -> np.ndarray:
+        """(N,), in errors, times the weights."""
+        return self.weight * (numbers(simulated, self.probes)[0] - self.values) / self.error
+
+    def beside(self, simulated: Sums, *, floor: str) -> Target:
+        """With the errors that a simulation near the recording shows. Chance: the jackknife of the differences, in
+        which the scene, the same in both, falls out.
+
+        floor : "expected": ``FLOOR``.   "lowest": a tenth of it, as for a model that is the camera.   "seen": what the
+        simulation is off by beyond chance, block by block, between the two."""
+        value = lambda without: (
+            numbers(simulated, self.probes, without)[0] - numbers(self.sums, self.probes, without)[0]
+        )
+        jackknife = np.stack([value(group) for group in range(GROUPS)])
+        chance = np.sqrt((GROUPS - 1) / GROUPS * ((jackknife - jackknife.mean(axis=0)) ** 2).sum(axis=0))
+        most = np.array([FLOOR[b] for b in self.block])
+        floors = most * (LOWEST if floor == "lowest" else 1.0)
+        off = value(None) ** 2 - chance**2
+        for name in set(self.block.tolist()) if floor == "seen" else ():
+            here = self.block == name
+            beyond = np.sqrt(max(float(np.mean(off[here])), 0.0))
+            floors[here] = np.clip(beyond, most[here] * LOWEST, most[here])
+        return replace(self, chance=chance, floor=floors, jackknife=jackknife)
+
+
+WEIGHTS = {"rate": 3.0, "light": 3.0, "interval": 3.0, "turn": 1.0, "count": 2.0, "still": 2.0, "still count": 2.0,
+           "polarity": 2.0}  # fmt: skip
+"""How much the blocks count, each as a whole: what rates and intervals are is what a simulation is used for."""
+FLOOR = {"rate": 0.02, "light": 0.05, "interval": 0.01, "turn": 0.02, "count": 0.01, "still": 0.05, "still count": 0.01,
+         "polarity": 0.02}  # fmt: skip
+"""No model is expected to be nearer to a camera than this: logarithms of rates, shares of events or of pixels."""
+LOWEST = 0.1
+"""Of a floor, where the model turns out to be nearer."""
+
+
+def target(recorded: Sums) -> Target:
+    """Of the recording's sums; with floors for errors until a simulation is beside it."""
+    probes = _probes(recorded.isi.sum(axis=(0, 1)))
+    values, block = numbers(recorded, probes)
+    floor = np.array([FLOOR[b] for b in block])
+    sizes = {b: np.count_nonzero(block == b) for b in FLOOR}
+    weight = np.array([WEIGHTS[b] / np.sqrt(sizes[b]) for b in block])
+    return Target(
+        recorded, probes, values, np.zeros(len(values)), floor, weight, np.zeros((GROUPS, len(values))), block
+    )
+
+
+def _probes(isi: np.ndarray) -> np.ndarray:
+    """Bins at which the recording's distribution of intervals passes the PROBES, and the one before its first."""
+    if not isi.sum():
+        return np.empty(0, np.int64)
+    cdf = np.cumsum(isi) / isi.sum()
+    found = np.searchsorted(cdf, PROBES)
+    return np.unique(np.concatenate([found, [max(found[0] - 2, 0)]]))
+
+
+def numbers(s: Sums, probes: np.ndarray, without: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """(N,) numbers of a stream, and the name of the block of each."""
+    rates, lights, isi, counts, still, still_counts, products, pixels = s.without(without)
+    values, block = [], []
+
+    def add(name: str, more: np.ndarray | float) -> None:
+        values.append(np.ravel(more))
+        block.extend([name] * np.size(more))
+
+    if pixels[0] >= LEAST_STILL:
+        seconds = s.seconds[:, None] * pixels[0]
+        add("rate", np.log((rates + 1) / seconds))
+        add("rate", np.log((rates.sum(axis=0) + 1) / seconds.sum()))
+        add("light", np.log((lights + 4) / (s.seconds.sum() * pixels[0])))
+        add("count", (np.cumsum(counts) / max(counts.sum(), 1))[:-1])
+        norm = np.sqrt(products[1] * products[2])
+        add("polarity", products[0] / norm if norm > 0 else 0.0)
+    if len(probes):
+        total = isi.sum()
+        add("interval", (np.cumsum(isi.sum(axis=0)) / max(total, 1))[probes])
+        add("turn", isi[1].sum() / max(total, 1))
+    if pixels[1] >= LEAST_STILL:
+        add("still", np.log((still + 2) / (s.seconds.sum() * pixels[1])))
+        # Of the pixels that fired at all: most never do, and would hide what the others are like.
+        add("still count", (np.cumsum(still_counts[1:]) / max(still_counts[1:].sum(), 1))[:-1])
+        add("still count", np.log((still_counts[1:].sum() + 2) / pixels[1]) / 5)
+    return np.concatenate(values) if values else np.empty(0), np.array(block)
+
+
+def interval_distance(a: Sums, b: Sums) -> float:
+    """Kolmogorov and Smirnov's distance of the intervals between events of a pixel."""
+    cdf = [np.cumsum(s.isi.sum(axis=(0, 1))) / max(s.isi.sum(), 1) for s in (a, b)]
+    return float(np.abs(cdf[0] - cdf[1]).max())

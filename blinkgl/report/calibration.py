@@ -1,0 +1,135 @@
+"""What a calibration found, as a page: before and after beside the recording, one self-contained HTML file."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from blinkgl.recordings.clip import polarity_sums
+from blinkgl.recordings.comparison import BLUR_PX
+from blinkgl.recordings.statistics import COUNTS, ISI_BINS, ISI_PER_DECADE, sums
+from blinkgl.report.markup import data_uri, render
+
+if TYPE_CHECKING:
+    from blinkgl.recordings.calibration import Calibration
+
+_COLOURS = {"recorded": "#222222", "before": "#e9a13b", "fitted": "#1764ab"}
+
+
+def page(result: Calibration, sensor_text: str) -> str:
+    """The HTML text. sensor_text : of the sensor file."""
+    a, b = result.halves
+    span = lambda part: (result.clip.edges_us[list(part)] - result.clip.edges_us[0]) / 1e6
+    return render(
+        "report/calibration.html",
+        title=f"{result.config.emulator} fitted to {result.recording.rsplit('/', 1)[-1]}",
+        result=result,
+        emulator=result.config.emulator,
+        rows=rows(result),
+        parameters=parameters(result),
+        spans=(span(a), span(b)),
+        picture=data_uri(picture(result)),
+        sensor=sensor_text,
+    )
+
+
+def rows(result: Calibration) -> list[tuple[str, list[str]]]:
+    """(quantity, [recorded, before, fitted] of the fitted half, then of the other) as text."""
+    found = []
+    text = lambda v, form: "–" if np.isnan(v) else form.format(v)
+    sides = list(zip(result.judged_before, result.judged))
+    each = lambda recorded, of: [cell for b, f in sides for cell in (recorded(f), of(b), of(f))]
+    found.append(("events", each(lambda j: f"{j.recorded:,}", lambda j: f"{j.events:,}")))
+    found.append(("event ratio", each(lambda j: "1", lambda j: f"{j.rate_ratio:.3f}")))
+    found.append(("ON / OFF", each(lambda j: f"{j.recorded_on_off:.3f}", lambda j: f"{j.on_off:.3f}")))
+    found.append(("intervals, KS", each(lambda j: "0", lambda j: f"{j.interval_distance:.3f}")))
+    if not np.isnan(result.judged[0].polarity_correlation):
+        found.append(("polarity, correlation", each(lambda j: "1", lambda j: f"{j.polarity_correlation:.3f}")))
+    if not np.isnan(result.judged[0].still_hz):
+        found.append(
+            (
+                "still pixels, Hz",
+                each(lambda j: text(j.recorded_still_hz, "{:.3g}"), lambda j: text(j.still_hz, "{:.3g}")),
+            )
+        )
+    return found
+
+
+def parameters(result: Calibration) -> list[tuple[str, str, str, str]]:
+    """(key, before, fitted, what is to be said) of everything that might have been fitted."""
+    found = []
+    for key in result.config.fitted:
+        before, after = getattr(result.before, key), getattr(result.config, key)
+        before = "" if before is None else f"{before:g}"
+        if key in result.values:
+            found.append((key, before, f"{after:.4g} ± {result.uncertainty[key]:.2g}", ""))
+        else:
+            said = result.untold.get(key, "asked to stay as it was")
+            found.append((key, before, "" if after is None else f"{after:.4g}", said))
+    return found
+
+
+def picture(result: Calibration) -> bytes:
+    """PNG: rates over time, intervals, counts, and polarity sums of one interval that was not fitted."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    clip, last = result.clip, result.halves[1][1]
+    streams = {"recorded": clip.events, "before": result.simulated_before, "fitted": result.simulated}
+    held = {name: sums(events, clip, *result.halves[1]) for name, events in streams.items()}
+    figure = Figure(figsize=(13, 7.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 3)
+    edges = (clip.edges_us - clip.edges_us[0]) / 1e6
+
+    ax = axes[0, 0]
+    for name, events in streams.items():
+        rate = np.diff(np.searchsorted(events.t, clip.edges_us)) / np.diff(edges) / 1e3
+        ax.step(edges, np.append(rate, rate[-1:]), where="post", color=_COLOURS[name], label=name)
+    ax.axvspan(edges[result.halves[1][0]], edges[last], color="0.93", zorder=0)
+    ax.set(title="event rate (grey: not fitted)", xlabel="s", ylabel="thousand events/s", ylim=(0, None))
+    ax.legend(frameon=False, fontsize=9)
+
+    ax = axes[0, 1]
+    bins = 10 ** (np.arange(ISI_BINS) / ISI_PER_DECADE) / 1000
+    for name, one in held.items():
+        isi = one.isi.sum(axis=(0, 1))
+        ax.plot(bins, np.cumsum(isi) / max(isi.sum(), 1), color=_COLOURS[name])
+    ax.set(title="interval between a pixel's events", xlabel="ms", ylabel="share below", xscale="log", ylim=(0, 1))
+    shown = np.flatnonzero(sum(one.isi.sum(axis=(0, 1)) for one in held.values()))
+    if len(shown):
+        ax.set_xlim(bins[shown[0]], bins[shown[-1]])
+
+    ax = axes[0, 2]
+    moved = held["recorded"].pixels[:, 0].sum() > 0
+    for name, one in held.items():
+        counts = (one.counts if moved else one.still_counts).sum(axis=0)
+        share = np.where(counts > 0, counts / max(counts.sum(), 1), np.nan)
+        ax.plot(range(len(COUNTS)), share, "o-", ms=3, color=_COLOURS[name])
+    of = "a pixel's events in an interval" if moved else "a pixel's events"
+    ax.set(title=of, ylabel="share of the pixels", yscale="log")
+    ax.set_xticks(range(len(COUNTS)), [f"{c}+" if c > 3 else f"{c}" for c in COUNTS], fontsize=8, rotation=45)
+
+    k = (result.halves[1][0] + last - 1) // 2
+    window = lambda events: events.window(int(clip.edges_us[k]), int(clip.edges_us[k + 1]))
+    images = {
+        name: cv2.GaussianBlur(polarity_sums(window(events), clip.size), (0, 0), BLUR_PX)
+        for name, events in streams.items()
+    }
+    top = max(float(np.percentile(np.abs(images["recorded"]), 99.5)), 0.1)
+    for ax, (name, image) in zip(axes[1], images.items()):
+        ax.imshow(image, cmap="RdBu_r", vmin=-top, vmax=top)
+        ax.set(title=f"{name}: ON - OFF, {edges[k]:.3f} to {edges[k + 1]:.3f} s", xticks=[], yticks=[])
+    for ax in axes[0]:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(alpha=0.25)
+    for axis in (axes[0, 1].xaxis, axes[0, 2].yaxis):  # without mathematical fonts
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    file = io.BytesIO()
+    figure.savefig(file, dpi=100, format="png", metadata={"Software": None})
+    return file.getvalue()

@@ -1,0 +1,245 @@
+"""calibrate: parameters that are known come back, what the data cannot tell is named, and nobody is led astray."""
+
+from __future__ import annotations
+
+import itertools
+import re
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from blinkgl.cli import run
+from blinkgl.errors import BlinkGLError, ConfigError, EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.formats import write_events
+from blinkgl.recordings.calibration import calibrate
+from blinkgl.recordings.clip import Clip, clip_of_frames, clip_of_still, clock_offset
+from blinkgl.recordings.simulation import emulator_config
+from blinkgl.recordings.statistics import numbers, sums, target
+from tests.shared_data import shared
+
+H, W, GAP_US = 64, 80, 20_000
+TRUE = dict(contrast_threshold=0.25, contrast_threshold_off=0.32, threshold_sigma=0.03, log_eps=0.03,
+            refractory_us=3000.0)  # fmt: skip
+
+
+def moving(count: int = 7, px: float = 6.0, seed: int = 0, most: float = 0.95) -> list[tuple[np.ndarray, int, str]]:
+    """Frames of a texture of three scales that moves; (codes, t_ns, name)."""
+    rng = np.random.default_rng(seed)
+    grown = lambda s: cv2.resize(
+        rng.normal(size=(H // s + 8, W // s + 40)).astype(np.float32), (W + 200, H + 40), interpolation=cv2.INTER_CUBIC
+    )
+    light = np.clip(np.exp(0.25 * grown(4) + 0.4 * grown(8) + 0.7 * grown(24) - 1.5), 0.01, most)
+    look = lambda k: cv2.warpAffine(light, np.float32([[1, 0, -px * k], [0, 1, -px * k / 4]]), (W, H))
+    return [(np.round(look(k) * 255).astype(np.uint8), (k + 1) * GAP_US * 1000, f"#{k}") for k in range(count)]
+
+
+def scene(frames=None) -> Clip:
+    """A clip of the frames, without a camera's events."""
+    frames = frames or moving()
+    first, last = frames[0][1] // 1000, frames[-1][1] // 1000
+    ends = Events(*(np.zeros(2, t) for t in (np.uint16, np.uint16)), np.array([first, last - 1]), np.zeros(2, np.uint8))
+    return clip_of_frames(ends, frames, (H, W), delay_us=0)
+
+
+def files(folder, frames=None, emulator=None, shift_us: int = 0, seed: int = 9):
+    """A recording, made by an emulator of the frames, and the frames, as a person has them."""
+    frames = frames or moving()
+    events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE, **(emulator or {})}), seed)
+    write_events(folder / "camera.npz", Events(events.x, events.y, events.t + shift_us, events.p), H, W)
+    np.savez(
+        folder / "frames.npz", frames=np.stack([f for f, _, _ in frames]), t=np.array([t // 1000 for _, t, _ in frames])
+    )
+    return folder / "camera.npz", folder / "frames.npz"
+
+
+# --- what is compared -------------------------------------------------------------------------------------------------
+
+
+def test_numbers_of_a_stream_against_counting_one_by_one():
+    clip = scene()
+    events = clip.simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
+    s = sums(events, clip, 1, 4)
+    inside = events.window(int(clip.edges_us[1]), int(clip.edges_us[4]))
+    still = clip.still[inside.y, inside.x]
+    assert s.rates.sum() == np.count_nonzero(~still) and s.still.sum() == np.count_nonzero(still)
+    for k, p in itertools.product(range(3), (0, 1)):
+        part = events.window(int(clip.edges_us[1 + k]), int(clip.edges_us[2 + k]))
+        assert s.rates[:, k, p].sum() == np.count_nonzero((part.p == p) & ~clip.still[part.y, part.x])
+    assert s.lights.sum() == s.rates.sum()
+    gaps = []
+    for pixel in set(zip(inside.y.tolist(), inside.x.tolist())):
+        here = (inside.y == pixel[0]) & (inside.x == pixel[1])
+        gaps += list(zip(np.diff(inside.t[here]), np.diff(inside.p[here].astype(int)) != 0))
+    assert s.isi.sum() == len(gaps) and s.isi[:, 1].sum() == sum(turn for _, turn in gaps)
+    # Forty bins per decade of microseconds.
+    assert np.array_equal(
+        s.isi.sum(axis=(0, 1)), np.histogram([g for g, _ in gaps], 10 ** (np.arange(281) / 40) - 1e-6)[0]
+    )
+    whole = np.bincount(inside.y.astype(int) * W + inside.x, minlength=H * W)
+    assert s.counts.sum() == 3 * np.count_nonzero(~clip.still) and s.counts[:, 0].sum() > 0
+    assert s.still_counts[:, 0].sum() == np.count_nonzero(whole[clip.still.ravel()] == 0)
+
+
+def test_a_stream_beside_itself_is_off_by_nothing_and_beside_another_by_chance():
+    clip = scene()
+    config = emulator_config({"emulator": "esim", **TRUE})
+    recorded, again = (sums(clip.simulate(config, seed), clip, 0, 3) for seed in (1, 2))
+    goal = target(recorded)
+    assert not goal.residual(recorded).any()
+    other = sums(clip.simulate(config, 2), clip, 0, 3, recorded.polarity)
+    near = goal.beside(other, floor="lowest")
+    off = (numbers(other, goal.probes)[0] - goal.values) / np.maximum(near.chance, 1e-4)
+    assert 0.3 < np.sqrt(np.mean(off[goal.block == "rate"] ** 2)) < 3, "the jackknife knows how large chance is"
+    assert (near.error < goal.error).mean() > 0.8
+    assert again.rates.sum() == other.rates.sum()
+
+
+def test_the_clock_is_found():
+    """Up to the emulator's own lag: levels are passed after the light has begun to change."""
+    clip = scene()
+    events = clip.simulate(emulator_config({"emulator": "esim", **TRUE}), 1)
+    lag, correlation = clock_offset(events, clip.change, clip.clock_us, (H, W))
+    assert 0 < lag < 4000 and correlation > 0.8
+    for shift in (4_300, -7_000):
+        found, _ = clock_offset(events, clip.change, clip.clock_us - shift, (H, W))
+        assert found - lag == pytest.approx(shift, abs=700)
+
+
+def test_tiles_of_a_large_sensor_have_the_same_events(monkeypatch):
+    """Half of the pixels: what they see, and their recorded events, stay together."""
+    frames = moving()
+    events = scene(frames).simulate(emulator_config({"emulator": "esim", **TRUE, "threshold_sigma": 0.0}), 1)
+    whole = clip_of_frames(events, frames, (H, W), delay_us=0)
+    part = clip_of_frames(events, frames, (H, W), delay_us=0, most=2 * 32 * 32 * len(whole.frames))
+    assert part.size == (64, 32) and part.share == pytest.approx(2 * 32 * 32 / (H * W))
+    again = part.simulate(emulator_config({"emulator": "esim", **TRUE, "threshold_sigma": 0.0}), 5)
+    assert len(again) == len(part.events) > 1000
+    a, b = (sums(e, part, 0, part.intervals).polarity for e in (again, part.events))
+    assert np.array_equal(a, b)
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
+
+
+def test_from_files_to_a_sensor_file_and_a_page(tmp_path, capsys):
+    camera, frames = files(tmp_path, shift_us=3000)
+    out = tmp_path / "mine.yaml"
+    fixed = [part for key in ("log_eps=0.03", "threshold_sigma=0.03") for part in ("--set", key)]
+    assert run(["calibrate", str(camera), "--frames", str(frames), "--out", str(out), "--starts", "1", *fixed]) == 0
+    said = capsys.readouterr().out
+    assert "Clock: the polarity sums follow the frames best when +" in said and "dense flow" in said
+    table = yaml.safe_load(out.read_text())
+    assert (table["width"], table["height"]) == (W, H)
+    found = table["emulators"]["esim"]
+    for key, within in (("contrast_threshold", 0.03), ("contrast_threshold_off", 0.03), ("refractory_us", 0.05)):
+        assert found[key] == pytest.approx(TRUE[key], rel=within), key
+        assert 0 < table["uncertainty"][f"emulators.esim.{key}"] < 0.1 * found[key]
+    assert found["log_eps"] == 0.03
+    emulator_config({"emulator": "esim", **found})
+    page = (tmp_path / "mine.html").read_text()
+    assert "data:image/png" in page and "asked to stay as it was" in page
+    assert run(["calibrate", str(camera), "--frames", str(frames), "--out", str(out)]) == 2
+    assert "output file exists" in capsys.readouterr().err
+
+
+def still_recording(folder, seconds: float = 2.0, size=(48, 60), **noise):
+    ends = Events(*(np.zeros(2, np.uint16) for _ in "xy"), np.array([0, round(seconds * 1e6)]), np.zeros(2, np.uint8))
+    events = clip_of_still(ends, size).simulate(emulator_config({"emulator": "v2e", **noise}), 3)
+    write_events(folder / "dark.npz", events, *size)
+    return folder / "dark.npz"
+
+
+def test_what_makes_no_difference_is_named(tmp_path):
+    """ESIM has no noise: a scene that stands still says nothing of any of its parameters."""
+    result = calibrate(still_recording(tmp_path, shot_noise_rate_hz=3.0), still=True, starts=1)
+    assert not result.values and set(result.untold) == set(result.config.fitted) and result.config == result.before
+    assert set(result.untold.values()) == {"makes no difference to this scene, left as it was"}
+
+
+def test_noise_of_a_still_scene_comes_back(tmp_path):
+    path = still_recording(tmp_path, leak_rate_hz=1.0, shot_noise_rate_hz=4.0)
+    told = ("leak_rate_hz", "shot_noise_rate_hz")
+    fixed = [key for key in emulator_config("v2e").fitted if key not in told]
+    result = calibrate(path, still=True, emulator="v2e", fixed=fixed, starts=1)
+    assert result.values == {
+        "leak_rate_hz": pytest.approx(1.0, rel=0.1),
+        "shot_noise_rate_hz": pytest.approx(4.0, rel=0.1),
+    }
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "what, said",
+    [
+        ("no frames", "the recording has no frames"),
+        ("other size", "frames are of another size than the recording .*got '64x80'.*80x64"),
+        ("no times", "frames without times"),
+        ("other scene", "events and frames do not match"),
+        ("other clock", "events and frames do not match"),
+        ("saturated", "too many pixels of the frames are saturated"),
+        ("few events", "too few events"),
+        ("two frames", "fewer than two intervals"),
+        ("unknown key", "speed"),
+        ("interpolation", "interpolate: cannot be calibrated with"),
+        ("still and frames", "a still scene needs no frames"),
+    ],
+)
+def test_one_line_and_nothing_written(tmp_path, capsys, what, said):
+    camera, file = files(tmp_path)
+    extra = {"no frames": [], "unknown key": ["--set", "speed=3"], "interpolation": ["--interpolate", "cubic"],
+             "still and frames": ["--still"]}.get(what, [])  # fmt: skip
+    stored = dict(np.load(file))
+    if what == "other size":
+        stored["frames"] = np.ascontiguousarray(stored["frames"].transpose(0, 2, 1))
+    elif what == "no times":
+        del stored["t"]
+    elif what == "other scene":
+        stored["frames"] = np.stack([f for f, _, _ in moving(seed=5, px=-2.0)])
+    elif what == "other clock":
+        stored["t"] = stored["t"] + 10_000_000
+    elif what == "saturated":
+        stored["frames"] = np.where(stored["frames"] > 60, 255, stored["frames"]).astype(np.uint8)
+    elif what == "two frames":
+        stored = {k: v[:2] for k, v in stored.items()}
+    np.savez(file, **stored)
+    if what == "few events":
+        write_events(camera, scene().simulate(emulator_config("esim"), 1).part(slice(100)), H, W)
+    before = sorted(tmp_path.iterdir())
+    given = [] if what == "no frames" else ["--frames", str(file)]
+    assert run(["calibrate", str(camera), *given, "--out", str(tmp_path / "out.yaml"), *extra]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.startswith("error: ")
+    assert re.search(said, error), error
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_an_emulator_that_says_nothing_and_a_file_of_another_kind(tmp_path, capsys):
+    camera, frames = files(tmp_path)
+    with pytest.raises(ConfigError, match="nothing is left to be fitted"):
+        calibrate(camera, frames, fixed=emulator_config("esim").fitted)
+    with pytest.raises(BlinkGLError, match="no such file"):
+        calibrate(tmp_path / "none.npz", frames)
+    assert run(["calibrate", str(camera), "--frames", str(frames), "--out", str(tmp_path / "out.txt")]) == 2
+    assert "ends in .yaml" in capsys.readouterr().err
+    with pytest.raises(EventDataError, match="no frames"):
+        calibrate(camera)
+
+
+# --- a real camera ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_slider_depth_is_fitted_on_its_first_half_and_judged_on_its_second():
+    root = shared("data/events/slider_depth")
+    result = calibrate(
+        root / "events_chunk.txt", root / "images", timestamps=root / "images.txt", emulator="esim", starts=2
+    )
+    before, after = result.judged_before[1], result.judged[1]
+    assert before.rate_ratio > 5 and 0.9 <= after.rate_ratio <= 1.1
+    assert before.interval_distance > 0.5 and after.interval_distance <= 0.1
+    assert after.polarity_correlation > before.polarity_correlation

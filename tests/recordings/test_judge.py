@@ -1,0 +1,84 @@
+"""The judge: guesses where there is nothing to tell, is sure where there is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blinkgl.cli import run
+from blinkgl.errors import EventDataError
+from blinkgl.events.types import Events
+from blinkgl.io.formats import write_events
+from blinkgl.recordings.comparison import compare
+from blinkgl.recordings.judge import LEAST_PATCHES, area, boosted, judge_halves, patches
+
+H, W = 96, 128
+
+
+def poisson(rate_hz: float, on_share: float = 0.5, seed: int = 0, size=(H, W), seconds: float = 1.0) -> Events:
+    rng = np.random.default_rng(seed)
+    n = rng.poisson(rate_hz * seconds * size[0] * size[1])
+    return Events(
+        rng.integers(0, size[1], n).astype(np.uint16),
+        rng.integers(0, size[0], n).astype(np.uint16),
+        np.sort(rng.integers(0, round(seconds * 1e6), n)),
+        (rng.random(n) < on_share).astype(np.uint8),
+    )
+
+
+def test_area_under_the_curve_counts_pairs():
+    rng = np.random.default_rng(0)
+    score, label = rng.integers(0, 6, 60).astype(float), rng.random(60) < 0.4
+    pairs = [(a > b) + 0.5 * (a == b) for a in score[label] for b in score[~label]]
+    assert area(score, label.astype(float)) == pytest.approx(np.mean(pairs))
+
+
+def test_stumps_learn_what_one_feature_says_and_nothing_of_chance():
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(1500, 4)).astype(np.float32)
+    label = (x[:, 2] + 0.5 * rng.normal(size=1500) > 0.3).astype(float)
+    assert area(boosted(x[:1000], label[:1000], x[1000:]), label[1000:]) > 0.9
+    shuffled = rng.permutation(label)
+    assert abs(area(boosted(x[:1000], shuffled[:1000], x[1000:]), shuffled[1000:]) - 0.5) < 0.08
+
+
+def test_what_is_told_of_a_patch():
+    events = Events(
+        np.array([0, 1, 0, 40, 0], np.uint16), np.array([0, 0, 0, 20, 0], np.uint16),
+        np.array([0, 500, 1500, 1600, 900_000]), np.array([1, 1, 0, 1, 1], np.uint8),
+    )  # fmt: skip
+    count, told = patches(events, (H, W), (0, 1_000_000))
+    assert count[0, 0, 0] == 3 and count[0, 1, 2] == 1 and count[14, 0, 0] == 1 and count.sum() == 5
+    on, off, skew, turns, gap, short, company, active, most, square, mean = told[0, 0, 0]
+    assert (on, off) == pytest.approx(np.log([3, 2])) and skew == pytest.approx(1 / 3)
+    assert turns == 1 and gap == pytest.approx(np.log(1500)) and short == 1
+    assert company == pytest.approx(2 / 3), "the second and the third have a neighbour that fired just before"
+    assert active == pytest.approx(np.log(3)) and most == 2 and mean == 1.5 and square == pytest.approx(4 / 3)
+
+
+def test_the_same_law_cannot_be_told_apart_and_another_can(tmp_path):
+    names = {
+        "a": poisson(8),
+        "same": poisson(8, seed=1),
+        "more_on": poisson(8, 0.65, seed=2),
+        "small": poisson(8, 0.9, seed=3, size=(64, 80)),
+    }
+    for name, events in names.items():
+        write_events(tmp_path / f"{name}.npz", events, *((64, 80) if name == "small" else (H, W)))
+    told = {n: compare(tmp_path / "a.npz", tmp_path / f"{n}.npz", judge=True) for n in ("same", "more_on", "small")}
+    assert abs(told["same"].told_apart.auc - 0.5) < 0.06
+    assert told["more_on"].told_apart.auc > 0.8 and told["small"].told_apart.auc > 0.95
+    assert all(abs(half.auc - 0.5) < 0.12 for result in told.values() for half in result.halves)
+    alone = compare(tmp_path / "a.npz", judge=True)
+    assert alone.told_apart is None and len(alone.halves) == 1
+    assert "judge: A from B, AUC" in [row[0] for row in told["same"].rows()]
+    assert told["same"].to_dict()["told_apart"]["auc"] == told["same"].told_apart.auc
+
+
+def test_too_few_events_is_one_line(tmp_path, capsys):
+    write_events(tmp_path / "a.npz", poisson(0.05), H, W)
+    assert run(["compare", str(tmp_path / "a.npz"), "--judge", "--out", str(tmp_path / "out")]) == 2
+    assert "too few patches with events for a judge" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(EventDataError, match=str(LEAST_PATCHES)):
+        judge_halves(poisson(0.05), (H, W), (0, 1_000_000))

@@ -8,7 +8,7 @@
 #ifdef TEXTURED
 #define NEEDS_UV
 #endif
-#ifdef LAMPS
+#if defined(LAMPS) || defined(SHADOWS)
 #define NEEDS_LOCAL
 #endif
 #include "vertex.glsl"

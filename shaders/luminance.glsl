@@ -23,7 +23,7 @@
 #ifdef LIT
 #define NEEDS_NORMAL
 #endif
-#if defined(CHANGES) || defined(LAMPS)
+#if defined(CHANGES) || defined(LAMPS) || defined(SHADOWS)
 #define NEEDS_LOCAL
 #endif
 #ifdef CHANGES

@@ -315,6 +315,12 @@ class LightConfig(Config):
         None,
         description="a panorama that lights the scene; null: the sun and the sky shine. In random worlds: sky.lights",
     )
+    shadows: Annotated[Literal["off", "hard", "soft"], BeforeValidator(lambda v: "off" if v is False else v)] = Field(
+        "off",
+        description="of objects and walls, cast by the sun, further suns and spot lights, four at most (soft: two); "
+        "hard: edges are as wide as a texel of the shadow map; soft: by the size of the light, up to 48 texels",
+    )
+    shadow_size: int = Field(1024, ge=64, le=8192, description="texels a side of each shadow map")
     unlit: bool = Field(False, description="radiance = albedo on every surface")
 
     def sun_direction(self, elevation: float = 60.0, azimuth: float = 40.0) -> Vector3:
@@ -329,9 +335,9 @@ class LightConfig(Config):
         if (given := len([*lights])) > MAX_LIGHTS:
             raise Refused("too many lights", where="lights", value=given, accepted=f"at most {MAX_LIGHTS}")
 
-    @rule("unlit", "#lights", "?environment")
-    def _lit(unlit, lights, environment):
-        for where, given in (("lights", [*lights]), ("environment", environment)):
+    @rule("unlit", "#lights", "?environment", "shadows")
+    def _lit(unlit, lights, environment, shadows):
+        for where, given in (("lights", [*lights]), ("environment", environment), ("shadows", shadows != "off")):
             if unlit and given:
                 raise Refused("nothing is lit by them", where=where, value="unlit: true", accepted="unlit: false")
 

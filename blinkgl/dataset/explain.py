@@ -215,6 +215,10 @@ def _shining(light: Light) -> str:
     names = [f"{count[kind]} {word}{'s' * (count[kind] > 1)}" for kind, word in words.items() if count[kind]]
     if light.sky:
         names.append("sky")
+    if light.around is not None:
+        names.append("panorama")
+    if light.shadows != "off":
+        names.append(f"{light.shadows} shadows")
     return ", ".join(names or ["nothing"]) + (", coloured" if is_coloured(light) else "")
 
 
@@ -427,4 +431,8 @@ def _left_out(config: SequenceConfig, scene: Scene, result: Explanation) -> None
     for name, value in config.events.model_dump().items():
         if value in (0, 0.0, False) and name != "seed":
             add(f"{config.events.emulator}: {name}", f"events.{name}: {value}".lower())
-    add("shadows, inter-reflection", "BlinkGL does not model them")
+    if config.scene.light.shadows == "off":
+        add("shadows", "scene.light.shadows: off")
+    elif config.timeline.kind in ("brightness", "budget") or config.timeline.reconstruction == "hermite":
+        add("the motion of shadows in rates of change", "dL/dt is that of the lit share of a surface: no edge is in it")
+    add("inter-reflection", "BlinkGL does not model it")

@@ -280,6 +280,13 @@ def _keys(base: EmulatorConfig, fixed: Iterable[str]) -> list[str]:
     if not base.fitted:
         raise ConfigError("this emulator says nothing of what may be fitted", where="emulator", value=base.emulator)
     fixed = set(fixed)
+    if "threshold_ratio" in fixed:
+        raise ConfigError(
+            "the two thresholds are fitted one by one, and not their ratio",
+            where="--set",
+            value="threshold_ratio",
+            accepted="contrast_threshold or contrast_threshold_off",
+        )
     keys = [key for key in base.fitted if key not in fixed]
     if not keys:
         raise ConfigError("nothing is left to be fitted", where="--set", value=sorted(fixed))
@@ -420,7 +427,10 @@ class _Search:
     def config(self, keys: list[str] | None = None, at: np.ndarray | None = None) -> EmulatorConfig:
         keys, at = (self._keys, self._at) if keys is None or at is None else (keys, at)
         values = {key: float(np.exp(v)) for key, v in zip(keys, at)}
-        return emulator_config({**self._base.model_dump(), **self._set, **values})
+        base = self._base.model_dump()
+        if base.get("threshold_ratio") is not None:  # of two thresholds that now go their own ways
+            base["threshold_ratio"] = None
+        return emulator_config({**base, **self._set, **values})
 
     def values(self) -> dict[str, float]:
         return {key: float(np.exp(v)) for key, v in zip(self._keys, self._at)}

@@ -21,13 +21,21 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Light
 
 EXAMPLES: tuple[dict[str, Any], ...] = (
-    {"LIGHTS": 1, "AMBIENT": 1},
+    {"LIGHTS": 1, "AMBIENT": 2},
     {"LIGHTS": 1, "SUNS": 2, "LAMPS": 2},
-    {"LIGHTS": 1, "SUNS": 2, "LAMPS": 3, "SPOTS": 1, "AMBIENT": 1},
-)
+    {"LIGHTS": 1, "SUNS": 1, "AMBIENT": 1, "SHADOWS": 1, "SHADOW_SUNS": 1},
+    {
+        "LIGHTS": 1, "SUNS": 2, "LAMPS": 3, "SPOTS": 2, "AMBIENT": 1,
+        "SHADOWS": 2, "SHADOW_SUNS": 1, "SHADOW_SPOTS": 1, "SOFT": 1,
+    },
+)  # fmt: skip
 """Variants for which a program of a pass that is lit has to compile, besides the plain light's; HUED comes on top."""
-_STRENGTHS = ("sun_strength", "lamp_strength")
-_AROUND = ("around", "around_rate")
+# By uniform, whether it has a value per channel: one of HUED's three, or the one that stands for them.
+_FIXED = {"sun_strength": True, "lamp_strength": True, "lamp_fading": False, "spot_cone": False}
+_PLACED = {
+    **dict.fromkeys(("sun_towards", "lamp_place", "spot_axis"), False),
+    **dict.fromkeys(("around_even", "around_squares", "around_mixed"), True),
+}
 
 
 class Lighting:
@@ -41,12 +49,13 @@ class Lighting:
         near = self.lamps[self._suns :]
         strength = np.array([lamp.strength for lamp in self.lamps], np.float64).reshape(-1, 3)
         self._fixed = {
-            "sun_strength": strength[: self._suns],
-            "lamp_strength": strength[self._suns :],
+            "sun_strength": strength[: self._suns].T,  # channels first
+            "lamp_strength": strength[self._suns :].T,
             "lamp_fading": np.array([lamp.reach**-4.0 for lamp in near]),  # of inf: 0
             "spot_cone": np.array([lamp.cone for lamp in near if lamp.kind == "spot"]),
         }
         self._weights: dict[tuple[float, ...], np.ndarray] = {}
+        self._bytes: dict[tuple, bytes] = {}  # of what is fixed, by uniform and by what its one channel stands for
         self._last: tuple[Moment | None, bool, dict[str, np.ndarray]] = None, False, {}
 
     def defines(self, pass_: Pass, kind: Kind) -> dict[str, Any]:
@@ -55,34 +64,47 @@ class Lighting:
         if self.plain or not (kind.lit and pass_.lit):
             return {}
         counts = {"SUNS": self._suns, "LAMPS": len(self.lamps) - self._suns, "SPOTS": self._spots}
+        ambient = 2 if self._quadric[:, :3, :3].any() else 1
         return (
             {"LIGHTS": 1}
             | {name: count for name, count in counts.items() if count}
-            | ({"AMBIENT": 1} if self._quadric.any() else {})
+            | ({"AMBIENT": ambient} if self._quadric.any() else {})
+            | self._shadows(pass_)
             | ({"HUED": 1} if self.coloured and (kind.hued or not pass_.one_channel) else {})
         )
+
+    def _shadows(self, pass_: Pass) -> dict[str, Any]:
+        maps = getattr(pass_, "shadows", ())
+        suns = sum(one.lamp.kind == "sun" for one in maps)
+        counts = {"SHADOWS": len(maps), "SHADOW_SUNS": suns, "SHADOW_SPOTS": len(maps) - suns}
+        return {name: n for name, n in counts.items() if n} | ({"SOFT": 1} if any(one.soft for one in maps) else {})
 
     def place(self, uniforms: Uniforms, item: DrawItem, moment: Moment) -> None:
         """Sets what lights.glsl asks for, of whichever variant the program is."""
         if self.plain:
             return
-        rates = any(name.endswith("_rate") for name in ("sun_towards_rate", "lamp_place_rate") if name in uniforms)
-        rates = rates or "around_rate" in uniforms
+        index, channel = item.object_index, item.material.base_color
+        for name, per_channel in _FIXED.items():
+            if (uniform := uniforms.get(name)) is not None:
+                one = per_channel and uniform.dimension == 1
+                key = (name, channel) if one else (name,)
+                if key not in self._bytes:
+                    values = self._fixed[name]
+                    values = self._channel(channel) @ values if one else values.T if per_channel else values
+                    self._bytes[key] = np.ascontiguousarray(values, np.float32).tobytes()
+                uniform.write(self._bytes[key])
+        rates = any(f"{name}_rate" in uniforms for name in _PLACED)
         placed = self._placed(moment, rates)
-        for name, values in (*self._fixed.items(), *placed.items()):
-            if name not in uniforms:
-                continue
-            if name in placed:
-                values = values[item.object_index]
-            if name in _STRENGTHS and uniforms[name].dimension == 1:
-                values = values @ self._channel(item)
-            elif name in _AROUND and uniforms[name].array_length == 1:
-                values = np.tensordot(self._channel(item), values, axes=1)
-            uniforms[name].write(np.ascontiguousarray(values, np.float32).tobytes())
+        for name, per_channel in _PLACED.items():
+            for one in (name, f"{name}_rate") if rates else (name,):
+                if (uniform := uniforms.get(one)) is not None:
+                    values = placed[one][index]
+                    if per_channel and uniform.array_length == 1:
+                        values = (self._channel(channel) @ values).astype(np.float32)
+                    uniform.write(values.tobytes())
 
-    def _channel(self, item: DrawItem) -> np.ndarray:
-        """(3,) what one channel stands for: the shares of r, g, b in the luminance of what the item is made of."""
-        base = item.material.base_color
+    def _channel(self, base: tuple[float, ...]) -> np.ndarray:
+        """(3,) what one channel stands for: the shares of r, g, b in the luminance of what is of this base colour."""
         if base not in self._weights:
             shares = LUMA * np.asarray(base, np.float64)
             total = shares.sum()
@@ -90,7 +112,7 @@ class Lighting:
         return self._weights[base]
 
     def _placed(self, moment: Moment, rates: bool) -> dict[str, np.ndarray]:
-        """By uniform, (objects, ...) float64 in the objects' axes; those of the last moment are kept."""
+        """By uniform, (objects, ...) float32 in the objects' axes; those of the last moment are kept."""
         if self._last[0] is moment and self._last[1] >= rates:
             return self._last[2]
         R, t = moment.T_world_obj[:, :3, :3], moment.T_world_obj[:, :3, 3]
@@ -100,12 +122,8 @@ class Lighting:
         axes, away = poses[:, :3, 2], poses[None, self._suns :, :3, 3] - t[:, None]
         own = axes @ R
         spots = slice(len(self.lamps) - self._spots, None)
-        placed = {
-            "sun_towards": own[:, : self._suns],
-            "lamp_place": away @ R,
-            "spot_axis": own[:, spots],
-            "around": turn[:, None].swapaxes(2, 3) @ self._quadric @ turn[:, None],
-        }
+        placed = {"sun_towards": own[:, : self._suns], "lamp_place": away @ R, "spot_axis": own[:, spots]}
+        placed |= _forms(turn[:, None].swapaxes(2, 3) @ self._quadric @ turn[:, None])
         if rates:
             dR, dt = moment.rates.T_world_obj[:, :3, :3], moment.rates.T_world_obj[:, :3, 3]
             changes = np.array([lamp.path.derivative(moment.t_ns) for lamp in self.lamps]).reshape(-1, 4, 4)
@@ -117,7 +135,20 @@ class Lighting:
                 "sun_towards_rate": own_rate[:, : self._suns],
                 "lamp_place_rate": away @ dR + (changes[None, self._suns :, :3, 3] - dt[:, None]) @ R,
                 "spot_axis_rate": own_rate[:, spots],
-                "around_rate": half + half.swapaxes(2, 3),
             }
+            placed |= {f"{name}_rate": values for name, values in _forms(half + half.swapaxes(2, 3)).items()}
+        placed = {name: np.ascontiguousarray(values, np.float32) for name, values in placed.items()}
         self._last = moment, rates, placed
         return placed
+
+
+def _forms(quadric: np.ndarray) -> dict[str, np.ndarray]:
+    """(..., 3, 4, 4) quadrics as the shader has them, (..., 3, 4 or 3)."""
+    Q = quadric
+    even = np.concatenate([2 * Q[..., :3, 3], Q[..., 3, 3:]], axis=-1)
+    mixed = 2 * np.stack([Q[..., 0, 1], Q[..., 1, 2], Q[..., 2, 0]], axis=-1)  # of xy, yz, zx
+    return {
+        "around_even": even,
+        "around_squares": np.diagonal(Q[..., :3, :3], axis1=-2, axis2=-1),
+        "around_mixed": mixed,
+    }

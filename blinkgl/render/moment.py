@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import DrawItem
     from blinkgl.scene.types import PosePath, Scene
 
+_TEXTURE_FROM_CLIP = np.array([[0.5, 0, 0, 0.5], [0, 0.5, 0, 0.5], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 KEPT = 4
 """Moments in memory: a label looks at its own time and at those of its neighbours, which look at it."""
 
@@ -110,6 +111,12 @@ class Moment:
         return np.ascontiguousarray(self.mvp.swapaxes(1, 2), np.float32)
 
     @_once
+    def texture_from_obj(self) -> np.ndarray:
+        """(n, 4, 4) float32, row by row, from the object's axes to coordinates and depth in a picture of this moment
+        that is a texture, [0, 1] each, times w."""
+        return np.ascontiguousarray(_TEXTURE_FROM_CLIP @ self.mvp, np.float32)
+
+    @_once
     def rates(self) -> Rates:
         stage = self._stage
         dT_world_obj = np.zeros_like(self.T_world_obj)
@@ -127,6 +134,8 @@ class Moment:
     @_once
     def inverse_depths(self) -> np.ndarray:
         """(m, 2) uint32: ``inverse_depths`` of guard.glsl, a uvec2 per item."""
+        if self.view.projection[3, 3]:  # parallel rays: w is 1 everywhere
+            return np.tile(inverse_depth_bits(np.ones(1), np.zeros(1), 1.0), (len(self._stage.items), 1))
         return inverse_depth_bits(self.centres[:, 2], self._stage.item_radius, self.view.camera.near)
 
     @_once

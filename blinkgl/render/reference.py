@@ -26,6 +26,7 @@ way to anti-alias, not a property of the scene.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -34,9 +35,9 @@ from scipy import ndimage
 
 from blinkgl.camera import CameraModel
 from blinkgl.render.raycast import Forest, build_tree, join_trees, nearest_exhaustive, nearest_tree
-from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of
+from blinkgl.scene.lights import ambient, beam, lamps_of, quadric_of, shadowing
 from blinkgl.scene.shapes.deformer import normals_at
-from blinkgl.scene.types import Material, Mesh, Part, Scene, SceneObject, Texture
+from blinkgl.scene.types import Lamp, Material, Mesh, Part, Scene, SceneObject, Texture
 
 LUMA = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, of linear R, G, B
 # A visibility ray ends this much (relative) before the point it aims at, so that the point does not hide itself:
@@ -205,10 +206,11 @@ def _forest(scene: Scene, t_ns: int) -> Forest:
     return kept[key]
 
 
-def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
-    """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`."""
+def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False, eye=None, near=None):
+    """(hit (N, 3) int32, bary (N, 3), depth (N,)) as described at :func:`raycast.nearest_tree`. eye, near : of other
+    rays than the camera's: (4, 4) pose where they come from, Z at which they begin."""
     forest = _forest(scene, int(t_ns))
-    camera_pose = scene.camera_path.pose(t_ns)
+    camera_pose = scene.camera_path.pose(t_ns) if eye is None else eye
     # relative to the camera by differences of positions, so that a common offset from the origin cancels first
     relative = [_relative_pose(camera_pose, thing.path.pose(t_ns)) for thing, _ in scene_parts(scene)]
     axes = np.array([m[:3, :3].T for m in relative]).reshape(-1, 3, 3)
@@ -223,7 +225,7 @@ def _nearest(scene, t_ns, rays, far=None, skip=None, exhaustive=False):
         origins,
         np.ascontiguousarray(axes),
         np.ascontiguousarray(rays),
-        float(scene.camera.near),
+        float(scene.camera.near if near is None else near),
         far,
         skip,
         hit,
@@ -390,7 +392,8 @@ def surface(scene: Scene, hits: Hits) -> Surface:
         if not part.material.unlit:
             pose = thing.path.pose(hits.t_ns)
             points = hits.local[rows] @ pose[:3, :3].T + pose[:3, 3]
-            colour[rows] *= received(scene, hits.t_ns, points, normal[rows]).total
+            own = np.column_stack([hits.part[rows], hits.triangle[rows]])
+            colour[rows] *= received(scene, hits.t_ns, points, normal[rows], own).total
     colour = seen_through_fog(scene, hits, colour)
     return Surface(normal, uv, albedo, colour, colour @ LUMA)
 
@@ -420,14 +423,75 @@ class Received:
         return self.direct.sum(axis=0) + self.around
 
 
-def received(scene: Scene, t_ns: int, points: np.ndarray, normal: np.ndarray) -> Received:
-    """What the scene's lights send at t_ns to (N, 3) points with (N, 3) unit normals, world axes."""
+def received(
+    scene: Scene, t_ns: int, points: np.ndarray, normal: np.ndarray, own: np.ndarray | None = None
+) -> Received:
+    """What the scene's lights send at t_ns to (N, 3) points with (N, 3) unit normals, world axes.
+
+    own : (N, 2) part and triangle that each point is on, which do not hide it from a lamp; None: no shadows."""
     lamps = lamps_of(scene.light)
     direct = np.zeros((len(lamps), *points.shape))
+    casting = shadowing(scene.light) if own is not None else ()
     for k, lamp in enumerate(lamps):
         towards, strength = beam(lamp, lamp.path.pose(t_ns), points)
-        direct[k] = np.maximum(0.0, (towards * normal).sum(axis=1))[:, None] * strength
+        facing = np.maximum(0.0, (towards * normal).sum(axis=1))
+        if k in casting:
+            facing = facing * seen_share(scene, t_ns, lamp, points, own)
+        direct[k] = facing[:, None] * strength
     return Received(direct, ambient(quadric_of(scene.light), normal))
+
+
+SOFT_SAMPLES = 64
+"""Points of a lamp that are looked for, of a soft shadow."""
+_FAR_AWAY = 1e5
+"""From where a sun's rays come, times the scene's size: parallel to 1e-5."""
+
+
+def seen_share(scene: Scene, t_ns: int, lamp: Lamp, points: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """(N,) how much of a lamp is seen from (N, 3) points, world axes, past what casts shadows: 0 or 1, of a soft shadow
+    a mean over the lamp. own : as for :func:`received`."""
+    casters, number = _casters(scene)
+    if not casters.objects or not len(points):
+        return np.ones(len(points))
+    skip = np.ascontiguousarray(np.column_stack([number[own[:, 0]], own[:, 1]]).astype(np.int32))
+    pose = lamp.path.pose(t_ns) @ np.diag([1.0, -1.0, -1.0, 1.0])  # a camera that looks where it shines
+    middle = points.mean(axis=0)
+    size = 1.0 + float(np.linalg.norm(points - middle, axis=1).max())
+    count = SOFT_SAMPLES if scene.light.shadows == "soft" and lamp.size > 0 else 1
+    total = np.zeros(len(points))
+    for i in range(count):
+        radius, angle = math.sqrt((i + 0.5) / count), i * 2.39996323
+        aside = (0.5 * lamp.size * radius if count > 1 else 0.0) * np.array([math.cos(angle), math.sin(angle)])
+        eye = pose.copy()
+        if lamp.kind == "sun":
+            ahead = eye[:3, 2] + eye[:3, :2] @ np.tan(aside)
+            eye[:3, 3] = middle - ahead * (_FAR_AWAY * size)
+        else:
+            eye[:3, 3] += eye[:3, :2] @ aside
+        there = (points - eye[:3, 3]) @ eye[:3, :3]
+        before = there[:, 2] > 0
+        far = np.where(before, there[:, 2] - 1e-7 * size, 0.0)
+        rays = np.where(before[:, None], there[:, :2] / np.where(before, there[:, 2], 1.0)[:, None], 0.0)
+        hit, _, _ = _nearest(casters, t_ns, np.ascontiguousarray(rays), far=far, skip=skip, eye=eye, near=1e-9)
+        total += ~(before & (hit[:, 0] >= 0))
+    return total / count
+
+
+_shadowers: WeakKeyDictionary = WeakKeyDictionary()
+
+
+def _casters(scene: Scene) -> tuple[Scene, np.ndarray]:
+    """The scene with what casts shadows alone, and what number each part has in it, -1: none (and -1 of no part)."""
+    if scene not in _shadowers:
+        kept, number, count = [], [], 0
+        for thing in scene.objects:
+            casting = [thing.category in ("object", "wall") and not part.material.unlit for part in thing.parts]
+            number += [count + sum(casting[:k]) if one else -1 for k, one in enumerate(casting)]
+            count += sum(casting)
+            if any(casting):
+                kept.append(replace(thing, parts=tuple(p for p, one in zip(thing.parts, casting) if one)))
+        _shadowers[scene] = replace(scene, objects=tuple(kept)), np.array([*number, -1])
+    return _shadowers[scene]
 
 
 def sample_albedo(material: Material, uv: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from blinkgl.render.frames import RenderStats
 from blinkgl.render.labels import Labels
 from blinkgl.render.moment import Moment, Moments
 from blinkgl.render.painter import Painter
-from blinkgl.render.passes import Brightness, Colour, Luminance, Pass, Shot, Velocity, filtered
+from blinkgl.render.passes import Brightness, Colour, Luminance, Pass, Shot, Velocity, filtered, shadow_maps
 from blinkgl.render.resources import DrawItem, SceneResources
 from blinkgl.render.still import StillCanvas
 from blinkgl.scene.geometry.lod import at_level_of_detail
@@ -68,7 +68,10 @@ class Renderer:
         # Worth it when something stands still besides the camera; a scene of movers alone is drawn whole.
         some_stand = any(o.is_static for o in scene.objects)
         lamps_stand = all(lamp.path.is_static for lamp in scene.light.lamps)
-        self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand)
+        self._shadows = shadow_maps(scene, self.items) if scene.light.shadows != "off" else ()
+        # What is in the shadow of something that moves changes, too, where it is itself at rest.
+        shadows_stand = not (self._shadows and any(item.casts and item.moves for item in self.items))
+        self.whole = whole or not (scene.camera_path.is_static and some_stand and lamps_stand and shadows_stand)
 
     def __enter__(self) -> Renderer:
         return self
@@ -134,7 +137,7 @@ class Renderer:
             inputs = {one.sampler: self._drawn(one.of, moment, ends, done) for one in pass_.inputs}
             canvas = self._canvases.get(pass_)
             if canvas is None:
-                kind = StillCanvas if pass_.still and not self.whole else Canvas
+                kind = StillCanvas if pass_.stands_still(self.whole) else Canvas
                 canvas = self._canvases[pass_] = kind(pass_, self._painter, self.width, self.height)
             frame = done[pass_] = canvas.draw(Shot(pass_.seen(moment), canvas.target, self.scene, ends, inputs))
         return frame
@@ -144,13 +147,13 @@ class Renderer:
     def luminance(self, t_ns: int, rate: bool = False) -> Frame:
         """Linear luminance at t_ns, (H, W) float32; with ``rate`` beside it "rate", d(luminance)/dt per second of each
         pixel, as the surface it shows moves (edges that pass are not in it)."""
-        return self.draw(filtered(Luminance(rate, self._samples)), t_ns)
+        return self.draw(filtered(Luminance(rate, self._samples, self._shadows)), t_ns)
 
     def brightness(self, t_ns: int, every: int = 1) -> Frame:
         """Luminance and d(luminance)/dt per second, (h, w, 2) float32, on every n-th pixel in x and y, textures
         filtered as for the whole image. h = max(1, H // every), w likewise: the small picture covers the whole image,
         so that its pixels are H / h and W / w pixels apart, a little more than ``every`` where that is no divisor."""
-        return self.draw(Brightness(every), t_ns)
+        return self.draw(Brightness(every, self._shadows), t_ns)
 
     def velocity(self, t_ns: int, every: int = 1) -> Frame:
         """Image velocity at t_ns in px/s (of the full-size image), (h, w, 2) float32, 0 where nothing is hit, h and w
@@ -166,7 +169,7 @@ class Renderer:
         """Linear radiance at a time, ns, or of a moment, (H, W, 3) float32; ``antialiasing`` overrides the
         configuration's."""
         samples = self._image_samples if antialiasing is None else samples_of(antialiasing)
-        return self.draw(filtered(Colour(samples)), at)
+        return self.draw(filtered(Colour(samples, self._shadows)), at)
 
     def labels(
         self, t_ns: int, request: LabelRequest, t_forward_ns: int | None = None, t_backward_ns: int | None = None

@@ -76,6 +76,7 @@ class DrawItem:
     sweeps.   corners : (8, 3) of the box.
     layer : 0 objects, 1 ground and walls, 2 sky; drawn in this order so that depth rejects hidden fragments early.
     two_sided : no culling, and the normal is turned towards the camera.   hued : as of :class:`Kind`.
+    casts : whether it throws shadows: objects and walls do, unless they are unlit (screens, skies of files).
     """
 
     object_index: int
@@ -92,6 +93,7 @@ class DrawItem:
     part: int = -1
     number: int = -1
     hued: bool = False
+    casts: bool = False
 
     def __post_init__(self) -> None:
         self.textured = self.material.texture is not None
@@ -377,4 +379,5 @@ def _draw_item(
         not material.unlit,
         moves,
         hued=grey.hued(material),
+        casts=category in ("object", "wall") and not material.unlit,
     )

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from blinkgl.render.resources import DrawItem
 
 _READ_FRAMEBUFFER, _DRAW_FRAMEBUFFER = 0x8CA8, 0x8CA9
-_COLOUR_AND_DEPTH, _NEAREST = 0x4000 | 0x0100, 0x2600
+_DEPTH, _COLOUR_AND_DEPTH, _NEAREST = 0x0100, 0x4000 | 0x0100, 0x2600
 
 
 def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel) -> Rectangle | None:
@@ -33,24 +33,24 @@ def screen_rectangle(item: DrawItem, T_cam_obj: np.ndarray, camera: CameraModel)
 
 
 class StillCanvas(Canvas):
-    """Of a pass that draws the scene with a camera that stands still. The target always holds the whole last frame;
-    what is kept beside it, the still objects' picture and the places of those that move, is nobody else's."""
+    """Of a pass that draws the scene with a camera, or for a lamp, that stands still. The target always holds the
+    whole last frame; what is kept beside it, the still objects' picture and the places of those that move, is nobody
+    else's."""
 
     _picture: Target | None = None
     _covered: tuple[Rectangle, ...] = ()  # by what moves, in the last frame
 
     def draw(self, shot: Shot) -> Frame:
         pass_, painter, moment = self.pass_, self.painter, shot.moment
-        visible = pass_.items(moment)
+        visible, camera = pass_.items(moment), moment.view.camera
         movers = []
         for item in visible:
             if item.moves:
-                rectangle = screen_rectangle(item, moment.T_cam_obj[item.object_index], shot.scene.camera)
+                rectangle = screen_rectangle(item, moment.T_cam_obj[item.object_index], camera)
                 if rectangle is not None:
                     movers.append((item, rectangle))
         covered = [rectangle for _, rectangle in movers]
         if self._picture is None:
-            camera = shot.scene.camera
             self._picture = self.make_target(camera.width, camera.height)
             still = replace(shot, target=self._picture)
             pass_.begin(painter, still)
@@ -78,7 +78,7 @@ class StillCanvas(Canvas):
         self._bind(_READ_FRAMEBUFFER, self._picture.fbo.glo)
         self._bind(_DRAW_FRAMEBUFFER, self.target.fbo.glo)
         edges = (rectangle.x0, rectangle.y0, rectangle.x1, rectangle.y1)
-        self._blit(*edges, *edges, _COLOUR_AND_DEPTH, _NEAREST)
+        self._blit(*edges, *edges, _COLOUR_AND_DEPTH if self.outputs else _DEPTH, _NEAREST)
         self.target.fbo.use()
 
     def release(self) -> None:

@@ -64,6 +64,21 @@ def lamps_of(light: Light) -> tuple[Lamp, ...]:
     return tuple(sorted(lamps, key=lambda lamp: order.index(lamp.kind)))
 
 
+MAX_SHADOWS, MAX_SOFT = 4, 2
+"""Lamps whose shadows are drawn, and of soft ones, whose programs are long: a map, and a texture unit, each."""
+
+
+def shadowing(light: Light) -> tuple[int, ...]:
+    """Which of :func:`lamps_of` cast shadows: suns, then spot lights, the first of each."""
+    if light.shadows == "off":
+        return ()
+    lamps = lamps_of(light)
+    suns, spots = ([k for k, lamp in enumerate(lamps) if lamp.kind == kind] for kind in ("sun", "spot"))
+    most = MAX_SOFT if light.shadows == "soft" else MAX_SHADOWS
+    suns = suns[:most]
+    return (*suns, *spots[: most - len(suns)])
+
+
 def quadric_of(light: Light) -> np.ndarray:
     """(3, 4, 4) what comes from all around, per channel, for :func:`ambient`; world axes."""
     one = np.zeros((4, 4))
@@ -119,6 +134,8 @@ def make_light(config: LightConfig, rng: np.random.Generator | None = None, furt
         config.sky_color,
         math.radians(config.sun_size),
         (*(_lamp(one) for one in config.lights), *further),
+        shadows=config.shadows,
+        shadow_size=config.shadow_size,
     )
 
 

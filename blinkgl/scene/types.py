@@ -178,6 +178,7 @@ class Light:
     lamps : what shines beside them.
     around : quadric of what else comes from all around (:func:`blinkgl.scene.lights.ambient`), 3 x 4 x 4 numbers; None:
         nothing.
+    shadows : of suns and spot lights; soft by their size.   shadow_size : px a side of the map of each.
 
     The defaults are those of ``light:`` in the configuration, where nothing is random.
     """
@@ -190,11 +191,14 @@ class Light:
     sun_size: float = math.radians(LightConfig().sun_size)
     lamps: tuple[Lamp, ...] = ()
     around: tuple[tuple[tuple[float, ...], ...], ...] | None = None
+    shadows: Literal["off", "hard", "soft"] = "off"
+    shadow_size: int = LightConfig().shadow_size
 
     @property
     def plain(self) -> bool:
         """Whether a white sun and sky are all there is: the formula above."""
-        return not self.lamps and self.around is None and self.sun_color == WHITE == self.sky_color
+        lone = not self.lamps and self.around is None and self.shadows == "off"
+        return lone and self.sun_color == WHITE == self.sky_color
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 //
 //   SUNS     number of suns           LAMPS    number of point and spot lights, SPOTS: the last of them are spot lights
 //   AMBIENT  light from all around    HUED     of three channels; else of one, what the luminance of this material takes
+//   SHADOWS  see shadows.glsl
 //
 // Everything is in the object's own frame, made from float64 poses, so that neither normals nor positions need a matrix.
 // A lamp is a Beam at a point of the surface: whoever shades by more than Lambert's cosine asks for the same beams.
@@ -9,6 +10,11 @@
 #define ILLUMINANT vec3
 #else
 #define ILLUMINANT float
+#endif
+
+#ifdef SHADOWS
+#include "shadows.glsl"
+float shadow_share[SHADOWS]; // of each lamp with a map, as irradiance() found it
 #endif
 
 struct Beam
@@ -61,14 +67,28 @@ Beam lamp_beam(int i, vec3 at)
 #else
 #define BANDS 1
 #endif
-uniform mat4 around[BANDS]; // Q, symmetric: a white surface with normal n gives back (n, 1) Q (n, 1)
+// Of a white surface with normal n: dot(even, (n, 1)), an even sky; and, of a panorama (AMBIENT 2), a quadratic form of n
+// besides: dot(squares, n n) + dot(mixed, n n.yzx).
+uniform vec4 around_even[BANDS];
+#if AMBIENT > 1
+uniform vec3 around_squares[BANDS], around_mixed[BANDS];
+#endif
 
-ILLUMINANT quadric(mat4 Q[BANDS], vec4 a, vec4 b)
+float around_band(int band, vec3 n)
+{
+    float sum = dot(around_even[band].xyz, n) + around_even[band].w;
+#if AMBIENT > 1
+    sum += dot(around_squares[band], n * n) + dot(around_mixed[band], n * n.yzx);
+#endif
+    return sum;
+}
+
+ILLUMINANT ambient(vec3 n)
 {
 #ifdef HUED
-    return vec3(dot(a, Q[0] * b), dot(a, Q[1] * b), dot(a, Q[2] * b));
+    return vec3(around_band(0, n), around_band(1, n), around_band(2, n));
 #else
-    return dot(a, Q[0] * b);
+    return around_band(0, n);
 #endif
 }
 #endif
@@ -79,20 +99,43 @@ ILLUMINANT irradiance(vec3 normal)
     vec3 n = normal * inversesqrt(max(dot(normal, normal), 1e-30)); // zero stays zero
     ILLUMINANT sum = ILLUMINANT(0.0);
 #ifdef AMBIENT
-    sum += max(quadric(around, vec4(n, 1.0), vec4(n, 1.0)), 0.0);
+#if AMBIENT > 1
+    sum += max(ambient(n), 0.0);
+#else
+    sum += ambient(n); // no sky is below 0
+#endif
 #endif
 #ifdef SUNS
     for (int i = 0; i < SUNS; ++i)
     {
         Beam beam = sun_beam(i);
-        sum += max(0.0, dot(n, beam.towards)) * beam.strength;
+        float facing = max(0.0, dot(n, beam.towards));
+#ifdef SHADOW_SUNS
+        if (i < SHADOW_SUNS)
+        {
+            shadow_share[i] = facing > 0.0 ? shadow(i, local, n, facing, vec3(0.0)) : 1.0; // not looked up where it does not shine
+            facing *= shadow_share[i];
+        }
+#endif
+        sum += facing * beam.strength;
     }
 #endif
 #ifdef LAMPS
     for (int i = 0; i < LAMPS; ++i)
     {
         Beam beam = lamp_beam(i, local);
-        sum += max(0.0, dot(n, beam.towards)) * beam.strength;
+        float facing = max(0.0, dot(n, beam.towards));
+#ifdef SHADOW_SPOTS
+        int k = i - (LAMPS - SPOTS);
+        if (k >= 0 && k < SHADOW_SPOTS)
+        {
+            int map = SHADOWS - SHADOW_SPOTS + k;
+            bool shines = facing > 0.0 && beam.strength != ILLUMINANT(0.0);
+            shadow_share[map] = shines ? shadow(map, local, n, facing, lamp_place[i]) : 1.0;
+            facing *= shadow_share[map];
+        }
+#endif
+        sum += facing * beam.strength;
     }
 #endif
     return sum;
@@ -110,7 +153,22 @@ uniform vec3 lamp_place_rate[LAMPS];
 uniform vec3 spot_axis_rate[SPOTS];
 #endif
 #ifdef AMBIENT
-uniform mat4 around_rate[BANDS];
+uniform vec4 around_even_rate[BANDS];
+#if AMBIENT > 1
+uniform vec3 around_squares_rate[BANDS], around_mixed_rate[BANDS];
+#endif
+
+// The product rule on around_band, whose numbers turn with the object.
+float around_band_rate(int band, vec3 n, vec3 turn)
+{
+    float rate = dot(around_even[band].xyz, turn) + dot(around_even_rate[band].xyz, n);
+#if AMBIENT > 1
+    rate += 2.0 * dot(around_squares[band], n * turn) + dot(around_squares_rate[band], n * n)
+          + dot(around_mixed[band], turn * n.yzx + n * turn.yzx) + dot(around_mixed_rate[band], n * n.yzx);
+    rate *= step(0.0, around_band(band, n)); // none where it is cut off
+#endif
+    return rate;
+}
 #endif
 
 // dE/dt of the same where the normal seen changes by normal_rate and the place seen by at_rate per second.
@@ -121,14 +179,22 @@ ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
     vec3 turn = (normal_rate - n * dot(n, normal_rate)) * scale; // dn/dt, see light.glsl
     ILLUMINANT sum = ILLUMINANT(0.0);
 #ifdef AMBIENT
-    ILLUMINANT change = 2.0 * quadric(around, vec4(turn, 0.0), vec4(n, 1.0))
-                      + quadric(around_rate, vec4(n, 1.0), vec4(n, 1.0));
-    sum += change * step(ILLUMINANT(0.0), quadric(around, vec4(n, 1.0), vec4(n, 1.0))); // none where it is cut off
+#ifdef HUED
+    sum += vec3(around_band_rate(0, n, turn), around_band_rate(1, n, turn), around_band_rate(2, n, turn));
+#else
+    sum += around_band_rate(0, n, turn);
+#endif
 #endif
 #ifdef SUNS
     for (int i = 0; i < SUNS; ++i)
-        if (dot(n, sun_towards[i]) > 0.0)
-            sum += (dot(turn, sun_towards[i]) + dot(n, sun_towards_rate[i])) * sun_strength[i];
+    {
+        float change = dot(n, sun_towards[i]) > 0.0 ? dot(turn, sun_towards[i]) + dot(n, sun_towards_rate[i]) : 0.0;
+#ifdef SHADOW_SUNS
+        if (i < SHADOW_SUNS)
+            change *= shadow_share[i]; // whose own change is not in the rate
+#endif
+        sum += change * sun_strength[i];
+    }
 #endif
 #ifdef LAMPS
     for (int i = 0; i < LAMPS; ++i)
@@ -154,6 +220,10 @@ ILLUMINANT irradiance_rate(vec3 normal, vec3 normal_rate, vec3 at_rate)
             float share = clamp(cosine * spot_cone[k].x + spot_cone[k].y, 0.0, 1.0);
             float share_rate = share > 0.0 && share < 1.0 ? spot_cone[k].x * cosine_rate : 0.0;
             rate = rate * share * share + value * 2.0 * share * share_rate;
+#ifdef SHADOW_SPOTS
+            if (k < SHADOW_SPOTS)
+                rate *= shadow_share[SHADOWS - SHADOW_SPOTS + k];
+#endif
         }
 #endif
         sum += rate * lamp_strength[i];

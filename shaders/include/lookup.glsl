@@ -19,6 +19,11 @@ vec4 noted_texture(sampler2D image, vec2 at, float bias)
     return texture(image, at, bias);
 }
 
+float noted_texture(sampler2DShadow map, vec3 at) // a shadow map is no albedo
+{
+    return texture(map, at);
+}
+
 vec4 noted_texture_lod(sampler2D image, vec2 at, float level)
 {
     noted += vec4(at, level, 1.0);

@@ -253,6 +253,7 @@ FEATURES: dict[str, dict[str, dict[str, Any]]] = {
     "light": {
         "lit": NOTHING,
         "unlit": {"scene": {"light": {"unlit": True}}},
+        "shadows": {"scene": {"light": {"shadows": "soft", "shadow_size": 64}}},
         "lamps": {
             "scene": {
                 "fog": {"density": 0.02},

@@ -40,11 +40,12 @@ def test_everything_compiles_and_nothing_is_unused(shader):
     result = json.loads(out)
     assert status == 0 and result["errors"] == [] and result["unused"] == []
     assert result["programs"] == {
-        "colour.glsl": 76,
+        "colour.glsl": 88,
         "debug.glsl": 13,
         "downsample.glsl": 2,
         "label.glsl": 819,
-        "luminance.glsl": 188,
+        "luminance.glsl": 214,
+        "shadow.glsl": 13,
         "velocity.glsl": 26,
     }
 

@@ -290,7 +290,8 @@ class ReferenceMoment(_Lazy):
             if not part.material.unlit:
                 pose = thing.path.pose(t_ns)
                 points = frame.local[on] @ pose[:3, :3].T + pose[:3, 3]
-                lit[on] *= (total := reference.received(scene, t_ns, points, frame.normal[on]).total)
+                own = np.column_stack([frame.part[on], frame.triangle[on]])
+                lit[on] *= (total := reference.received(scene, t_ns, points, frame.normal[on], own).total)
                 grey = albedo[on] @ LUMA
                 light[on] = np.where(grey > 0, lit[on] @ LUMA / np.where(grey > 0, grey, 1.0), total @ LUMA)
         colour = np.where(frame.hit[..., None], lit, frame.colour)

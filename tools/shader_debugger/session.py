@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import os
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -318,7 +318,7 @@ class DebugRenderer(Renderer):
                 accepted='#include "lookup.glsl" and show_lookup(albedo, light) under #ifdef SHOW_LOOKUP, as in the '
                 "shipped file",
             )
-        frame = self.draw(LOOKUPS[name], t_ns)
+        frame = self.draw(replace(LOOKUPS[name], shadows=self._shadows), t_ns)
         lookup, albedo = frame.read("lookup"), frame.read("albedo")
         return {
             "result": frame.read(name),

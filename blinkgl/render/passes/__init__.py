@@ -10,9 +10,10 @@ from blinkgl.render.passes.colour import Colour
 from blinkgl.render.passes.geometry import Geometry
 from blinkgl.render.passes.luminance import Brightness, Luminance
 from blinkgl.render.passes.mean import Mean, filtered
+from blinkgl.render.passes.shadow import Shaded, ShadowMap, shadow_maps
 from blinkgl.render.passes.velocity import Velocity
 
-PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean)
+PASSES: tuple[type[Pass], ...] = (Luminance, Brightness, Velocity, Colour, Geometry, Mean, ShadowMap)
 """Those that a renderer draws of itself."""
 
 __all__ = [
@@ -27,7 +28,10 @@ __all__ = [
     "Pass",
     "ScenePass",
     "ScreenPass",
+    "Shaded",
+    "ShadowMap",
     "Shot",
     "Velocity",
     "filtered",
+    "shadow_maps",
 ]

@@ -97,6 +97,10 @@ class Pass:
         and, of a pass that is ``lit``, those of the scene's light."""
         return {}
 
+    def stands_still(self, whole: bool) -> bool:
+        """Whether only what moves is drawn again. whole : no pass of the camera's is to be drawn so."""
+        return self.still and not whole
+
     def seen(self, moment: Moment) -> Moment:
         """The moment as this pass looks at it: the camera's, unless it draws for another one
         (``moment.from_place``)."""

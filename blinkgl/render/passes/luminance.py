@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from blinkgl.render.antialiasing import Samples
 from blinkgl.render.matrices import rows_xyw_bytes
-from blinkgl.render.passes.base import Output, Pass, ScenePass, Shot
+from blinkgl.render.passes.base import Output, Pass, Shot
+from blinkgl.render.passes.shadow import Shaded, ShadowMap
 
 if TYPE_CHECKING:
     from blinkgl.render.painter import Painter, Uniforms
@@ -16,15 +17,15 @@ if TYPE_CHECKING:
     from blinkgl.scene.types import Scene
 
 
-class _Luminance(ScenePass):
+class _Luminance(Shaded):
     program: ClassVar[str] = "luminance.glsl"
-    lit: ClassVar[bool] = True
     one_channel: ClassVar[bool] = True
 
     def background(self, scene: Scene) -> tuple[float, ...]:
         return scene.backdrop, 0.0
 
     def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        super().set(painter, uniforms, item, shot)
         if item.kind.hued:
             painter.resources.shares_texture(item.material).use(0)
         elif item.textured:
@@ -48,6 +49,7 @@ class Luminance(_Luminance):
 
     rate: bool = False
     samples: Samples = Samples()
+    shadows: tuple[ShadowMap, ...] = ()
     still: ClassVar[bool] = True
 
     @property
@@ -70,6 +72,7 @@ class Brightness(_Luminance):
     textures filtered as for the whole image."""
 
     every: int = 1
+    shadows: tuple[ShadowMap, ...] = ()
     outputs: ClassVar[tuple[Output, ...]] = (Output("brightness", "RG32F"),)
 
     def defines(self, kind: Kind | None) -> dict[str, Any]:

@@ -1,0 +1,108 @@
+"""What lamps see: a pass before those that are lit by them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from moderngl import LINEAR
+
+from blinkgl.render.canvas import DEPTH_BUFFER
+from blinkgl.render.passes.base import Input, Output, Pass, ScenePass, Shot
+from blinkgl.render.shadows import Box, boxes, planes_of, scale_of, view_of
+from blinkgl.scene.lights import MAX_SHADOWS, lamps_of
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.types import Lamp
+
+if TYPE_CHECKING:
+    from blinkgl.render.moment import Moment
+    from blinkgl.render.painter import Painter, Uniforms
+    from blinkgl.render.resources import DrawItem
+    from blinkgl.scene.types import Scene
+
+
+@dataclass(frozen=True)
+class ShadowMap(ScenePass):
+    """Depth buffer of what casts a lamp's shadows, (texels, texels) float32, reversed: 0 where nothing does. Drawn
+    again only where something that casts has moved.
+
+    box : of a sun.   soft : whether those who read it look at the depths themselves."""
+
+    lamp: Lamp
+    box: Box | None
+    texels: int
+    soft: bool = False
+    program: ClassVar[str] = "shadow.glsl"
+    outputs: ClassVar[tuple[Output, ...]] = ()
+    depth: ClassVar[str] = "texture"
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        return self.texels, self.texels
+
+    def stands_still(self, whole: bool) -> bool:
+        """Whatever the camera does: the lamp's place is what counts."""
+        return self.lamp.path.is_static
+
+    def seen(self, moment: Moment) -> Moment:
+        return moment.from_place(*view_of(self.lamp, self.box, self.texels, self.lamp.path.pose(moment.t_ns)))
+
+    def items(self, moment: Moment) -> list[DrawItem]:
+        return [item for item in moment.visible if item.casts]
+
+    def paint(self, painter: Painter, shot: Shot, items: Iterable[DrawItem] | None = None) -> None:
+        painter.gl.ctx.cull_face = "front"
+        super().paint(painter, shot, items)
+        painter.gl.ctx.cull_face = "back"
+
+    @classmethod
+    def every_kind(cls) -> Iterator[Pass]:
+        yield cls(Lamp("sun", (1.0, 1.0, 1.0), StaticPath()), Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 64)
+
+
+def shadow_maps(scene: Scene, items: Sequence[DrawItem]) -> tuple[ShadowMap, ...]:
+    """Of the scene's light, suns first; none where it asks for none or nothing casts."""
+    lamps, light = lamps_of(scene.light), scene.light
+    return tuple(
+        ShadowMap(lamps[k], box, light.shadow_size, light.shadows == "soft") for k, box in boxes(scene, items).items()
+    )
+
+
+class Shaded(ScenePass):
+    """A pass that is lit. shadows : maps of the lamps whose shadows it draws, a field of the pass."""
+
+    lit: ClassVar[bool] = True
+    shadows: tuple[ShadowMap, ...]
+
+    @property
+    def inputs(self) -> tuple[Input, ...]:
+        return tuple(Input(name, map_, DEPTH_BUFFER) for name, map_ in zip(_SAMPLERS, self.shadows))
+
+    def bind(self, uniforms: Uniforms, shot: Shot) -> None:
+        for unit, (name, map_) in enumerate(zip(_SAMPLERS, self.shadows), 1):
+            if name in uniforms:
+                texture = shot.inputs[name].texture(DEPTH_BUFFER)
+                if not map_.soft and texture.compare_func != ">=":
+                    texture.compare_func, texture.filter = ">=", (LINEAR, LINEAR)
+                texture.use(unit)
+                uniforms[name].value = unit
+
+    def set(self, painter: Painter, uniforms: Uniforms, item: DrawItem, shot: Shot) -> None:
+        if "shadow_rows" in uniforms:
+            seen = [shot.inputs[name].moment for name, _ in zip(_SAMPLERS, self.shadows)]
+            rows = np.stack([moment.texture_from_obj[item.object_index] for moment in seen])
+            uniforms["shadow_rows"].write(rows.tobytes())
+            uniforms["shadow_scale"].write(_scales(self.shadows).tobytes())
+            if "shadow_plane" in uniforms:
+                uniforms["shadow_plane"].write(planes_of(rows, _scales(self.shadows)).astype(np.float32).tobytes())
+
+
+_SAMPLERS = tuple(f"shadow_map_{k}" for k in range(MAX_SHADOWS))
+
+
+@lru_cache(maxsize=64)
+def _scales(maps: tuple[ShadowMap, ...]) -> np.ndarray:
+    """(maps, 4) float32, ``shadow_scale`` of shadows.glsl."""
+    return np.array([scale_of(one.lamp, one.box, one.texels) for one in maps], np.float32)

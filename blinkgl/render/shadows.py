@@ -1,0 +1,153 @@
+"""Shadow maps: what each lamp sees of the scene, and how a surface finds itself in it.
+
+A map of a sun is a box of parallel light around all that casts shadows, at any time of the scene; outside of it nothing
+is in the way. It does not depend on the camera, so it stays where it is while the camera moves. That of a spot light is
+a picture of its cone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from blinkgl.camera import PinHole
+from blinkgl.render.moment import View
+from blinkgl.scene.lights import lamps_of, shadowing
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from blinkgl.render.resources import DrawItem
+    from blinkgl.scene.types import Lamp, Scene
+
+CV_FROM_LAMP = np.diag([1.0, -1.0, -1.0, 1.0])
+"""A lamp shines along its -z axis, a camera looks along its z axis with y down."""
+_TIMES = 129  # at which the places of what moves are looked up; in between its speed bounds them
+_SPARE = 4  # texels on every side of a map
+_NEAR = 0.02  # world units in front of a spot light in which nothing casts
+
+
+class Parallel(NamedTuple):
+    """A camera of parallel rays, for :class:`~blinkgl.render.moment.View`: sees |X| <= half_x, |Y| <= half_y, and
+    0 <= Z <= depth, on size x size texels."""
+
+    size: int
+    half_x: float
+    half_y: float
+    depth: float
+
+    @property
+    def width(self) -> int:
+        return self.size
+
+    @property
+    def height(self) -> int:
+        return self.size
+
+    def clip_from_cam(self) -> np.ndarray:
+        """(4, 4) float64; w = 1, depth 1 at Z = 0 and 0 at the far end."""
+        return np.array(
+            [
+                [1 / self.half_x, 0, 0, 0],
+                [0, 1 / self.half_y, 0, 0],
+                [0, 0, -1 / self.depth, 1.0],
+                [0, 0, 0, 1.0],
+            ]
+        )
+
+    def bounds(self, points: np.ndarray) -> tuple[int, int, int, int] | None:
+        """As of a camera model: texels that the convex hull of (n, 3) points can touch."""
+        x = (points[:, 0] / self.half_x + 1) * self.size / 2
+        y = (points[:, 1] / self.half_y + 1) * self.size / 2
+        x0, x1 = max(0, math.floor(x.min()) - 1), min(self.size, math.ceil(x.max()) + 2)
+        y0, y1 = max(0, math.floor(y.min()) - 1), min(self.size, math.ceil(y.max()) + 2)
+        return (x0, y0, x1, y1) if x0 < x1 and y0 < y1 else None
+
+
+@dataclass(frozen=True)
+class Box:
+    """Of a sun's map, in world axes and in the lamp's. centre : (3,).   half : (3,) along the lamp's axes."""
+
+    centre: tuple[float, float, float]
+    half: tuple[float, float, float]
+
+
+def boxes(scene: Scene, items: Sequence[DrawItem]) -> dict[int, Box | None]:
+    """Of each lamp of :func:`shadowing` that is a sun, by its number, around all that casts; None for spot lights.
+    Empty where nothing casts."""
+    spheres = _swept(scene, items)
+    if not len(spheres):
+        return {}
+    found: dict[int, Box | None] = {}
+    lamps = lamps_of(scene.light)
+    for k in shadowing(scene.light):
+        found[k] = _box(lamps[k], spheres) if lamps[k].kind == "sun" else None
+    return found
+
+
+def _box(lamp: Lamp, spheres: np.ndarray) -> Box:
+    centres, radius = spheres[:, :3], spheres[:, 3:]
+    if lamp.path.is_static:
+        R = (lamp.path.pose(0) @ CV_FROM_LAMP)[:3, :3]
+        low, high = (centres @ R - radius).min(axis=0), (centres @ R + radius).max(axis=0)
+        middle, half = R @ (low + high) / 2, (high - low) / 2
+    else:  # whatever its direction
+        low, high = (centres - radius).min(axis=0), (centres + radius).max(axis=0)
+        middle = (low + high) / 2
+        half = np.full(3, (np.linalg.norm(centres - middle, axis=1) + spheres[:, 3]).max())
+    x, y, z = (float(v) for v in middle)
+    a, b, c = (max(float(v), 1e-6) for v in half)
+    return Box((x, y, z), (a, b, c))
+
+
+def _swept(scene: Scene, items: Sequence[DrawItem]) -> np.ndarray:
+    """(n, 4) centre and radius, world axes, of spheres that hold every item that casts at all times."""
+    times = np.linspace(scene.t0_ns, scene.t1_ns, _TIMES).astype(np.int64)
+    spheres = []
+    for item in items:
+        if not item.casts:
+            continue
+        path = scene.objects[item.object_index].path
+        poses = path.poses(times[:1] if path.is_static else times)
+        centres = poses[:, :3, :3] @ item.centre + poses[:, :3, 3]
+        room = item.radius
+        if not path.is_static:
+            speed, turning = path.speed_bound(scene.t0_ns, scene.t1_ns)
+            step = (scene.t1_ns - scene.t0_ns) * 1e-9 / (_TIMES - 1)
+            room += 0.5 * step * (speed + turning * float(np.linalg.norm(item.centre)))
+        spheres.append(np.column_stack([centres, np.full(len(centres), room)]))
+    return np.concatenate(spheres) if spheres else np.zeros((0, 4))
+
+
+def view_of(lamp: Lamp, box: Box | None, size: int, pose: np.ndarray) -> tuple[View, np.ndarray]:
+    """What the lamp's map sees, and (4, 4) T_world_cam from where. pose : T_world_lamp."""
+    T = pose @ CV_FROM_LAMP
+    if box is None:
+        half = size / 2 - _SPARE
+        return View.of(PinHole.centred(size, size, half / math.tan(min(lamp.outer, 1.5)), near=_NEAR)), T
+    x, y, z = (h * size / (size - 2 * _SPARE) for h in box.half)
+    camera = Parallel(size, x, y, 2 * z)
+    T[:3, 3] = np.asarray(box.centre) - z * T[:3, 2]
+    # By sphere against planes through one point nothing is out of it: each item is drawn that casts.
+    return View(camera, camera.clip_from_cam(), np.zeros((1, 3))), T
+
+
+def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, float, float]:
+    """``shadow_scale`` of shadows.glsl."""
+    camera = view_of(lamp, box, size, np.eye(4))[0].camera
+    if isinstance(camera, Parallel):
+        return 2 * max(camera.half_x, camera.half_y) / camera.size, 0.0, 1 / camera.depth, lamp.size
+    return 0.0, 1 / camera.fx, 0.0, lamp.size
+
+
+def planes_of(rows: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """``shadow_plane`` of shadows.glsl, (maps, 3, 3): the depth of a plane with normal n is affine in the map, and its
+    slopes along x and y are the first two times n, over the third times n (of a spot light it is made in the shader),
+    times the depth of a world unit. rows, scales : (maps, 4, 4), (maps, 4) as the shader has them."""
+    across = rows[:, :2, :3] - 0.5 * rows[:, 3:, :3]  # without what centres a perspective map
+    across = across / (across**2).sum(axis=2, keepdims=True)
+    along = rows[:, 2:3, :3] / -np.where(scales[:, 2] > 0, scales[:, 2], 1.0)[:, None, None]
+    return np.concatenate([across, along], axis=1)

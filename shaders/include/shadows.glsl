@@ -1,0 +1,129 @@
+// How much of a lamp is seen from a point of the surface, by its shadow map (shadow.glsl): 1 all of it, 0 nothing.
+//
+//   SHADOW_SUNS, SHADOW_SPOTS   the first of the suns and of the spot lights have a map each, in this order
+//   SHADOWS   their number, 1 to 4          SOFT   by the size of the lamp; else each edge is one texel wide
+//
+// Depth is reversed: what is nearer to the lamp is larger. What is compared with the map is moved towards the lamp by as
+// much as the surface's own plane changes over the texels that are looked at, so that no surface is in its own shadow;
+// it is not moved aside, so that edges stay where they are.
+uniform mat4 shadow_rows[SHADOWS];       // object frame to the map, by rows: x, y and depth in [0, 1], times w; and w
+#ifdef SOFT
+uniform mat3 shadow_plane[SHADOWS];      // by rows: what makes of a normal the slope of its plane's depth in the map
+#endif
+uniform vec4 shadow_scale[SHADOWS];      // width of a texel: .x + .y w, world units; depth per world unit: .z (suns);
+                                         // what softens: a sun's angle, rad, or a lamp's diameter, world units: .w
+#ifdef SOFT
+#define SHADOW_MAP sampler2D
+#else
+#define SHADOW_MAP sampler2DShadow
+#endif
+uniform SHADOW_MAP shadow_map_0;
+#if SHADOWS > 1
+uniform SHADOW_MAP shadow_map_1;
+#endif
+#if SHADOWS > 2
+uniform SHADOW_MAP shadow_map_2;
+#endif
+#if SHADOWS > 3
+uniform SHADOW_MAP shadow_map_3;
+#endif
+
+const float SPARE = 0.25, FARTHEST = 16.0; // texels towards the lamp: always, and at most (where light grazes)
+
+#ifdef SOFT
+const float WIDEST = 24.0; // texels, radius of what is looked at
+const int TAPS = 16;
+
+// Of a disc of radius 1, as evenly as sunflower seeds; the same for every pixel: no noise, which would be events.
+vec2 seed(int i)
+{
+    float angle = float(i) * 2.39996323;
+    return sqrt((float(i) + 0.5) / float(TAPS)) * vec2(cos(angle), sin(angle));
+}
+
+float nearer(SHADOW_MAP map, vec2 at, float depth)
+{
+    vec2 size = vec2(textureSize(map, 0)), f = fract(at * size - 0.5);
+    vec4 lit = vec4(greaterThanEqual(vec4(depth), textureGather(map, at))); // (0, 1), (1, 1), (1, 0), (0, 0)
+    return mix(mix(lit.w, lit.z, f.x), mix(lit.x, lit.y, f.x), f.y);
+}
+
+// at: where the point is in the map; slope: of its plane's depth there; unit, texel: depth of a world unit, width of one.
+float seen_share(SHADOW_MAP map, vec3 at, vec2 slope, float unit, float texel, vec4 scale)
+{
+    vec2 one = 1.0 / vec2(textureSize(map, 0));
+    float most = FARTHEST * texel * unit, least = dot(abs(slope), one) + SPARE * texel * unit;
+    bool sun = scale.z > 0.0;
+    // What is in the way, and how far from here: of the sun a cone's width, of a lamp what its disc spans from there.
+    float reach = sun ? scale.w * (1.0 - at.z) / scale.z : scale.w, sum = 0.0, count = 0.0;
+    vec2 search = clamp(0.5 * reach / texel, 1.0, WIDEST) * one;
+    for (int i = 0; i < TAPS; i += 2)
+    {
+        vec2 aside = seed(i) * search;
+        float there = texelFetch(map, ivec2((at.xy + aside) / one), 0).r; // outside: 0, nothing
+        if (there > max(at.z + clamp(least + dot(slope, aside), -most, most), 0.0))
+        {
+            sum += there;
+            count += 1.0;
+        }
+    }
+    if (count == 0.0)
+        return 1.0;
+    float blocker = sum / count;
+    float width = sun ? scale.w * (blocker - at.z) / scale.z : scale.w * max(blocker / at.z - 1.0, 0.0);
+    vec2 radius = clamp(0.5 * width / texel, 0.5, WIDEST) * one;
+    float lit = 0.0;
+    for (int i = 0; i < TAPS; ++i)
+    {
+        vec2 aside = seed(i) * radius;
+        lit += nearer(map, at.xy + aside, max(at.z + clamp(least + dot(slope, aside), -most, most), 0.0));
+    }
+    return lit / float(TAPS);
+}
+#endif
+
+// Of map k for the surface at ``at`` with unit normal n. facing: n.l > 0. lamp: where it is, of a spot light. Beside a map nothing is in
+// the way: its edge is empty, and holds for what lies outside.
+float shadow(int k, vec3 at, vec3 n, float facing, vec3 lamp)
+{
+    vec4 scale = shadow_scale[k], p = vec4(at, 1.0);
+    vec3 c = vec3(dot(shadow_rows[k][0], p), dot(shadow_rows[k][1], p), dot(shadow_rows[k][2], p));
+    float texel = scale.x, unit = scale.z;
+#ifdef SHADOW_SPOTS
+    float w = 1.0;
+    if (scale.z == 0.0) // a spot light's: perspective; depth is near / Z, which is affine in its picture, too
+    {
+        w = max(dot(shadow_rows[k][3], p), 1e-6);
+        c /= w;
+        texel = scale.y * w;
+        unit = c.z / w;
+    }
+#endif
+#ifdef SOFT
+    float through = dot(shadow_plane[k][2], n);
+#ifdef SHADOW_SPOTS
+    through = scale.z == 0.0 ? dot(n, at - lamp) / (w * w) : through;
+#endif
+    through = abs(through) > 1e-4 ? through : 1e-4;
+    vec2 slope = vec2(dot(shadow_plane[k][0], n), dot(shadow_plane[k][1], n)) * (unit / through);
+#define SEEN(map) seen_share(map, c, slope, unit, texel, scale)
+#else
+    // The four texels that an edge is smoothed over are up to one away in x and y, together at most sqrt(2) slopes.
+    float slant = sqrt(max(1.0 - facing * facing, 0.0)) / facing;
+    c.z = max(c.z + min(1.5 * slant + SPARE, FARTHEST) * texel * unit, 0.0); // 0: behind all that casts
+#define SEEN(map) texture(map, c)
+#endif
+#if SHADOWS > 3
+    if (k == 3)
+        return SEEN(shadow_map_3);
+#endif
+#if SHADOWS > 2
+    if (k == 2)
+        return SEEN(shadow_map_2);
+#endif
+#if SHADOWS > 1
+    if (k == 1)
+        return SEEN(shadow_map_1);
+#endif
+    return SEEN(shadow_map_0);
+}

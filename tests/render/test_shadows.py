@@ -1,0 +1,189 @@
+"""Shadows of suns and spot lights: edges of known geometry, the float64 reference, no acne, nothing that floats."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from blinkgl.config.sequence import RenderConfig
+from blinkgl.render import reference
+from blinkgl.render.passes import shadow_maps
+from blinkgl.render.renderer import Renderer
+from blinkgl.scene.lights import lamp_pose
+from blinkgl.scene.motion.paths import StaticPath
+from blinkgl.scene.types import Lamp, Light, Material, Part, SceneObject
+from render_scenes import LEVEL, SECOND, cube, curve, drift, quad, rig, scene, sphere, still, thing
+
+PLAIN = RenderConfig(image_antialiasing="none")
+DOWN = LEVEL * Rotation.from_rotvec([-0.45, 0, 0])
+SLANT = np.array([-0.5, -0.3, 1.0]) / np.sqrt(1.34)
+
+
+def floor(size=15):
+    return SceneObject("ground", 1, (Part(quad(size, size), Material()),), still((0, 5, -1)), "ground")
+
+
+def sunlit(*objects, sky=0.0, towards=SLANT, shadows="hard", size=2048, **more):
+    light = Light(tuple(towards), 1.0, sky, shadows=shadows, shadow_size=size, **more)
+    return scene([floor(), *objects], rig(path=still((0, 0, 1.0), DOWN)), light)
+
+
+def drawn(gl, world, t=0, **options):
+    with Renderer(gl, world, PLAIN, **options) as renderer:
+        return renderer.luminance(t).read().astype(np.float64)
+
+
+def ground_points(world, t=0):
+    """(reference frame, (n, 3) world places of the ground's pixels)."""
+    ref = reference.render(world, t)
+    on = ref.instance == 1
+    return ref, on, ref.local[on] + [0, 5, -1]
+
+
+@pytest.mark.parametrize("kind", ["sun", "spot"])
+def test_the_edge_of_a_balls_shadow_is_where_it_should_be(gl, kind):
+    """Within a texel of its map: what is farther from the edge is dark or lit altogether."""
+    radius, centre = 0.5, np.array([0.2, 4.0, 0.6])
+    ball = thing("ball", 2, sphere(radius, 5), still(centre))
+    place = centre + 3.0 * SLANT
+    world = sunlit(ball, size=512)
+    if kind == "spot":
+        lamp = Lamp("spot", (9.0, 9.0, 9.0), StaticPath(lamp_pose(place, -SLANT)), inner=0.7, outer=0.8)
+        world = replace(world, light=Light(sun=0, sky=0, lamps=(lamp,), shadows="hard", shadow_size=512))
+    seen = drawn(gl, world)
+    lit = drawn(gl, replace(world, light=replace(world.light, shadows="off")))
+    _, on, points = ground_points(world)
+    if kind == "sun":
+        distance = np.linalg.norm(np.cross(points - centre, SLANT), axis=1) - radius
+        wide = 2 * radius / 500
+    else:
+        way = points - place
+        axis = np.linalg.norm(np.cross(way, centre - place), axis=1) / np.linalg.norm(way, axis=1)
+        distance, wide = axis - radius, 2 * np.linalg.norm(way, axis=1) * math.tan(0.8) / 500
+        distance = np.where(lit[on] > 0.01, distance, np.nan)
+    share = seen[on] / np.where(lit[on] > 0, lit[on], 1.0)
+    inner, outer = distance < -1.5 * wide, distance > 1.5 * wide
+    assert inner.sum() > 150 and outer.sum() > 1000
+    np.testing.assert_allclose(share[inner], 0.0, atol=1e-6)
+    np.testing.assert_allclose(share[outer], 1.0, atol=1e-4)
+
+
+def moving_world(seed, camera=True, shadows="hard", lamps=()):
+    """Ball, box, open sheet over a floor, all moving, random sun."""
+    rng = np.random.default_rng(seed)
+    elevation, azimuth = rng.uniform(0.4, 1.4), rng.uniform(-np.pi, np.pi)
+    towards = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation))
+    things = [
+        thing("ball", 2, sphere(0.5, 4), curve(seed, (-0.9, 4.5, 0.0), 0.3, 0.4)),
+        thing("box", 3, cube(0.4), curve(seed + 1, (0.8, 4.0, -0.1), 0.3, 0.5)),
+        thing("sheet", 4, quad(0.5, 0.4), curve(seed + 2, (0.1, 3.6, 0.6), 0.2, 0.6), Material(double_sided=True)),
+        thing("standing", 5, cube(0.3), still((0.1, 5.5, -0.7))),
+    ]
+    eye = curve(seed + 3, (0, 0, 1.0), 0.2, 0.05, DOWN) if camera else still((0, 0, 1.0), DOWN)
+    light = Light(towards, 1.0, 0.2, shadows=shadows, shadow_size=1024, lamps=lamps)
+    return scene([floor(), *things], rig(96, 72, 90.0, eye), light)
+
+
+def errors(gl, world, t):
+    """(share of wrong pixels: dark where the reference is lit, lit where it is dark), off silhouettes and shadow
+    edges."""
+    ref = reference.render(world, t)
+    seen = drawn(gl, world, t)
+    lit = reference.render(replace(world, light=replace(world.light, shadows="off")), t).luminance
+    dark = ref.luminance < lit - 1e-6
+    edge = reference.silhouette_band(2 * ref.instance + dark, ref.depth, width=2)
+    graded = ref.hit & ~edge & (lit > 0.25)  # sky alone: no sun there
+    wrong = np.abs(seen - ref.luminance) > 0.1 * (lit - 0.2)
+    return (wrong & graded & ~dark).sum() / graded.sum(), (wrong & graded & dark).sum() / graded.sum()
+
+
+def test_nothing_shadows_itself_and_nothing_floats(gl):
+    """Random suns, poses and views, against rays cast in float64: acne would be dark pixels that should be lit, a
+    shadow that begins too far from what throws it lit ones that should be dark."""
+    found = np.array([errors(gl, moving_world(seed), SECOND // 3) for seed in range(12)])
+    assert found.mean() < 2e-3 and found.max() < 0.02, found
+
+
+def test_soft_shadows_are_a_mean_over_the_sun(gl):
+    """A box over the floor and a wide sun: the penumbra is that of the reference's 64 suns."""
+    world = sunlit(thing("box", 2, cube(0.5), still((0.2, 4.0, 0.6))), shadows="soft", size=512, sun_size=0.12)
+    ref, on, _ = ground_points(world)
+    hard = drawn(gl, replace(world, light=replace(world.light, shadows="hard")))[on]
+    seen, true = drawn(gl, world)[on], ref.luminance[on]
+    half = (true > 0.05 * SLANT[2]) & (true < 0.95 * SLANT[2])
+    assert half.sum() > 100
+    assert np.abs(seen - true)[half].mean() < 0.12 < np.abs(hard - true)[half].mean()
+    assert np.abs(seen - true).mean() < 0.01
+
+
+def test_a_map_is_drawn_again_only_where_something_moved(gl):
+    """Whatever the camera does; and it stays where it is: what does not move has the same shadow on the same place."""
+    still_world = sunlit(thing("box", 2, cube(0.5), still((0.2, 4.0, 0.6))))
+    flown = still_world.with_path(drift((0, 0, 1), (0.3, 0.2, 1.2), DOWN))
+    with Renderer(gl, flown, PLAIN) as renderer:
+        (map_,) = shadow_maps(flown, renderer.items)
+        first = renderer.draw(map_, 0)
+        before = first.target.read_depth()
+        second = renderer.draw(map_, SECOND // 2)
+        assert second.changed == [] and (before > 0).sum() > 1e5
+        np.testing.assert_array_equal(second.target.read_depth(), before)
+    mover = thing("ball", 3, sphere(0.3), drift((-1, 4, 0.5), (0.5, 4, 0.5)))
+    moved = replace(flown, objects=(*flown.objects, mover))
+    with Renderer(gl, moved, PLAIN) as renderer, Renderer(gl, moved, PLAIN) as other:
+        (map_,) = shadow_maps(moved, renderer.items)
+        for t in (0, SECOND // 8, SECOND // 4):
+            frame = renderer.draw(map_, t)
+            seen = frame.target.read_depth()
+        assert frame.changed and sum(r.area for r in frame.changed) < 0.5 * map_.texels**2
+        np.testing.assert_array_equal(seen, other.draw(map_, SECOND // 4).target.read_depth())
+
+
+def test_a_still_camera_sees_shadows_move(gl):
+    """What is lit by a lamp behind something that moves is drawn again, too."""
+    world = moving_world(3, camera=False)
+    with Renderer(gl, world, PLAIN) as renderer, Renderer(gl, world, PLAIN, whole=True) as whole:
+        for t in (0, SECOND // 4, SECOND // 2):
+            np.testing.assert_array_equal(renderer.luminance(t).read(), whole.luminance(t).read())
+
+
+def test_who_casts(gl):
+    """Objects and walls; not the ground, the sky, nor what is unlit."""
+    for category, unlit, casts in (
+        ("object", False, True),
+        ("wall", False, True),
+        ("object", True, False),
+        ("sky", False, False),
+    ):
+        body = SceneObject("box", 2, (Part(cube(0.5), Material(unlit=unlit)),), still((0.2, 4.0, 0.6)), category)
+        world = sunlit(body)
+        with Renderer(gl, world, PLAIN) as renderer:
+            assert bool(shadow_maps(world, renderer.items)) == casts
+            assert isinstance(renderer.luminance(0).read(), np.ndarray)
+
+
+def test_no_more_than_four_lamps_cast(gl):
+    lamps = tuple(Lamp("spot", (2.0, 2.0, 2.0), StaticPath(lamp_pose((k - 2, 3, 3), (0.1, 0.3, -1)))) for k in range(5))
+    world = sunlit(thing("box", 2, cube(0.5), still((0.2, 4.0, 0.6))), lamps=lamps, size=256)
+    ref, seen = reference.render(world, 0), drawn(gl, world)
+    with Renderer(gl, world, PLAIN) as renderer:
+        assert [m.lamp.kind for m in shadow_maps(world, renderer.items)] == ["sun", "spot", "spot", "spot"]
+    off = ref.hit & ~reference.silhouette_band(ref.instance, ref.depth)
+    assert np.median(np.abs(seen - ref.luminance)[off]) < 1e-5
+
+
+def test_the_rate_keeps_to_what_is_lit(gl):
+    """dL/dt of a surface in the shadow is that of its other light; the shadow's own motion is not in it."""
+    roof = thing("roof", 2, quad(3, 3), still((0, 4, 2)), Material(double_sided=True))
+    turn = Rotation.from_rotvec([0, 0.4, 0])
+    world = sunlit(roof, thing("ball", 3, sphere(0.4), drift((0, 4, 0), (0, 4, 0.2), None, turn)), sky=0.3)
+    dark = replace(world, light=replace(world.light, sun=0.0, shadows="off"))
+    with Renderer(gl, world, PLAIN, whole=True) as renderer, Renderer(gl, dark, PLAIN, whole=True) as other:
+        mine, theirs = (r.luminance(SECOND // 2, rate=True).read("rate") for r in (renderer, other))
+    ref = reference.render(world, SECOND // 2)
+    inside = (ref.instance == 3) & ~reference.silhouette_band(ref.instance, ref.depth, width=2)
+    assert inside.sum() > 100
+    np.testing.assert_allclose(mine[inside], theirs[inside], atol=1e-5)

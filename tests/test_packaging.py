@@ -270,6 +270,9 @@ def test_the_container_installs_what_setup_sh_asks_for():
         for word in step.text.split()
     }
     assert wanted <= installed
+    shipped = [file.read_text(encoding="utf-8") for file in (REPOSITORY / "configs").rglob("*.yaml")]
+    assert any("\n  physics:" in text for text in shipped)  # so what they need is there, too
+    assert any("pip install" in step.text and '".[physics]"' in step.text for step in cpu)
     nvidia = stage((REPOSITORY / "Dockerfile").read_text(encoding="utf-8"), "nvidia")[1]
     assert nvidia[: len(cpu)] == cpu and any("graphics" in step.text for step in nvidia if step.instruction == "ENV")
     assert [step.text for step in nvidia if step.instruction == "USER"][-1] == "blinkgl"

@@ -70,11 +70,13 @@ class WaveConfig(DeformConfig):
 
 
 class FlagConfig(DeformConfig):
-    """Cloth in wind: held at its low end of ``along``, waving the more the further from it, with a second, shorter
-    wave aslant."""
+    """Cloth in wind: held at one end, waving the more the further from it, with a second, shorter wave aslant."""
 
     kind: Literal["flag"] = "flag"
-    along: Axis = Field("x", description="axis from the held end to the free one, of the object at rest")
+    along: Axis = Field("x", description="axis between the held end and the free one, of the object at rest")
+    held: Literal["low", "high"] = Field(
+        "low", description="end of ``along`` that is held; along z, high: a sheet on a line"
+    )
     towards: Axis = Field("y", description="axis that the cloth moves along")
     amplitude: float = Field(
         0.12, ge=0, le=1, description="at the free end, parts of the object's length along ``along``"

@@ -619,7 +619,7 @@ class ObjectConfig(KeyedMotionConfig):
         "object", description="what it is: collisions and drawing order"
     )
     animation: str | int | AnimationConfig | None = Field(
-        None, description="clip of the mesh's gltf or glb file that it plays, looped; null: the file's rest shape"
+        None, description="clip of the mesh's gltf or glb file that it plays, looped; null: the file at rest"
     )
     physics: BodyConfig | None = Field(
         None,

@@ -91,7 +91,7 @@ def test_no_feature_is_without_a_row():
 def test_every_pair_of_kinds_is_in_a_row():
     covered = set().union(*map(pairs, ROWS))
     assert all_pairs() <= covered and all(map(fits, ROWS))
-    assert len(ROWS) < 80 and covering_rows() == ROWS
+    assert len(ROWS) < 100 and covering_rows() == ROWS
 
 
 @pytest.mark.parametrize(
@@ -179,17 +179,22 @@ def test_a_read_out_neither_makes_nor_hides_events(assets, tmp_path, source):
 
 
 def test_executors_and_resume_and_groups(assets, tmp_path):
-    """Scenes, a scene file and frames by two workers, cut short and continued by other
+    """Scenes, one that lives, a scene file and frames by two workers, cut short and continued by other
     means: the bytes of one process."""
     groups = {
         name: merged(configuration({"source": source, "timeline": "displacement"}), {"output": {"sequences": 2}})
-        for name, source in (("scene", "random"), ("file", "file"), ("recorded", "frames, motion"))
+        for name, source in (
+            ("scene", "random"),
+            ("living", "living"),
+            ("file", "file"),
+            ("recorded", "frames, motion"),
+        )
     }
     template = load_run(recipe(assets, "executors", groups))
     run_dataset(template, tmp_path / "one")
     outcome = run_dataset(template, tmp_path / "two", Local(workers=2))
-    assert len(outcome.made) == 6 and tree(tmp_path / "two") == tree(tmp_path / "one")
-    for name in ("train/scene_000001", "train/recorded_000000"):
+    assert len(outcome.made) == 8 and tree(tmp_path / "two") == tree(tmp_path / "one")
+    for name in ("train/scene_000001", "train/living_000000", "train/recorded_000000"):
         shutil.rmtree(tmp_path / "two" / name)
-    assert len(run_dataset(template, tmp_path / "two", resume=True).made) == 2
+    assert len(run_dataset(template, tmp_path / "two", resume=True).made) == 3
     assert tree(tmp_path / "two") == tree(tmp_path / "one")

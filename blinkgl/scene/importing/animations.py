@@ -4,18 +4,19 @@ pieces that follow them."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from blinkgl.config.deform import AnimationConfig, ClipConfig
-from blinkgl.errors import ConfigError
+from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.shapes.clips import PATHS, Blend, Clip, Playing, Track
 from blinkgl.scene.shapes.deformer import Deformer
-from blinkgl.scene.shapes.skeleton import Motion, Skeleton
+from blinkgl.scene.shapes.skeleton import Motion, Skeleton, Still
 from blinkgl.scene.shapes.skin import Morphs, Skin
+from blinkgl.scene.types import Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +162,44 @@ def play(document: gltf.Document, config: AnimationConfig, base: Path, where: st
     return Animation(
         document, [_part(document, clip, share, base, key) for clip, share, key in zip(clips, shares, keys)]
     )
+
+
+def rest_pieces(document: gltf.Document, node: int) -> tuple[list[gltf.Piece], np.ndarray]:
+    """(pieces of a node's mesh as the file shows them at rest, (4, 4) what takes them to the file's world): a skin has
+    its joints where its nodes are, morph targets have the weights that the file gives. What is wrong with a skin that
+    nobody plays is no reason to refuse the file: its shape as it was modelled is drawn, and that is said."""
+    mesh, skin = document.nodes[node].mesh, document.nodes[node].skin
+    assert mesh is not None
+    try:
+        pieces = document.mesh_pieces(mesh, changing=True)
+        bound = skin is not None and any(piece.binding is not None for piece in pieces)
+        joints, bind = document.skin(skin) if bound and skin is not None else ([], np.zeros((0, 4, 4)))
+        posed = [_at_rest(document, node, piece, joints, bind) for piece in pieces]
+        return posed, np.eye(4) if bound else document.world(node)
+    except AssetError as error:
+        pieces = document.mesh_pieces(mesh)  # which raises what is wrong with the rest
+        document.omissions.add(f"a pose at rest ({error.problem})")
+        return pieces, document.world(node)
+
+
+def _at_rest(
+    document: gltf.Document, node: int, piece: gltf.Piece, joints: Sequence[int], bind: np.ndarray
+) -> gltf.Piece:
+    """A piece of a node's mesh; in the file's world where there are joints."""
+    if piece.targets is not None:
+        positions, normals = piece.targets
+        weights = document.morph_weights(node, len(positions))
+        piece = replace(piece, vertices=piece.vertices + np.tensordot(weights, positions, 1), targets=None)
+        if piece.normals is not None and normals is not None:
+            piece = replace(piece, normals=piece.normals + np.tensordot(weights, normals, 1))
+    if len(joints):
+        shape = Mesh(piece.vertices, piece.faces, piece.normals, piece.uvs)  # type: ignore[arg-type]
+        if piece.binding is None:  # follows the node, and not its joints
+            return gltf.transformed(piece, document.world(node))
+        skin = Skin(document.skeleton(Still(document.rest())), joints, bind, *piece.binding, where=document.path.name)
+        turned = None if piece.normals is None else skin.normals(shape, 0)
+        piece = replace(piece, vertices=skin.positions(shape, 0), normals=turned, binding=None)
+    return piece
 
 
 def clip_names(document: gltf.Document) -> list[str]:

@@ -81,6 +81,18 @@ class Piece:
     targets: tuple[np.ndarray, np.ndarray | None] | None = None
 
 
+def _surface_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V, 3) unit means of the faces round each vertex, by their area; 0 where there are none. Vertices in one place
+    are not one: a file has several where its surface has an edge."""
+    corners = vertices[faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    out = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(out, faces[:, k], area)
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.divide(out, length, out=np.zeros_like(out), where=length > 0)
+
+
 def transformed(piece: Piece, matrix: np.ndarray) -> Piece:
     """The piece under an affine (4, 4) map; a mirroring one turns the faces round, so that they keep facing out."""
     linear = matrix[:3, :3]
@@ -199,7 +211,7 @@ class Document:
             if primitive.get("targets") and not changing:
                 self.omissions.add("morph targets (the base shape is drawn)")
             if "JOINTS_0" in attributes and not changing:
-                self.omissions.add("skins (the rest shape is drawn)")
+                self.omissions.add("skins (the shape as it was modelled is drawn)")
             material, uv_set, uv_matrix = self.material(primitive.get("material"))
             normals = self._attribute(primitive, "NORMAL", 3, len(vertices))
             uvs = self._attribute(primitive, f"TEXCOORD_{uv_set}", 2, len(vertices))
@@ -210,7 +222,7 @@ class Document:
                 material = self._coloured(primitive, material, len(vertices))
             piece = Piece(vertices, _triangles(order, mode), normals, uvs, material)
             if changing:
-                bound, targets = self._binding(primitive, len(vertices)), self._targets(primitive, len(vertices))
+                bound, targets = self._binding(primitive, len(vertices)), self._targets(primitive, piece)
                 piece = replace(piece, binding=bound, targets=targets)
             pieces.append(piece)
         return pieces
@@ -229,8 +241,10 @@ class Document:
                 )
         return (np.hstack(joints), np.hstack(weights)) if joints else None
 
-    def _targets(self, primitive: dict, count: int) -> tuple[np.ndarray, np.ndarray | None] | None:
-        targets = primitive.get("targets", [])
+    def _targets(self, primitive: dict, piece: Piece) -> tuple[np.ndarray, np.ndarray | None] | None:
+        """Of a primitive whose base shape is ``piece``. A target without normals has those of its own surface: what
+        they are more than those of the base surface, computed the same way."""
+        targets, count = primitive.get("targets", []), len(piece.vertices)
         if len(targets) * count > _MAX_TARGET_VERTICES:
             raise AssetError(
                 "the mesh has too many morph targets",
@@ -257,8 +271,18 @@ class Document:
                 raise AssetError(f"a morph target is no number, or beyond 1e12 ({name})", where=self.where)
             return values
 
-        normals = np.stack([read(t, "NORMAL") for t in targets]) if any("NORMAL" in t for t in targets) else None
-        return np.stack([read(t, "POSITION") for t in targets]), normals
+        positions = np.stack([read(t, "POSITION") for t in targets])
+        if piece.normals is None:
+            return positions, None
+        base = None
+        normals = np.zeros_like(positions)
+        for number, target in enumerate(targets):
+            if "NORMAL" in target:
+                normals[number] = read(target, "NORMAL")
+            elif positions[number].any():
+                base = _surface_normals(piece.vertices, piece.faces) if base is None else base
+                normals[number] = _surface_normals(piece.vertices + positions[number], piece.faces) - base
+        return positions, normals if normals.any() else None
 
     def skin(self, index: int) -> tuple[list[int], np.ndarray]:
         """(joints as places among :attr:`nodes`, (m, 4, 4) inverse bind matrices). AssetError for a joint that is not
@@ -369,16 +393,6 @@ class Document:
         if material is None:
             return {}
         return _item(self.tree, "materials", material, self.where).get("pbrMetallicRoughness", {})
-
-    def pieces(self, changing: bool = False) -> list[tuple[int, Piece]]:
-        """(node, piece) of the whole scene at rest as one object, in the file's axes; changing : as
-        :meth:`mesh_pieces`."""
-        return [
-            (i, transformed(p, self.world(i)))
-            for i, node in self.nodes.items()
-            if node.mesh is not None
-            for p in self.mesh_pieces(node.mesh, changing)
-        ]
 
     def accessor(self, index: int) -> np.ndarray:
         """(count, n) values; normalised integers become floats."""

@@ -25,7 +25,7 @@ from blinkgl.config.deform import AnimationConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, concatenate, make_mesh, normalise
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.animations import clip_names, play
+from blinkgl.scene.importing.animations import clip_names, play, rest_pieces
 from blinkgl.scene.omissions import Omissions
 from blinkgl.scene.reading import MAX_BYTES, contents, reading
 from blinkgl.scene.shapes.skin import Skin, joined
@@ -77,7 +77,7 @@ def load_asset(
 ) -> Asset:
     """One object from a file.
 
-    animation : of a glTF file, which it plays; None: its rest shape.   base : folder that paths in it start from.
+    animation : of a glTF file, which it plays; None: it is at rest.   base : folder that paths in it start from.
     where : its key of the
         configuration.
 
@@ -134,8 +134,16 @@ def _load(
         document = gltf.read(path, data, max_faces=max_faces, max_texture=max_texture, materials=keep_materials)
         log, omissions, clips = document.log, document.omissions, clip_names(document)
         played = None if animation is None else play(document, animation, base, key)
-        placed = document.pieces(changing=played is not None)
-        nodes, at_rest, pieces = [n for n, _ in placed], [document.world(n) for n, _ in placed], [p for _, p in placed]
+        nodes, at_rest, pieces = [], [], []
+        for node in (i for i, n in document.nodes.items() if n.mesh is not None):
+            if played is not None:
+                own, world = document.mesh_pieces(document.nodes[node].mesh, changing=True), document.world(node)
+            else:
+                own, world = rest_pieces(document, node)
+            for piece in own:
+                nodes.append(node)
+                at_rest.append(world)
+                pieces.append(gltf.transformed(piece, world))
         if clips and played is None:
             omissions.add("animations (the rest pose is drawn)")
     else:

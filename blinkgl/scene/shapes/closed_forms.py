@@ -173,14 +173,17 @@ class Flag(Waves):
         along, towards = _AXES[config.along], _AXES[config.towards]
         across = np.abs(np.cross(along, towards))
         length = _length(low, high, along)
+        pole = low
+        if config.held == "high":
+            along, pole = -along, np.where(along > 0, high, low)
         k = 2 * math.pi / (config.wavelength * length)
         first, second = k * along, k * (1.6 * along + 0.9 * across)
         beat = Beat(config.period, -math.radians(config.phase))
         amplitude = config.amplitude * length
         return cls(
             towards,
-            (along / length, -float(along @ low) / length),
-            ((first, -float(first @ low)), (second, -float(second @ low))),
+            (along / length, -float(along @ pole) / length),
+            ((first, -float(first @ pole)), (second, -float(second @ pole))),
             (amplitude, 0.3 * amplitude),
             (beat, Beat(config.period / 2, 2 * beat.phase)),
         )

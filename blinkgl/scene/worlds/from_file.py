@@ -26,7 +26,7 @@ from blinkgl.config.scene import FileSceneConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.geometry.meshes import closed_together, make_mesh
 from blinkgl.scene.importing import gltf
-from blinkgl.scene.importing.animations import Animation, clip_names, play
+from blinkgl.scene.importing.animations import Animation, clip_names, play, rest_pieces
 from blinkgl.scene.importing.mesh_files import piece_of_trimesh
 from blinkgl.scene.lights import MAX_LAMPS, lamp_of_gltf, make_light
 from blinkgl.scene.motion.paths import KeyframePath, StaticPath
@@ -143,11 +143,18 @@ def _from_document(
     for index, node in document.nodes.items():
         if node.mesh is None:
             continue
-        pieces = document.mesh_pieces(node.mesh, changing=animation is not None)
+        if animation is None:
+            pieces, world = rest_pieces(document, index)
+            if any(len(p.faces) for p in pieces):
+                place, baked = split_rigid(gltf.Z_UP @ world)
+                parts = _parts(pieces, baked, node.name, document.where, document.log)
+                objects.append((node.name, parts, StaticPath(place, t0_ns, t1_ns)))
+            continue
+        pieces = document.mesh_pieces(node.mesh, changing=True)
         if not any(len(p.faces) for p in pieces):
             continue
-        skinned = animation is not None and node.skin is not None and any(p.binding is not None for p in pieces)
-        if animation is not None and (skinned or _beyond_a_path(animation, index)):
+        skinned = node.skin is not None and any(p.binding is not None for p in pieces)
+        if skinned or _beyond_a_path(animation, index):
             motion, baked, on_path, turn = (
                 StaticPath(None, t0_ns, t1_ns),
                 gltf.Z_UP @ document.world(index),
@@ -159,7 +166,7 @@ def _from_document(
             on_path, turn = True, np.eye(4)
 
         deformer = None
-        if animation is not None and (skinned or not on_path or any(p.targets is not None for p in pieces)):
+        if skinned or not on_path or any(p.targets is not None for p in pieces):
             deformer = partial(animation.deformer, index, at_rest=baked, turn=turn, on_path=on_path)
         parts = _parts(pieces, baked, node.name, document.where, document.log, deformer)
         objects.append((node.name, parts, motion))

@@ -76,6 +76,20 @@ def test_a_shape_that_is_not_to_move_stays_as_it_is(kind):
     assert SceneObject("box", 1, (Part(mesh, Material()),), StaticPath()).is_static
 
 
+@pytest.mark.parametrize("along", ["x", "z"])
+def test_a_sheet_on_a_line_is_the_flag_turned_round(along):
+    """Held at its high end it does there what one held at its low end does here."""
+    mesh, axis, t = BUILDERS["cuboid"](extents=(1.0, 0.1, 2.0), subdivisions=6), "xyz".index(along), 137 * MS
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    flags = [deformer_of(FlagConfig(along=along, towards="y", held=held), low, high) for held in ("low", "high")]
+    mirrored = replace(mesh, vertices=mesh.vertices * np.where(np.arange(3) == axis, -1.0, 1.0))
+    ours, theirs = flags[1].positions(mesh, t), flags[0].positions(mirrored, t)
+    np.testing.assert_allclose(ours[:, 1], theirs[:, 1], atol=1e-12)
+    top = mesh.vertices[:, axis] == high[axis]
+    np.testing.assert_array_equal(ours[top], mesh.vertices[top])
+    assert np.abs(ours - mesh.vertices).max() > 0.05
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_bounds_hold_every_shape(kind):
     mesh = body(kind)

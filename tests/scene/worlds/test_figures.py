@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from shared_data import shared
 
@@ -13,8 +14,10 @@ from blinkgl.config.scene import ExplicitSceneConfig, FileSceneConfig, RandomSce
 from blinkgl.config.sequence import CameraConfig
 from blinkgl.errors import AssetError, ConfigError
 from blinkgl.scene.build import build_scene
+from blinkgl.scene.geometry.primitives import BUILDERS
 from blinkgl.scene.importing import gltf
 from blinkgl.scene.importing.mesh_files import load_asset
+from blinkgl.scene.shapes.skin import Skin
 from tests.scene.gltf_files import arm_file
 
 SECOND = 10**9
@@ -63,12 +66,74 @@ def test_a_clip_of_another_file_and_two_at_once(tmp_path):
     np.testing.assert_allclose(fast.deformer.positions(fast, 9 * SECOND), b.deformer.positions(b, 0), atol=1e-12)
 
 
-def test_a_file_of_which_nothing_is_played_says_so(tmp_path):
-    (tmp_path / "arm.glb").write_bytes(arm_file(morphs=True).glb())
+def posed(builder):
+    """At rest the upper joint is turned, and the target has a weight."""
+    nodes = {node["name"]: node for node in builder.tree["nodes"]}
+    nodes["upper"]["rotation"] = [float(v) for v in Rotation.from_rotvec([0, 0, 0.4]).as_quat()]
+    builder.tree["meshes"][0]["weights"] = [0.6]
+
+
+def assert_is_the_bar(vertices, angle, swell):
+    """All vertices of the bar of :func:`arm_file` so bent, z up, and no others, in whatever order."""
+    rest = BUILDERS["cuboid"](extents=(0.4, 2.0, 0.4), subdivisions=4)
+    up = np.clip(rest.vertices[:, 1] / 0.8 + 0.5, 0, 1)
+    true = bent(rest.vertices, up, angle, swell) @ gltf.Z_UP[:3, :3].T
+    assert max(cKDTree(true).query(vertices)[0].max(), cKDTree(vertices).query(true)[0].max()) < 1e-6
+
+
+@pytest.mark.parametrize("change, angle, swell", [(None, 0.0, 0.0), (posed, 0.4, 0.6)])
+def test_a_file_of_which_nothing_is_played_is_drawn_at_rest(tmp_path, change, angle, swell):
+    """Joints where its nodes are, targets with the file's weights: as any viewer shows it. As an object, as a scene,
+    and by the pool."""
+    (tmp_path / "arm.glb").write_bytes(arm_file(morphs=True, change=change).glb())
     asset = load_asset(tmp_path / "arm.glb")
     assert asset.parts[0].mesh.deformer is None
+    assert asset.omissions == ("arm.glb asks for what is not drawn: animations (the rest pose is drawn)",)
+    camera = {"position": [0, -6, 0], "look_at": [0, 0, 0]}
+    scene = scene_of(tmp_path, FileSceneConfig, kind="file", path="arm.glb", animation=None, pose=camera)
+    (bar,) = scene.objects
+    assert not bar.deforms and bar.is_static
+    for mesh, T in ((asset.parts[0].mesh, np.eye(4)), (bar.parts[0].mesh, bar.path.pose(0))):
+        assert_is_the_bar(mesh.vertices @ T[:3, :3].T + T[:3, 3], angle, swell)
+        corners = mesh.vertices[mesh.faces]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert ((mesh.normals[mesh.faces] * flat[:, None]).sum(axis=2) > 0).all()  # they turned with it
+    bare = load_asset(tmp_path / "arm.glb", keep_materials=False).parts[0].mesh
+    np.testing.assert_array_equal(bare.vertices, asset.parts[0].mesh.vertices)
+
+
+def test_a_skin_that_nobody_plays_may_be_wrong(tmp_path):
+    """What is wrong is said, and the shape drawn as it was modelled; who plays it is refused (below)."""
+
+    def change(builder):
+        builder.tree["skins"][0]["inverseBindMatrices"] = builder.array(np.full((2, 16), np.nan, "f4"), "MAT4")
+
+    (tmp_path / "arm.glb").write_bytes(arm_file(change=change).glb())
+    asset = load_asset(tmp_path / "arm.glb")
     (line,) = asset.omissions
-    assert "skins (the rest shape is drawn)" in line and "animations (the rest pose is drawn)" in line
+    assert "a pose at rest (the inverse bind matrix of joint 0 of a skin is not finite)" in line
+    assert "skins (the shape as it was modelled is drawn)" in line
+    assert_is_the_bar(asset.parts[0].mesh.vertices - [9, -9, 9], 0, 0)
+
+
+def test_a_target_without_normals_has_those_of_its_shape(tmp_path):
+    """A shape pulled aslant: its normals at weight 1 are those of the slanted surface."""
+
+    def change(builder):
+        bar = BUILDERS["cuboid"](extents=(0.4, 2.0, 0.4), subdivisions=4)
+        shear = np.stack([bar.vertices[:, 1], 0 * bar.vertices[:, 1], 0 * bar.vertices[:, 1]], axis=1).astype("f4")
+        builder.tree["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": builder.array(shear, "VEC3")}]
+
+    (tmp_path / "arm.glb").write_bytes(arm_file(morphs=True, change=change).glb())
+    mesh = load_asset(tmp_path / "arm.glb", animation=AnimationConfig(clip="wave")).parts[0].mesh
+    deformer = Skin.morphing(mesh.deformer.morphs)  # its joints turn besides
+    for t in (0, SECOND // 2):  # weights 0 and 1
+        corners = deformer.positions(mesh, t)[mesh.faces]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat /= np.linalg.norm(flat, axis=1, keepdims=True)
+        n = deformer.normals(mesh, t)[mesh.faces]
+        n /= np.linalg.norm(n, axis=2, keepdims=True)
+        assert (n * flat[:, None]).sum(axis=2).min() > 1 - 1e-6
 
 
 def scene_of(tmp_path, model, **tree):
@@ -204,6 +269,7 @@ def broken(said, **change):
         broken("a morph target has another size", target=1),
         broken("the nodes are no tree", cycle=True),
         broken("too many joints and morph targets", joints=[0] * 400),
+        broken("a skin has too many joints", joints=[0] * 1_000_000),
         broken("skins.0.joints", joints=[]),
     ],
 )  # fmt: skip

@@ -13,6 +13,9 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ.setdefault("LP_NUM_THREADS", "0")
     # pyrender imports its viewer's pyglet, which fails where there is only half of X11.
     os.environ.setdefault("PYGLET_HEADLESS", "1")
+    # Runs of the tests count as one build, although somebody may be editing the code while they are on. (From the
+    # start: a process looks once.)
+    os.environ["BLINKGL_BUILD"] = "tests"
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +26,16 @@ class PinHole(CameraModel):
     def centred(cls, width: int, height: int, fx: float, fy: float | None = None, near: float = 0.05) -> PinHole:
         """With the principal point in the middle of the image; ``fy``: as fx."""
         return cls(width, height, fx, fx if fy is None else fy, (width - 1) / 2, (height - 1) / 2, near)
+
+    def from_lens_point(self, a: float, b: float, focus: float) -> PinHole:
+        """What a point (a, b) of a lens before this camera sees, in place at depth ``focus``: a camera whose centre is
+        (a, b, 0), its picture moved."""
+        return replace(self, cx=self.cx + self.fx * a / focus, cy=self.cy + self.fy * b / focus)
+
+    @property
+    def px_per_slope(self) -> float:
+        """How far, px, the image of a point moves at most when X / Z or Y / Z changes by 1."""
+        return max(self.fx, self.fy)
 
     def project(self, points: np.ndarray) -> np.ndarray:
         x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)

@@ -9,20 +9,17 @@ the image; a point at depth Z is spread over a disc of diameter ``aperture * f *
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
-from blinkgl.camera import CameraModel
+from blinkgl.camera import PinHole
 from blinkgl.config.images import LensConfig
 
 
-def blur_px(lens: LensConfig, camera: CameraModel, depth: np.ndarray) -> np.ndarray:
+def blur_px(lens: LensConfig, camera: PinHole, depth: np.ndarray) -> np.ndarray:
     """(…) diameter, px, of the disc that a point at (…) depth Z > 0 becomes; inf is a depth."""
     with np.errstate(divide="ignore"):
-        return (
-            lens.aperture * max(camera.fx, camera.fy) * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
-        )
+        return lens.aperture * camera.px_per_slope * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
 
 
 def samples(largest_px: float, spacing_px: float) -> int:
@@ -43,10 +40,10 @@ def points(count: int, diameter: float) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
-def through(camera: CameraModel, point: np.ndarray, focus: float) -> CameraModel:
+def through(camera: PinHole, point: np.ndarray, focus: float) -> PinHole:
     """The pin-hole camera at ``point`` (2,) of the lens, whose picture is in place at depth ``focus``."""
     a, b = (float(v) for v in point)
-    return replace(camera, cx=camera.cx + camera.fx * a / focus, cy=camera.cy + camera.fy * b / focus)
+    return camera.from_lens_point(a, b, focus)
 
 
 def at_point(T_world_cam: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -56,7 +53,7 @@ def at_point(T_world_cam: np.ndarray, point: np.ndarray) -> np.ndarray:
     return moved
 
 
-def vignette(camera: CameraModel, strength: float) -> np.ndarray:
+def vignette(camera: PinHole, strength: float) -> np.ndarray:
     """(H, W) float64: share of the light that arrives, 1 - strength (1 - cos^4) of the angle between a pixel's ray and
     the optical axis."""
     y, x = np.mgrid[: camera.height, : camera.width]

@@ -98,6 +98,7 @@ class Renderer:
     def look_through(self, camera: CameraModel) -> None:
         """From now on draws with another camera of the same size and path: another part of the picture at the same
         cost. Nothing of what was drawn before is used again, and frames are drawn whole."""
+        self.scene = self.scene.with_camera(camera)
         self._moments.look_through(camera)
         self._labels.forget()
         self.whole = True  # what stands still in one picture is no backdrop of the other

@@ -126,8 +126,7 @@ def view_of(lamp: Lamp, box: Box | None, size: int, pose: np.ndarray) -> tuple[V
     """What the lamp's map sees, and (4, 4) T_world_cam from where. pose : T_world_lamp."""
     T = pose @ CV_FROM_LAMP
     if box is None:
-        half = size / 2 - _SPARE
-        return View.of(PinHole.centred(size, size, half / math.tan(min(lamp.outer, 1.5)), near=_NEAR)), T
+        return View.of(PinHole.centred(size, size, 1 / _texel_of_cone(lamp, size), near=_NEAR)), T
     x, y, z = (h * size / (size - 2 * _SPARE) for h in box.half)
     camera = Parallel(size, x, y, 2 * z)
     T[:3, 3] = np.asarray(box.centre) - z * T[:3, 2]
@@ -140,7 +139,12 @@ def scale_of(lamp: Lamp, box: Box | None, size: int) -> tuple[float, float, floa
     camera = view_of(lamp, box, size, np.eye(4))[0].camera
     if isinstance(camera, Parallel):
         return 2 * max(camera.half_x, camera.half_y) / camera.size, 0.0, 1 / camera.depth, lamp.size
-    return 0.0, 1 / camera.fx, 0.0, lamp.size
+    return 0.0, _texel_of_cone(lamp, size), 0.0, lamp.size
+
+
+def _texel_of_cone(lamp: Lamp, size: int) -> float:
+    """How wide a texel of a spot's map is at a depth of 1."""
+    return math.tan(min(lamp.outer, 1.5)) / (size / 2 - _SPARE)
 
 
 def planes_of(rows: np.ndarray, scales: np.ndarray) -> np.ndarray:

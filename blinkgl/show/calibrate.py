@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
+from blinkgl.config.reader import to_short_yaml
 from blinkgl.errors import OutputError
 from blinkgl.io.atomic import atomic_file, output_errors
 from blinkgl.recordings.calibration import calibrate
@@ -54,7 +54,7 @@ def run(
         task = bar.add_task("reading", total=1.0)
         progress = lambda what, done: bar.update(task, description=what, completed=done)
         result = calibrate(recording, frames, emulator=base, fixed=fixed, progress=progress, **options)
-    text = yaml.safe_dump(result.sensor(), sort_keys=False, width=120, allow_unicode=True)
+    text = to_short_yaml(result.sensor())
     with atomic_file(beside, overwrite=overwrite) as html, atomic_file(target, overwrite=overwrite) as file:
         with output_errors(target):
             html.write_text(page(result, text), encoding="utf-8")

@@ -15,14 +15,6 @@ from gltf_files import GltfBuilder, arm_file
 FRAMES, SHIFT = 5, (1.25, -0.5)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def one_build():
-    """Runs of these tests count as one build, although somebody may be editing the code while they are on."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("BLINKGL_BUILD", "tests")
-        yield
-
-
 @pytest.fixture(scope="session")
 def assets(tmp_path_factory) -> Path:
     """Folder that relative paths of the rows start from."""

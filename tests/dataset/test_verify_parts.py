@@ -356,7 +356,7 @@ def known(
     **noise,
 ):
     config = SimpleNamespace(
-        frames=frames, scene=SimpleNamespace(kind=kind), seed=seed, events=SimpleNamespace(**noise)
+        frames=frames, scene=SimpleNamespace(kind=kind), seed=seed, events=SimpleNamespace(**noise), readout=None
     )
     return name, verify._Known(
         Path(name),
@@ -422,10 +422,15 @@ def test_twins(first, second, problems, notes):
     ["threshold_sigma", "threshold_jitter", "leak_rate_hz", "shot_noise_rate_hz", "hot_pixel_fraction", "k3", "k6"],
 )
 def test_what_makes_two_seeds_differ(key):
-    assert verify._noisy(SimpleNamespace(events=SimpleNamespace(**{key: 0.1})))
-    assert not verify._noisy(SimpleNamespace(events=SimpleNamespace(**{key: 0.0}))) and not verify._noisy(
-        SimpleNamespace(events=SimpleNamespace())
-    )
+    of = lambda **keys: SimpleNamespace(events=SimpleNamespace(**keys), readout=None)
+    assert verify._noisy(of(**{key: 0.1}))
+    assert not verify._noisy(of(**{key: 0.0})) and not verify._noisy(of())
+
+
+@pytest.mark.parametrize(("key", "differ"), [("pixels", True), ("latency", True), ("filters", False)])
+def test_a_read_out_may_make_two_seeds_differ(key, differ):
+    readout = SimpleNamespace(**{"pixels": None, "latency": None, key: object()})
+    assert verify._noisy(SimpleNamespace(events=SimpleNamespace(), readout=readout)) is differ
 
 
 def test_a_check_that_stops_is_a_line():

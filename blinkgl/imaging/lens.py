@@ -12,14 +12,16 @@ import math
 
 import numpy as np
 
-from blinkgl.camera import PinHole
+from blinkgl.camera import CameraModel, PinHole
 from blinkgl.config.images import LensConfig
 
 
-def blur_px(lens: LensConfig, camera: PinHole, depth: np.ndarray) -> np.ndarray:
+def blur_px(lens: LensConfig, camera: CameraModel, depth: np.ndarray) -> np.ndarray:
     """(…) diameter, px, of the disc that a point at (…) depth Z > 0 becomes; inf is a depth."""
     with np.errstate(divide="ignore"):
-        return lens.aperture * camera.px_per_slope * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
+        return (
+            lens.aperture * _drawn(camera).px_per_slope * np.abs(1.0 / np.asarray(depth, np.float64) - 1.0 / lens.focus)
+        )
 
 
 def samples(largest_px: float, spacing_px: float) -> int:
@@ -40,10 +42,15 @@ def points(count: int, diameter: float) -> np.ndarray:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
-def through(camera: PinHole, point: np.ndarray, focus: float) -> PinHole:
+def through(camera: CameraModel, point: np.ndarray, focus: float) -> CameraModel:
     """The pin-hole camera at ``point`` (2,) of the lens, whose picture is in place at depth ``focus``."""
     a, b = (float(v) for v in point)
-    return camera.from_lens_point(a, b, focus)
+    return _drawn(camera).from_lens_point(a, b, focus)
+
+
+def _drawn(camera: CameraModel) -> PinHole:
+    assert isinstance(camera, PinHole)  # a renderer draws no other
+    return camera
 
 
 def at_point(T_world_cam: np.ndarray, point: np.ndarray) -> np.ndarray:
@@ -53,7 +60,7 @@ def at_point(T_world_cam: np.ndarray, point: np.ndarray) -> np.ndarray:
     return moved
 
 
-def vignette(camera: PinHole, strength: float) -> np.ndarray:
+def vignette(camera: CameraModel, strength: float) -> np.ndarray:
     """(H, W) float64: share of the light that arrives, 1 - strength (1 - cos^4) of the angle between a pixel's ray and
     the optical axis."""
     y, x = np.mgrid[: camera.height, : camera.width]

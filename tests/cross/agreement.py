@@ -260,9 +260,12 @@ def of_explanation(told: Explanation, config: SequenceConfig, report: SequenceRe
     if config.timeline.kind == "uniform":
         found.same("event frames", explain=told.frames, manifest=manifest["frames"])
     else:
-        # An estimate, from the pace at a few moments of a clip of 40 ms.
+        # An estimate, from the pace at a few moments of a clip of 40 ms; of a budget a prior until it has measured.
         low, high = sorted((told.frames, manifest["frames"]))
-        found.expect(high <= 10 + 6 * low, f"event frames: explain {told.frames}, made {manifest['frames']}")
+        found.expect(
+            high <= 10 + (12 if config.timeline.kind == "budget" else 6) * low,
+            f"event frames: explain {told.frames}, made {manifest['frames']}",
+        )
     for what, off in (
         ("level of detail", not config.render.lod.enabled),
         ("anisotropic filtering", config.render.anisotropy == 1),

@@ -98,10 +98,10 @@ def test_motions_of_a_millionth_of_a_pixel(gl, kind):
     assert length(labels.velocity[off] - limit).max() <= 1e-5 * length(limit).max()
 
 
-@pytest.mark.parametrize("kind", FORMS)
+@pytest.mark.parametrize("kind", [*FORMS, "skin", "figure"])
 def test_there_and_back_again(gl, kind):
     """backward flow at where forward flow ends, of the same surface: back to the pixel."""
-    what = world(by_formula(sphere(1.0, 4), kind))
+    what = world({"skin": arm, "figure": figure_of}[kind]() if kind not in FORMS else by_formula(sphere(1.0, 4), kind))
     _, there, off = graded(gl, what, T0, T1, T_BACK)
     _, back, _ = graded(gl, what, T1, T1 + MS, T0)
     y, x = np.nonzero(off & ~there.forward.occluded & (there.ids == 3))
@@ -115,7 +115,7 @@ def test_there_and_back_again(gl, kind):
     f = back.backward.flow
     mean = (1 - b) * ((1 - a) * f[y0, x0] + a * f[y0, x0 + 1]) + b * ((1 - a) * f[y0 + 1, x0] + a * f[y0 + 1, x0 + 1])
     start = np.stack([x, y], axis=1)[inside][same]
-    assert same.sum() > 500 and np.median(length(at + mean - start)) < 5e-3
+    assert same.sum() > (500 if kind in FORMS else 120) and np.median(length(at + mean - start)) < 5e-3
 
 
 @pytest.mark.parametrize("kind", FORMS)
